@@ -1,0 +1,34 @@
+"""BiResNeRF: refine camera poses by optimising poses and a radiance field together.
+
+Importing the package loads neither torch nor numba; ``refine`` does when it is first used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from biresnerf.config import RefineOptions
+from biresnerf.errors import BiresnerfError, InputError, Interrupted, RefinementError
+from biresnerf.progress import Progress
+
+if TYPE_CHECKING:
+    from biresnerf.pipeline import refine
+
+__version__ = "0.1.0"
+__all__ = [
+    "BiresnerfError",
+    "InputError",
+    "Interrupted",
+    "Progress",
+    "RefineOptions",
+    "RefinementError",
+    "refine",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "refine":
+        from biresnerf.pipeline import refine
+
+        return refine
+    raise AttributeError(f"module 'biresnerf' has no attribute {name!r}")

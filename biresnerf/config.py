@@ -1,0 +1,194 @@
+"""What a user may ask for: frozen models that give the CLI flags, the HTTP schema and config.json alike.
+
+A field left at ``None`` takes the preset's value; ``RefineOptions.resolved()`` fills them all in.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from biresnerf.errors import InputError
+
+PresetName = Literal["fast", "balanced", "quality", "paper"]
+Device = Literal["auto", "cpu", "cuda"]
+Background = Literal["auto", "white", "black", "none"]
+PoseParametrisation = Literal["se3_world", "so3xr3"]
+
+
+class RefineOptions(BaseModel):
+    """Options of one refinement. Unknown keys are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", title="Refinement options")
+
+    preset: PresetName = Field("balanced", description="Fills every option that is left out.")
+    device: Device = Field("auto", description="Where to compute; auto takes CUDA where there is one.")
+    seed: int = Field(0, ge=0, lt=2**31, description="Same seed, same machine, same result on the CPU.")
+    threads: int = Field(0, ge=0, le=256, description="CPU threads; 0 takes all cores this process may use.")
+
+    max_image_size: int | None = Field(
+        None, ge=16, le=4096, description="Long side (px) that images are optimised at; results are full size."
+    )
+    holdout: int | None = Field(
+        None, ge=0, le=200, description="Views kept out of the field's training, to measure it. Default: a tenth."
+    )
+    background: Background = Field(
+        "auto", description="What lies behind the scene: a colour, or none where photos show surroundings."
+    )
+
+    steps: int | None = Field(None, ge=20, le=1_000_000, description="Steps of both stages together.")
+    coarse_steps_min: int | None = Field(None, ge=10, description="Stage 1 takes at least this many steps.")
+    coarse_steps_max: int | None = Field(None, ge=10, description="Stage 1 ends here, stable or not.")
+    check_every: int | None = Field(None, ge=5, description="Steps between two looks of the stability detector.")
+    samples_per_step: int | None = Field(
+        None, ge=1024, le=2**22, description="Field samples a step at the end of the coarse-to-fine ramp."
+    )
+
+    pose_rate: float | None = Field(None, gt=0, le=0.1, description="Pose learning rate at the start.")
+    pose_rate_final: float | None = Field(None, gt=0, le=0.1, description="Pose learning rate at the end.")
+    field_rate: float | None = Field(None, gt=0, le=0.5, description="Field learning rate at the start.")
+    field_rate_final: float | None = Field(None, gt=0, le=0.5, description="Field learning rate at the end.")
+    warmup_steps: int | None = Field(
+        None, ge=1, description="Steps over which the reconstruction module's learning rate rises."
+    )
+    pose_parametrisation: PoseParametrisation = Field(
+        "se3_world", description="se3_world turns cameras about the scene, so3xr3 about themselves."
+    )
+
+    pose_levels: int = Field(3, ge=1, le=16, description="Levels of the pose-estimation module.")
+    pose_resolution_min: int = Field(16, ge=2, le=128)
+    pose_resolution_max: int = Field(72, ge=2, le=128)
+    reconstruction_levels: int | None = Field(None, ge=1, le=16, description="Levels of the reconstruction module.")
+    reconstruction_resolution_min: int = Field(128, ge=4, le=8192)
+    reconstruction_resolution_max: int | None = Field(None, ge=4, le=16384)
+    table_size_log2: int | None = Field(None, ge=10, le=22, description="Entries of a hashed level, log2.")
+
+    checkpoint_every_s: float = Field(20.0, gt=0, description="Seconds between two checkpoints.")
+    orbit_frames: int | None = Field(None, ge=0, le=600, description="Frames of the orbit video; 0 leaves it out.")
+    render_size: int | None = Field(None, ge=16, le=4096, description="Long side (px) of renders in the output.")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> RefineOptions:
+        pairs = (
+            ("coarse_steps_min", "coarse_steps_max"),
+            ("coarse_steps_max", "steps"),
+            ("pose_rate_final", "pose_rate"),
+            ("field_rate_final", "field_rate"),
+            ("pose_resolution_min", "pose_resolution_max"),
+            ("reconstruction_resolution_min", "reconstruction_resolution_max"),
+        )
+        for low, high in pairs:
+            a, b = getattr(self, low), getattr(self, high)
+            if a is not None and b is not None and a > b:
+                raise ValueError(f"{low} ({a}) must not exceed {high} ({b})")
+        return self
+
+    def resolved(self) -> RefineOptions:
+        """These options with every field left at ``None`` filled in from the preset (``holdout`` stays)."""
+        preset = PRESETS[self.preset]
+        given = self.model_dump()
+        filled = {key: preset[key] if given[key] is None else given[key] for key in preset}
+        # A shorter run asked for by `steps` alone keeps the preset's proportions.
+        if self.steps is not None:
+            ratio = self.steps / preset["steps"]
+            for key in ("coarse_steps_min", "coarse_steps_max", "check_every", "warmup_steps"):
+                if given[key] is None:
+                    filled[key] = max(10, round(preset[key] * ratio))
+        return parse_options({**given, **filled})
+
+
+PRESETS: dict[PresetName, dict[str, Any]] = {
+    "fast": {
+        "max_image_size": 128,
+        "steps": 3000,
+        "coarse_steps_min": 1000,
+        "coarse_steps_max": 2000,
+        "check_every": 50,
+        "samples_per_step": 2**15,
+        "pose_rate": 5e-3,
+        "pose_rate_final": 1e-4,
+        "field_rate": 1e-2,
+        "field_rate_final": 1e-3,
+        "warmup_steps": 200,
+        "reconstruction_levels": 8,
+        "reconstruction_resolution_max": 1024,
+        "table_size_log2": 16,
+        "orbit_frames": 24,
+        "render_size": 256,
+    },
+    "balanced": {
+        "max_image_size": 200,
+        "steps": 8000,
+        "coarse_steps_min": 2000,
+        "coarse_steps_max": 4500,
+        "check_every": 100,
+        "samples_per_step": 2**16,
+        "pose_rate": 5e-3,
+        "pose_rate_final": 5e-5,
+        "field_rate": 1e-2,
+        "field_rate_final": 5e-4,
+        "warmup_steps": 400,
+        "reconstruction_levels": 12,
+        "reconstruction_resolution_max": 2048,
+        "table_size_log2": 17,
+        "orbit_frames": 48,
+        "render_size": 400,
+    },
+    "quality": {
+        "max_image_size": 400,
+        "steps": 20_000,
+        "coarse_steps_min": 3000,
+        "coarse_steps_max": 8000,
+        "check_every": 200,
+        "samples_per_step": 2**17,
+        "pose_rate": 5e-3,
+        "pose_rate_final": 2e-5,
+        "field_rate": 1e-2,
+        "field_rate_final": 2e-4,
+        "warmup_steps": 800,
+        "reconstruction_levels": 16,
+        "reconstruction_resolution_max": 4096,
+        "table_size_log2": 19,
+        "orbit_frames": 96,
+        "render_size": 800,
+    },
+    # Guo et al., Appl. Sci. 2023, 13(24), 13333: Table 1 for the encodings; steps, period and floor inferred
+    # from its timing tables; rates and loss inherited from BAA-NGP, which it builds on.
+    "paper": {
+        "max_image_size": 400,
+        "steps": 40_000,
+        "coarse_steps_min": 5000,
+        "coarse_steps_max": 16_000,
+        "check_every": 200,
+        "samples_per_step": 2**18,
+        "pose_rate": 5e-3,
+        "pose_rate_final": 1e-5,
+        "field_rate": 1e-2,
+        "field_rate_final": 1e-4,
+        "warmup_steps": 1000,
+        "reconstruction_levels": 16,
+        "reconstruction_resolution_max": 4096,
+        "table_size_log2": 19,
+        "orbit_frames": 96,
+        "render_size": 800,
+    },
+}
+
+
+def parse_options(values: dict[str, Any]) -> RefineOptions:
+    """Options from untrusted values; raises `InputError` naming the path of every key that is wrong."""
+    try:
+        return RefineOptions.model_validate(values)
+    except ValidationError as error:
+        problems = []
+        for item in error.errors():
+            path = ".".join(str(part) for part in item["loc"]) or "options"
+            known = "unknown option" if item["type"] == "extra_forbidden" else item["msg"]
+            problems.append(f"{path}: {known}")
+        raise InputError(
+            "invalid_options",
+            "; ".join(problems),
+            where="options",
+            mend="`biresnerf refine --help` and GET /v1/options list what there is.",
+        ) from None

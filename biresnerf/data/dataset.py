@@ -1,0 +1,119 @@
+"""What the reader hands on: cameras, frames and where they came from. Frozen, numpy only."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.geometry.camera_models import OpenCVParameters, full_parameters, smallest_model
+
+PoseSource = Literal["given", "colmap"]
+Dialect = Literal["nerfstudio", "instant-ngp", "blender", "images"]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics: COLMAP model name, image size (px) and parameters in COLMAP's order.
+
+    Pixels; the centre of the first pixel lies at (0.5, 0.5).
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def full(self) -> OpenCVParameters:
+        """These intrinsics as the full OPENCV model (fx, fy, cx, cy, k1, k2, p1, p2)."""
+        return full_parameters(self.model, self.params)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the same picture resampled to ``width`` x ``height`` px.
+
+        The true ratios are used, so a model with one focal length may have to become one with two.
+        """
+        a, b = width / self.width, height / self.height
+        p = self.full()
+        scaled = p._replace(fx=p.fx * a, fy=p.fy * b, cx=p.cx * a, cy=p.cy * b)
+        model, params = smallest_model(scaled, self.model)
+        return Camera(model, width, height, params)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image and its pose.
+
+    Attributes:
+        name: exactly what the user's file calls the image, or its path relative to the folder of images.
+        path: the image file.
+        camera: index into ``Dataset.cameras``.
+        world_from_cam: float64 [4, 4], a rigid motion; OpenCV axes (x right, y down, z forward).
+        pose_source: who found the pose.
+        raw: the frame as the user's file has it (empty for a folder of images).
+    """
+
+    name: str
+    path: Path
+    camera: int
+    world_from_cam: NDArray[np.float64]
+    pose_source: PoseSource
+    raw: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class SourceFormat:
+    """How the input was written, so that the result can be written the same way.
+
+    Attributes:
+        dialect: which convention the input follows; ``images`` for a folder without poses.
+        file: the transforms file, or None for a folder of images.
+        document: its top-level values other than ``frames``, in their order; and the place of ``frames`` kept
+            as a None.
+        applied_transform: float64 [4, 4] rigid motion of nerfstudio's key, identity where there is none.
+        applied_scale: nerfstudio's key, 1 where there is none. A point of the world lies in the file at
+            ``applied_scale * (applied_transform @ x)``.
+    """
+
+    dialect: Dialect
+    file: Path | None
+    document: dict[str, Any]
+    applied_transform: NDArray[np.float64]
+    applied_scale: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A validated set of images with poses. ``root`` is the folder that image names are relative to."""
+
+    root: Path
+    cameras: tuple[Camera, ...]
+    frames: tuple[Frame, ...]
+    source: SourceFormat
+    warnings: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The images' names as the user's file writes them, in its order."""
+        return tuple(frame.name for frame in self.frames)
+
+    @property
+    def file_names(self) -> tuple[str, ...]:
+        """The images' paths relative to ``root``, with extension and forward slashes (COLMAP's names)."""
+        return tuple(Path(os.path.relpath(frame.path, self.root)).as_posix() for frame in self.frames)
+
+    @property
+    def world_from_cam(self) -> NDArray[np.float64]:
+        """All poses, float64 [n, 4, 4]."""
+        return np.stack([frame.world_from_cam for frame in self.frames])
+
+    def camera_of(self, index: int) -> Camera:
+        """The camera of frame ``index``, at full size."""
+        return self.cameras[self.frames[index].camera]

@@ -1,0 +1,101 @@
+"""Array access that lets LLVM vectorise gathers inside Numba loops.
+
+Numba cannot declare two arrays disjoint, so a store in a loop forbids LLVM to vectorise the loads around it.
+``load`` tags what it reads with an alias scope and ``store`` declares that it never writes that scope; an array
+that a loop both reads and writes is read with ``reload``. No bounds check, no negative indices.
+"""
+
+from __future__ import annotations
+
+import llvmlite.binding
+from llvmlite import ir
+from numba import types
+from numba.core import config
+from numba.extending import intrinsic
+
+# LLVM avoids 512-bit registers by default; the kernels here are long enough streams to gain from them.
+config.CPU_NAME = llvmlite.binding.get_host_cpu_name()
+config.CPU_FEATURES = llvmlite.binding.get_host_cpu_features().flatten() + ",-prefer-256-bit"
+
+KERNEL = {
+    "nogil": True,
+    "fastmath": True,
+    "boundscheck": False,
+    "error_model": "numpy",
+    "cache": True,
+}
+PARALLEL_KERNEL = {"parallel": True, **KERNEL}
+
+
+def _scope(builder):  # noqa: ANN001, ANN202
+    module = builder.module
+    domain = module.add_metadata([ir.MetaDataString(module, "biresnerf_domain")])
+    scope = module.add_metadata([ir.MetaDataString(module, "biresnerf_read_only"), domain])
+    return module.add_metadata([scope])
+
+
+def _pointer(context, builder, array_type, array, index_type, index):  # noqa: ANN001, ANN202
+    data = context.make_array(array_type)(context, builder, array).data
+    if index.type.width < 64:
+        extend = builder.sext if index_type.signed else builder.zext
+        index = extend(index, ir.IntType(64))
+    return builder.gep(data, [index], inbounds=True)
+
+
+def _flat(array) -> bool:  # noqa: ANN001
+    return isinstance(array, types.Array) and array.ndim == 1 and array.layout == "C"
+
+
+def _make_load(tag: str):  # noqa: ANN202
+    def load_kind(typing_context, array, index):  # noqa: ANN001, ANN202
+        if not _flat(array):
+            return None
+
+        def codegen(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+            pointer = _pointer(
+                context, builder, signature.args[0], arguments[0], signature.args[1], arguments[1]
+            )
+            value = builder.load(pointer)
+            value.set_metadata(tag, _scope(builder))
+            return value
+
+        return array.dtype(array, index), codegen
+
+    return load_kind
+
+
+@intrinsic
+def load(typing_context, array, index):  # noqa: ANN001, ANN201
+    """Read an element of a flat array that the enclosing loop only reads."""
+    return _make_load("alias.scope")(typing_context, array, index)
+
+
+@intrinsic
+def reload(typing_context, array, index):  # noqa: ANN001, ANN201
+    """Read an element of a flat array that the enclosing loop also writes."""
+    return _make_load("noalias")(typing_context, array, index)
+
+
+@intrinsic
+def store(typing_context, array, index, value):  # noqa: ANN001, ANN201
+    """Write an element of a flat array that the enclosing loop never reads with ``load``."""
+    if not _flat(array):
+        return None
+
+    def codegen(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+        pointer = _pointer(context, builder, signature.args[0], arguments[0], signature.args[1], arguments[1])
+        converted = context.cast(builder, arguments[2], signature.args[2], signature.args[0].dtype)
+        builder.store(converted, pointer).set_metadata("noalias", _scope(builder))
+        return context.get_dummy_value()
+
+    return types.void(array, index, value), codegen
+
+
+@intrinsic
+def float_from_bits(typing_context, bits):  # noqa: ANN001, ANN201
+    """The float32 with the given uint32 pattern."""
+
+    def codegen(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+        return builder.bitcast(arguments[0], ir.FloatType())
+
+    return types.float32(types.uint32), codegen

@@ -1,0 +1,29 @@
+"""Progress as data: what the pipeline tells whoever runs it. No torch, no text formatting."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Stage = Literal["preparing", "seeding", "coarse", "fine", "evaluating", "exporting"]
+STAGES: tuple[Stage, ...] = ("preparing", "seeding", "coarse", "fine", "evaluating", "exporting")
+
+
+class Progress(BaseModel):
+    """One report of progress. ``fraction`` never falls within one run."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    stage: Stage
+    step: int = Field(0, ge=0)
+    steps_total: int = Field(0, ge=0)
+    fraction: float = Field(0.0, ge=0.0, le=1.0)
+    eta_s: float | None = Field(None, ge=0.0, description="Estimated seconds to the end of the run.")
+    metrics: dict[str, float] = Field(default_factory=dict)
+    message: str = ""
+    checkpoint: str | None = Field(None, description="File name of a checkpoint just completed, relative to the output folder.")
+
+
+OnProgress = Callable[[Progress], None]

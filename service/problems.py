@@ -1,0 +1,165 @@
+"""Every error the service answers with: one model, one catalogue of codes, one place that renders them."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from biresnerf.errors import InputError
+
+MEDIA_TYPE = "application/problem+json"
+RETRY_AFTER_S = "5"
+
+# code -> (status, title). A code stands for one kind of mistake and never changes its meaning.
+CATALOGUE: dict[str, tuple[int, str]] = {
+    "malformed_json": (400, "The body is not valid JSON"),
+    "malformed_body": (400, "The body could not be read"),
+    "bad_range": (400, "The Range header is malformed"),
+    "bad_idempotency_key": (400, "The Idempotency-Key header is malformed"),
+    "bad_cursor": (400, "The cursor is not one this service gave out"),
+    "not_found": (404, "There is no such thing here"),
+    "method_not_allowed": (405, "This address does not answer that method"),
+    "dataset_not_ready": (409, "The dataset is not ready for jobs"),
+    "dataset_in_use": (409, "A job uses the dataset"),
+    "dataset_sealed": (409, "The dataset takes no more files"),
+    "dataset_empty": (409, "The dataset holds no files"),
+    "name_collision": (409, "Another file has this name but for case or accents"),
+    "state_conflict": (409, "The state does not allow that"),
+    "idempotency_in_progress": (409, "The first request with this key is still running"),
+    "result_not_ready": (409, "The job has no result yet"),
+    "precondition_failed": (412, "A condition of the request does not hold"),
+    "body_too_large": (413, "The body is larger than the service takes"),
+    "too_many_files": (413, "There are more files than the service takes"),
+    "archive_too_large": (413, "The archive unpacks to more than the service takes"),
+    "image_too_large": (413, "An image is larger than the service takes"),
+    "unsupported_media": (415, "This kind of content is not taken here"),
+    "range_not_satisfiable": (416, "The file does not have those bytes"),
+    "invalid_request": (422, "The request does not fit the schema"),
+    "invalid_options": (422, "The options are not valid"),
+    "idempotency_key_reused": (422, "The key was used for a different request"),
+    "unsafe_path": (422, "A file name is not safe"),
+    "archive_rejected": (422, "The archive cannot be taken"),
+    "digest_mismatch": (422, "The bytes do not have the digest that was announced"),
+    "dataset_invalid": (422, "The images and poses cannot be used"),
+    "validation_timeout": (422, "Checking the files took too long"),
+    "validation_resources": (422, "Checking the files took too much memory or crashed"),
+    "queue_full": (429, "Too many jobs are waiting"),
+    "internal_error": (500, "Something is wrong with the service"),
+    "unavailable": (503, "The service is not ready"),
+    "database_unavailable": (503, "The database does not answer"),
+    "storage_unavailable": (503, "The file storage does not answer"),
+    "storage_full": (507, "There is no room left for files"),
+}
+
+
+class FieldProblem(BaseModel):
+    """One wrong field."""
+
+    model_config = ConfigDict(frozen=True)
+
+    pointer: str = Field(description="JSON pointer into the body (`#/options/steps`), or `query/limit` and the like.")
+    detail: str
+
+
+class Problem(BaseModel):
+    """An error as RFC 9457 has it, with a stable `code`."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        json_schema_extra={
+            "examples": [
+                {
+                    "type": "urn:biresnerf:problem:unsafe_path",
+                    "title": "A file name is not safe",
+                    "status": 422,
+                    "detail": "The name has a part `..`.",
+                    "instance": "/v1/datasets/ds_01/archive",
+                    "code": "unsafe_path",
+                    "request_id": "5f1c0d9e6a0b4a3c",
+                    "retryable": False,
+                    "where": "../evil.png",
+                    "mend": "Pack the archive with relative names inside one folder.",
+                    "errors": [],
+                }
+            ]
+        },
+    )
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    instance: str | None = None
+    code: str
+    request_id: str | None = None
+    retryable: bool = False
+    where: str | None = Field(None, description="The file or entry at fault, and the field in it where there is one.")
+    mend: str | None = Field(None, description="What to do about it.")
+    errors: list[FieldProblem] = Field(default_factory=list)
+
+
+class ProblemError(Exception):
+    """Raised anywhere in the service to answer with a problem; the catalogue gives status and title."""
+
+    def __init__(
+        self,
+        code: str,
+        detail: str,
+        *,
+        where: str | None = None,
+        mend: str | None = None,
+        errors: list[FieldProblem] | None = None,
+        headers: dict[str, str] | None = None,
+    ) -> None:
+        super().__init__(f"{code}: {detail}")
+        # Validation has codes of its own, which are all mistakes in the content.
+        self.status, self.title = CATALOGUE.get(code, (422, "The content cannot be used"))
+        self.code, self.detail, self.where, self.mend = code, detail, where, mend
+        self.errors = errors or []
+        self.headers = headers or {}
+
+    @classmethod
+    def from_input_error(cls, error: InputError) -> ProblemError:
+        """The same mistake as HTTP tells it."""
+        return cls(error.code, error.what, where=error.where or None, mend=error.mend or None)
+
+    @property
+    def retryable(self) -> bool:
+        """Whether the same request may succeed later."""
+        return self.status in {429, 503, 507} or self.code == "idempotency_in_progress"
+
+    def response_headers(self) -> dict[str, str]:
+        """Extra headers of the answer; what may be tried again says when."""
+        return {**({"Retry-After": RETRY_AFTER_S} if self.retryable else {}), **self.headers}
+
+    def problem(self, instance: str | None = None, request_id: str | None = None) -> Problem:
+        """The body of the answer."""
+        return Problem(
+            type=f"urn:biresnerf:problem:{self.code}",
+            title=self.title,
+            status=self.status,
+            detail=self.detail,
+            instance=instance,
+            code=self.code,
+            request_id=request_id,
+            retryable=self.retryable,
+            where=self.where,
+            mend=self.mend,
+            errors=self.errors,
+        )
+
+
+def declared(*codes: str) -> dict[int | str, dict[str, Any]]:
+    """The OpenAPI `responses` of a route that may answer with these codes."""
+    by_status: dict[int, list[str]] = {}
+    for code in codes:
+        by_status.setdefault(CATALOGUE[code][0], []).append(code)
+    return {
+        status: {
+            "model": Problem,
+            "description": f"{HTTPStatus(status).phrase}: `{'`, `'.join(names)}`",
+        }
+        for status, names in sorted(by_status.items())
+    }

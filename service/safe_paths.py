@@ -1,0 +1,101 @@
+"""Which file names a client may send, and the set of names one dataset may hold."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+from biresnerf.errors import InputError
+
+PART_BYTES_MAX = 255
+PATH_BYTES_MAX = 1024
+DEPTH_MAX = 16
+_DRIVE = re.compile(r"^[A-Za-z]:")
+_MEND = "Use relative names with forward slashes, such as images/0001.png."
+# What Finder and Explorer add by themselves; nobody means to send it.
+_LITTER = {".ds_store", "thumbs.db", "desktop.ini"}
+
+
+def checked_path(name: str) -> str:
+    """`name` as a safe relative POSIX path (a leading `./` dropped); raises `InputError` ``unsafe_path``.
+
+    Refuses `..`, absolute names, drive letters, backslashes, NUL and control characters, undecodable
+    bytes, empty parts, parts longer than 255 bytes and nesting deeper than 16.
+    """
+    fault = _fault(name)
+    if fault:
+        raise InputError("unsafe_path", fault, where=_printable(name), mend=_MEND)
+    return "/".join(part for part in name.split("/") if part != ".")
+
+
+def _fault(name: str) -> str | None:
+    parts = name.split("/")
+    if any(unicodedata.category(char) in {"Cc", "Cs", "Zl", "Zp"} for char in name):
+        return "The name has a control character or bytes that are not text."
+    if "\\" in name:
+        return "The name has a backslash."
+    if name.startswith("/"):
+        return "The name is absolute."
+    if _DRIVE.match(name):
+        return "The name begins with a drive letter."
+    if ".." in parts:
+        return "The name has a part `..`."
+    kept = [part for part in parts if part != "."]
+    if not kept or "" in kept:
+        return "The name has an empty part."
+    if max(len(part.encode()) for part in kept) > PART_BYTES_MAX:
+        return f"A part of the name is longer than {PART_BYTES_MAX} bytes."
+    if len(name.encode()) > PATH_BYTES_MAX:
+        return f"The name is longer than {PATH_BYTES_MAX} bytes."
+    if len(kept) > DEPTH_MAX:
+        return f"The name is nested deeper than {DEPTH_MAX} folders."
+    return None
+
+
+def _printable(name: str) -> str:
+    """The name for a message: escapes made visible, and no longer than a message should be."""
+    return name.encode("unicode_escape").decode()[:300]
+
+
+def is_litter(path: str) -> bool:
+    """Whether a desktop added the file by itself (`__MACOSX/`, `._a.png`, `.DS_Store`)."""
+    parts = path.split("/")
+    return "__MACOSX" in parts or parts[-1].startswith("._") or parts[-1].lower() in _LITTER
+
+
+class NameSet:
+    """Names that must stay apart on every file system: no two equal but for case or Unicode form."""
+
+    def __init__(self) -> None:
+        self._files: dict[str, str] = {}
+        self._folders: dict[str, str] = {}
+
+    def add(self, path: str) -> None:
+        """Takes one safe path; raises `InputError` ``name_collision`` where it meets another."""
+        parts = path.split("/")
+        for depth in range(1, len(parts)):
+            folder = "/".join(parts[:depth])
+            known = self._folders.setdefault(_key(folder), folder)
+            if known != folder:
+                raise _collision(path, known)
+            if _key(folder) in self._files:
+                raise _collision(path, self._files[_key(folder)])
+        key = _key(path)
+        if key in self._files or key in self._folders:
+            raise _collision(path, self._files.get(key) or self._folders[key])
+        self._files[key] = path
+
+
+def _key(path: str) -> str:
+    # Casefolding can undo NFC, so normalise on both sides of it (Unicode, definition D146).
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", path).casefold())
+
+
+def _collision(path: str, other: str) -> InputError:
+    return InputError(
+        "name_collision",
+        f"The name meets another one, {_printable(other)}: they are equal but for case or accents, "
+        "the same twice, or a file and a folder at once.",
+        where=_printable(path),
+        mend="Give every file a name of its own.",
+    )
