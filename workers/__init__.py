@@ -1,0 +1,4 @@
+"""What a job is, how it is queued, who runs it, what happens when it dies, where files lie.
+
+Nothing here loads torch except `workers.run`, the program of one job's child process.
+"""

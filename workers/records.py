@@ -1,0 +1,156 @@
+"""What a job and a dataset look like to everybody outside the engine. Frozen, JSON-ready, torch-free."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, Generic, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from biresnerf.progress import Stage
+
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+DatasetState = Literal["open", "finalizing", "ready", "rejected"]
+FINAL_JOB_STATES: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled"})
+
+# queued started stage checkpoint attempt_crashed requeued cancel_requested succeeded failed cancelled
+EventType = Literal[
+    "queued",
+    "started",
+    "stage",
+    "checkpoint",
+    "attempt_crashed",
+    "requeued",
+    "cancel_requested",
+    "succeeded",
+    "failed",
+    "cancelled",
+]
+FINAL_EVENTS: frozenset[EventType] = frozenset({"succeeded", "failed", "cancelled"})
+
+
+class Record(BaseModel):
+    """Base of everything that crosses a process border."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class JobProgress(Record):
+    """How far the running attempt is. ``fraction`` never falls within one attempt."""
+
+    fraction: float = Field(0.0, ge=0.0, le=1.0)
+    step: int = 0
+    steps_total: int = 0
+    eta_s: float | None = None
+
+
+class JobError(Record):
+    """Why a job failed.
+
+    ``code`` is the pipeline's own (InputError, RefinementError) or one of the engine's: ``timeout``,
+    ``too_many_crashes``, ``engine_error``. ``log_tail`` is the end of what the job wrote to stderr.
+    """
+
+    code: str
+    detail: str
+    where: str = ""
+    mend: str = ""
+    retryable: bool = False
+    log_tail: str = ""
+
+
+class Job(Record):
+    """A job as clients see it. ``revision`` grows with every change (use it as a weak ETag)."""
+
+    id: str
+    dataset_id: str
+    state: JobState
+    stage: Stage | None = None
+    progress: JobProgress = JobProgress()
+    queue_position: int | None = Field(None, description="1 is next; none unless queued.")
+    attempt: int = 0
+    cancel_requested: bool = False
+    created_at: datetime
+    started_at: datetime | None = None
+    finished_at: datetime | None = None
+    options: dict[str, Any] = Field(description="Resolved RefineOptions.")
+    metrics: dict[str, float] = {}
+    message: str = ""
+    error: JobError | None = None
+    labels: dict[str, str] = {}
+    revision: int = 0
+
+    @property
+    def final(self) -> bool:
+        """Nothing will change any more."""
+        return self.state in FINAL_JOB_STATES
+
+
+class JobEvent(Record):
+    """One entry of a job's gapless history; ``seq`` starts at 1 (use it as the SSE id)."""
+
+    seq: int
+    at: datetime
+    attempt: int
+    type: EventType
+    data: dict[str, Any] = {}
+
+
+class JobUpdate(Record):
+    """What a subscriber gets at every change: the job now, and the events since the last update."""
+
+    job: Job
+    events: tuple[JobEvent, ...] = ()
+
+
+class Artifact(Record):
+    """One file of a job's published result (or ``log.txt`` of a failed one). Read it by ``key``."""
+
+    name: str = Field(description="Path relative to the result, for example renders/orbit.mp4.")
+    key: str = Field(description="Key in the FileStore.")
+    size: int
+    sha256: str
+    media_type: str
+
+
+class ManifestEntry(Record):
+    """A file the client says it is going to send."""
+
+    path: str
+    size: int | None = Field(None, ge=0)
+    sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
+
+
+class DatasetRecord(Record):
+    """A set of uploaded files. ``report`` is what the validation found (or why it was rejected)."""
+
+    id: str
+    name: str
+    state: DatasetState
+    files: int = 0
+    bytes: int = 0
+    missing: tuple[str, ...] = Field((), description="Manifest paths not received yet.")
+    report: dict[str, Any] | None = None
+    error: JobError | None = None
+    created_at: datetime
+    revision: int = 0
+
+
+class DatasetFile(Record):
+    """One file of a dataset. Read it by ``key``."""
+
+    path: str
+    key: str
+    size: int
+    sha256: str
+    created_at: datetime
+
+
+T = TypeVar("T")
+
+
+class Page(Record, Generic[T]):
+    """One page of a listing; ``next_cursor`` is opaque and none at the end."""
+
+    items: tuple[T, ...]
+    next_cursor: str | None = None

@@ -1,0 +1,95 @@
+"""What the operator sets, by environment variables ``BIRESNERF_*`` (lists as JSON)."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from pydantic import Field, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from workers.errors import SetupError
+
+MIB = 2**20
+GIB = 2**30
+
+
+def default_data_dir() -> Path:
+    """Where data lies if nobody says: a system folder for root, the XDG data folder for everybody else."""
+    if hasattr(os, "geteuid") and os.geteuid() == 0:
+        return Path("/var/lib/biresnerf")
+    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share") / "biresnerf"
+
+
+class Settings(BaseSettings):
+    """Deployment settings, the same for every process of one installation."""
+
+    model_config = SettingsConfigDict(env_prefix="BIRESNERF_", frozen=True, extra="ignore")
+
+    database_url: str | None = Field(None, description="postgresql://…; none starts a private PostgreSQL.")
+    data_dir: Path = Field(
+        default_factory=default_data_dir, description="Files, scratch and private database."
+    )
+    pg_bin: Path | None = Field(None, description="Folder with initdb and postgres for the private database.")
+    host: str = "127.0.0.1"
+    port: int = Field(8000, ge=0, le=65535)
+
+    slots: int = Field(1, ge=0, le=64, description="Jobs that run at the same time on this machine.")
+    beat_s: float = Field(10.0, gt=0, description="Seconds between two signs of life of a worker.")
+    stall_s: float = Field(60.0, gt=0, description="A worker silent for so long is taken for dead.")
+    poll_s: float = Field(2.0, gt=0, description="Seconds between two looks where a notification was lost.")
+    janitor_s: float = Field(5.0, gt=0, description="Seconds between two rounds of the janitor.")
+    stop_grace_s: float = Field(
+        20.0, gt=0, description="Seconds a job may take to write a checkpoint and exit."
+    )
+    job_timeout_s: float = Field(2 * 3600, gt=0, description="Longest run of one attempt.")
+    check_timeout_s: float = Field(900, gt=0, description="Longest validation of one dataset.")
+    max_attempts: int = Field(3, ge=1, description="Attempts of a job that crashes.")
+    max_queued: int = Field(1000, ge=1, description="Jobs that may wait.")
+
+    max_files: int = Field(1000, ge=1, description="Files in a dataset.")
+    max_file_bytes: int = Field(64 * MIB, ge=1)
+    max_dataset_bytes: int = Field(8 * GIB, ge=1)
+    max_archive_bytes: int = Field(8 * GIB, ge=1, description="Size of an uploaded archive.")
+    max_unpacked_bytes: int = Field(20 * GIB, ge=1, description="Size of all that comes out of an archive.")
+
+    job_command: tuple[str, ...] = Field(
+        (sys.executable, "-m", "workers.run"),
+        description="Program of a job; gets the job folder as its last argument.",
+    )
+    check_command: tuple[str, ...] = Field(
+        (sys.executable, "-m", "workers.check"),
+        description="Program that validates a dataset; gets the folder as its last argument.",
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Settings:
+        if self.stall_s < 2 * self.beat_s:
+            raise ValueError(f"stall_s ({self.stall_s}) must be at least twice beat_s ({self.beat_s})")
+        return self
+
+    @property
+    def scratch_dir(self) -> Path:
+        """Local working copies of running jobs."""
+        return self.data_dir / "scratch"
+
+    @property
+    def files_dir(self) -> Path:
+        """Root of the file store."""
+        return self.data_dir / "files"
+
+    @property
+    def postgres_dir(self) -> Path:
+        """Home of the private PostgreSQL."""
+        return self.data_dir / "postgres"
+
+    def require_database_url(self) -> str:
+        """The database's address; raises `SetupError` where none is set."""
+        if self.database_url is None:
+            raise SetupError(
+                "no_database",
+                "BIRESNERF_DATABASE_URL is not set. Use `biresnerf up`, which starts a private PostgreSQL, "
+                "or set it to postgresql://user:password@host/database.",
+            )
+        return self.database_url
