@@ -1,8 +1,8 @@
 """Exponential and logarithm of rotations and rigid motions on torch tensors, finite everywhere with gradient.
 
 A rotation vector is axis times angle (rad). Rotation and translation are always two arguments, never packed.
-Closed forms are used for angles above one radian and Taylor series below; the argument of the form not taken is
-guarded too, since ``where`` passes NaN gradients of the branch it discards.
+Closed forms are used for angles above one radian and Taylor series below; the argument of the form not taken
+is guarded too, since ``where`` passes NaN gradients of the branch it discards.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ def se3_exp(rotvec: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         rotvec: [..., 3], angular part of the twist (rad).
-        velocity: [..., 3], linear part of the twist (world units); equals the translation where ``rotvec`` is zero.
+        velocity: [..., 3], linear part of the twist (world units); equals the translation where ``rotvec`` is
+            zero.
 
     Returns:
         rotation [..., 3, 3] and translation [..., 3], so that ``x -> rotation @ x + translation``.
@@ -66,8 +67,9 @@ def se3_exp(rotvec: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
 def so3_log(rotation: Tensor) -> Tensor:
     """Rotation vectors [..., 3] of angle at most pi, of rotation matrices [..., 3, 3].
 
-    Goes through the unit quaternion, read from the row of the matrix ``4 q q^T`` that is largest for the rotation
-    at hand: linear in the matrix, no square root of a difference, and so exact near pi as well as near zero.
+    Goes through the unit quaternion, read from the row of the matrix ``4 q q^T`` that is largest for the
+    rotation at hand: linear in the matrix, no square root of a difference, and so exact near pi as well as
+    near zero.
 
     Raises:
         ValueError: if the last axes are not 3 x 3 or the tensor is not of a float type.

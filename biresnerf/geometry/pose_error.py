@@ -1,8 +1,9 @@
 """How far estimated camera poses are from true ones, by the definitions of BARF and BAA-NGP.
 
 Rotation error is the angle of ``R_est R_true^T``; translation error is the distance of the world-to-camera
-translation vectors ``t = -R c`` (BARF prints it raw and tabulates it times 100). Seen from a camera that looks at the
-world origin ``t`` hardly changes when the camera moves around it, so the error of the centres is reported beside it.
+translation vectors ``t = -R c`` (BARF prints it raw and tabulates it times 100). Seen from a camera that
+looks at the world origin ``t`` hardly changes when the camera moves around it, so the error of the centres is
+reported beside it.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class FrameError(BaseModel):
         description="World-to-camera translation vectors, in world units, as BARF prints it."
     )
     translation_table: Spread = Field(
-        description="The same times 100, in a world whose origin is the focus point and whose mean camera distance is 4."
+        description="The same times 100, the origin at the focus point and the mean camera distance at 4."
     )
     centre_percent: Spread = Field(description="Camera centres, in percent of the reference distance.")
     worst: int = Field(description="Index of the camera with the largest rotation error.")
@@ -62,8 +63,8 @@ class PoseError(BaseModel):
     own_frame: FrameError = Field(description="Without any alignment.")
     reference_distance: float = Field(description="What centre_percent is a percentage of, in world units.")
     reference: Literal["focus", "spread", "unit"] = Field(
-        description="Mean distance to the focus point; where axes are parallel, the rms spread of the centres; "
-        "where these are one point, one world unit."
+        description="Mean distance to the focus point; where axes are parallel, the rms spread of the "
+        "centres; where these are one point, one world unit."
     )
 
 
@@ -105,8 +106,8 @@ def pose_error(estimate: Array, truth: Array) -> PoseError:
     """Compare estimated poses with true ones.
 
     Args:
-        estimate, truth: ``world_from_cam`` [n, 4, 4] of the same cameras in the same order, OpenCV axes. Lengths in
-            the result are in units of the truth's world.
+        estimate, truth: ``world_from_cam`` [n, 4, 4] of the same cameras in the same order, OpenCV axes.
+            Lengths in the result are in units of the truth's world.
 
     Raises:
         ValueError: if shapes differ, there is no camera, or a number is not finite.

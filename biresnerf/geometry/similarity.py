@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Centres whose correlation across a line is below this share of that along it leave the turn about the line to the
-# cameras' rotations. A spread of one hundredth of the length gives 1e-4.
+# Centres whose correlation across a line is below this share of that along it leave the turn about the line
+# to the cameras' rotations. A spread of one hundredth of the length gives 1e-4.
 _LINE_BELOW = 1e-4
 # Centres spread by less than this share of their coordinates are one point.
 _POINT_BELOW = 1e-9
@@ -74,12 +74,13 @@ class Similarity:
 
 
 def align_umeyama(a_from_cam: Array, b_from_cam: Array) -> Similarity:
-    """The ``b_from_a`` that carries the camera centres of a rig in a onto those in b, as BARF's evaluation does.
+    """The ``b_from_a`` that carries the camera centres of a rig in a onto those in b, as BARF's evaluation
+    does.
 
-    Scale is the ratio of the root-mean-square spreads; the rotation comes from the singular value decomposition of
-    the correlation with the determinant kept at +1 (Umeyama 1991), so flat rigs are safe however they are tilted.
-    What the centres leave free is fixed by the cameras' rotations: the turn about the line of collinear centres, the
-    whole rotation where all centres are one point (scale is 1 then).
+    Scale is the ratio of the root-mean-square spreads; the rotation comes from the singular value
+    decomposition of the correlation with the determinant kept at +1 (Umeyama 1991), so flat rigs are safe
+    however they are tilted. What the centres leave free is fixed by the cameras' rotations: the turn about
+    the line of collinear centres, the whole rotation where all centres are one point (scale is 1 then).
 
     Args:
         a_from_cam, b_from_cam: poses [n, 4, 4] of the same n >= 1 cameras in the same order.
@@ -95,8 +96,8 @@ def align_umeyama(a_from_cam: Array, b_from_cam: Array) -> Similarity:
 def align_robust(a_from_cam: Array, b_from_cam: Array) -> Similarity:
     """As `align_umeyama`, with cameras that do not follow the others weighed down.
 
-    Iteratively reweighted least squares with Cauchy weights; the scale is twice the median residual of each round,
-    for centres and for rotations apart.
+    Iteratively reweighted least squares with Cauchy weights; the scale is twice the median residual of each
+    round, for centres and for rotations apart.
 
     Raises:
         ValueError: as `align_umeyama`.
@@ -137,13 +138,14 @@ def _align_weighted(a: Array, b: Array, weights_centre: Array, weights_rotation:
 
 
 def _rotation_of(correlation: Array, turn: Array) -> Array:
-    """Rotation maximising ``trace(rotation^T correlation)``; `turn` decides what a rank of one leaves free."""
+    """Rotation maximising ``trace(rotation^T correlation)``; `turn` decides what a rank of one leaves
+    free."""
     left, values, right_t = np.linalg.svd(correlation)
     if values[1] > _LINE_BELOW * values[0]:
         sign = np.sign(np.linalg.det(left) * np.linalg.det(right_t))
         return left @ np.diag([1.0, 1.0, sign]) @ right_t
-    # Complete both directions of the line to right-handed frames, then turn about the line by the angle that brings
-    # the cameras closest.
+    # Complete both directions of the line to right-handed frames, then turn about the line by the angle that
+    # brings the cameras closest.
     left[:, 2] *= np.linalg.det(left)
     right_t[2] *= np.linalg.det(right_t)
     about = left.T @ turn @ right_t.T
