@@ -34,8 +34,8 @@ def file_from_world_from_cam(
 def quat_wxyz_from_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit quaternion (w, x, y, z), w >= 0, of a rotation matrix [3, 3].
 
-    It is the largest eigenvector of a symmetric 4 x 4 matrix (Bar-Itzhack 2000), so no branch loses digits near
-    half turns.
+    It is the largest eigenvector of a symmetric 4 x 4 matrix (Bar-Itzhack 2000), so no branch loses digits
+    near half turns.
     """
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
     k = np.array(

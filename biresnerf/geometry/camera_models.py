@@ -1,7 +1,7 @@
 """COLMAP's camera models that this project supports, as plain numbers (needs no torch).
 
-All of them are special cases of OPENCV: two focal lengths, a principal point, two radial coefficients (k1, k2) and
-two tangential ones (p1, p2). Lengths are in pixels; the centre of the first pixel lies at (0.5, 0.5).
+All of them are special cases of OPENCV: two focal lengths, a principal point, two radial coefficients (k1,
+k2) and two tangential ones (p1, p2). Lengths are in pixels; the centre of the first pixel lies at (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -77,8 +77,9 @@ def smallest_model(full: OpenCVParameters, preferred: str) -> tuple[str, tuple[f
 def folds_inside_image(full: OpenCVParameters, width: int, height: int) -> bool:
     """Whether the radial distortion turns back on itself before it reaches the image's farthest corner.
 
-    Pixels beyond the fold have no viewing ray. The radius r(1 + k1 r^2 + k2 r^4) stops growing at the smallest
-    positive root of 1 + 3 k1 s + 5 k2 s^2, s = r^2. The tangential part is small beside it and is left out.
+    Pixels beyond the fold have no viewing ray. The radius r(1 + k1 r^2 + k2 r^4) stops growing at the
+    smallest positive root of 1 + 3 k1 s + 5 k2 s^2, s = r^2. The tangential part is small beside it and is
+    left out.
     """
     a, b, c = 5.0 * full.k2, 3.0 * full.k1, 1.0
     roots: list[float] = []
@@ -94,6 +95,8 @@ def folds_inside_image(full: OpenCVParameters, width: int, height: int) -> bool:
     s = min(positive)
     reach = math.sqrt(s) * (1.0 + full.k1 * s + full.k2 * s * s)
     corner = max(
-        math.hypot((x - full.cx) / full.fx, (y - full.cy) / full.fy) for x in (0.0, width) for y in (0.0, height)
+        math.hypot((x - full.cx) / full.fx, (y - full.cy) / full.fy)
+        for x in (0.0, width)
+        for y in (0.0, height)
     )
     return corner >= 0.999 * reach

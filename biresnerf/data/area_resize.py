@@ -1,0 +1,35 @@
+"""Exact area averaging: every output pixel is the mean of the part of the picture that it covers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def _shrink_rows(picture: NDArray[np.generic], rows: int) -> NDArray[np.float32]:
+    """[h, ...] -> float32 [rows, ...]; fractional rows count by the fraction covered."""
+    height = picture.shape[0]
+    result = np.empty((rows, *picture.shape[1:]), dtype=np.float32)
+    edges = np.arange(rows + 1) * (height / rows)
+    for row in range(rows):
+        low, high = edges[row], min(edges[row + 1], float(height))
+        first, last = int(low), min(int(np.ceil(high)), height)
+        index = np.arange(first, last)
+        weights = np.minimum(index + 1, high) - np.maximum(index, low)
+        weights = (weights / weights.sum()).astype(np.float32)
+        result[row] = np.tensordot(weights, picture[first:last].astype(np.float32), axes=1)
+    return result
+
+
+def area_resize(picture: NDArray[np.generic], width: int, height: int) -> NDArray[np.float32]:
+    """``picture`` [h, w, c] averaged down to float32 [height, width, c], same range of values.
+
+    Sizes must not exceed the picture's. Resampling filters that weigh whole pixels (Pillow's BOX) shift
+    content by up to half a source pixel where the ratio is no integer; camera poses would feel that.
+    """
+    if not (0 < height <= picture.shape[0] and 0 < width <= picture.shape[1]):
+        raise ValueError(f"cannot average {picture.shape[1]} x {picture.shape[0]} px to {width} x {height}")
+    if (height, width) == picture.shape[:2]:
+        return picture.astype(np.float32)
+    tall = _shrink_rows(picture, height)
+    return np.ascontiguousarray(_shrink_rows(tall.swapaxes(0, 1), width).swapaxes(0, 1))

@@ -1,0 +1,192 @@
+"""Decoding every image fully, at working size, into one flat array of bytes."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from biresnerf.config import Background
+from biresnerf.data.area_resize import area_resize
+from biresnerf.data.background import uniform_background
+from biresnerf.data.dataset import Camera, Dataset
+from biresnerf.data.image_files import DAMAGED, open_image
+from biresnerf.errors import InputError
+
+_ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})
+_WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+_DECODERS = 4  # more threads hold more full-size pictures at once than they save time
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSet:
+    """All images at working size. Colours are as stored (sRGB values, not linear light), 0 to 255.
+
+    Attributes:
+        pixels: uint8 [total_px, 3], image after image, row by row; composited on the background where there
+            is
+            transparency.
+        alpha: uint8 [total_px], or None where every pixel is opaque.
+        offsets: int64 [n + 1]; image i has the pixels from offsets[i] to offsets[i + 1].
+        widths, heights: int32 [n], px.
+        cameras: of each image, at its working size.
+        background: float32 [3], 0 to 1: the colour behind the scene; None where photos show surroundings.
+    """
+
+    pixels: NDArray[np.uint8]
+    alpha: NDArray[np.uint8] | None
+    offsets: NDArray[np.int64]
+    widths: NDArray[np.int32]
+    heights: NDArray[np.int32]
+    cameras: tuple[Camera, ...]
+    background: NDArray[np.float32] | None
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """uint8 [h, w, 3], a view of image ``index``."""
+        rows = self.pixels[self.offsets[index] : self.offsets[index + 1]]
+        return rows.reshape(int(self.heights[index]), int(self.widths[index]), 3)
+
+    def alpha_image(self, index: int) -> NDArray[np.uint8] | None:
+        """uint8 [h, w], a view of the opacity of image ``index``, or None where all is opaque."""
+        if self.alpha is None:
+            return None
+        rows = self.alpha[self.offsets[index] : self.offsets[index + 1]]
+        return rows.reshape(int(self.heights[index]), int(self.widths[index]))
+
+
+def working_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
+    """Width and height (px) with the long side at most ``max_size``; never enlarged, never below 1."""
+    longest = max(width, height)
+    if max_size is None or longest <= max_size:
+        return width, height
+    return max(1, round(width * max_size / longest)), max(1, round(height * max_size / longest))
+
+
+def load_images(dataset: Dataset, max_size: int | None = None, background: Background = "auto") -> ImageSet:
+    """Decodes all images, shrunk by exact area averaging so that the long side is ``max_size`` px at most.
+
+    ``background``: ``white`` and ``black`` say what lies behind the scene, and what transparency is
+    composited on; ``none`` says that photos show surroundings (opacity is then dropped and colours are taken
+    as stored); ``auto`` is white where images have transparency, else black or white where all borders show
+    it, else none.
+
+    Raises:
+        InputError: ``not_an_image``, ``image_truncated``, ``image_too_large``, ``image_changed`` or
+            ``image_format_unsupported``, naming the image.
+    """
+    sizes = [working_size(c.width, c.height, max_size) for c in map(dataset.camera_of, range(len(dataset)))]
+    widths = np.array([w for w, _ in sizes], dtype=np.int32)
+    heights = np.array([h for _, h in sizes], dtype=np.int32)
+    offsets = np.concatenate(([0], np.cumsum(widths.astype(np.int64) * heights)))
+    pixels = np.empty((int(offsets[-1]), 3), dtype=np.uint8)
+    alpha = np.empty(int(offsets[-1]), dtype=np.uint8)
+    behind = _BLACK if background == "black" else _WHITE
+
+    def fill(index: int) -> None:
+        part = slice(int(offsets[index]), int(offsets[index + 1]))
+        picture = decode(dataset.frames[index].path, dataset.names[index], dataset.camera_of(index))
+        colour, opacity = _shrink(picture, *sizes[index], behind, keep_alpha=background != "none")
+        pixels[part], alpha[part] = colour.reshape(-1, 3), opacity.reshape(-1)
+
+    threads = min(_DECODERS, os.cpu_count() or 1, len(dataset))
+    with ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
+        pending = [pool.submit(fill, index) for index in range(len(dataset))]
+        try:
+            for job in pending:
+                job.result()
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    opaque = bool(alpha.min() == 255)
+    cameras = tuple(dataset.camera_of(i).resized(*sizes[i]) for i in range(len(dataset)))
+    images = ImageSet(pixels, None if opaque else alpha, offsets, widths, heights, cameras, None)
+    return _with_background(images, background, behind)
+
+
+def _with_background(images: ImageSet, background: Background, behind: tuple[float, ...]) -> ImageSet:
+    colour: NDArray[np.float32] | None
+    if background == "none":
+        colour = None
+    elif background == "auto" and images.alpha is None:
+        colour = uniform_background([images.image(index) for index in range(len(images))])
+    else:
+        colour = np.array(behind, dtype=np.float32)
+    return ImageSet(
+        images.pixels, images.alpha, images.offsets, images.widths, images.heights, images.cameras, colour
+    )
+
+
+def decode(path: Path, name: str, camera: Camera) -> NDArray[np.uint8]:
+    """The stored pixels, uint8 [h, w, 3] or [h, w, 4] (straight alpha); 16-bit and grey become 8-bit RGB.
+
+    Raises:
+        InputError: as `load_images`.
+    """
+    with open_image(path, name) as image:
+        if image.size != (camera.width, camera.height):
+            raise InputError(
+                "image_changed",
+                f"has {image.width} x {image.height} px now, not {camera.width} x {camera.height}.",
+                where=name,
+                mend="Leave the images alone while they are being read.",
+            )
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                image.load()
+                return _eight_bit(image, name)
+        except DAMAGED:
+            raise InputError(
+                "image_truncated",
+                "is cut off or damaged.",
+                where=name,
+                mend="Copy it again, or remove its frame.",
+            ) from None
+
+
+def _eight_bit(image: Image.Image, name: str) -> NDArray[np.uint8]:
+    if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
+        # 65535 becomes 255: the full range, rounded.
+        grey = ((np.asarray(image).astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+        return np.repeat(grey[..., None], 3, axis=2)
+    if image.mode in ("I", "F"):
+        raise InputError(
+            "image_format_unsupported",
+            "holds 32-bit numbers, which are no colours.",
+            where=name,
+            mend="Save it with 8 or 16 bits per channel.",
+        )
+    if image.mode in _ALPHA_MODES or "transparency" in image.info:
+        return np.asarray(image.convert("RGBA"))
+    return np.asarray(image.convert("RGB"))
+
+
+def _shrink(
+    picture: NDArray[np.uint8], width: int, height: int, behind: tuple[float, ...], *, keep_alpha: bool
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Colour over ``behind`` uint8 [h, w, 3] and opacity uint8 [h, w] at the given size."""
+    opaque = np.full((height, width), 255, dtype=np.uint8)
+    if picture.shape[2] == 3 or not keep_alpha or picture[..., 3].min() == 255:
+        if picture.shape[:2] == (height, width):
+            return picture[..., :3], opaque
+        return _bytes(area_resize(picture[..., :3], width, height)), opaque
+    # Averages of colours weigh by opacity, else hidden colours bleed into the edges.
+    premultiplied = picture.astype(np.float32)
+    premultiplied[..., :3] *= premultiplied[..., 3:] / 255.0
+    small = area_resize(premultiplied, width, height)
+    opacity = small[..., 3:] / 255.0
+    colour = small[..., :3] + (1.0 - opacity) * (255.0 * np.asarray(behind, dtype=np.float32))
+    return _bytes(colour), _bytes(small[..., 3])
+
+
+def _bytes(values: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)

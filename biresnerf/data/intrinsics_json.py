@@ -1,0 +1,214 @@
+"""One frame's camera from the intrinsics of a transforms.json: shared ones, the frame's own, or a mix."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from biresnerf.data.dataset import Camera
+from biresnerf.data.image_files import ImageHeader
+from biresnerf.errors import InputError
+from biresnerf.geometry.camera_models import MODEL_IDS, OpenCVParameters, folds_inside_image, smallest_model
+
+_UNSUPPORTED = "camera_model_unsupported"
+# Keys of instant-ngp that mean another lens than the pinhole with radial and tangential distortion.
+_OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
+_MODEL_MEND = (
+    f"Supported are {', '.join(MODEL_IDS)}; undistort the images to one of them "
+    "(for example with COLMAP's image_undistorter)."
+)
+
+
+class Fields:
+    """Numbers looked up in the frame first and in the file's top level second."""
+
+    def __init__(self, frame: dict[str, Any], top: dict[str, Any], file: str, index: int) -> None:
+        self.frame, self.top, self.file, self.index = frame, top, file, index
+
+    def where(self, key: str) -> str:
+        """File and field of ``key``."""
+        return f"{self.file} frames[{self.index}].{key}" if self.own(key) else f"{self.file} {key}"
+
+    def own(self, key: str) -> bool:
+        """Whether the frame itself says it."""
+        return self.frame.get(key) is not None
+
+    def get(self, key: str) -> float | None:
+        """The number, or None where neither says it. Raises InputError where it is no finite number."""
+        value = self.frame[key] if self.own(key) else self.top.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
+            raise InputError(
+                "intrinsics_invalid",
+                f"{_short(value)} is not a usable number.",
+                where=self.where(key),
+                mend="Give a number (pixels for lengths).",
+            )
+        return float(value)
+
+
+class FrameCamera(NamedTuple):
+    """The camera, whether the frame brought its own intrinsics, and notes for the user."""
+
+    camera: Camera
+    own: bool
+    notes: tuple[str, ...]
+
+
+def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCamera:
+    """The full-size camera of one frame.
+
+    Raises:
+        InputError: ``camera_model_unsupported``, ``intrinsics_missing``, ``intrinsics_invalid`` or
+            ``image_size_mismatch``.
+    """
+    preferred = _declared_model(fields)
+    width, height, notes = _declared_size(fields, header, name)
+    full, more = _parameters(fields, width, height)
+    if preferred is None:
+        preferred = "PINHOLE" if full.k1 == full.k2 == full.p1 == full.p2 == 0.0 else "OPENCV"
+    # nerfstudio writes OPENCV with zeros for a pinhole; PINHOLE is the same camera and more programs read it.
+    elif preferred == "OPENCV" and full.k1 == full.k2 == full.p1 == full.p2 == 0.0:
+        preferred = "PINHOLE"
+    if folds_inside_image(full, width, height):
+        raise InputError(
+            "intrinsics_invalid",
+            "the distortion folds back inside the image, so its outer pixels have no viewing ray.",
+            where=fields.where("k1"),
+            mend="Check k1 and k2, or undistort the images.",
+        )
+    model, params = smallest_model(full, preferred)
+    camera = Camera(model, width, height, params).resized(header.width, header.height)
+    own = any(fields.own(key) for key in ("fl_x", "fl_y", "camera_angle_x", "x_fov"))
+    return FrameCamera(camera, own, (*notes, *more))
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def _declared_model(fields: Fields) -> str | None:
+    for key in _OTHER_LENSES:
+        for source in (fields.frame, fields.top):
+            if source.get(key):
+                raise InputError(
+                    _UNSUPPORTED,
+                    f"{key}: fisheye and panorama lenses are not supported.",
+                    where=fields.where(key),
+                    mend=_MODEL_MEND,
+                )
+    declared = fields.frame.get("camera_model") or fields.top.get("camera_model")
+    if declared is None:
+        return None
+    if not isinstance(declared, str) or declared.upper() not in MODEL_IDS:
+        raise InputError(
+            _UNSUPPORTED,
+            f"the camera model {_short(declared)} is not supported.",
+            where=fields.where("camera_model"),
+            mend=_MODEL_MEND,
+        )
+    return declared.upper()
+
+
+def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int, int, list[str]]:
+    """The size the intrinsics are meant for, and notes. The image's own size where the file names none."""
+    width, height = fields.get("w"), fields.get("h")
+    if width is None and height is None:
+        return header.width, header.height, []
+    # A file-wide size says nothing about frames that bring their own focal length and differ in size.
+    if fields.own("fl_x") and not (fields.own("w") or fields.own("h")):
+        return header.width, header.height, []
+    w = header.width if width is None else round(width)
+    h = header.height if height is None else round(height)
+    if (w, h) == (header.width, header.height):
+        return w, h, []
+    sizes = f"{name} has {header.width} x {header.height} px"
+    where = fields.where("w")
+    if w <= 0 or h <= 0:
+        raise InputError(
+            "intrinsics_invalid", f"w = {w}, h = {h}.", where=where, mend="Give the size in pixels."
+        )
+    if (w, h) == (header.height, header.width):
+        raise InputError(
+            "image_size_mismatch",
+            f"{sizes}, the file says {w} x {h}: turned by 90 degrees.",
+            where=where,
+            mend="Rotate the stored pixels (an EXIF tag is not enough), or exchange w and h, cx and cy.",
+        )
+    # Within one pixel of rounding, the image is a resized copy of the one the intrinsics were made for.
+    if min(abs(h * header.width / w - header.height), abs(w * header.height / h - header.width)) > 1.0:
+        raise InputError(
+            "image_size_mismatch",
+            f"{sizes}, the file says {w} x {h}: not the same shape.",
+            where=where,
+            mend="Give the intrinsics of these images; cropped images need their own cx and cy.",
+        )
+    return w, h, [f"{sizes}, the file says {w} x {h}; its intrinsics were scaled to the images"]
+
+
+def _parameters(fields: Fields, width: int, height: int) -> tuple[OpenCVParameters, list[str]]:
+    for key in ("k3", "k4"):
+        if fields.get(key):
+            raise InputError(
+                _UNSUPPORTED,
+                f"{key} is not zero.",
+                where=fields.where(key),
+                mend=_MODEL_MEND + " Or set it to 0.",
+            )
+    fx, key_x = _focal(fields, ("fl_x", "camera_angle_x", "x_fov"), width)
+    fy, key_y = _focal(fields, ("fl_y", "camera_angle_y", "y_fov"), height)
+    if key_x != "fl_x" and key_y != "fl_y":
+        # camera_angle_y and y_fov come from rounded angles of square pixels: one focal length serves both
+        # axes.
+        fy = fx if fx is not None else fy
+    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
+    if fx is None or fy is None:
+        raise InputError(
+            "intrinsics_missing",
+            "no focal length: neither fl_x nor camera_angle_x.",
+            where=f"{fields.file} frames[{fields.index}]",
+            mend="Add fl_x (pixels) or camera_angle_x (radians), for all frames or in each.",
+        )
+    cx, cy = fields.get("cx"), fields.get("cy")
+    notes = []
+    if key_x == "fl_x" and (cx is None or cy is None):
+        notes.append("cx or cy is not given; the image centre was taken")
+    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    if not (-width < cx < 2 * width and -height < cy < 2 * height):
+        raise InputError(
+            "intrinsics_invalid",
+            f"the principal point ({cx:g}, {cy:g}) lies far outside the image.",
+            where=fields.where("cx"),
+            mend="Give cx and cy in pixels from the top left corner.",
+        )
+    k1, k2, p1, p2 = (fields.get(key) or 0.0 for key in ("k1", "k2", "p1", "p2"))
+    return OpenCVParameters(fx, fy, cx, cy, k1, k2, p1, p2), notes
+
+
+def _focal(fields: Fields, keys: tuple[str, str, str], size: int) -> tuple[float | None, str | None]:
+    """Focal length (px) and the key it came from: pixels, an angle in radians, or instant-ngp's degrees."""
+    # What the frame says goes before what the file says, whichever way it is put.
+    ordered = sorted(keys, key=lambda key: not fields.own(key))
+    for key in ordered:
+        value = fields.get(key)
+        if value is None:
+            continue
+        if key == keys[0]:
+            focal, fits = value, value > 0.0
+        else:
+            angle = value if key == keys[1] else math.radians(value)
+            fits = 0.0 < angle < math.pi
+            focal = 0.5 * size / math.tan(0.5 * angle) if fits else 0.0
+        if not fits or focal < 1e-3 * size:
+            raise InputError(
+                "intrinsics_invalid",
+                f"{value:g} is not a focal length."
+                if key == keys[0]
+                else f"{value:g} is not an angle of view.",
+                where=fields.where(key),
+                mend="Give a positive focal length in pixels, or camera_angle_x in radians below pi.",
+            )
+        return focal, key
+    return None, None

@@ -1,0 +1,114 @@
+"""Strict reading of a JSON file from anybody: bounded, finite, without duplicate keys."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from biresnerf.errors import InputError
+
+MAX_JSON_BYTES = 64 * 2**20  # some 100 000 frames; a larger file is no pose file
+_CODE = "pose_file_invalid"
+
+
+class _DuplicateKeyError(ValueError):
+    pass
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in result:
+            beside = result.get("file_path")
+            raise _DuplicateKeyError(
+                f"the key {key!r} stands twice in one object" + (f" (of {beside!r})." if beside else ".")
+            )
+        result[key] = value
+    return result
+
+
+def first_non_finite(value: Any, path: str = "") -> str | None:
+    """The path (``frames[3].transform_matrix[0][1]``) of the first NaN or infinite number, or None."""
+    if isinstance(value, float):
+        return None if math.isfinite(value) else path
+    if isinstance(value, dict):
+        items = [(f"{path}.{key}" if path else key, item) for key, item in value.items()]
+    elif isinstance(value, list):
+        items = [(f"{path}[{index}]", item) for index, item in enumerate(value)]
+    else:
+        return None
+    for item_path, item in items:
+        if isinstance(item, float | dict | list) and (found := first_non_finite(item, item_path)):
+            return found
+    return None
+
+
+def read_json_object(path: Path) -> dict[str, Any]:
+    """The object in the JSON file ``path``.
+
+    Raises:
+        InputError: ``pose_file_invalid`` for a file that cannot be read, is larger than ``MAX_JSON_BYTES``,
+            is no
+            JSON, holds NaN, Infinity or a key twice, is nested too deeply, or is not an object.
+    """
+    where = path.name
+    text = _read_text(path)
+    try:
+        document = json.loads(text, object_pairs_hook=_object)
+        not_finite = first_non_finite(document)
+    except _DuplicateKeyError as error:
+        raise InputError(_CODE, str(error), where=where, mend="Remove one of the two.") from None
+    except json.JSONDecodeError as error:
+        raise InputError(
+            _CODE,
+            f"not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}.",
+            where=where,
+            mend="The file may be cut off; export or copy it again.",
+        ) from None
+    except RecursionError:
+        raise InputError(_CODE, "nested too deeply.", where=where, mend="Export the poses again.") from None
+    except ValueError as error:  # numbers of thousands of digits
+        raise InputError(
+            _CODE, f"not readable: {error}.", where=where, mend="Export the poses again."
+        ) from None
+    if not isinstance(document, dict):
+        raise InputError(
+            _CODE,
+            f"holds a {type(document).__name__}, not an object with `frames`.",
+            where=where,
+            mend="Give a transforms.json as nerfstudio, instant-ngp or Blender write it.",
+        )
+    if not_finite is not None:
+        raise InputError(
+            "pose_not_finite",
+            "NaN or an infinite number.",
+            where=f"{where} {not_finite}",
+            mend="Remove the frame, or its transform_matrix, or export it again.",
+        )
+    return document
+
+
+def _read_text(path: Path) -> str:
+    try:
+        size = path.stat().st_size
+        if size > MAX_JSON_BYTES:
+            raise InputError(
+                _CODE,
+                f"{size / 2**20:.0f} MiB is more than a pose file may have ({MAX_JSON_BYTES // 2**20} MiB).",
+                where=path.name,
+                mend="Leave out what does not describe cameras, or split the set.",
+            )
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(
+            _CODE,
+            f"cannot be read: {error.strerror}.",
+            where=path.name,
+            mend="Check the path and its permissions.",
+        ) from None
+    except UnicodeDecodeError:
+        raise InputError(
+            _CODE, "is not UTF-8 text.", where=path.name, mend="Save it as JSON in UTF-8."
+        ) from None

@@ -1,0 +1,98 @@
+"""Checks of a pose that a file gives: shape, finiteness, and that it is a rigid motion."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.errors import InputError
+
+ROTATION_REFUSED = 1e-2  # a singular value farther than this from 1 is a scaling or a shear, not rounding
+ROTATION_WARNED = 1e-4  # files with 5 to 6 digits stay below it
+MAX_COORDINATE = 1e9  # map coordinates in millimetres fit; beyond it float32 maths says nothing
+_REFLECTION_MEND = "Flip whole axes of the world instead (a rotation), or export with another axis setting."
+
+
+def _numbers(value: Any, where: str) -> NDArray[np.float64]:
+    rows = value if isinstance(value, list) else None
+    if (
+        rows is not None
+        and len(rows) in (3, 4)
+        and all(isinstance(row, list) and len(row) == 4 for row in rows)
+    ):
+        flat = [item for row in rows for item in row]
+        if all(isinstance(item, int | float) and not isinstance(item, bool) for item in flat):
+            try:
+                return np.array(rows, dtype=np.float64)
+            except OverflowError:
+                pass
+        raise InputError(
+            "pose_shape",
+            "holds something that is not a number.",
+            where=where,
+            mend="Give 4 rows of 4 numbers.",
+        )
+    raise InputError(
+        "pose_shape",
+        "is not a matrix of 4 x 4 (or 3 x 4) numbers.",
+        where=where,
+        mend="Give the camera-to-world matrix as 4 rows of 4 numbers.",
+    )
+
+
+def rigid_matrix(value: Any, where: str) -> tuple[NDArray[np.float64], float]:
+    """A rigid motion float64 [4, 4] from a JSON value of 3 or 4 rows of 4 numbers.
+
+    The rotation is projected to the nearest one. Returns also how far it was from one: the largest deviation
+    of a singular value from 1.
+
+    Raises:
+        InputError: ``pose_shape``, ``pose_not_finite`` or ``pose_not_rotation``; ``where`` names file and
+            field.
+    """
+    rows = _numbers(value, where)
+    if not np.isfinite(rows).all():
+        raise InputError(
+            "pose_not_finite",
+            "NaN or an infinite number.",
+            where=where,
+            mend="Remove the frame or export it again.",
+        )
+    if len(rows) == 4 and not np.allclose(rows[3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-6):
+        raise InputError(
+            "pose_shape",
+            f"the last row is {rows[3].tolist()}, not [0, 0, 0, 1].",
+            where=where,
+            mend="Give row vectors of a camera-to-world matrix; it may be transposed.",
+        )
+    if np.abs(rows[:3, 3]).max() > MAX_COORDINATE:
+        raise InputError(
+            "pose_out_of_range",
+            f"the position is farther than {MAX_COORDINATE:g} from the origin.",
+            where=where,
+            mend="Move the scene's origin near the scene.",
+        )
+    matrix = np.eye(4)
+    matrix[:3, 3] = rows[:3, 3]
+    matrix[:3, :3], deviation = _nearest_rotation(rows[:3, :3], where)
+    return matrix, deviation
+
+
+def _nearest_rotation(block: NDArray[np.float64], where: str) -> tuple[NDArray[np.float64], float]:
+    u, stretch, vt = np.linalg.svd(block)
+    deviation = float(np.abs(stretch - 1.0).max())
+    if deviation > ROTATION_REFUSED:
+        if stretch[2] > 1e-12 and stretch[0] / stretch[2] - 1.0 < ROTATION_REFUSED:
+            what = f"the rotation is scaled by {stretch.mean():.6g}."
+            mend = "Divide the 3 x 3 block by that factor; put a change of scale into the positions alone."
+        else:
+            what = "the upper left 3 x 3 block is no rotation (its columns are not unit and orthogonal)."
+            mend = "Export the camera-to-world matrix again; rows and columns may be mixed up."
+        raise InputError("pose_not_rotation", what, where=where, mend=mend)
+    if np.linalg.det(block) < 0.0:
+        raise InputError(
+            "pose_not_rotation", "the rotation mirrors (determinant -1).", where=where, mend=_REFLECTION_MEND
+        )
+    return u @ vt, deviation

@@ -1,0 +1,85 @@
+"""Refined poses out: in the caller's own dialect, frame, names and order, and as a COLMAP model."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.atomic_file import whole_file
+from biresnerf.data.colmap_model import write_colmap_model
+from biresnerf.data.conventions import file_from_world_from_cam
+from biresnerf.data.dataset import Camera, Dataset
+
+
+def write_transforms(dataset: Dataset, world_from_cam: NDArray[np.float64], path: Path) -> None:
+    """Writes the transforms file ``path`` like the input's: all other keys and values and the order kept.
+
+    For a folder of images the nerfstudio dialect is written, with ``file_path`` relative to that folder.
+
+    Args:
+        dataset: the input.
+        world_from_cam: float64 [n, 4, 4] in the order of ``dataset.frames``, in the input's world.
+        path: the file; it appears whole or not at all.
+    """
+    if world_from_cam.shape != (len(dataset), 4, 4) or not np.isfinite(world_from_cam).all():
+        raise ValueError(
+            f"poses must be finite and of shape ({len(dataset)}, 4, 4), not {world_from_cam.shape}"
+        )
+    source = dataset.source
+    matrices = file_from_world_from_cam(world_from_cam, source.applied_transform, source.applied_scale)
+    document: dict[str, Any] = (
+        dict(source.document) if source.document else {"camera_model": "OPENCV", "frames": None}
+    )
+    document["frames"] = [
+        _frame_object(dataset, index, matrix.tolist()) for index, matrix in enumerate(matrices)
+    ]
+    if source.dialect == "images":
+        document = _with_intrinsics(document, dataset)
+    with whole_file(path) as temporary:
+        temporary.write_text(
+            json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n", "utf-8"
+        )
+
+
+def _frame_object(dataset: Dataset, index: int, matrix: list[list[float]]) -> dict[str, Any]:
+    frame = dataset.frames[index]
+    row = dict(frame.raw) or {"file_path": dataset.file_names[index]}
+    rows_given = row.get("transform_matrix")
+    row["transform_matrix"] = matrix[:3] if isinstance(rows_given, list) and len(rows_given) == 3 else matrix
+    return row
+
+
+def _with_intrinsics(document: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
+    """Intrinsics shared by all frames, or in each frame where there are several cameras."""
+    frames = document.pop("frames")
+    if len(dataset.cameras) == 1:
+        return {**document, **_intrinsics(dataset.cameras[0]), "frames": frames}
+    described = [
+        {"file_path": row.pop("file_path"), **_intrinsics(dataset.camera_of(index)), **row}
+        for index, row in enumerate(frames)
+    ]
+    return {**document, "frames": described}
+
+
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    p = camera.full()
+    values: dict[str, float] = {"w": camera.width, "h": camera.height}
+    values |= {"fl_x": p.fx, "fl_y": p.fy, "cx": p.cx, "cy": p.cy}
+    values |= {"k1": p.k1, "k2": p.k2, "p1": p.p1, "p2": p.p2}
+    return values
+
+
+def write_colmap(dataset: Dataset, world_from_cam: NDArray[np.float64], folder: Path) -> None:
+    """Writes cameras.bin, images.bin and an empty points3D.bin into ``folder``.
+
+    Image names are paths relative to ``dataset.root``, with extension. The frame is the dataset's world: for
+    a nerfstudio file with ``applied_transform`` that is the frame from before it.
+    """
+    indices = [frame.camera for frame in dataset.frames]
+    write_colmap_model(
+        folder, dataset.cameras, dataset.file_names, indices, np.asarray(world_from_cam, np.float64)
+    )
