@@ -1,0 +1,50 @@
+# Everything a developer does, in one or two lines each. Needs make and Python 3.11 or later with its venv module.
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV ?= .venv
+EXTRAS ?= service,colmap,dev
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+# Pins for what is installed and, under the names that older and newer pips know, for what builds it.
+export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
+export PIP_BUILD_CONSTRAINT := $(CURDIR)/constraints.txt
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: help setup test lint format demo serve bench
+.DELETE_ON_ERROR:
+
+help:  ## what there is
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' Makefile | expand -t 8
+
+setup: $(INSTALLED)  ## the environment in .venv, with everything installed
+
+test: setup  ## all tests; PYTEST="-k name" chooses
+	$(BIN)/python -m pytest $(PYTEST)
+
+lint: setup  ## format, style, types and the direction of imports
+	$(BIN)/ruff format --check . && $(BIN)/ruff check .
+	$(BIN)/mypy && $(BIN)/lint-imports
+
+format: setup  ## rewrite the code in the project's format
+	$(BIN)/ruff format . && $(BIN)/ruff check --fix .
+
+demo: setup  ## a whole job over HTTP on a scene of known poses; SCENE=folder-or-transforms.json takes yours
+	$(BIN)/biresnerf demo $(if $(SCENE),--scene "$(SCENE)")
+
+serve: setup  ## the service on this machine
+	$(BIN)/biresnerf up
+
+bench: setup  ## the measurements of docs/benchmarks.md
+	$(BIN)/python -m benchmarks $(BENCH)
+
+# The pip of an environment that was made without ensurepip is missing too, so both are looked at first.
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Python 3.11 or later is needed; say which with: make PYTHON=/path/to/python" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' || \
+	  { echo "Python's venv module is not whole; on Debian: apt install python3.11-venv" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[$(EXTRAS)]"
+	@touch $@

@@ -1,0 +1,113 @@
+"""`biresnerf pose-error RESULT TRUTH`: how far refined poses are from true ones."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from biresnerf.errors import InputError
+
+if TYPE_CHECKING:
+    from biresnerf.geometry.pose_error import PoseError, Spread
+
+_ROWS = (
+    ("rotation_deg", "rotation (deg)"),
+    ("centre_percent", "camera centre (% of distance)"),
+    ("translation", "translation t of cam_from_world"),
+    ("translation_table", "  the same x100 at distance 4"),
+)
+
+
+@click.command("pose-error")
+@click.argument("result", type=click.Path(path_type=Path))
+@click.argument("truth", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")
+def pose_error_command(result: Path, truth: Path, as_json: bool) -> None:
+    """Compare the poses of RESULT with those of TRUTH.
+
+    Both are transforms.json files or folders that hold one. Images are matched by name, with or without
+    extension; they need not be there. "aligned" is after the best similarity of the camera centres, as
+    published tables have it; "robust" after one that single lost cameras do not drag along; "own frame"
+    without any alignment.
+    """
+    import numpy as np
+
+    from biresnerf.data.pose_file import read_poses
+    from biresnerf.geometry.pose_error import pose_error
+
+    estimated, true = read_poses(result), read_poses(truth)
+    pairs = matched_names(list(estimated), list(true))
+    if not pairs:
+        raise InputError(
+            "no_common_images",
+            f"no image with a pose in both files ({len(estimated)} there, {len(true)} in {truth}).",
+            where=str(result),
+            mend="Compare files of the same images; file_path decides.",
+        )
+    error = pose_error(
+        np.stack([estimated[name] for name, _ in pairs]), np.stack([true[name] for _, name in pairs])
+    )
+    left_out = {"result": len(estimated) - len(pairs), "truth": len(true) - len(pairs)}
+    if as_json:
+        click.echo(json.dumps(_as_json(error, [name for name, _ in pairs], left_out)))
+    else:
+        click.echo(_as_table(error, [name for name, _ in pairs], left_out))
+
+
+def matched_names(estimated: list[str], true: list[str]) -> list[tuple[str, str]]:
+    """Pairs (name in the estimate, name in the truth) of the same image, in the order of the estimate.
+
+    Equal names match; else names that differ in the image's extension only, where one file alone has each.
+    """
+    exact = set(true)
+    by_bare = _names_by_bare(true)
+    estimated_by_bare = _names_by_bare(estimated)
+    pairs = []
+    for name in estimated:
+        candidates = by_bare.get(_bare(name), [])
+        if name in exact:
+            pairs.append((name, name))
+        elif len(candidates) == len(estimated_by_bare[_bare(name)]) == 1:
+            pairs.append((name, candidates[0]))
+    return pairs
+
+
+def _names_by_bare(names: list[str]) -> dict[str, list[str]]:
+    grouped: dict[str, list[str]] = {}
+    for name in names:
+        grouped.setdefault(_bare(name), []).append(name)
+    return grouped
+
+
+def _bare(name: str) -> str:
+    from biresnerf.data.image_files import is_image_name
+
+    return str(Path(name).with_suffix("")) if is_image_name(Path(name)) else name
+
+
+def _as_json(error: PoseError, names: list[str], left_out: dict[str, int]) -> dict[str, Any]:
+    values = error.model_dump()
+    for frame in ("aligned", "aligned_robust", "own_frame"):
+        values[frame]["worst"] = names[values[frame]["worst"]]
+    return {**values, "left_out": left_out}
+
+
+def _as_table(error: PoseError, names: list[str], left_out: dict[str, int]) -> str:
+    lines = [f"{error.cameras} cameras; distance {error.reference_distance:.6g} ({error.reference})"]
+    if any(left_out.values()):
+        lines.append(
+            f"left out: {left_out['result']} only in the result, {left_out['truth']} only in the truth"
+        )
+    for title, frame in (
+        ("aligned", error.aligned),
+        ("robust", error.aligned_robust),
+        ("own frame", error.own_frame),
+    ):
+        lines.append(f"\n{title:<34}{'mean':>12}{'median':>12}{'max':>12}   worst {names[frame.worst]}")
+        for key, label in _ROWS:
+            spread: Spread = getattr(frame, key)
+            lines.append(f"  {label:<32}{spread.mean:>12.5g}{spread.median:>12.5g}{spread.max:>12.5g}")
+    return "\n".join(lines)
