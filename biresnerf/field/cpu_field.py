@@ -92,7 +92,9 @@ class CpuField(RadianceField):
         last[:3] = self.networks[4].detach().numpy()
         return [first, *(w.detach().numpy() for w in self.networks[1:4]), last]
 
-    def _encode(self, x: np.ndarray, gradient: PositionGradient, role: str) -> tuple[np.ndarray, list[np.ndarray]]:
+    def _encode(
+        self, x: np.ndarray, gradient: PositionGradient, role: str
+    ) -> tuple[np.ndarray, list[np.ndarray]]:
         n, width = len(x) // 3, self._width()
         features = self._buffers.take(f"{role} features", width, n)
         jacobians, row = [], 0
@@ -147,7 +149,14 @@ class CpuField(RadianceField):
         density, colour = take("density", n), take("colour", 3 * n)
         weights = [w.reshape(-1) for w in self._weights()]
         network.network_forward(
-            features.reshape(-1), features.shape[0], view.reshape(-1), ray, *weights, density, colour, self.workers
+            features.reshape(-1),
+            features.shape[0],
+            view.reshape(-1),
+            ray,
+            *weights,
+            density,
+            colour,
+            self.workers,
         )
         return Samples(offset, x, t, dt, ray, features, jacobians, density, colour)
 
@@ -170,7 +179,9 @@ class CpuField(RadianceField):
                     g_density, g_colour, g_features.reshape(-1), g_view, *sums,
                 )  # fmt: skip
         if trained:
-            self._keep_network_gradients([s.sum(0).reshape(w.shape) for s, w in zip(sums, weights, strict=True)])
+            self._keep_network_gradients(
+                [s.sum(0).reshape(w.shape) for s, w in zip(sums, weights, strict=True)]
+            )
             self._pending = (samples, g_features, trained)
         dx, row = take("dx", n, 3), 0
         shares = (1.0, gradient.reconstruction_share)
@@ -185,7 +196,9 @@ class CpuField(RadianceField):
         first = torch.from_numpy(gradients[0])
         self.networks[0].grad = first[:, :low].clone()
         if self.reconstructing:
-            self.reconstruction_columns.grad = first[:, low : low + self.shape.reconstruction_grid.width].clone()
+            self.reconstruction_columns.grad = first[
+                :, low : low + self.shape.reconstruction_grid.width
+            ].clone()
         for weight, gradient in zip(self.networks[1:4], gradients[1:4], strict=True):
             weight.grad = torch.from_numpy(gradient)
         self.networks[4].grad = torch.from_numpy(gradients[4][:3].copy())
@@ -199,7 +212,13 @@ class CpuField(RadianceField):
         table = self.pose_table if pose else self.reconstruction_table
         row = 0 if pose else self.shape.pose_grid.width
         step = self.steps[name]
-        adam = (f4(BETA1), f4(BETA2), f4(EPSILON), f4(1 / (1 - BETA1**step)), f4(1 / (1 - BETA2**step) ** 0.5))
+        adam = (
+            f4(BETA1),
+            f4(BETA2),
+            f4(EPSILON),
+            f4(1 / (1 - BETA1**step)),
+            f4(1 / (1 - BETA2**step) ** 0.5),
+        )
         moment1, moment2 = (m.numpy().reshape(-1) for m in self.moments[name])
         encoding.update_table(
             samples.x, trained, g_features[row : row + grid.width], grid.scale, grid.stride, grid.hashed, grid.offset,
@@ -246,7 +265,16 @@ class _RenderRays(torch.autograd.Function):
         g_origin, g_direction = np.empty_like(o), np.empty_like(d)
         g_harmonics = np.empty((len(o), VIEW_FEATURES), f4)
         ray_kernels.ray_gradients(
-            o, d, samples.offset, samples.t, dx, g_view, field.shape.unbounded, g_origin, g_direction, g_harmonics
+            o,
+            d,
+            samples.offset,
+            samples.t,
+            dx,
+            g_view,
+            field.shape.unbounded,
+            g_origin,
+            g_direction,
+            g_harmonics,
         )
         grads = (torch.from_numpy(a) for a in (g_origin, g_direction, g_harmonics))
         return (*grads, None, None, None, None)

@@ -59,9 +59,7 @@ def network(features: Tensor, view: Tensor, weights: list[Tensor]) -> tuple[Tens
     """
     w1, w2, w3, w4, w5 = weights
     outputs = torch.relu(features @ w1.T) @ w2.T
-    colour = torch.sigmoid(
-        torch.relu(torch.relu(torch.cat([view, outputs], 1) @ w3.T) @ w4.T) @ w5.T
-    )
+    colour = torch.sigmoid(torch.relu(torch.relu(torch.cat([view, outputs], 1) @ w3.T) @ w4.T) @ w5.T)
     return density_of(outputs[:, 0]), colour
 
 

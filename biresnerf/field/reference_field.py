@@ -35,9 +35,7 @@ class ReferenceField(RadianceField):
         self.reconstruction_table.requires_grad_()
 
     def _features(self, x: Tensor, gradient: PositionGradient) -> Tensor:
-        features = [
-            reference.encode(x, self.pose_table, self.shape.pose_grid, gradient.pose_smoothing)
-        ]
+        features = [reference.encode(x, self.pose_table, self.shape.pose_grid, gradient.pose_smoothing)]
         if self.reconstructing:
             share = gradient.reconstruction_share
             passed = x.detach() + share * (x - x.detach())

@@ -72,7 +72,9 @@ def test_fast_field_equals_reference_in_values_and_all_gradients(unbounded, reco
         target = torch.linspace(0, 1, count * 3).reshape(count, 3)
         loss = ((rendering.colour - target) ** 2).mean() + 0.1 * (rendering.opacity**2).mean()
         loss.backward()
-        results.append((rendering, rays, [None if w.grad is None else w.grad.clone() for w in field.networks]))
+        results.append(
+            (rendering, rays, [None if w.grad is None else w.grad.clone() for w in field.networks])
+        )
     (a, rays_a, weights_a), (b, rays_b, weights_b) = results
     assert a.samples == pytest.approx(b.samples, abs=2)  # a midpoint on a cell face may fall to either side
     assert b.samples > 5 * count

@@ -257,9 +257,7 @@ def update_table(
             mask = u4((hi - lo) // 2 - 1)
             g0, g1 = g[2 * level], g[2 * level + 1]
             if hashed[level]:
-                _scatter_hashed(
-                    x, gradient, scale[level], stride[level], mask, g0, g1, corner, value, count
-                )
+                _scatter_hashed(x, gradient, scale[level], stride[level], mask, g0, g1, corner, value, count)
             else:
                 _scatter_dense(x, gradient, scale[level], stride[level], mask, g0, g1, corner, value, count)
             _adam_touched(

@@ -112,9 +112,7 @@ def network_backward(
             for c in range(3):
                 for t in range(n):
                     v = load(out, c * BLOCK + t)
-                    store(
-                        g_out, c * BLOCK + t, load(g_colour, c * total + begin + t) * v * (f4(1) - v)
-                    )
+                    store(g_out, c * BLOCK + t, load(g_colour, c * total + begin + t) * v * (f4(1) - v))
             if with_weights:
                 add_outer(g_out, h4, d5[worker], 4, HIDDEN, n)
             product(t5, g_out, ga, HIDDEN, 4, n, False)

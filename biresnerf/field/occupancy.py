@@ -1,0 +1,70 @@
+"""Which cells of the scene hold anything: the grid that lets ray marching skip empty space.
+
+As NerfAcc and BAA-NGP: a running maximum of density times step, decaying by 0.95 per update; a cell is occupied
+above min(mean, 0.01). Everything counts as occupied until `prune` is first asked for.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from biresnerf.field.radiance_field import RadianceField
+
+DECAY = 0.95
+THRESHOLD = 0.01
+DENSITY_CHUNK = 1 << 18  # cells whose density is asked for at once
+
+
+class OccupancyGrid:
+    """`occupied` is uint8 [side, side, side] over (z, y, x) of the grid position."""
+
+    def __init__(self, side: int, device: torch.device) -> None:
+        self.side, self.device = side, device
+        self.thickness = torch.zeros(side**3, device=device)
+        self.occupied = torch.ones(side, side, side, dtype=torch.uint8, device=device)
+
+    def update(
+        self,
+        field: RadianceField,
+        step: float,
+        generator: torch.Generator,
+        *,
+        everywhere: bool,
+        prune: bool,
+        dilate: bool,
+    ) -> None:
+        """Look again at all cells, or at a random quarter and the occupied ones, at a random point in each."""
+        cells = torch.arange(self.side**3)
+        if not everywhere:
+            chosen = torch.rand(len(cells), generator=generator) < 0.25
+            cells = cells[chosen | self.occupied.reshape(-1).cpu().bool()]
+        self.thickness *= DECAY
+        for part in cells.split(DENSITY_CHUNK):
+            index = torch.stack([part % self.side, part // self.side % self.side, part // self.side**2], 1)
+            position = (index + torch.rand(len(part), 3, generator=generator)) / self.side
+            density = field.density(position.to(self.device))
+            part = part.to(self.device)
+            self.thickness[part] = torch.maximum(self.thickness[part], density * step)
+        if prune:
+            self._prune(dilate)
+
+    def _prune(self, dilate: bool) -> None:
+        bound = min(float(self.thickness.mean()), THRESHOLD)
+        occupied = (self.thickness > bound).float().reshape(1, 1, self.side, self.side, self.side)
+        if dilate:
+            # A camera that is still off must meet density a cell away, or it has no gradient to come back by.
+            occupied = torch.nn.functional.max_pool3d(occupied, 3, stride=1, padding=1)
+        self.occupied = occupied[0, 0].to(torch.uint8).contiguous()
+
+    @property
+    def share(self) -> float:
+        """The share of cells that are occupied."""
+        return float(self.occupied.float().mean())
+
+    def state(self) -> dict[str, Tensor]:
+        return {"thickness": self.thickness, "occupied": self.occupied}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self.thickness.copy_(state["thickness"])
+        self.occupied = state["occupied"].to(self.device).contiguous()

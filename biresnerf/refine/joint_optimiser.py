@@ -1,0 +1,172 @@
+"""The joint optimisation of poses and radiance field: one object holding all state, one method taking a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from biresnerf.config import RefineOptions
+from biresnerf.data.images import ImageSet
+from biresnerf.field.backends import make_field
+from biresnerf.field.grid_levels import grid_levels
+from biresnerf.field.occupancy import OccupancyGrid
+from biresnerf.field.radiance_field import FieldShape, Marching, PositionGradient, Rays, Rendering
+from biresnerf.geometry.camera import Intrinsics, directions_in_cam
+from biresnerf.refine.photo_sampler import PhotoSampler
+from biresnerf.refine.pose_parameters import PoseParameters
+from biresnerf.refine.scene_frame import SceneFrame
+from biresnerf.refine.schedule import FINE_INTERVAL, INTERVAL_PIXELS, Schedule
+
+MOST_SAMPLES = 768  # per ray
+RAYS_LEAST, RAYS_MOST = 256, 1 << 15
+OCCUPANCY_PERIOD = 16
+DENSE_TABLE_LOG2 = 22  # the pose-estimation module is stored densely whatever its resolution
+RIG_DISTANCE = 4.0  # BARF's rigs: learning rates of translations are for cameras this far away
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """Loss against the (blurred) targets, mean squared error of training rays against the sharp photos, and effort."""
+
+    loss: float
+    mean_squared_error: float
+    rays: int
+    samples: int
+
+
+class JointOptimiser:
+    """Poses, field, occupancy and their schedules.
+
+    Args:
+        images: photos at working size.
+        frame: the unit frame.
+        unit_from_cam: start poses [n, 4, 4].
+        options: resolved.
+        held_out: images whose rays move their own pose but never the field.
+    """
+
+    def __init__(
+        self,
+        images: ImageSet,
+        frame: SceneFrame,
+        unit_from_cam: np.ndarray,
+        options: RefineOptions,
+        held_out: list[int],
+        device: torch.device,
+        threads: int,
+    ) -> None:
+        self.frame, self.options, self.device = frame, options, device
+        shape = FieldShape(
+            grid_levels(
+                options.pose_levels,
+                options.pose_resolution_min,
+                options.pose_resolution_max,
+                DENSE_TABLE_LOG2,
+            ),
+            grid_levels(
+                int(options.reconstruction_levels or 0),
+                options.reconstruction_resolution_min,
+                int(options.reconstruction_resolution_max or 0),
+                int(options.table_size_log2 or 0),
+            ),
+            frame.unbounded,
+        )
+        self.field = make_field(shape, options.seed, device, threads)
+        self.poses = PoseParameters(
+            torch.from_numpy(unit_from_cam),
+            options.pose_parametrisation,
+            frame.distance / RIG_DISTANCE,
+            device,
+        )
+        self.schedule = Schedule(options, max(FINE_INTERVAL, INTERVAL_PIXELS * frame.pixel))
+        self.sampler = PhotoSampler(images, held_out, device)
+        self.intrinsics = Intrinsics.from_cameras(images.cameras).to(device)
+        self.occupancy = OccupancyGrid(64 if int(options.samples_per_step or 0) <= 2**16 else 128, device)
+        self.generator = torch.Generator().manual_seed(options.seed)
+        behind = frame.background if frame.background is not None else images.pixels.mean(0) / 255
+        self.background = torch.as_tensor(behind, dtype=torch.float32, device=device)
+        self.step_index, self.switch = 0, None
+        self.pose_scale = 1.0
+        self.rays = max(RAYS_LEAST, self.schedule.samples(0, None) // 64)
+
+    def marching(self, interval: float) -> Marching:
+        return Marching(interval, self.frame.near, self.frame.far, MOST_SAMPLES, self.occupancy.occupied)
+
+    def cast(self, unit_from_cam: Tensor, image: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
+        """Origin and direction [rays, 3] in the unit frame of pixels `xy` of images, from matrices [n, 3, 4]."""
+        in_cam = directions_in_cam(self.intrinsics, image, xy)
+        matrix = unit_from_cam[image]
+        direction = (matrix[:, :, :3] @ in_cam[:, :, None])[:, :, 0]
+        return matrix[:, :, 3].contiguous(), direction.contiguous()
+
+    def render(
+        self,
+        origin: Tensor,
+        direction: Tensor,
+        trained: int,
+        interval: float,
+        gradient: PositionGradient,
+        *,
+        jitter: bool,
+    ) -> Rendering:
+        """Render rays over the scene's background; `jitter` randomises where sampling starts."""
+        count = len(origin)
+        start = (
+            torch.rand(count, generator=self.generator).to(self.device)
+            if jitter
+            else torch.full((count,), 0.5)
+        )
+        rays = Rays(
+            origin, direction, self.background.expand(count, 3).contiguous(), start.to(self.device), trained
+        )
+        return self.field.render(rays, self.marching(interval), gradient)
+
+    def step(self) -> StepResult:
+        """One step of the joint optimisation."""
+        t, schedule = self.step_index, self.schedule
+        if t % OCCUPANCY_PERIOD == 0:
+            self._update_occupancy(t)
+        batch = self.sampler.draw(
+            self.rays, schedule.blur(t, self.switch, self.sampler.long_side), self.generator
+        )
+        origin, direction = self.cast(self.poses.matrices(), batch.image, batch.xy)
+        rendering = self.render(
+            origin, direction, batch.trained, schedule.interval(t, self.switch),
+            schedule.position_gradient(t, self.switch), jitter=True,
+        )  # fmt: skip
+        loss = torch.nn.functional.smooth_l1_loss(rendering.colour, batch.target)
+        loss.backward()
+        self.field.step(schedule.field_rates(t, self.switch))
+        rate = schedule.pose_rate(t, self.switch) * self.pose_scale
+        if rate > 0:
+            self.poses.step(rate)
+        else:
+            self.poses.forget_gradients()
+        self.step_index += 1
+        self._adapt_rays(rendering.samples, schedule.samples(t, self.switch))
+        error = ((rendering.colour.detach() - batch.sharp) ** 2)[: batch.trained].mean()
+        return StepResult(float(loss.detach()), float(error), len(origin), rendering.samples)
+
+    def start_reconstruction(self) -> None:
+        """Switch to stage 2 at this step."""
+        self.switch = self.step_index
+        self.field.start_reconstruction()
+
+    def _update_occupancy(self, step: int) -> None:
+        fresh = self.switch is not None and step - self.switch < 512
+        self.occupancy.update(
+            self.field,
+            self.schedule.fine_interval,
+            self.generator,
+            everywhere=step < 256 or fresh,
+            prune=self.schedule.pruned(step),
+            dilate=self.switch is None,
+        )
+
+    def _adapt_rays(self, samples: int, budget: int) -> None:
+        wanted = self.rays * budget / max(1, samples)
+        wanted = min(max(wanted, self.rays / 1.5), self.rays * 1.5)
+        self.rays = int(min(max(wanted, RAYS_LEAST), RAYS_MOST))

@@ -1,0 +1,100 @@
+"""Random pixels of the photos, with their colour at a chosen sharpness. Photos stay bytes in memory."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from biresnerf.data.area_resize import area_resize
+from biresnerf.data.images import ImageSet
+
+PYRAMID_LEVELS = 5
+LEVEL_SIGMA = 0.5  # blur of level k, in px: 0.5 * 2**k (a box of 2**k px and the bilinear taps)
+
+
+@dataclass(frozen=True)
+class PixelBatch:
+    """`image` [rays] indices, pixel centres `xy` [rays, 2] px, colours [rays, 3] in 0..1: blurred and sharp.
+
+    The first `trained` rays belong to training views, the rest to held-out ones.
+    """
+
+    image: Tensor
+    xy: Tensor
+    target: Tensor
+    sharp: Tensor
+    trained: int
+
+
+class PhotoSampler:
+    """Draws the same number of pixels from every image; keeps an image pyramid for coarse-to-fine targets."""
+
+    def __init__(self, images: ImageSet, held_out: list[int], device: torch.device) -> None:
+        count = len(images)
+        training = [i for i in range(count) if i not in set(held_out)]
+        self.order = torch.tensor(training + sorted(held_out), device=device)
+        self.training, self.device = len(training), device
+        levels, offsets, sizes, base = [], [], [], 0
+        current = [images.image(i) for i in range(count)]
+        for level in range(PYRAMID_LEVELS):
+            if level:
+                current = [_half(image) for image in current]
+            offsets.append(
+                [base + n for n in np.cumsum([0, *(im.shape[0] * im.shape[1] for im in current)])[:-1]]
+            )
+            sizes.append([(im.shape[1], im.shape[0]) for im in current])
+            levels.append(np.concatenate([im.reshape(-1, 3) for im in current]))
+            base += len(levels[-1])
+        self.pixels = torch.from_numpy(np.concatenate(levels)).to(device)
+        self.offsets = torch.tensor(offsets, device=device)
+        self.sizes = torch.tensor(sizes, device=device)
+        self.long_side = float(self.sizes[0].max())
+
+    def draw(self, rays: int, blur_px: float, generator: torch.Generator) -> PixelBatch:
+        """`rays` pixels, spread evenly over all images; `blur_px` is scaled by a random share of it."""
+        count = len(self.order)
+        where = (torch.arange(rays) + torch.rand(rays, generator=generator)) * (count / rays)
+        position = where.long().clamp(max=count - 1).to(self.device)
+        image = self.order[position]
+        size = self.sizes[0][image]
+        xy = (torch.rand(rays, 2, generator=generator).to(self.device) * size).floor()
+        index = self.offsets[0][image] + (xy[:, 1] * size[:, 0] + xy[:, 0]).long()
+        sharp = self.pixels[index].float() / 255
+        xy = xy + 0.5
+        sigma = blur_px * float(torch.rand((), generator=generator))
+        target = sharp if sigma <= LEVEL_SIGMA else self._blurred(image, xy, sigma)
+        return PixelBatch(image, xy, target, sharp, int((position < self.training).sum()))
+
+    def _blurred(self, image: Tensor, xy: Tensor, sigma: float) -> Tensor:
+        level = min(math.log2(sigma / LEVEL_SIGMA), PYRAMID_LEVELS - 1.0)
+        lower = int(level)
+        share = level - lower
+        colour = self._bilinear(lower, image, xy) * (1 - share)
+        if share > 0:
+            colour = colour + self._bilinear(lower + 1, image, xy) * share
+        return colour
+
+    def _bilinear(self, level: int, image: Tensor, xy: Tensor) -> Tensor:
+        size = self.sizes[level][image]
+        at = xy * (size / self.sizes[0][image]) - 0.5
+        low = at.floor()
+        fraction = at - low
+        total = torch.zeros(len(image), 3, device=self.device)
+        for dx in (0, 1):
+            for dy in (0, 1):
+                corner = (low + torch.tensor([dx, dy], device=self.device)).long()
+                corner = torch.minimum(corner.clamp(min=0), size - 1)
+                index = self.offsets[level][image] + corner[:, 1] * size[:, 0] + corner[:, 0]
+                wx = fraction[:, 0] if dx else 1 - fraction[:, 0]
+                wy = fraction[:, 1] if dy else 1 - fraction[:, 1]
+                total += (wx * wy)[:, None] * self.pixels[index].float()
+        return total / 255
+
+
+def _half(image: np.ndarray) -> np.ndarray:
+    height, width = max(1, image.shape[0] // 2), max(1, image.shape[1] // 2)
+    return np.clip(np.rint(area_resize(image, width, height)), 0, 255).astype(np.uint8)

@@ -1,0 +1,94 @@
+"""Camera poses as parameters of the optimisation."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from biresnerf.config import PoseParametrisation
+from biresnerf.geometry.lie import se3_exp, so3_exp
+
+BETAS, EPSILON = (0.9, 0.99), 1e-12
+
+
+class PoseParameters:
+    """Increments on given poses ``unit_from_cam0`` [n, 4, 4], zero at the start, one row per image.
+
+    Two parametrisations (method: BARF's and the decoupled one), both with rotation in radians and translation in
+    quarters of the rig's distance, so that one learning rate suits every scene:
+
+    - ``se3_world``: unit_from_cam = exp(rotation, translation) unit_from_cam0; a rotation orbits the scene.
+    - ``so3xr3``: R = exp(rotation) R0, c = c0 + translation; a rotation turns the camera in place.
+    """
+
+    def __init__(
+        self, unit_from_cam: Tensor, parametrisation: PoseParametrisation, length: float, device: torch.device
+    ) -> None:
+        self.parametrisation, self.length = parametrisation, length
+        self.start = unit_from_cam[:, :3].to(torch.float32).to(device)
+        count = len(unit_from_cam)
+        self.rotation = torch.zeros(count, 3, device=device, requires_grad=True)
+        self.translation = torch.zeros(count, 3, device=device, requires_grad=True)
+        self._adam = torch.optim.Adam([self.rotation, self.translation], betas=BETAS, eps=EPSILON)
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def matrices(self) -> Tensor:
+        """unit_from_cam [n, 3, 4], differentiable."""
+        rotation0, centre0 = self.start[:, :, :3], self.start[:, :, 3]
+        shift = self.translation * self.length
+        if self.parametrisation == "se3_world":
+            rotation, translation = se3_exp(self.rotation, shift)
+            centre = (rotation @ centre0[:, :, None])[:, :, 0] + translation
+        else:
+            rotation, centre = so3_exp(self.rotation), centre0 + shift
+        return torch.cat([rotation @ rotation0, centre[:, :, None]], 2)
+
+    @torch.no_grad()
+    def poses(self) -> Tensor:
+        """unit_from_cam [n, 4, 4] in float64, without gradient."""
+        top = self.matrices().double().cpu()
+        bottom = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(len(top), 1, 4)
+        return torch.cat([top, bottom], 1)
+
+    def step(self, rate: float, rows: Tensor | None = None) -> None:
+        """One Adam step; rows not in the mask `rows` [n] keep still, as do cameras without gradient."""
+        self._adam.param_groups[0]["lr"] = rate
+        kept = None
+        if rows is not None:
+            kept = (self.rotation.detach().clone(), self.translation.detach().clone())
+        self._adam.step()
+        if rows is not None and kept is not None:
+            with torch.no_grad():
+                self.rotation.copy_(torch.where(rows[:, None], self.rotation, kept[0]))
+                self.translation.copy_(torch.where(rows[:, None], self.translation, kept[1]))
+        self.forget_gradients()
+
+    def forget_gradients(self) -> None:
+        self._adam.zero_grad(set_to_none=True)
+
+    def state(self) -> dict[str, Tensor]:
+        state = {
+            "start": self.start,
+            "rotation": self.rotation.detach(),
+            "translation": self.translation.detach(),
+        }
+        for i, entry in self._adam.state_dict()["state"].items():
+            for key, value in entry.items():
+                state[f"adam_{i}_{key}"] = torch.as_tensor(value)
+        return state
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        with torch.no_grad():
+            self.start.copy_(state["start"])
+            self.rotation.copy_(state["rotation"])
+            self.translation.copy_(state["translation"])
+        saved = self._adam.state_dict()
+        saved["state"] = {}
+        for i in range(2):
+            head = f"adam_{i}_"
+            entry = {k[len(head) :]: v.clone() for k, v in state.items() if k.startswith(head)}
+            if entry:
+                saved["state"][i] = entry
+        self._adam.load_state_dict(saved)

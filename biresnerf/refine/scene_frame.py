@@ -1,0 +1,99 @@
+"""The unit frame: where the scene lies, how large it is, and what lies around it.
+
+One rule for all rigs: the inner box [-1, 1]^3 is centred on the point the cameras look at and as large as what a
+camera sees at that distance. A scene with a known background colour is taken to end there; another goes on
+outside, contracted.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+
+from biresnerf.data.dataset import Dataset
+from biresnerf.data.images import ImageSet
+from biresnerf.geometry.focus import focus_point
+from biresnerf.geometry.similarity import Similarity
+
+logger = logging.getLogger(__name__)
+
+# Below this mean squared sine the axes are too parallel to say where they meet (a spread of about 6 degrees).
+CONVERGING = 0.01
+FORWARD_FACING_DEPTH = 6.0  # in spreads of the camera centres, where nothing better is known
+ALPHA_MARGIN = 1.15  # poses are noisy: the silhouettes' box is widened by this
+NEAR_SHARE = 0.05  # of the mean distance: nearer than this nothing is sampled
+FAR_BOXES = 60.0  # unbounded rays end this many inner boxes away (contracted to 1.98 of 2)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFrame:
+    """`unit_from_world` with what sampling needs to know; lengths are in units of the unit frame.
+
+    Attributes:
+        distance: mean distance of the cameras from the centre.
+        pixel: what one pixel of the working size spans at that distance.
+        background: colour [3], 0 to 1, behind the scene; None where the scene has surroundings.
+    """
+
+    unit_from_world: Similarity
+    unbounded: bool
+    distance: float
+    pixel: float
+    near: float
+    far: float
+    background: np.ndarray | None
+
+
+def _half_angle_tangent(images: ImageSet) -> float:
+    full = [camera.full() for camera in images.cameras]
+    sides = [max(c.width / f.fx, c.height / f.fy) / 2 for c, f in zip(images.cameras, full, strict=True)]
+    return float(np.median(sides))
+
+
+def _silhouette_tangent(images: ImageSet) -> float | None:
+    """How far from the optical axis silhouettes reach, as a tangent; None without alpha."""
+    reach = []
+    for i, camera in enumerate(images.cameras):
+        alpha = images.alpha_image(i)
+        if alpha is None:
+            return None
+        rows, columns = np.nonzero(alpha > 127)
+        if len(rows):
+            full = camera.full()
+            x, y = (columns + 0.5 - full.cx) / full.fx, (rows + 0.5 - full.cy) / full.fy
+            reach.append(max(np.abs(x).max(), np.abs(y).max()))
+    return float(np.quantile(reach, 0.9)) if reach else None
+
+
+def scene_frame(dataset: Dataset, images: ImageSet) -> SceneFrame:
+    """The unit frame of a set, from its given poses (noisy ones will do) and images."""
+    poses = dataset.world_from_cam
+    centres = poses[:, :3, 3]
+    focus = focus_point(poses)
+    centre, distance = focus.point, focus.mean_distance
+    if focus.conditioning < CONVERGING or focus.in_front < 0.5:
+        spread = float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
+        axis = poses[:, :3, 2].mean(0)
+        length = float(np.linalg.norm(axis))
+        forward = axis / length if length > 0.2 else np.zeros(3)
+        distance = FORWARD_FACING_DEPTH * spread if spread > 0 else 1.0
+        centre = centres.mean(0) + distance * forward
+        logger.info("optical axes do not meet: taking the scene %.3g ahead of the cameras", distance)
+    tangent = _half_angle_tangent(images)
+    silhouette = _silhouette_tangent(images)
+    if silhouette is not None:
+        tangent = min(tangent, ALPHA_MARGIN * silhouette)
+    half = distance * tangent
+    widest = float(np.median([max(c.width, c.height) for c in images.cameras]))
+    unit_from_world = Similarity(1 / half, np.eye(3), -centre / half)
+    return SceneFrame(
+        unit_from_world=unit_from_world,
+        unbounded=images.background is None,
+        distance=distance / half,
+        pixel=2 * _half_angle_tangent(images) / widest * distance / half,
+        near=NEAR_SHARE * distance / half,
+        far=FAR_BOXES if images.background is None else 4 * distance / half + 4,
+        background=images.background,
+    )

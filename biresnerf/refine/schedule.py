@@ -1,0 +1,110 @@
+"""How learning rates, sampling and smoothing change over the steps (method.md of the docs names the symbols)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from biresnerf.config import RefineOptions
+from biresnerf.field.radiance_field import FieldRates, PositionGradient
+
+COARSE_INTERVAL = 2.5e-2  # ray marching interval at the start, unit lengths: half a cell of the pose module
+FINE_INTERVAL = 3.3e-3  # BAA-NGP's 5e-3 in a box of side 3
+INTERVAL_PIXELS = 0.4  # no finer than this share of a pixel
+UNPRUNED_SHARE = 0.1  # of the least length of stage 1: until then every cell counts as occupied
+RAMP_SHARE = 0.75  # of the greatest length of stage 1: the interval has reached its fine value
+BLUR_END_SHARE = 0.6  # of the greatest length of stage 1: photos are sharp from then on
+BLUR_PIXELS = 0.03  # blur at the start, as a share of the long side (6 px of 200)
+FIELD_START, POSE_START = 200, 500  # steps of the paper's 40 000 over which rates rise from zero
+POSE_DIP = 0.05  # pose rate right after the switch, as a share
+POSE_STAGE2_CAP = 1e-3
+FIELD_DIP = 0.3
+FREEZE_SHARE = 0.95  # of all steps: poses stand still from then on
+
+
+def smooth_ramp(q: float) -> float:
+    """(1 - cos(pi q)) / 2 of q clamped to [0, 1]."""
+    return (1 - math.cos(math.pi * min(max(q, 0.0), 1.0))) / 2
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """All schedules of a run; `options` must be resolved. `switch` is the step stage 2 began at, None before."""
+
+    options: RefineOptions
+    fine_interval: float
+
+    @property
+    def steps(self) -> int:
+        return int(self.options.steps or 0)
+
+    def _option(self, name: str) -> float:
+        return float(getattr(self.options, name))
+
+    def _decayed(self, name: str, share: float) -> float:
+        start, end = self._option(f"{name}_rate"), self._option(f"{name}_rate_final")
+        return start * (end / start) ** min(share, 1.0)
+
+    def interval(self, step: int, switch: int | None) -> float:
+        """Ray marching interval, unit lengths."""
+        if switch is not None:
+            return self.fine_interval
+        share = min(1.0, step / (RAMP_SHARE * self._option("coarse_steps_max")))
+        return max(self.fine_interval, COARSE_INTERVAL * (self.fine_interval / COARSE_INTERVAL) ** share)
+
+    def samples(self, step: int, switch: int | None) -> int:
+        """Samples a step: half of the budget at the start of stage 1, all of it from its end."""
+        share = (
+            1.0 if switch is not None else min(1.0, step / (RAMP_SHARE * self._option("coarse_steps_max")))
+        )
+        return int(self._option("samples_per_step") * 2 ** (share - 1))
+
+    def pruned(self, step: int) -> bool:
+        """Whether empty space may be skipped."""
+        return step >= UNPRUNED_SHARE * self._option("coarse_steps_min")
+
+    def blur(self, step: int, switch: int | None, long_side: float) -> float:
+        """Standard deviation (px) that photos are blurred with, before its random factor."""
+        end = BLUR_END_SHARE * self._option("coarse_steps_max")
+        if switch is not None or step >= end:
+            return 0.0
+        start = BLUR_PIXELS * long_side
+        return start * (0.3 / max(start, 0.31)) ** (step / end)
+
+    def pose_rate(self, step: int, switch: int | None) -> float:
+        """Learning rate of the poses; 0 once they are frozen."""
+        if step >= FREEZE_SHARE * self.steps:
+            return 0.0
+        rate = smooth_ramp(step / (POSE_START / 40_000 * self.steps)) * self._decayed(
+            "pose", step / self.steps
+        )
+        if switch is not None:
+            warmup = 2 * self._option("warmup_steps")
+            rise = POSE_DIP + (1 - POSE_DIP) * smooth_ramp((step - switch) / warmup)
+            rate = min(rate, POSE_STAGE2_CAP) * rise
+        return rate
+
+    def field_rates(self, step: int, switch: int | None) -> FieldRates:
+        """Learning rates of the field: smooth warm-up of the reconstruction module after the switch."""
+        rate = smooth_ramp(step / (FIELD_START / 40_000 * self.steps)) * self._decayed(
+            "field", step / self.steps
+        )
+        if switch is None:
+            return FieldRates(rate, rate, (), 0.0)
+        warmup = self._option("warmup_steps")
+        q = (step - switch + 1) / warmup
+        rate *= FIELD_DIP + (1 - FIELD_DIP) * smooth_ramp(q)
+        high = smooth_ramp(q) * self._decayed("field", (step - switch) / max(1, self.steps - switch))
+        levels = int(self._option("reconstruction_levels"))
+        # Level by level, about three at a time; the last opens as the warm-up ends.
+        opened = [smooth_ramp(6 * q - 5 * level / max(1, levels - 1)) for level in range(levels)]
+        return FieldRates(rate, rate, tuple(high * r for r in opened), high)
+
+    def position_gradient(self, step: int, switch: int | None) -> PositionGradient:
+        """Straight-through smoothing, and how much of the reconstruction module's gradient reaches the poses."""
+        if switch is None:
+            return PositionGradient(1.0, 0.0, 0.0)
+        share = smooth_ramp((step - switch) / self._option("warmup_steps") - 1)
+        half = (switch + self.steps) / 2
+        smoothing = 1.0 - smooth_ramp((step - half) / max(1.0, self.steps - half))
+        return PositionGradient(1.0, smoothing, share)

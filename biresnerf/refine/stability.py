@@ -1,0 +1,70 @@
+"""Error-stability detection, Algorithm 1 of Guo et al. 2023: when the coarse stage has given what it can.
+
+Reconstruction of the `trend` reading: the error (dB) is averaged over blocks between checks; over a window of blocks a
+line is fitted, and the error is stable when it neither rises nor falls by more than its own fluctuation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+Verdict = Literal["running", "stable", "cap", "diverging"]
+
+WINDOW = 10  # blocks
+SLOPE_DB = 0.15  # net change over the window that still counts as flat
+FLUCTUATION_DB = 0.35  # standard deviation about the line that still counts as calm
+CONFIRMATIONS = 2
+RISING_BLOCKS = 3  # blocks in a row with rising error that mean divergence
+STILL_DEG = 0.05  # 90 % quantile of rotation change per block below which cameras have settled
+
+
+@dataclass
+class StabilityDetector:
+    """Feed it the mean squared error of each block; `check` says what to do.
+
+    Attributes:
+        floor, cap: no switch before step `floor`; always at step `cap`.
+        motion_deg: how calm cameras must be for STABLE: the 90 % quantile of their rotation within the block.
+    """
+
+    floor: int
+    cap: int
+    motion_deg: float = STILL_DEG
+    decibels: list[float] = field(default_factory=list)
+    confirmed: int = 0
+    rising: int = 0
+
+    def check(self, step: int, mean_squared_error: float, moved_deg: float) -> Verdict:
+        """One block's result at `step`. `moved_deg`: 90 % quantile of the cameras' rotation during the block."""
+        self.decibels.append(-10 * math.log10(max(mean_squared_error, 1e-12)))
+        if len(self.decibels) >= WINDOW:
+            change, fluctuation, imbalance = self._trend()
+            tolerance = max(SLOPE_DB, fluctuation)
+            flat = abs(change) <= tolerance and fluctuation <= FLUCTUATION_DB and imbalance <= WINDOW // 2
+            self.rising = self.rising + 1 if change < -tolerance else 0
+            self.confirmed = self.confirmed + 1 if flat and moved_deg < self.motion_deg else 0
+            if self.rising >= RISING_BLOCKS:
+                return "diverging"
+        if step >= self.cap:
+            return "cap"
+        if self.confirmed >= CONFIRMATIONS and step >= self.floor:
+            return "stable"
+        return "running"
+
+    def _trend(self) -> tuple[float, float, int]:
+        """Net change (dB) over the window, standard deviation about the line, and |rises - falls|."""
+        values = np.array(self.decibels[-WINDOW:])
+        x = np.arange(WINDOW)
+        slope, intercept = np.polyfit(x, values, 1)
+        fluctuation = float(np.std(values - (slope * x + intercept)))
+        signs = np.sign(np.diff(values))
+        return float(slope * (WINDOW - 1)), fluctuation, int(abs(signs.sum()))
+
+    def clear(self) -> None:
+        """Forget the window, after a rollback."""
+        self.decibels.clear()
+        self.confirmed = self.rising = 0
