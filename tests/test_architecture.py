@@ -1,0 +1,85 @@
+"""The direction of imports: the contracts hold, each breaks when it should, and light imports stay light."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+LINT_IMPORTS = Path(sys.executable).with_name("lint-imports")
+HEAVY = ("torch", "numba", "numpy", "scipy", "PIL", "pycolmap")
+
+
+def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [LINT_IMPORTS, "--no-cache"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder), "COLUMNS": "200"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """The three packages and the contracts, to plant faults in."""
+    for package in ("biresnerf", "workers", "service"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    return tmp_path
+
+
+def test_contracts_hold():
+    outcome = lint_imports(ROOT)
+    assert outcome.returncode == 0, outcome.stdout
+    assert "0 broken" in outcome.stdout
+
+
+@pytest.mark.parametrize(
+    ("module", "line", "contract"),
+    [
+        ("biresnerf/geometry/focus.py", "import workers.records", "service -> workers -> biresnerf"),
+        ("workers/records.py", "import service.app", "service -> workers -> biresnerf"),
+        ("biresnerf/geometry/focus.py", "import biresnerf.refine", "arrows point down"),
+        ("biresnerf/data/dataset.py", "import biresnerf.field", "arrows point down"),
+        ("service/problems.py", "def f():\n    import torch", "never loads torch"),
+        ("workers/jobs.py", "import biresnerf.geometry.lie", "only the job child"),
+        ("biresnerf/errors.py", "import numpy", "leaves stay leaves"),
+    ],
+)
+def test_an_import_against_the_arrows_breaks_its_contract(copy, module, line, contract):
+    with (copy / module).open("a") as file:
+        file.write(f"\n{line}\n")
+    outcome = lint_imports(copy)
+    assert outcome.returncode != 0
+    broken = [text for text in outcome.stdout.splitlines() if text.rstrip().endswith("BROKEN")]
+    assert any(contract in text for text in broken), outcome.stdout + outcome.stderr
+
+
+@pytest.mark.parametrize(
+    ("module", "forbidden"),
+    [
+        ("biresnerf", HEAVY),
+        ("biresnerf.command_line", HEAVY),
+        ("workers.jobs", ("torch", "numba", "pycolmap")),
+        ("workers.slot", ("torch", "numba", "pycolmap")),
+        ("service.app", ("torch", "numba", "pycolmap")),
+    ],
+)
+def test_importing_a_light_part_loads_no_heavy_library(module, forbidden):
+    code = f"import sys, {module}; print(*(name for name in {forbidden!r} if name in sys.modules))"
+    outcome = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert outcome.stdout.split() == []
+
+
+def test_the_method_is_reached_through_the_package():
+    code = "import biresnerf; assert callable(biresnerf.refine); import sys; assert 'torch' in sys.modules"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
