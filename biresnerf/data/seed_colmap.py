@@ -1,0 +1,175 @@
+"""Poses for a folder of images that has none: COLMAP, run in a child process."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from biresnerf.data.dataset import Camera, Dataset, Frame, SourceFormat
+from biresnerf.data.image_files import ImageHeader, read_header
+from biresnerf.data.transforms_json import MIN_IMAGES, few_names, orientation_notes, refuse_too_few
+from biresnerf.errors import InputError, Interrupted, RefinementError
+from biresnerf.geometry.camera_models import folds_inside_image
+
+ALL_PAIRS_UP_TO = 150  # images; beyond it, neighbours in the order of names are matched (11 000 pairs at 150)
+_POLL_S = 0.2
+_PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None)  # loaded here: between fork and exec it would be too late to load anything
+_OVERLAP_MEND = (
+    "Take sharp photos that overlap by more than half, of something with texture, from many places; "
+    "or give a transforms.json with approximate poses."
+)
+
+
+def seed_poses(
+    root: Path,
+    images: Sequence[Path],
+    *,
+    should_stop: Callable[[], bool] | None = None,
+    seed: int = 0,
+    limit_s: float = 3600.0,
+) -> Dataset:
+    """The images that COLMAP can place, with its poses and one shared camera (one each where sizes differ).
+
+    Names are paths relative to ``root``. The frame and scale are COLMAP's own choice. Images it could not
+    place are left out and named in the warnings.
+
+    Raises:
+        InputError: ``too_few_images``, ``colmap_missing``, ``seed_failed``, ``seed_timeout``, or a code of
+            `read_header`.
+        Interrupted: ``should_stop`` said so.
+        RefinementError: ``seeding_crashed``: COLMAP itself failed.
+    """
+    names = [path.relative_to(root).as_posix() for path in images]
+    refuse_too_few(len(names), root.name)
+    headers = {name: read_header(path, name) for name, path in zip(names, images, strict=True)}
+    if importlib.util.find_spec("pycolmap") is None:
+        raise InputError(
+            "colmap_missing",
+            "there is no transforms.json, and finding poses needs COLMAP, which is not installed.",
+            where=root.name,
+            mend="Run `pip install 'biresnerf[colmap]'`, or give a transforms.json.",
+        )
+    with tempfile.TemporaryDirectory(prefix="biresnerf-colmap-") as work:
+        request = {
+            "root": str(root.resolve()),
+            "names": names,
+            "work": work,
+            "answer": str(Path(work, "answer.json")),
+            "camera_per_image": len({(h.width, h.height) for h in headers.values()}) > 1,
+            "sequential": len(names) > ALL_PAIRS_UP_TO,
+            "seed": seed,
+        }
+        answer = _run_child(request, Path(work), should_stop or (lambda: False), limit_s)
+    return _dataset(root, headers, answer)
+
+
+def _run_child(
+    request: dict[str, Any], work: Path, should_stop: Callable[[], bool], limit_s: float
+) -> dict[str, Any]:
+    request_path, log_path = work / "request.json", work / "colmap.log"
+    request_path.write_text(json.dumps(request), "utf-8")
+    command = [sys.executable, "-P", str(Path(__file__).with_name("colmap_child.py")), str(request_path)]
+    with log_path.open("wb") as log:
+        child = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            preexec_fn=_die_with_parent if sys.platform == "linux" else None,
+        )
+        try:
+            _wait(child, should_stop, limit_s)
+        finally:
+            if child.poll() is None:
+                os.killpg(child.pid, signal.SIGKILL)
+                child.wait()
+    answer = Path(request["answer"])
+    if child.returncode != 0 or not answer.is_file():
+        tail = log_path.read_text("utf-8", errors="replace").strip().splitlines()[-3:]
+        raise RefinementError("seeding_crashed", f"COLMAP ended with {child.returncode}: {' | '.join(tail)}")
+    result: dict[str, Any] = json.loads(answer.read_text("utf-8"))
+    return result
+
+
+def _wait(child: subprocess.Popen[bytes], should_stop: Callable[[], bool], limit_s: float) -> None:
+    end = time.monotonic() + limit_s
+    while child.poll() is None:
+        if should_stop():
+            raise Interrupted("stopped while COLMAP looked for poses")
+        if time.monotonic() > end:
+            raise InputError(
+                "seed_timeout",
+                f"COLMAP did not finish within {limit_s:.0f} s.",
+                mend="Give fewer images, or a transforms.json with approximate poses.",
+            )
+        time.sleep(_POLL_S)
+
+
+def _die_with_parent() -> None:
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def _dataset(root: Path, headers: dict[str, ImageHeader], answer: dict[str, Any]) -> Dataset:
+    placed = {image["name"]: image for image in answer["images"]}
+    missing = [name for name in headers if name not in placed]
+    if len(placed) < MIN_IMAGES:
+        raise InputError(
+            "seed_failed",
+            f"COLMAP could place {len(placed)} of {len(headers)} images; at least {MIN_IMAGES} are needed.",
+            where=root.name,
+            mend=_OVERLAP_MEND,
+        )
+    cameras: dict[Camera, int] = {}
+    frames = []
+    for name in headers:
+        if name not in placed:
+            continue
+        described = answer["cameras"][placed[name]["camera"]]
+        camera = Camera(
+            described["model"], described["width"], described["height"], tuple(described["params"])
+        )
+        cam_from_world = np.vstack([placed[name]["cam_from_world"], [0.0, 0.0, 0.0, 1.0]])
+        index = cameras.setdefault(camera, len(cameras))
+        frames.append(Frame(name, root / name, index, _inverse(cam_from_world), "colmap"))
+    _refuse_implausible(cameras, root)
+    notes = orientation_notes(list(headers.values()), headers)
+    if missing:
+        notes.append(
+            f"COLMAP could not place {len(missing)} of {len(headers)} images, which are left out: "
+            f"{few_names(missing, 20)}"
+        )
+    source = SourceFormat("images", None, {}, np.eye(4))
+    return Dataset(root, tuple(cameras), tuple(frames), source, tuple(notes))
+
+
+def _inverse(rigid: np.ndarray) -> np.ndarray:
+    inverse = np.eye(4)
+    inverse[:3, :3] = rigid[:3, :3].T
+    inverse[:3, 3] = -rigid[:3, :3].T @ rigid[:3, 3]
+    return inverse
+
+
+def _refuse_implausible(cameras: dict[Camera, int], root: Path) -> None:
+    """A lens that folds inside the image is what COLMAP finds where the views fix too little."""
+    for camera in cameras:
+        if folds_inside_image(camera.full(), camera.width, camera.height):
+            raise InputError(
+                "seed_failed",
+                "COLMAP found an impossible lens, so its poses mean nothing.",
+                where=root.name,
+                mend=_OVERLAP_MEND,
+            )
