@@ -1,10 +1,35 @@
-"""The dataset record: create, fill with files, check, list, delete. Used by the service; never loads torch."""
+"""The dataset record: create, fill with files, check, list, delete. For the service; never loads torch."""
 
 from __future__ import annotations
 
+import asyncio
+import re
 from collections.abc import AsyncIterable, Sequence
+from typing import Any
 
+from psycopg.types.json import Jsonb
+
+from biresnerf.errors import InputError
+from workers.checking import check_files
+from workers.database import Connection, Database
+from workers.errors import Conflict, LimitReached, NotFound
+from workers.files import FileStore, StoredFile
+from workers.idents import cursor_after, cursor_place, cursor_time, new_id
+from workers.ledger import insist
 from workers.records import DatasetFile, DatasetRecord, DatasetState, ManifestEntry, Page
+from workers.settings import Settings
+
+# The file store keeps such names for uploads under way.
+RESERVED_NAME = re.compile(r"#\d+$")
+DATASET = """
+    SELECT datasets.*, coalesce(total.files, 0) AS files, coalesce(total.bytes, 0)::bigint AS bytes,
+        ARRAY(SELECT entry ->> 'path' FROM jsonb_array_elements(datasets.manifest) AS entry WHERE NOT EXISTS (
+            SELECT 1 FROM dataset_files AS file WHERE file.dataset_id = datasets.id
+            AND file.path = entry ->> 'path')) AS missing
+    FROM datasets LEFT JOIN LATERAL (SELECT count(*) AS files, sum(size) AS bytes
+        FROM dataset_files WHERE dataset_id = datasets.id) AS total ON true"""
+
+FILE = "SELECT path, key, size, sha256, created_at FROM dataset_files"
 
 
 class DatasetStore:
@@ -13,19 +38,47 @@ class DatasetStore:
     Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
     """
 
+    def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:
+        self._database, self._files, self._settings = database, files, settings
+        self._checks = asyncio.Semaphore(1)  # decoding a thousand photos is enough work for one machine
+
     async def create(self, name: str, manifest: Sequence[ManifestEntry] = ()) -> DatasetRecord:
-        """An empty dataset in state ``open``."""
-        raise NotImplementedError
+        """An empty dataset in state ``open``; raises `LimitReached` (``too_many_files``)."""
+        if len(manifest) > self._settings.max_files:
+            raise LimitReached(
+                "too_many_files", f"The manifest has more than {self._settings.max_files} files."
+            )
+        dataset_id = new_id("ds")
+        async with self._database.transaction() as connection:
+            await connection.execute(
+                "INSERT INTO datasets (id, name, manifest) VALUES (%s, %s, %s)",
+                (dataset_id, name, Jsonb([entry.model_dump() for entry in manifest])),
+            )
+            return await _required(connection, dataset_id)
 
     async def get(self, dataset_id: str) -> DatasetRecord:
         """The dataset; raises `NotFound`."""
-        raise NotImplementedError
+        async with self._database.transaction() as connection:
+            return await _required(connection, dataset_id)
 
     async def list(
         self, *, state: DatasetState | None = None, limit: int = 50, cursor: str | None = None
     ) -> Page[DatasetRecord]:
         """Datasets, newest first; raises `InputError` (``bad_cursor``)."""
-        raise NotImplementedError
+        created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
+        rows = await self._database.fetch(
+            DATASET + " WHERE (%s::text IS NULL OR state = %s)"
+            " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
+            " ORDER BY created_at DESC, id DESC LIMIT %s",
+            *(state, state),
+            *((cursor_time(created),) * 2 if created else (None, None)),
+            *(last_id, limit + 1),
+        )
+        items = tuple(_record(row) for row in rows[:limit])
+        more = len(rows) > limit
+        return Page(
+            items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
+        )
 
     async def add_file(
         self,
@@ -42,17 +95,75 @@ class DatasetStore:
         (``body_too_large``, ``too_many_files``), `InputError` (``unsafe_path``, ``digest_mismatch``).
         Where it raises, the dataset is as before.
         """
-        raise NotImplementedError
+        async with self._database.transaction() as connection:
+            row = await self._require_open(connection, dataset_id, path, overwrite=overwrite)
+        room = min(self._settings.max_file_bytes, self._settings.max_dataset_bytes - row["bytes"])
+        # A folder of its own for each upload: one that fails or comes too late never touches an older file.
+        folder = f"datasets/{dataset_id}/files/{new_id('v')}"
+        try:
+            stored = await self._files.put(
+                _key(folder, path), chunks, limit_bytes=room, expected_sha256=sha256
+            )
+            async with self._database.transaction() as connection:
+                await self._require_open(connection, dataset_id, path, overwrite=overwrite, size=stored.size)
+                return await _record_file(connection, dataset_id, path, stored)
+        except BaseException:
+            await self._files.delete_prefix(folder)
+            raise
+
+    async def _require_open(
+        self, connection: Connection, dataset_id: str, path: str, *, overwrite: bool, size: int = 0
+    ) -> dict[str, Any]:
+        """The dataset's row, locked, with the bytes and files it would have besides ``path``."""
+        cursor = await connection.execute(
+            "SELECT state FROM datasets WHERE id = %s FOR UPDATE", (dataset_id,)
+        )
+        dataset = await cursor.fetchone()
+        if dataset is None:
+            raise NotFound(f"No dataset {dataset_id}.")
+        if dataset["state"] != "open":
+            raise Conflict(
+                "dataset_not_open", f"Dataset {dataset_id} is {dataset['state']}; it takes no more files."
+            )
+        cursor = await connection.execute(
+            "SELECT count(*) FILTER (WHERE path <> %s) AS files, count(*) FILTER (WHERE path = %s) AS same,"
+            " coalesce(sum(size) FILTER (WHERE path <> %s), 0)::bigint AS bytes"
+            " FROM dataset_files WHERE dataset_id = %s",
+            (path, path, path, dataset_id),
+        )
+        row = await cursor.fetchone()
+        assert row is not None, "an aggregate gives a row"
+        if row["same"] and not overwrite:
+            raise Conflict("file_exists", f"{path} is there already.")
+        if row["files"] >= self._settings.max_files:
+            raise LimitReached("too_many_files", f"A dataset holds at most {self._settings.max_files} files.")
+        if row["bytes"] + size > self._settings.max_dataset_bytes:
+            raise LimitReached(
+                "body_too_large", f"A dataset holds at most {self._settings.max_dataset_bytes} bytes."
+            )
+        return row
 
     async def file(self, dataset_id: str, path: str) -> DatasetFile:
         """One file; raises `NotFound`."""
-        raise NotImplementedError
+        rows = await self._database.fetch(FILE + " WHERE dataset_id = %s AND path = %s", dataset_id, path)
+        if not rows:
+            raise NotFound(f"Dataset {dataset_id} has no file {path}.")
+        return DatasetFile.model_validate(rows[0])
 
     async def files(
         self, dataset_id: str, *, limit: int = 1000, cursor: str | None = None
     ) -> Page[DatasetFile]:
         """The files, by path; raises `NotFound`, `InputError` (``bad_cursor``)."""
-        raise NotImplementedError
+        after = cursor_place(cursor, 1)[0] if cursor else ""
+        async with self._database.transaction() as connection:
+            await _required(connection, dataset_id)
+            found = await connection.execute(
+                FILE + " WHERE dataset_id = %s AND path > %s ORDER BY path LIMIT %s",
+                (dataset_id, after, limit + 1),
+            )
+            rows = await found.fetchall()
+        items = tuple(DatasetFile.model_validate(row) for row in rows[:limit])
+        return Page(items=items, next_cursor=cursor_after(items[-1].path) if len(rows) > limit else None)
 
     async def finalize(self, dataset_id: str) -> DatasetRecord:
         """Freeze the content: ``open`` becomes ``finalizing`` (other states come back as they are).
@@ -60,19 +171,111 @@ class DatasetStore:
         Raises `NotFound`, `Conflict` (``dataset_not_complete``: manifest files lack, or no file at all).
         Then call `check` (in a background task, or awaited), which leads to ``ready`` or ``rejected``.
         """
-        raise NotImplementedError
+        async with self._database.transaction() as connection:
+            await connection.execute("SELECT 1 FROM datasets WHERE id = %s FOR UPDATE", (dataset_id,))
+            dataset = await _required(connection, dataset_id)
+            if dataset.state != "open":
+                return dataset
+            if dataset.missing or not dataset.files:
+                lacking = ", ".join(dataset.missing[:5]) or "files"
+                raise Conflict("dataset_not_complete", f"Dataset {dataset_id} still lacks {lacking}.")
+            await connection.execute(
+                "UPDATE datasets SET state = 'finalizing', revision = revision + 1 WHERE id = %s",
+                (dataset_id,),
+            )
+            return await _required(connection, dataset_id)
 
     async def check(self, dataset_id: str) -> DatasetRecord:
         """Validate a ``finalizing`` dataset in a child process and write the outcome; idempotent.
 
         Only one check of a dataset runs at a time, over all processes. Other states come back as they are.
         """
-        raise NotImplementedError
+        async with self._checks:
+            return await insist(lambda: self._check(dataset_id))
+
+    async def _check(self, dataset_id: str) -> DatasetRecord:
+        async with self._database.transaction() as connection:
+            # Held while the child works; another process waits here and then finds the outcome.
+            await connection.execute("SELECT pg_advisory_xact_lock(hashtextextended(%s, 0))", (dataset_id,))
+            dataset = await _required(connection, dataset_id)
+            if dataset.state != "finalizing":
+                return dataset
+            cursor = await connection.execute(
+                "SELECT key, path FROM dataset_files WHERE dataset_id = %s", (dataset_id,)
+            )
+            files = [(row["key"], row["path"]) for row in await cursor.fetchall()]
+            verdict = await check_files(self._files, files, self._settings)
+            await connection.execute(
+                "UPDATE datasets SET state = %s, report = %s, error = %s, revision = revision + 1"
+                " WHERE id = %s",
+                (
+                    *("rejected" if verdict.error else "ready", Jsonb(verdict.report)),
+                    *(Jsonb(verdict.error.model_dump()) if verdict.error else None, dataset_id),
+                ),
+            )
+            return await _required(connection, dataset_id)
 
     async def unfinished(self) -> tuple[str, ...]:
         """Ids left in ``finalizing`` (by a process that died): `check` them at start."""
-        raise NotImplementedError
+        rows = await self._database.fetch(
+            "SELECT id FROM datasets WHERE state = 'finalizing' ORDER BY created_at"
+        )
+        return tuple(row["id"] for row in rows)
 
     async def delete(self, dataset_id: str) -> None:
-        """Delete a dataset with its files; raises `NotFound`, `Conflict` (``dataset_in_use`` by an unfinished job)."""
-        raise NotImplementedError
+        """Delete a dataset with its files; raises `NotFound`, `Conflict` (``dataset_in_use`` by jobs)."""
+        async with self._database.transaction() as connection:
+            await connection.execute("SELECT 1 FROM datasets WHERE id = %s FOR UPDATE", (dataset_id,))
+            await _required(connection, dataset_id)
+            cursor = await connection.execute(
+                "SELECT id, state FROM jobs WHERE dataset_id = %s", (dataset_id,)
+            )
+            users = [f"{job['id']} ({job['state']})" for job in await cursor.fetchall()]
+            if users:
+                raise Conflict(
+                    "dataset_in_use", f"Delete first the jobs of {dataset_id}: {', '.join(users[:5])}."
+                )
+            await connection.execute("DELETE FROM datasets WHERE id = %s", (dataset_id,))
+            await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (f"datasets/{dataset_id}",))
+
+
+async def _record_file(
+    connection: Connection, dataset_id: str, path: str, stored: StoredFile
+) -> tuple[DatasetFile, bool]:
+    before = await (
+        await connection.execute(
+            "DELETE FROM dataset_files WHERE dataset_id = %s AND path = %s RETURNING key", (dataset_id, path)
+        )
+    ).fetchone()
+    if before is not None:
+        await connection.execute(
+            "INSERT INTO trash (prefix) VALUES (%s)", (before["key"].removesuffix(f"/{path}"),)
+        )
+    cursor = await connection.execute(
+        "INSERT INTO dataset_files (dataset_id, path, key, size, sha256) VALUES (%s, %s, %s, %s, %s)"
+        " RETURNING path, key, size, sha256, created_at",
+        (dataset_id, path, stored.key, stored.size, stored.sha256),
+    )
+    await connection.execute("UPDATE datasets SET revision = revision + 1 WHERE id = %s", (dataset_id,))
+    return DatasetFile.model_validate(await cursor.fetchone()), before is None
+
+
+def _key(folder: str, path: str) -> str:
+    """The key of a client's path; raises `InputError` (``unsafe_path``)."""
+    parts = path.split("/")
+    bad = any(part in ("", ".", "..") or len(part.encode()) > 255 for part in parts) or "\0" in path
+    if bad or RESERVED_NAME.search(path):
+        raise InputError("unsafe_path", "Not a usable file name.", where=path[:300], mend="Rename the file.")
+    return f"{folder}/{path}"
+
+
+async def _required(connection: Connection, dataset_id: str) -> DatasetRecord:
+    row = await (await connection.execute(DATASET + " WHERE datasets.id = %s", (dataset_id,))).fetchone()
+    if row is None:
+        raise NotFound(f"No dataset {dataset_id}.")
+    return _record(row)
+
+
+def _record(row: dict[str, Any]) -> DatasetRecord:
+    same = ("id", "name", "state", "files", "bytes", "missing", "report", "error", "created_at", "revision")
+    return DatasetRecord.model_validate({key: row[key] for key in same})

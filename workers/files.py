@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 import obstore
 from obstore.store import LocalStore
 
+from biresnerf.errors import InputError
 from workers.errors import LimitReached, NotFound, SetupError
 from workers.records import Record
 
@@ -51,10 +52,13 @@ class FileStore:
                 f"Cannot use {root}: {error}. Set BIRESNERF_DATA_DIR to a writable folder.",
             ) from error
 
-    async def put(self, key: str, chunks: AsyncIterable[bytes], *, limit_bytes: int) -> StoredFile:
+    async def put(
+        self, key: str, chunks: AsyncIterable[bytes], *, limit_bytes: int, expected_sha256: str | None = None
+    ) -> StoredFile:
         """Store a byte stream of at most ``limit_bytes``, hashing it on the way.
 
-        Raises `LimitReached` (``body_too_large``) at the first byte too many; then nothing is stored.
+        Raises `LimitReached` (``body_too_large``) at the first byte too many, `InputError`
+        (``digest_mismatch``) at the end; then nothing is stored, and what was there before stays.
         """
         digest, size = hashlib.sha256(), 0
 
@@ -66,6 +70,13 @@ class FileStore:
                     raise LimitReached("body_too_large", f"{key} has more than {limit_bytes} bytes.")
                 digest.update(chunk)
                 yield chunk
+            if expected_sha256 is not None and digest.hexdigest() != expected_sha256:
+                raise InputError(
+                    "digest_mismatch",
+                    f"What arrived has SHA-256 {digest.hexdigest()}, announced was {expected_sha256}.",
+                    where=key.rpartition("/")[2],
+                    mend="Send the file again.",
+                )
 
         await obstore.put_async(self._store, _checked(key), measured(), chunk_size=PART_BYTES)
         return (await self.head(key)).model_copy(update={"sha256": digest.hexdigest()})

@@ -2,10 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping
+import asyncio
+import contextlib
+import hashlib
+import json
+from collections.abc import AsyncGenerator, Mapping
+from typing import Any
+
+from psycopg.types.json import Jsonb
 
 from biresnerf.config import RefineOptions
-from workers.records import Artifact, Job, JobEvent, JobState, JobUpdate, Page
+from workers.database import Connection, Database
+from workers.errors import Conflict, LimitReached, NotFound
+from workers.follow import Listener, follow
+from workers.idents import cursor_after, cursor_place, cursor_time, new_id
+from workers.records import Artifact, Job, JobError, JobEvent, JobProgress, JobState, JobUpdate, Page
+from workers.settings import Settings
+
+# Two submits at once must not both take the last place.
+QUEUE_LIMIT_LOCK = 7_201_604
+JOB = """
+    SELECT jobs.*, CASE WHEN jobs.state = 'queued' THEN
+        (SELECT count(*) FROM jobs AS ahead WHERE ahead.state = 'queued' AND ahead.queue_id <= jobs.queue_id)
+        END AS queue_position
+    FROM jobs"""
 
 
 class JobStore:
@@ -13,6 +33,9 @@ class JobStore:
 
     Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
     """
+
+    def __init__(self, database: Database, listener: Listener, settings: Settings) -> None:
+        self._database, self._listener, self._settings = database, listener, settings
 
     async def submit(
         self,
@@ -28,11 +51,53 @@ class JobStore:
         Raises `NotFound` (dataset), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``),
         `LimitReached` (``queue_full``).
         """
-        raise NotImplementedError
+        resolved = options.resolved().model_dump(mode="json")
+        request = json.dumps([dataset_id, resolved, dict(labels or {})], sort_keys=True)
+        fingerprint = hashlib.sha256(request.encode()).hexdigest()
+        async with self._database.transaction() as connection:
+            # Serialises submits (a millisecond each): the queue limit and repeated keys need no more thought.
+            await connection.execute("SELECT pg_advisory_xact_lock(%s)", (QUEUE_LIMIT_LOCK,))
+            if idempotency_key is not None:
+                known = await _one(connection, JOB + " WHERE idempotency_key = %s", idempotency_key)
+                if known is not None and known["fingerprint"] != fingerprint:
+                    raise Conflict(
+                        "idempotency_key_reused", f"The key was used for another request ({known['id']})."
+                    )
+                if known is not None:
+                    return job_from_row(known), False
+            await self._require_room(connection, dataset_id)
+            job_id = new_id("job")
+            await connection.execute(
+                "INSERT INTO jobs (id, dataset_id, options, labels, idempotency_key, fingerprint)"
+                " VALUES (%s, %s, %s, %s, %s, %s)",
+                (
+                    job_id,
+                    dataset_id,
+                    Jsonb(resolved),
+                    Jsonb(dict(labels or {})),
+                    idempotency_key,
+                    fingerprint,
+                ),
+            )
+            queue_id = await self._database.enqueue(connection, job_id)
+            await connection.execute("UPDATE jobs SET queue_id = %s WHERE id = %s", (queue_id, job_id))
+            await connection.execute("SELECT add_job_event(%s, 'queued', '{}')", (job_id,))
+            return job_from_row(await _required(connection, job_id)), True
+
+    async def _require_room(self, connection: Connection, dataset_id: str) -> None:
+        dataset = await _one(connection, "SELECT state FROM datasets WHERE id = %s FOR SHARE", dataset_id)
+        if dataset is None:
+            raise NotFound(f"No dataset {dataset_id}.")
+        if dataset["state"] != "ready":
+            raise Conflict("dataset_not_ready", f"Dataset {dataset_id} is {dataset['state']}, not ready.")
+        queued = await _one(connection, "SELECT count(*) AS n FROM jobs WHERE state = 'queued'")
+        if queued is not None and queued["n"] >= self._settings.max_queued:
+            raise LimitReached("queue_full", f"{queued['n']} jobs wait already, which is the limit.")
 
     async def get(self, job_id: str) -> Job:
         """The job now; raises `NotFound`."""
-        raise NotImplementedError
+        async with self._database.transaction() as connection:
+            return job_from_row(await _required(connection, job_id))
 
     async def list(
         self,
@@ -43,46 +108,142 @@ class JobStore:
         cursor: str | None = None,
     ) -> Page[Job]:
         """Jobs, newest first; raises `InputError` (``bad_cursor``)."""
-        raise NotImplementedError
+        created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
+        rows = await self._database.fetch(
+            JOB + " WHERE (%s::text IS NULL OR state = %s) AND (%s::jsonb IS NULL OR labels @> %s)"
+            " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
+            " ORDER BY created_at DESC, id DESC LIMIT %s",
+            *(state, state),
+            *((Jsonb({label[0]: label[1]}),) * 2 if label else (None, None)),
+            *((cursor_time(created),) * 2 if created else (None, None)),
+            last_id,
+            limit + 1,
+        )
+        items = tuple(job_from_row(row) for row in rows[:limit])
+        more = len(rows) > limit
+        return Page(
+            items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
+        )
 
     async def cancel(self, job_id: str) -> Job:
         """Ask for the end of a job: a queued one is cancelled at once, a running one within seconds.
 
         A job already final is returned as it is. Raises `NotFound`.
         """
-        raise NotImplementedError
+        async with self._database.transaction() as connection:
+            changed = await _one(
+                connection,
+                "UPDATE jobs SET cancel_requested = true,"
+                " finished_at = CASE WHEN state = 'queued' THEN clock_timestamp() END,"
+                " state = CASE WHEN state = 'queued' THEN 'cancelled' ELSE state END"
+                " WHERE id = %s AND state IN ('queued', 'running') AND NOT cancel_requested"
+                " RETURNING queue_id, state",
+                job_id,
+            )
+            if changed is not None:
+                await connection.execute(
+                    "SELECT procrastinate_cancel_job_v1(%s, true, false)", (changed["queue_id"],)
+                )
+                event = "cancelled" if changed["state"] == "cancelled" else "cancel_requested"
+                await connection.execute("SELECT add_job_event(%s, %s, '{}')", (job_id, event))
+            return job_from_row(await _required(connection, job_id))
 
     async def delete(self, job_id: str) -> None:
         """Delete a final job with its files; raises `NotFound`, `Conflict` (``state_conflict``)."""
-        raise NotImplementedError
+        async with self._database.transaction() as connection:
+            row = await _one(connection, "SELECT state FROM jobs WHERE id = %s FOR UPDATE", job_id)
+            if row is None:
+                raise NotFound(f"No job {job_id}.")
+            if row["state"] in ("queued", "running"):
+                raise Conflict("state_conflict", f"Job {job_id} is {row['state']}; cancel it first.")
+            await connection.execute("DELETE FROM jobs WHERE id = %s", (job_id,))
+            await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (f"jobs/{job_id}",))
+            await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job_id,))
 
-    async def events(self, job_id: str, *, after: int = 0, limit: int = 1000) -> list[JobEvent]:
+    async def events(self, job_id: str, *, after: int = 0, limit: int = 1000) -> tuple[JobEvent, ...]:
         """The history after ``seq == after``, gapless and in order; raises `NotFound`."""
-        raise NotImplementedError
+        async with self._database.transaction() as connection:
+            await _required(connection, job_id)
+            return await _events(connection, job_id, after, limit)
 
     async def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
         """The published files, by name; empty while there is no result. Raises `NotFound`."""
-        raise NotImplementedError
+        rows = await self._database.fetch("SELECT artifacts FROM jobs WHERE id = %s", job_id)
+        if not rows:
+            raise NotFound(f"No job {job_id}.")
+        return tuple(Artifact.model_validate(item) for item in rows[0]["artifacts"])
+
+    async def update(self, job_id: str, after: int = 0) -> JobUpdate:
+        """The job and the events after ``after``, seen in one snapshot; raises `NotFound`."""
+        async with self._database.transaction() as connection:
+            await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
+            job = job_from_row(await _required(connection, job_id))
+            return JobUpdate(job=job, events=await _events(connection, job_id, after, 10_000))
 
     def subscribe(
         self, job_id: str, *, after: int = 0, heartbeat_s: float = 15.0
-    ) -> AsyncIterator[JobUpdate | None]:
+    ) -> AsyncGenerator[JobUpdate | None]:
         """Follow a job: first its state and the events after ``after``, then every change.
 
         Yields none when nothing changed for ``heartbeat_s`` (time for a keep-alive). Ends after the update
         that carries a final state. Progress is in ``update.job``, at most once a second. Survives a restart
         of the database. Raises `NotFound`, also when the job is deleted meanwhile.
         """
-        raise NotImplementedError
+        return follow(self.update, self._listener, job_id, after, heartbeat_s)
 
     async def wait(self, job_id: str, *, timeout_s: float) -> Job:
         """The job as soon as it is final, or as it is after ``timeout_s`` (for long polls)."""
-        raise NotImplementedError
+        job = await self.get(job_id)
+        updates = follow(self.update, self._listener, job_id, 0, timeout_s)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s), contextlib.aclosing(updates):
+                async for update in updates:
+                    job = job if update is None else update.job
+        return job
 
     async def counts(self) -> dict[JobState, int]:
         """How many jobs are in each state."""
-        raise NotImplementedError
+        rows = await self._database.fetch("SELECT state, count(*) AS n FROM jobs GROUP BY state")
+        return {row["state"]: row["n"] for row in rows}
 
     async def healthy(self) -> bool:
         """Whether the database answers within two seconds."""
-        raise NotImplementedError
+        return await self._listener.database_answers(2.0)
+
+
+async def _one(connection: Connection, sql: Any, *parameters: Any) -> dict[str, Any] | None:
+    return await (await connection.execute(sql, parameters)).fetchone()
+
+
+async def _required(connection: Connection, job_id: str) -> dict[str, Any]:
+    row = await _one(connection, JOB + " WHERE id = %s", job_id)
+    if row is None:
+        raise NotFound(f"No job {job_id}.")
+    return row
+
+
+async def _events(connection: Connection, job_id: str, after: int, limit: int) -> tuple[JobEvent, ...]:
+    cursor = await connection.execute(
+        "SELECT seq, at, attempt, type, data FROM job_events WHERE job_id = %s AND seq > %s"
+        " ORDER BY seq LIMIT %s",
+        (job_id, after, limit),
+    )
+    return tuple(JobEvent.model_validate(row) for row in await cursor.fetchall())
+
+
+def job_from_row(row: dict[str, Any]) -> Job:
+    """The public record of a row of `JOB`."""
+    same = (
+        "id",
+        "dataset_id",
+        "state",
+        "stage",
+        "queue_position",
+        "attempt",
+        "cancel_requested",
+        "created_at",
+    )
+    also = ("started_at", "finished_at", "options", "metrics", "message", "labels", "revision")
+    progress = JobProgress(**{key: row[key] for key in ("fraction", "step", "steps_total", "eta_s")})
+    error = JobError.model_validate(row["error"]) if row["error"] else None
+    return Job(**{key: row[key] for key in same + also}, progress=progress, error=error)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
+from workers.database import open_database
 from workers.datasets import DatasetStore
 from workers.files import FileStore
+from workers.follow import Listener
 from workers.jobs import JobStore
 from workers.settings import Settings
+
+FOLLOW_POLL_S = 1.5
 
 
 @dataclass(frozen=True)
@@ -27,5 +32,12 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
 
     Raises `SetupError`. Opening waits up to 30 s for the database.
     """
-    raise NotImplementedError
-    yield
+    files = FileStore(settings.files_dir)
+    async with open_database(settings.require_database_url()) as database:
+        listener = Listener(database, FOLLOW_POLL_S)
+        listening = asyncio.create_task(listener.run())
+        try:
+            jobs = JobStore(database, listener, settings)
+            yield Stores(jobs, DatasetStore(database, files, settings), files)
+        finally:
+            listening.cancel()

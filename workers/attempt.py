@@ -1,0 +1,211 @@
+"""One attempt at one job: stage the files, run the process, carry its reports, conclude."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import mimetypes
+import shutil
+from collections.abc import Awaitable, Mapping
+from pathlib import Path
+from typing import Literal
+
+from pydantic import ValidationError
+
+from biresnerf.progress import Progress
+from workers.child import Child, log_tail
+from workers.courier import Courier
+from workers.database import Database
+from workers.files import FileStore
+from workers.ledger import Claim, Ledger, crashed_too_often
+from workers.records import Artifact, JobError
+from workers.settings import Settings
+
+log = logging.getLogger(__name__)
+
+StopReason = Literal["cancel", "shutdown"]
+EXIT_ERRORS = {2: "InputError", 3: "RefinementError"}  # deterministic: another attempt would end the same
+LOG_NAME = "log.txt"
+
+
+class Attempt:
+    """Runs a claimed job in ``folder`` (fresh, local, ours). `ask_stop` may be called at any time."""
+
+    def __init__(
+        self,
+        database: Database,
+        files: FileStore,
+        settings: Settings,
+        claim: Claim,
+        folder: Path,
+        variables: Mapping[str, str],
+    ) -> None:
+        self._claim, self._settings, self._files = claim, settings, files
+        self._database, self._variables = database, variables
+        self._ledger = Ledger(database, claim)
+        self._folder, self._output, self._log = folder, folder / "output", folder / LOG_NAME
+        self._stop_reason: StopReason | None = None
+        self._stop = asyncio.Event()
+        self._timed_out = False
+        self._child: Child | None = None
+
+    def ask_stop(self, reason: StopReason) -> None:
+        """End soon: the process writes a checkpoint and exits. A cancellation outweighs a shutdown."""
+        if self._stop_reason != "cancel":
+            self._stop_reason = reason
+        self._stop.set()
+
+    async def run(self) -> bool:
+        """Run to the end; True where the job goes back to the queue. Raises `Fenced`.
+
+        Whatever goes wrong on our side counts as a crash of the attempt.
+        """
+        try:
+            status = await self._run_process()
+            return await self._conclude(status)
+        except Exception as error:
+            log.exception("attempt %s of %s failed on our side", self._claim.name, self._claim.job_id)
+            return await self._crashed(f"{type(error).__name__}: {error}")
+        finally:
+            if self._child is not None:
+                self._child.kill()
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    async def _run_process(self) -> int | None:
+        """Exit status of the process; none where a stop came before it was started."""
+        staging = asyncio.create_task(self._stage())
+        await _first(staging, self._stop.wait())
+        if not staging.done():
+            staging.cancel()
+            return None
+        await staging
+        command, variables = self._settings.job_command, self._variables
+        child = self._child = await Child.start(command, self._folder, self._log, variables)
+        courier = Courier(self._ledger, self._files, self._output)
+        carrying = asyncio.create_task(courier.run())
+        pumping = asyncio.create_task(self._pump(child, courier))
+        ended = asyncio.create_task(child.wait())
+        try:
+            async with asyncio.timeout(self._settings.job_timeout_s):
+                await _first(ended, carrying, self._stop.wait())
+        except TimeoutError:
+            self._timed_out = True
+        try:
+            if carrying.done():
+                await carrying  # Fenced
+            if not ended.done():
+                await child.stop(self._settings.stop_grace_s)
+            status = await ended
+            await pumping
+            courier.close()
+            await carrying
+            return status
+        finally:
+            for task in (carrying, pumping, ended):
+                task.cancel()
+
+    async def _stage(self) -> None:
+        """The dataset to ``input``, the last checkpoint to ``output``, the order to ``job.json``."""
+        rows = await self._database.fetch(
+            "SELECT key, path FROM dataset_files WHERE dataset_id = %s", self._claim.dataset_id
+        )
+        shutil.rmtree(self._folder, ignore_errors=True)
+        (self._folder / "input").mkdir(parents=True)
+        self._output.mkdir()
+        await self._files.stage(((row["key"], row["path"]) for row in rows), self._folder / "input")
+        if self._claim.checkpoint is not None:
+            prefix, names = self._claim.checkpoint["prefix"], self._claim.checkpoint["files"]
+            await self._files.stage(((f"{prefix}/{name}", name) for name in names), self._output)
+        # Relative, so that an attempt elsewhere is the same job to the process.
+        order = {"input": "input", "output": "output", "options": self._claim.options}
+        (self._folder / "job.json").write_text(json.dumps(order, indent=1))
+
+    async def _pump(self, child: Child, courier: Courier) -> None:
+        async for line in child.lines():
+            try:
+                courier.offer(Progress.model_validate_json(line))
+            except ValidationError:
+                with self._log.open("ab") as file:  # a library printed something
+                    file.write(line)
+
+    async def _conclude(self, status: int | None) -> bool:
+        keep = (self._claim.name, self._settings.stall_s)
+        if status == 0:
+            artifacts = await self._upload_result()
+            if not await self._ledger.publish(artifacts, *keep):
+                await self._ledger.cancelled(artifacts, *keep)
+            return False
+        if status in EXIT_ERRORS:
+            await self._ledger.fail(self._reported_error(), await self._upload_result(log_only=True), *keep)
+            return False
+        if self._stop_reason == "cancel":
+            await self._ledger.cancelled(await self._upload_result(), *keep)
+            return False
+        if self._stop_reason == "shutdown":
+            return await self._ledger.give_back("requeued", {"why": "shutdown"}, counted=False)
+        if self._timed_out:
+            error = JobError(
+                code="timeout",
+                detail=f"The job took longer than {self._settings.job_timeout_s:g} s.",
+                mend="Ask for fewer steps or smaller images, or raise BIRESNERF_JOB_TIMEOUT_S.",
+                log_tail=log_tail(self._log),
+            )
+            await self._ledger.fail(error, await self._upload_result(), *keep)
+            return False
+        return await self._crashed(f"exit status {status}")
+
+    async def _crashed(self, how: str) -> bool:
+        tail = log_tail(self._log)
+        if self._claim.attempt < self._settings.max_attempts:
+            return await self._ledger.give_back(
+                "attempt_crashed", {"how": how, "log_tail": tail}, counted=True
+            )
+        error = crashed_too_often(self._claim.attempt, tail)
+        error = error.model_copy(update={"detail": f"{error.detail} The last time: {how}."})
+        artifacts = await self._upload_result(log_only=True)
+        await self._ledger.fail(error, artifacts, self._claim.name, self._settings.stall_s)
+        return False
+
+    def _reported_error(self) -> JobError:
+        """What the process wrote to ``error.json`` before it exited with 2 or 3."""
+        tail = log_tail(self._log)
+        try:
+            said = json.loads((self._folder / "error.json").read_text())
+            return JobError(**said, log_tail=tail)
+        except (OSError, ValueError, TypeError) as error:
+            detail = f"The job failed and its error report could not be read ({error})."
+            return JobError(code="engine_error", detail=detail, log_tail=tail)
+
+    async def _upload_result(self, *, log_only: bool = False) -> list[Artifact]:
+        """Store the output (all but the checkpoint) and the log under this attempt's own prefix."""
+        prefix = f"jobs/{self._claim.job_id}/results/{self._claim.name}"
+        names = {LOG_NAME: self._log} if self._log.exists() else {}
+        for path in () if log_only else sorted(self._output.rglob("*")):
+            relative = path.relative_to(self._output)
+            if path.is_file() and not path.is_symlink() and relative.parts[0] != "checkpoint":
+                names[relative.as_posix()] = path
+        artifacts = []
+        for name, path in sorted(names.items()):
+            stored = await self._files.put_path(f"{prefix}/{name}", path)
+            artifacts.append(
+                Artifact(
+                    name=name,
+                    key=stored.key,
+                    size=stored.size,
+                    sha256=stored.sha256 or "",
+                    media_type=mimetypes.guess_type(name)[0] or "application/octet-stream",
+                )
+            )
+        return artifacts
+
+
+async def _first(*waits: Awaitable[object]) -> None:
+    """Until the first of them is done; coroutines among them are cancelled, tasks are left running."""
+    tasks = [asyncio.ensure_future(wait) for wait in waits]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task, wait in zip(tasks, waits, strict=True):
+            if task is not wait:
+                task.cancel()

@@ -1,0 +1,135 @@
+"""Connections: one pool per process, the queue engine on the same pool, and errors translated once."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+from collections.abc import AsyncIterator, Iterable
+from contextlib import asynccontextmanager
+from typing import Any, LiteralString
+
+import psycopg
+from procrastinate import App, PsycopgConnector
+from procrastinate.connector import Notify
+from procrastinate.exceptions import ConnectorException
+from psycopg.rows import DictRow, dict_row
+from psycopg_pool import AsyncConnectionPool, PoolTimeout
+
+from workers.errors import SetupError, Unavailable
+
+log = logging.getLogger(__name__)
+
+Connection = psycopg.AsyncConnection[DictRow]
+# What a database that is away, or just went away, raises.
+AWAY = (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout)
+QUEUE = "refine"
+TASK = "refine"
+LISTEN_CHANNEL = "biresnerf_jobs"
+
+
+class PatientConnector(PsycopgConnector):
+    """The queue's connector, except that its listener outlives a restart of the database."""
+
+    async def listen_notify(self, on_notification: Notify, channels: Iterable[str]) -> None:
+        """Listen for ever; while the database is away, try again each second (polling fills the gap)."""
+        wanted = list(channels)
+        while True:
+            try:
+                await super().listen_notify(on_notification, wanted)
+            except (ConnectorException, *AWAY) as error:
+                log.warning("queue listener lost the database (%s)", first_line(error))
+                await asyncio.sleep(1)
+
+
+class Database:
+    """One process's pool and queue app. Use `open_database`."""
+
+    def __init__(self, url: str, pool: AsyncConnectionPool[Connection], app: App) -> None:
+        self.url, self.pool, self.app = url, pool, app
+
+    @asynccontextmanager
+    async def transaction(self) -> AsyncIterator[Connection]:
+        """A connection inside one transaction; raises `Unavailable` where the database is away."""
+        try:
+            async with self.pool.connection() as connection:
+                yield connection
+        except AWAY as error:
+            raise Unavailable(
+                "database_unavailable", f"The database does not answer: {first_line(error)}"
+            ) from error
+
+    async def fetch(self, sql: LiteralString, *parameters: Any) -> list[DictRow]:
+        """Rows of one statement in a transaction of its own."""
+        async with self.transaction() as connection:
+            cursor = await connection.execute(sql, parameters)
+            return await cursor.fetchall() if cursor.description else []
+
+    async def enqueue(self, connection: Connection, job_id: str) -> int:
+        """Put a job into the queue, in the caller's transaction; returns the queue row's id."""
+        task = self.app.configure_task(TASK, queue=QUEUE, connection=connection)
+        try:
+            return await task.defer_async(job_id=job_id)
+        except ConnectorException as error:
+            if isinstance(error.__cause__, AWAY):
+                raise error.__cause__ from None
+            raise
+
+
+@asynccontextmanager
+async def open_database(
+    url: str, *, connections: int = 8, patience_s: float = 10.0
+) -> AsyncIterator[Database]:
+    """Pool and queue app, closed at the end.
+
+    Args:
+        connections: most connections of the pool.
+        patience_s: how long a caller waits for a free and living connection.
+
+    Raises `SetupError` if the database does not answer within 30 s or is not migrated.
+    """
+    pool: AsyncConnectionPool[Connection] = AsyncConnectionPool(
+        url,
+        min_size=1,
+        max_size=connections,
+        timeout=patience_s,
+        reconnect_timeout=float("inf"),
+        kwargs={"row_factory": dict_row, "connect_timeout": 5},
+        connection_class=psycopg.AsyncConnection[DictRow],
+        check=AsyncConnectionPool.check_connection,  # connections killed with the server are replaced unseen
+        open=False,
+    )
+    logging.getLogger("psycopg.pool").setLevel(logging.ERROR)  # it warns at every reconnect attempt
+    try:
+        await pool.open(wait=True, timeout=30)
+    except PoolTimeout:
+        await pool.close()
+        raise SetupError(
+            "database_unreachable", f"The database at {without_password(url)} does not answer."
+        ) from None
+    try:
+        app = App(connector=PatientConnector(conninfo=url, kwargs={"connect_timeout": 5}))
+        async with app.open_async(pool):
+            database = Database(url, pool, app)
+            await _require_schema(database)
+            yield database
+    finally:
+        await pool.close()
+
+
+async def _require_schema(database: Database) -> None:
+    rows = await database.fetch(
+        "SELECT to_regclass('jobs') IS NOT NULL AS ours, to_regclass('schema_steps') AS steps"
+    )
+    if not rows[0]["ours"]:
+        raise SetupError("database_not_migrated", "The database has no tables yet. Run `biresnerf migrate`.")
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error's text, or its type's name."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+def without_password(url: str) -> str:
+    """The address fit for a log."""
+    return re.sub(r"(://[^:/@]*):[^@]*@", r"\1:***@", url)

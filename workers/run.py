@@ -1,0 +1,91 @@
+"""The program of one job's child process: `python -m workers.run JOB_FOLDER`.
+
+Reads ``job.json``, writes one line of JSON per report to standard output, everything else to standard error.
+Exit status: 0 done, 2 the user's mistake and 3 the refinement failed (details in ``error.json``), 143 stopped by
+SIGTERM after writing a checkpoint, 1 anything else.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import TextIO
+
+from pydantic import BaseModel, ConfigDict
+
+from biresnerf.config import RefineOptions, parse_options
+from biresnerf.errors import InputError, Interrupted, RefinementError
+from biresnerf.progress import Progress
+
+EXIT_BUG = 1
+EXIT_INPUT = 2
+EXIT_REFINEMENT = 3
+EXIT_STOPPED = 128 + signal.SIGTERM
+
+
+class Order(BaseModel):
+    """``job.json``: relative paths are below the job folder."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    input: Path
+    output: Path
+    options: dict[str, object]
+
+
+def main(folder: Path) -> int:
+    """Run the job in ``folder``; returns the exit status."""
+    protocol = _protocol_only()
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s %(message)s")
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        os.chdir(folder)
+        order = Order.model_validate_json(Path("job.json").read_bytes())
+        _refine(order, parse_options(order.options), protocol, stop)
+    except Interrupted:
+        return EXIT_STOPPED
+    except InputError as error:
+        _report(error.code, error.what, error.where, error.mend)
+        return EXIT_INPUT
+    except RefinementError as error:
+        _report(error.code, error.what, "", "")
+        return EXIT_REFINEMENT
+    except Exception:  # noqa: BLE001 - the last line of defence: a bug ends in the log and in the status
+        traceback.print_exc()
+        return EXIT_BUG
+    return 0
+
+
+def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: threading.Event) -> None:
+    from biresnerf.pipeline import refine  # loads torch; SIGTERM during that is seen at the first step
+
+    def tell(progress: Progress) -> None:
+        protocol.write(progress.model_dump_json() + "\n")
+        protocol.flush()
+
+    refine(order.input, order.output, options, on_progress=tell, should_stop=stop.is_set)
+
+
+def _protocol_only() -> TextIO:
+    """The real standard output, for reports alone: what libraries print goes to standard error."""
+    protocol = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    return protocol
+
+
+def _report(code: str, detail: str, where: str, mend: str) -> None:
+    said = json.dumps({"code": code, "detail": detail, "where": where, "mend": mend})
+    Path("error.json").write_text(said)
+    sys.stderr.write(f"{detail} {mend}\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

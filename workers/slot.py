@@ -1,0 +1,199 @@
+"""A slot: a small process that runs one job at a time, each in a child process. Loads no torch, no numpy."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import fcntl
+import logging
+import os
+import platform
+import re
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import IO, TypeVar
+
+from procrastinate import JobContext, RetryStrategy
+from procrastinate.job_context import AbortReason
+from procrastinate.worker import Worker
+
+from workers.attempt import Attempt
+from workers.beat import Beat
+from workers.database import QUEUE, TASK, Database, open_database
+from workers.errors import SetupError
+from workers.files import FileStore
+from workers.janitor import Janitor, release_worker
+from workers.ledger import Fenced, claim_job
+from workers.settings import Settings
+
+log = logging.getLogger(__name__)
+
+EXIT_FENCED = 75
+NEVER_S = 86_400.0
+T = TypeVar("T")
+
+
+class BackToQueue(Exception):
+    """Tells the queue engine to offer the job again."""
+
+
+class SlotLock:
+    """Makes a slot name unique on this host and remembers the queue id of who held it last."""
+
+    def __init__(self, data_dir: Path, name: str) -> None:
+        """Take the lock; raises `SetupError` where another process holds it."""
+        folder = data_dir / "slots"
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{platform.node() or 'localhost'}.{name}"
+        self._file: IO[str] = path.open("a+")
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # freed by the kernel, however we die
+        except BlockingIOError:
+            raise SetupError(
+                "slot_taken", f"Slot {name} runs already on this machine; give this one another --slot."
+            ) from None
+        self._file.seek(0)
+        text = self._file.read().strip()
+        self.predecessor = int(text) if text.isdigit() else None
+
+    def remember(self, worker_id: int) -> None:
+        """Write down our id for our successor."""
+        self._file.truncate(0)
+        self._file.write(str(worker_id))
+        self._file.flush()
+
+
+class Slot:
+    """Claims jobs from the queue and runs them one after the other until told to stop."""
+
+    def __init__(self, settings: Settings, name: str) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", name):
+            raise SetupError("bad_slot_name", f"--slot {name!r}: letters, digits, - and _ only, at most 40.")
+        self._settings, self._name = settings, name
+        self._files = FileStore(settings.files_dir)
+        self._lock = SlotLock(settings.data_dir, name)
+        self._scratch = settings.scratch_dir / f"{platform.node() or 'localhost'}.{name}"
+        self._running: set[int] = set()
+        self._worker: Worker | None = None
+
+    async def run(self) -> None:
+        """Until SIGTERM or SIGINT. A running job then writes a checkpoint and goes back to the queue."""
+        shutil.rmtree(self._scratch, ignore_errors=True)  # a predecessor's; the lock says it is gone
+        self._scratch.mkdir(parents=True)
+        async with open_database(self._settings.require_database_url(), connections=5) as database:
+            if self._lock.predecessor is not None:
+                await release_worker(database, self._lock.predecessor)
+            self._register(database)
+            worker = self._worker = Worker(
+                database.app,
+                queues=[QUEUE],
+                name=self._name,
+                concurrency=1,
+                shutdown_graceful_timeout=0.1,  # the attempt writes its checkpoint after this, see `_relay`
+                update_heartbeat_interval=NEVER_S,  # see Beat
+                stalled_worker_timeout=self._settings.stall_s,
+                fetch_job_polling_interval=self._settings.poll_s,
+                abort_job_polling_interval=self._settings.poll_s,
+            )
+            beat = Beat(database.url, self._settings.beat_s, self._worker_id)
+            beat.start()
+            janitor = Janitor(database, self._files, self._settings, self._worker_id, self._running)
+            side = [asyncio.create_task(janitor.run()), asyncio.create_task(self._remember())]
+            try:
+                log.info("slot %s is ready", self._name)
+                await worker.run()
+            finally:
+                beat.end()
+                for task in side:
+                    task.cancel()
+
+    def _worker_id(self) -> int | None:
+        return self._worker.worker_id if self._worker is not None else None
+
+    async def _remember(self) -> None:
+        while (worker_id := self._worker_id()) is None:
+            await asyncio.sleep(0.01)
+        self._lock.remember(worker_id)
+
+    def _register(self, database: Database) -> None:
+        # No cap on the engine's side: attempts are counted in the job, where shutdowns do not count.
+        @database.app.task(name=TASK, queue=QUEUE, pass_context=True, retry=RetryStrategy(wait=0))
+        async def refine(context: JobContext, job_id: str) -> None:
+            queue_id = context.job.id
+            assert queue_id is not None, "fetched from the database"
+            self._running.add(queue_id)
+            try:
+                again = await self._run_job(database, context, job_id)
+            except Fenced as fenced:
+                log.warning("%s; leaving", fenced)
+                # Without a word to the queue: its row belongs to the new owner.
+                os._exit(EXIT_FENCED)
+            finally:
+                self._running.discard(queue_id)
+            if again:
+                raise BackToQueue
+
+    async def _run_job(self, database: Database, context: JobContext, job_id: str) -> bool:
+        claiming = asyncio.create_task(claim_job(database, job_id, self._settings.max_attempts))
+        stopped: list[str] = []
+        claim = await _relay(claiming, lambda: stopped.append("early"))
+        if claim is None:
+            return False
+        log.info("job %s, attempt %s", job_id, claim.name)
+        folder = self._scratch / f"{job_id}-{claim.name}"
+        attempt = Attempt(database, self._files, self._settings, claim, folder, self._variables())
+
+        def ask_stop() -> None:
+            cancelled = context.abort_reason() == AbortReason.USER_REQUEST
+            attempt.ask_stop("cancel" if cancelled else "shutdown")
+
+        if stopped:
+            ask_stop()
+        return await _relay(asyncio.create_task(attempt.run()), ask_stop)
+
+    def _variables(self) -> Mapping[str, str]:
+        """Which device and how many cores the job of this slot may use."""
+        variables = {"PYTHONUNBUFFERED": "1"}
+        gpu = re.fullmatch(r"gpu(\d+)", self._name)
+        if gpu:
+            variables["CUDA_VISIBLE_DEVICES"] = gpu[1]
+        if self._settings.slots > 1 and "OMP_NUM_THREADS" not in os.environ:
+            share = max(1, len(os.sched_getaffinity(0)) // self._settings.slots)
+            variables |= {"OMP_NUM_THREADS": str(share), "NUMBA_NUM_THREADS": str(share)}
+        return variables
+
+
+async def _relay(work: asyncio.Task[T], on_cancel: Callable[[], object]) -> T:
+    """Await ``work`` to its end, turning each cancellation of us into a call of ``on_cancel``.
+
+    The queue engine cancels its task both for a user's wish and for a shutdown, and may do so twice. The work
+    has a database to write to and must not be torn at any await.
+    """
+    while True:
+        try:
+            return await asyncio.shield(work)
+        except asyncio.CancelledError:
+            if work.cancelled():
+                raise
+            on_cancel()
+
+
+def main() -> int:
+    """`python -m workers.slot --slot NAME`, settings from the environment."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--slot", default="cpu0")
+    arguments = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format=f"%(asctime)s {arguments.slot} %(levelname)s %(message)s")
+    logging.getLogger("procrastinate").setLevel(logging.CRITICAL)  # outcomes are in the job's own history
+    try:
+        asyncio.run(Slot(Settings(), arguments.slot).run())
+    except SetupError as error:
+        sys.stderr.write(f"{error.what}\n")
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

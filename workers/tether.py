@@ -1,0 +1,47 @@
+"""Runs a program that dies with its parent: `python tether.py PARENT_PID SIGNAL USER COMMAND…`.
+
+A program of its own (standard library only, started by path) instead of a ``preexec_fn``, because Python code
+between fork and exec can deadlock in a process that has threads. USER is a user name, or ``-`` for no change.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import pwd
+import sys
+
+PR_SET_PDEATHSIG = 1
+
+
+def main(arguments: list[str]) -> None:
+    """Change the user, tie this process to its parent, become the command."""
+    parent, signal_number, user, command = int(arguments[0]), int(arguments[1]), arguments[2], arguments[3:]
+    if user != "-":
+        entry = pwd.getpwnam(user)
+        os.setgroups([])
+        os.setgid(entry.pw_gid)
+        os.setuid(entry.pw_uid)
+        os.environ["HOME"] = entry.pw_dir
+    # After the change of user: the kernel forgets the wish when credentials change.
+    if (
+        sys.platform == "linux"
+        and ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal_number) != 0
+    ):
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
+    if os.getppid() != parent:  # it died before we were tied to it
+        os._exit(1)
+    os.execvp(command[0], command)
+
+
+def tethered(command: list[str], *, signal_number: int, user: str | None = None) -> list[str]:
+    """The command line that runs ``command`` tied to this process."""
+    return [
+        *(sys.executable, "-I", "-S", os.path.abspath(__file__)),
+        *(str(os.getpid()), str(signal_number), user or "-"),
+        *command,
+    ]
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
