@@ -37,7 +37,7 @@ serve: setup  ## the service on this machine
 bench: setup  ## the measurements of docs/benchmarks.md
 	$(BIN)/python -m benchmarks $(BENCH)
 
-# The pip of an environment that was made without ensurepip is missing too, so both are looked at first.
+# Without ensurepip the venv module leaves half an environment behind, so it is looked for first.
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Python 3.11 or later is needed; say which with: make PYTHON=/path/to/python" >&2; exit 1; }
@@ -46,5 +46,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip --upgrade || \
+	  { echo "$(VENV) has no pip; remove it, or name another with: make VENV=folder" >&2; exit 1; }
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[$(EXTRAS)]"
 	@touch $@
