@@ -1,8 +1,9 @@
 """The program that validates a dataset: `python -m workers.check FOLDER`.
 
-Writes one line of JSON to standard output: ``{"report": {...}}`` (exit status 0), or ``{"error": {"code",
-"detail", "where", "mend"}}`` (exit status 2). It reads what strangers sent, so it confines itself first: memory, CPU
-time, no files written. Loads neither torch nor pycolmap; poses that are missing are found by the job, not here.
+Writes one line of JSON to standard output: ``{"report": {...}}`` (exit status 0), or ``{"error":
+{"code", "detail", "where", "mend"}}`` (exit status 2). It reads what strangers sent, so it confines itself
+first: memory, CPU time, no files written. Loads neither torch nor pycolmap; poses that are missing are
+found by the job, not here.
 """
 
 from __future__ import annotations
