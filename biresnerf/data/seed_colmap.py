@@ -26,7 +26,8 @@ from biresnerf.geometry.camera_models import folds_inside_image
 ALL_PAIRS_UP_TO = 150  # images; beyond it, neighbours in the order of names are matched (11 000 pairs at 150)
 _POLL_S = 0.2
 _PR_SET_PDEATHSIG = 1
-_LIBC = ctypes.CDLL(None)  # loaded here: between fork and exec it would be too late to load anything
+# Loaded here: between fork and exec it would be too late to load anything.
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 _OVERLAP_MEND = (
     "Take sharp photos that overlap by more than half, of something with texture, from many places; "
     "or give a transforms.json with approximate poses."
@@ -120,6 +121,7 @@ def _wait(child: subprocess.Popen[bytes], should_stop: Callable[[], bool], limit
 
 
 def _die_with_parent() -> None:
+    assert _LIBC is not None
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 

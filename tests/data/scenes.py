@@ -1,0 +1,73 @@
+"""Small scenes on disk for the tests of reading and writing: real image files, made up poses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from biresnerf.errors import InputError
+
+WIDTH, HEIGHT = 20, 16
+
+
+def write_image(
+    path: Path, seed: int = 0, size: tuple[int, int] = (WIDTH, HEIGHT), mode: str = "RGB"
+) -> None:
+    """A noise image of the given mode, in the format its extension says."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    channels = {"L": (), "RGB": (3,), "RGBA": (4,)}[mode]
+    values = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], *channels), dtype=np.uint8)
+    Image.fromarray(values).save(path)
+
+
+def opengl_poses(count: int, seed: int = 0) -> list[list[list[float]]]:
+    """Camera-to-world matrices as a file holds them: nothing special about them but being rigid."""
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
+    poses[:, :3, 3] = rng.normal(size=(count, 3)) * 3
+    return poses.tolist()
+
+
+def nerfstudio_scene(folder: Path, count: int = 4, **top: Any) -> dict[str, Any]:
+    """Writes images/*.jpg and returns the document of a transforms.json for them, with shared intrinsics."""
+    for index in range(count):
+        write_image(folder / f"images/{index:03}.jpg", index)
+    frames = [
+        {"file_path": f"images/{index:03}.jpg", "transform_matrix": pose}
+        for index, pose in enumerate(opengl_poses(count))
+    ]
+    intrinsics = {"w": WIDTH, "h": HEIGHT, "fl_x": 18.0, "fl_y": 18.5, "cx": 10.25, "cy": 7.75}
+    return {"camera_model": "OPENCV", **intrinsics, **top, "frames": frames}
+
+
+def blender_scene(folder: Path, count: int = 4) -> dict[str, Any]:
+    """Writes train/r_*.png (RGBA) and returns the document of a Blender transforms file."""
+    for index in range(count):
+        write_image(folder / f"train/r_{index}.png", index, mode="RGBA")
+    frames = [
+        {"file_path": f"./train/r_{index}", "rotation": 0.0125, "transform_matrix": pose}
+        for index, pose in enumerate(opengl_poses(count))
+    ]
+    return {"camera_angle_x": 0.6911112070083618, "frames": frames}
+
+
+def save(folder: Path, document: Any, name: str = "transforms.json") -> Path:
+    """Writes the document, NaN and all, and returns its path."""
+    path = folder / name
+    path.write_text(document if isinstance(document, str) else json.dumps(document), "utf-8")
+    return path
+
+
+def assert_complete(error: InputError, code: str, *where: str) -> None:
+    """The error has the code, names every part of ``where``, and says what and how to mend it."""
+    assert error.code == code, f"{error.code}: {error}"
+    for part in where:
+        assert part in error.where, f"{part!r} is not in {error.where!r}"
+    assert error.what.endswith("."), error.what
+    assert error.mend.endswith("."), error.mend

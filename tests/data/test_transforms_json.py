@@ -1,0 +1,383 @@
+"""transforms.json of three dialects: what is read from it, and what is refused and how."""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from biresnerf.data.dataset import Camera
+from biresnerf.data.read import read_dataset
+from biresnerf.errors import InputError
+from tests.data.scenes import (
+    HEIGHT,
+    WIDTH,
+    assert_complete,
+    blender_scene,
+    nerfstudio_scene,
+    save,
+    write_image,
+)
+
+OPENGL = np.diag([1.0, -1, -1, 1])
+
+
+def test_opengl_becomes_opencv(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    dataset = read_dataset(save(tmp_path, document))
+    for frame, row in zip(dataset.frames, document["frames"], strict=True):
+        given = np.array(row["transform_matrix"])
+        np.testing.assert_allclose(frame.world_from_cam[:3, 3], given[:3, 3], atol=1e-14)
+        np.testing.assert_allclose(frame.world_from_cam[:3, 0], given[:3, 0], atol=1e-14)  # right stays right
+        np.testing.assert_allclose(frame.world_from_cam[:3, 1], -given[:3, 1], atol=1e-14)  # up turns down
+        np.testing.assert_allclose(
+            frame.world_from_cam[:3, 2], -given[:3, 2], atol=1e-14
+        )  # it looks along -z
+        assert frame.pose_source == "given"
+        assert frame.raw == row
+
+
+def test_shared_intrinsics_make_one_camera(tmp_path):
+    dataset = read_dataset(save(tmp_path, nerfstudio_scene(tmp_path, k1=-0.01, p2=0.001)))
+    assert dataset.cameras == (
+        Camera("OPENCV", WIDTH, HEIGHT, (18.0, 18.5, 10.25, 7.75, -0.01, 0, 0, 0.001)),
+    )
+    assert dataset.names == tuple(f"images/{i:03}.jpg" for i in range(4))
+    assert dataset.source.dialect == "nerfstudio"
+    assert dataset.warnings == ()
+
+
+def test_intrinsics_of_a_frame_go_before_the_shared_ones(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    document["frames"][2] |= {"fl_x": 21.0, "fl_y": 22.0, "cx": 9.0, "k1": 0.02}
+    dataset = read_dataset(save(tmp_path, document))
+    assert dataset.camera_of(2).full()[:5] == (21.0, 22.0, 9.0, 7.75, 0.02)
+    assert dataset.camera_of(1).full()[:5] == (18.0, 18.5, 10.25, 7.75, 0.0)
+    assert len(dataset.cameras) == 2
+
+
+def test_images_of_mixed_sizes_with_their_own_intrinsics_are_read(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    for index, row in enumerate(document["frames"]):
+        size = (20 + index, 16)
+        write_image(tmp_path / row["file_path"], size=size)
+        row |= {"w": size[0], "h": size[1], "fl_x": 20.0 + index, "fl_y": 20.0, "cx": 10.0, "cy": 8.0}
+    dataset = read_dataset(save(tmp_path, document))
+    assert [c.width for c in dataset.cameras] == [20, 21, 22, 23]
+    assert [c.full().fx for c in dataset.cameras] == [20.0, 21.0, 22.0, 23.0]
+
+
+def test_blender_takes_the_focal_length_from_the_angle_and_the_true_width(tmp_path):
+    dataset = read_dataset(save(tmp_path, blender_scene(tmp_path), "transforms_train.json"))
+    focal = 0.5 * WIDTH / math.tan(0.5 * 0.6911112070083618)
+    assert dataset.cameras == (Camera("PINHOLE", WIDTH, HEIGHT, (focal, focal, WIDTH / 2, HEIGHT / 2)),)
+    assert dataset.source.dialect == "blender"
+    assert dataset.names[1] == "./train/r_1"
+    assert dataset.file_names[1] == "train/r_1.png"
+
+
+def test_instant_ngp_takes_pixels_before_angles(tmp_path):
+    document = nerfstudio_scene(tmp_path, aabb_scale=16, camera_angle_x=0.1, camera_angle_y=0.1)
+    del document["camera_model"]
+    dataset = read_dataset(save(tmp_path, document))
+    assert dataset.source.dialect == "instant-ngp"
+    assert dataset.cameras[0].full()[:4] == (18.0, 18.5, 10.25, 7.75)
+
+
+def test_instant_ngp_degrees_of_view_are_read(tmp_path):
+    document = nerfstudio_scene(tmp_path, x_fov=50.0)
+    for key in ("fl_x", "fl_y", "camera_model"):
+        del document[key]
+    focal = 0.5 * WIDTH / math.tan(math.radians(25.0))
+    assert read_dataset(save(tmp_path, document)).cameras[0].full().fx == pytest.approx(focal)
+
+
+def test_one_focal_length_serves_both_axes(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    del document["fl_y"], document["cx"]
+    dataset = read_dataset(save(tmp_path, document))
+    assert dataset.cameras[0].full()[:4] == (18.0, 18.0, WIDTH / 2, 7.75)
+    assert "image centre" in dataset.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("declared", "extra", "model"),
+    [
+        ("OPENCV", {}, "PINHOLE"),
+        ("opencv", {"k1": 0.01}, "OPENCV"),
+        ("PINHOLE", {}, "PINHOLE"),
+        ("SIMPLE_PINHOLE", {"fl_y": 18.0}, "SIMPLE_PINHOLE"),
+        ("SIMPLE_PINHOLE", {}, "PINHOLE"),
+        ("SIMPLE_RADIAL", {"fl_y": 18.0, "k1": 0.01}, "SIMPLE_RADIAL"),
+        ("RADIAL", {"fl_y": 18.0, "k1": 0.01, "k2": 0.01}, "RADIAL"),
+        ("RADIAL", {"k1": 0.01, "p1": 0.001}, "OPENCV"),
+        (None, {}, "PINHOLE"),
+        (None, {"p1": 0.001}, "OPENCV"),
+    ],
+)
+def test_the_camera_model_is_the_declared_one_where_it_holds_the_numbers(tmp_path, declared, extra, model):
+    document = nerfstudio_scene(tmp_path, camera_model=declared, **extra)
+    camera = read_dataset(save(tmp_path, document)).cameras[0]
+    assert camera.model == model
+    expected = {"k1": 0.0, "k2": 0.0, "p1": 0.0, "fl_y": 18.5} | extra
+    full = camera.full()
+    assert (full.fx, full.fy) == (18.0, expected["fl_y"])
+    assert (full.k1, full.k2, full.p1) == (expected["k1"], expected["k2"], expected["p1"])
+
+
+def test_applied_transform_and_scale_are_undone(tmp_path):
+    applied = [[1.0, 0, 0, 0.5], [0, 0, 1, -2], [0, -1, 0, 3]]
+    document = nerfstudio_scene(tmp_path, applied_transform=applied, applied_scale=2.5)
+    a = np.vstack([applied, [0, 0, 0, 1]])
+    originals = [np.array(row["transform_matrix"]) for row in document["frames"]]
+    for row, original in zip(document["frames"], originals, strict=True):
+        moved = a @ original
+        moved[:3, 3] *= 2.5
+        row["transform_matrix"] = moved.tolist()
+    dataset = read_dataset(save(tmp_path, document))
+    for frame, original in zip(dataset.frames, originals, strict=True):
+        np.testing.assert_allclose(frame.world_from_cam, original @ OPENGL, atol=1e-12)
+
+
+def test_intrinsics_of_a_larger_copy_are_scaled_by_the_true_ratios(tmp_path):
+    document = nerfstudio_scene(tmp_path, w=41, h=33, fl_x=41.0, fl_y=33.0, cx=20.5, cy=16.5)
+    dataset = read_dataset(save(tmp_path, document))
+    assert dataset.cameras[0].full()[:4] == pytest.approx((WIDTH, HEIGHT, WIDTH / 2, HEIGHT / 2))
+    assert "scaled" in dataset.warnings[0]
+
+
+def test_three_by_four_matrices_are_read(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    expected = read_dataset(save(tmp_path, document)).world_from_cam
+    for row in document["frames"]:
+        row["transform_matrix"] = row["transform_matrix"][:3]
+    assert np.array_equal(read_dataset(save(tmp_path, document)).world_from_cam, expected)
+
+
+def test_rounded_rotations_are_made_orthonormal_and_said_so(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    document["frames"][1]["transform_matrix"] = np.round(
+        document["frames"][1]["transform_matrix"], 3
+    ).tolist()
+    dataset = read_dataset(save(tmp_path, document))
+    rotation = dataset.world_from_cam[1, :3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
+    assert "orthonormal" in dataset.warnings[0]
+    assert "images/001.jpg" in dataset.warnings[0]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".JPG", ".jpeg", ".webp", ".tif"])
+def test_images_are_found_without_their_extension(tmp_path, suffix):
+    document = nerfstudio_scene(tmp_path)
+    for index, row in enumerate(document["frames"]):
+        os.remove(tmp_path / row["file_path"])
+        write_image(tmp_path / f"images/{index:03}{suffix}", index)
+        row["file_path"] = f"images/{index:03}"
+    dataset = read_dataset(save(tmp_path, document))
+    assert dataset.frames[0].path.suffix == suffix
+
+
+def test_names_with_spaces_accents_backslashes_and_dots_are_found(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    names = ["images/a b.jpg", "images/Übersicht é.jpg", "images/v1.2.jpg", "../elsewhere/out.jpg"]
+    for name, row in zip(names, document["frames"], strict=True):
+        write_image(tmp_path / name)
+        row["file_path"] = name
+    document["frames"][0]["file_path"] = "images\\a b.jpg"
+    dataset = read_dataset(save(tmp_path, document))
+    assert dataset.names[0] == "images\\a b.jpg"
+    assert dataset.file_names == (*names[:3], "../elsewhere/out.jpg")
+
+
+def test_an_exif_orientation_is_said_and_left_alone(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "images/002.jpg", exif=exif)
+    dataset = read_dataset(save(tmp_path, document))
+    assert dataset.camera_of(2).width == WIDTH
+    assert "EXIF" in dataset.warnings[0]
+    assert "images/002.jpg" in dataset.warnings[0]
+
+
+def test_unused_masks_and_images_without_frame_are_said(tmp_path):
+    document = nerfstudio_scene(tmp_path, count=5)
+    del document["frames"][4]
+    document["frames"][0]["mask_path"] = "masks/000.png"
+    warnings = read_dataset(save(tmp_path, document)).warnings
+    assert any("masks" in text for text in warnings)
+    assert any("004.jpg" in text for text in warnings)
+
+
+# Each case: the code, what the place must name, and what is done to a good document.
+def _frame(index, **values):
+    return lambda document: document["frames"][index].update(values)
+
+
+def _matrix(index, row, column, value):
+    def change(document):
+        document["frames"][index]["transform_matrix"][row][column] = value
+
+    return change
+
+
+def _scaled_rotation(document):
+    matrix = np.array(document["frames"][1]["transform_matrix"])
+    matrix[:3, :3] *= 1.5
+    document["frames"][1]["transform_matrix"] = matrix.tolist()
+
+
+def _mirrored(document):
+    matrix = np.array(document["frames"][1]["transform_matrix"])
+    matrix[:3, 0] *= -1
+    document["frames"][1]["transform_matrix"] = matrix.tolist()
+
+
+def _transposed(document):
+    matrix = np.array(document["frames"][3]["transform_matrix"])
+    document["frames"][3]["transform_matrix"] = matrix.T.tolist()
+
+
+def _same_place(document):
+    for row in document["frames"]:
+        for axis in range(3):
+            row["transform_matrix"][axis][3] = 1.0
+
+
+def _angle(value):
+    def change(document):
+        del document["fl_x"], document["fl_y"]
+        document["camera_angle_x"] = value
+
+    return change
+
+
+def _without(*keys):
+    def change(document):
+        for key in keys:
+            del document[key]
+
+    return change
+
+
+BAD = {
+    "nan in a pose": ("pose_not_finite", "frames[2].transform_matrix[0][3]", _matrix(2, 0, 3, math.nan)),
+    "infinite pose": ("pose_not_finite", "frames[1].transform_matrix[2][1]", _matrix(1, 2, 1, math.inf)),
+    "text in a pose": ("pose_shape", "frames[1].transform_matrix", _matrix(1, 2, 1, "0.5")),
+    "true in a pose": ("pose_shape", "frames[1].transform_matrix", _matrix(1, 2, 1, True)),
+    "huge number": ("pose_shape", "frames[1].transform_matrix", _matrix(1, 2, 1, 10**400)),
+    "far away": ("pose_out_of_range", "frames[1].transform_matrix", _matrix(1, 2, 3, 1e12)),
+    "flat matrix": ("pose_shape", "frames[0].transform_matrix", _frame(0, transform_matrix=[1.0] * 16)),
+    "two rows": ("pose_shape", "frames[0].transform_matrix", _frame(0, transform_matrix=[[1, 0, 0, 0]] * 2)),
+    "short rows": ("pose_shape", "frames[0].transform_matrix", _frame(0, transform_matrix=[[1, 0, 0]] * 3)),
+    "last row": ("pose_shape", "frames[0].transform_matrix", _matrix(0, 3, 3, 2.0)),
+    "transposed": ("pose_shape", "frames[3].transform_matrix", _transposed),
+    "sheared": ("pose_not_rotation", "frames[0].transform_matrix", _matrix(0, 0, 0, 3.0)),
+    "zeros": ("pose_not_rotation", "frames[0]", _frame(0, transform_matrix=[[0] * 4] * 3 + [[0, 0, 0, 1]])),
+    "scaled": ("pose_not_rotation", "frames[1].transform_matrix", _scaled_rotation),
+    "mirrored": ("pose_not_rotation", "frames[1].transform_matrix", _mirrored),
+    "one place": ("poses_coincide", "frames", _same_place),
+    "no pose": (
+        "pose_missing",
+        "frames[2].transform_matrix",
+        lambda d: d["frames"][2].pop("transform_matrix"),
+    ),
+    "null pose": ("pose_missing", "frames[2].transform_matrix", _frame(2, transform_matrix=None)),
+    "no image name": (
+        "frame_without_image",
+        "frames[1].file_path",
+        lambda d: d["frames"][1].pop("file_path"),
+    ),
+    "empty image name": ("frame_without_image", "frames[1].file_path", _frame(1, file_path="")),
+    "number for a name": ("frame_without_image", "frames[1].file_path", _frame(1, file_path=7)),
+    "missing image": ("image_missing", "frames[1].file_path", _frame(1, file_path="images/none.jpg")),
+    "folder for an image": ("image_missing", "frames[1].file_path", _frame(1, file_path="images")),
+    "nul in a name": ("image_missing", "frames[1].file_path", _frame(1, file_path="images/\0.jpg")),
+    "long name": ("image_missing", "frames[1].file_path", _frame(1, file_path="x" * 5000)),
+    "twice": ("duplicate_image", "frames[3].file_path", _frame(3, file_path="./images/001.jpg")),
+    "two frames": ("too_few_images", "frames", lambda d: d["frames"].__delitem__(slice(2, None))),
+    "no frames": ("too_few_images", "frames", lambda d: d.update(frames=[])),
+    "frames is text": ("pose_file_invalid", "frames", lambda d: d.update(frames="images")),
+    "frame is a list": ("pose_file_invalid", "frames[1]", lambda d: d["frames"].__setitem__(1, [])),
+    "frames missing": ("pose_file_invalid", "frames", _without("frames")),
+    "fisheye": (
+        "camera_model_unsupported",
+        "camera_model",
+        lambda d: d.update(camera_model="OPENCV_FISHEYE"),
+    ),
+    "own fisheye": ("camera_model_unsupported", "frames[2].camera_model", _frame(2, camera_model="FISHEYE")),
+    "odd model": ("camera_model_unsupported", "camera_model", lambda d: d.update(camera_model=["OPENCV"])),
+    "ngp fisheye": ("camera_model_unsupported", "is_fisheye", lambda d: d.update(is_fisheye=True)),
+    "k3": ("camera_model_unsupported", "k3", lambda d: d.update(k3=0.01)),
+    "own k4": ("camera_model_unsupported", "frames[1].k4", _frame(1, k4=0.01)),
+    "negative focal": ("intrinsics_invalid", "fl_x", lambda d: d.update(fl_x=-18.0)),
+    "zero focal": ("intrinsics_invalid", "frames[2].fl_y", _frame(2, fl_y=0)),
+    "focal is text": ("intrinsics_invalid", "fl_x", lambda d: d.update(fl_x="18")),
+    "nan focal": ("pose_not_finite", "fl_x", lambda d: d.update(fl_x=math.nan)),
+    "huge focal": ("intrinsics_invalid", "fl_x", lambda d: d.update(fl_x=10**400)),
+    "no focal": ("intrinsics_missing", "frames[0]", _without("fl_x", "fl_y")),
+    "negative angle": ("intrinsics_invalid", "camera_angle_x", _angle(-0.7)),
+    "angle in degrees": ("intrinsics_invalid", "camera_angle_x", _angle(40.0)),
+    "centre outside": ("intrinsics_invalid", "cx", lambda d: d.update(cx=500.0)),
+    "folding lens": ("intrinsics_invalid", "k1", lambda d: d.update(k1=-3.0)),
+    "other shape": ("image_size_mismatch", "w", lambda d: d.update(w=40, h=20)),
+    "turned": ("image_size_mismatch", "w", lambda d: d.update(w=HEIGHT, h=WIDTH)),
+    "size zero": ("intrinsics_invalid", "w", lambda d: d.update(w=0)),
+    "bad applied": ("pose_shape", "applied_transform", lambda d: d.update(applied_transform=[1, 2, 3])),
+    "scaled applied": (
+        "pose_not_rotation",
+        "applied_transform",
+        lambda d: d.update(applied_transform=[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]),
+    ),
+    "applied scale": ("pose_file_invalid", "applied_scale", lambda d: d.update(applied_scale=0)),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files_are_refused_with_file_field_and_mend(tmp_path, case):
+    code, place, change = BAD[case]
+    document = nerfstudio_scene(tmp_path)
+    read_dataset(save(tmp_path, copy.deepcopy(document)))  # good before the change
+    change(document)
+    with pytest.raises(InputError) as caught:
+        read_dataset(save(tmp_path, document))
+    assert_complete(caught.value, code, "transforms.json", place)
+
+
+def test_mixed_sizes_with_shared_intrinsics_are_refused(tmp_path):
+    for document in (nerfstudio_scene(tmp_path), blender_scene(tmp_path)):
+        document.pop("w", None), document.pop("h", None)
+        name = document["frames"][2]["file_path"]
+        suffix = "" if name.endswith(".jpg") else ".png"
+        write_image(tmp_path / (name + suffix), size=(WIDTH + 4, HEIGHT))
+        with pytest.raises(InputError) as caught:
+            read_dataset(save(tmp_path, document))
+        assert_complete(caught.value, "mixed_sizes", "transforms.json", "frames[2]")
+
+
+@pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n", b"GIF89a" + b"\0" * 50])
+def test_files_that_are_no_images_are_refused(tmp_path, content):
+    document = nerfstudio_scene(tmp_path)
+    (tmp_path / "images/001.jpg").write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_dataset(save(tmp_path, document))
+    assert_complete(caught.value, "not_an_image", "images/001.jpg")
+
+
+def test_an_image_that_would_unpack_to_gigabytes_is_refused_from_its_header(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    Image.new("1", (30_000, 20_000)).save(tmp_path / "images/001.png")
+    document["frames"][1]["file_path"] = "images/001.png"
+    with pytest.raises(InputError) as caught:
+        read_dataset(save(tmp_path, document))
+    assert_complete(caught.value, "image_too_large", "images/001.png")
+
+
+def test_a_path_that_does_not_exist_is_refused(tmp_path):
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path / "nothing")
+    assert_complete(caught.value, "input_missing", "nothing")
