@@ -28,6 +28,8 @@ class Child:
         """Run ``command FOLDER`` inside ``folder`` with a clean environment; appends stderr to ``log``."""
         # The job reads strangers' files: it gets neither the database's address nor other settings of ours.
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("BIRESNERF_")}
+        # ``python -m`` would look for modules in the folder first, where a stranger's json.py may lie.
+        inherited["PYTHONSAFEPATH"] = "1"
         with log.open("ab") as errors:
             process = await asyncio.create_subprocess_exec(
                 *tethered([*command, str(folder)], signal_number=signal.SIGKILL),

@@ -44,27 +44,25 @@ class JobStore:
         *,
         labels: Mapping[str, str] | None = None,
         idempotency_key: str | None = None,
+        request_digest: str | None = None,
     ) -> tuple[Job, bool]:
         """Queue a job; the job and its queue entry are written in one transaction.
 
+        ``request_digest`` stands for the dataset when requests are compared, where the client sent the
+        files themselves and the dataset was made for them (see `repeated`).
         Returns the job and whether it is new (False: the same key with the same request came before).
         Raises `NotFound` (dataset), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``),
         `LimitReached` (``queue_full``).
         """
         resolved = options.resolved().model_dump(mode="json")
-        request = json.dumps([dataset_id, resolved, dict(labels or {})], sort_keys=True)
-        fingerprint = hashlib.sha256(request.encode()).hexdigest()
+        fingerprint = _fingerprint(request_digest or dataset_id, resolved, labels)
         async with self._database.transaction() as connection:
             # Serialises submits (a millisecond each): the queue limit and repeated keys need no more thought.
             await connection.execute("SELECT pg_advisory_xact_lock(%s)", (QUEUE_LIMIT_LOCK,))
             if idempotency_key is not None:
-                known = await _one(connection, JOB + " WHERE idempotency_key = %s", idempotency_key)
-                if known is not None and known["fingerprint"] != fingerprint:
-                    raise Conflict(
-                        "idempotency_key_reused", f"The key was used for another request ({known['id']})."
-                    )
+                known = await _known(connection, idempotency_key, fingerprint)
                 if known is not None:
-                    return job_from_row(known), False
+                    return known, False
             await self._require_room(connection, dataset_id)
             job_id = new_id("job")
             await connection.execute(
@@ -93,6 +91,17 @@ class JobStore:
         queued = await _one(connection, "SELECT count(*) AS n FROM jobs WHERE state = 'queued'")
         if queued is not None and queued["n"] >= self._settings.max_queued:
             raise LimitReached("queue_full", f"{queued['n']} jobs wait already, which is the limit.")
+
+    async def repeated(
+        self, request_digest: str, options: RefineOptions, labels: Mapping[str, str], idempotency_key: str
+    ) -> Job | None:
+        """The job of an earlier request with this key, before anything is done for this one.
+
+        Raises `Conflict` (``idempotency_key_reused``) where the earlier request was a different one.
+        """
+        resolved = options.resolved().model_dump(mode="json")
+        async with self._database.transaction() as connection:
+            return await _known(connection, idempotency_key, _fingerprint(request_digest, resolved, labels))
 
     async def get(self, job_id: str) -> Job:
         """The job now; raises `NotFound`."""
@@ -213,6 +222,18 @@ class JobStore:
 
 async def _one(connection: Connection, sql: Any, *parameters: Any) -> dict[str, Any] | None:
     return await (await connection.execute(sql, parameters)).fetchone()
+
+
+def _fingerprint(subject: str, options: dict[str, Any], labels: Mapping[str, str] | None) -> str:
+    request = json.dumps([subject, options, dict(labels or {})], sort_keys=True)
+    return hashlib.sha256(request.encode()).hexdigest()
+
+
+async def _known(connection: Connection, idempotency_key: str, fingerprint: str) -> Job | None:
+    row = await _one(connection, JOB + " WHERE idempotency_key = %s", idempotency_key)
+    if row is not None and row["fingerprint"] != fingerprint:
+        raise Conflict("idempotency_key_reused", f"The key was used for another request ({row['id']}).")
+    return None if row is None else job_from_row(row)
 
 
 async def _required(connection: Connection, job_id: str) -> dict[str, Any]:
