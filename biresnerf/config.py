@@ -28,10 +28,16 @@ class RefineOptions(BaseModel):
     threads: int = Field(0, ge=0, le=256, description="CPU threads; 0 takes all cores this process may use.")
 
     max_image_size: int | None = Field(
-        None, ge=16, le=4096, description="Long side (px) that images are optimised at; results are full size."
+        None,
+        ge=16,
+        le=4096,
+        description="Long side (px) that images are optimised at; results are full size.",
     )
     holdout: int | None = Field(
-        None, ge=0, le=200, description="Views kept out of the field's training, to measure it. Default: a tenth."
+        None,
+        ge=0,
+        le=200,
+        description="Views kept out of the field's training, to measure it. Default: a tenth.",
     )
     background: Background = Field(
         "auto", description="What lies behind the scene: a colour, or none where photos show surroundings."
@@ -40,7 +46,9 @@ class RefineOptions(BaseModel):
     steps: int | None = Field(None, ge=20, le=1_000_000, description="Steps of both stages together.")
     coarse_steps_min: int | None = Field(None, ge=10, description="Stage 1 takes at least this many steps.")
     coarse_steps_max: int | None = Field(None, ge=10, description="Stage 1 ends here, stable or not.")
-    check_every: int | None = Field(None, ge=5, description="Steps between two looks of the stability detector.")
+    check_every: int | None = Field(
+        None, ge=5, description="Steps between two looks of the stability detector."
+    )
     samples_per_step: int | None = Field(
         None, ge=1024, le=2**22, description="Field samples a step at the end of the coarse-to-fine ramp."
     )
@@ -59,14 +67,20 @@ class RefineOptions(BaseModel):
     pose_levels: int = Field(3, ge=1, le=16, description="Levels of the pose-estimation module.")
     pose_resolution_min: int = Field(16, ge=2, le=128)
     pose_resolution_max: int = Field(72, ge=2, le=128)
-    reconstruction_levels: int | None = Field(None, ge=1, le=16, description="Levels of the reconstruction module.")
+    reconstruction_levels: int | None = Field(
+        None, ge=1, le=16, description="Levels of the reconstruction module."
+    )
     reconstruction_resolution_min: int = Field(128, ge=4, le=8192)
     reconstruction_resolution_max: int | None = Field(None, ge=4, le=16384)
     table_size_log2: int | None = Field(None, ge=10, le=22, description="Entries of a hashed level, log2.")
 
     checkpoint_every_s: float = Field(20.0, gt=0, description="Seconds between two checkpoints.")
-    orbit_frames: int | None = Field(None, ge=0, le=600, description="Frames of the orbit video; 0 leaves it out.")
-    render_size: int | None = Field(None, ge=16, le=4096, description="Long side (px) of renders in the output.")
+    orbit_frames: int | None = Field(
+        None, ge=0, le=600, description="Frames of the orbit video; 0 leaves it out."
+    )
+    render_size: int | None = Field(
+        None, ge=16, le=4096, description="Long side (px) of renders in the output."
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> RefineOptions:

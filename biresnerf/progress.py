@@ -23,7 +23,9 @@ class Progress(BaseModel):
     eta_s: float | None = Field(None, ge=0.0, description="Estimated seconds to the end of the run.")
     metrics: dict[str, float] = Field(default_factory=dict)
     message: str = ""
-    checkpoint: str | None = Field(None, description="File name of a checkpoint just completed, relative to the output folder.")
+    checkpoint: str | None = Field(
+        None, description="File name of a checkpoint just completed, relative to the output folder."
+    )
 
 
 OnProgress = Callable[[Progress], None]

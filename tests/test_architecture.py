@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LINT_IMPORTS = Path(sys.executable).with_name("lint-imports")
+# What a package is imported as, where that is not what it is installed as.
+IMPORTED_AS = {
+    "pillow": {"PIL"},
+    "psycopg": {"psycopg", "psycopg_pool"},  # by its extra `pool`
+    "numba": {"numba", "llvmlite"},  # which pins its version
+    "fastapi": {"fastapi", "starlette"},  # built on it, and documented so
+}
 HEAVY = ("torch", "numba", "numpy", "scipy", "PIL", "pycolmap")
 
 
@@ -83,3 +93,36 @@ def test_importing_a_light_part_loads_no_heavy_library(module, forbidden):
 def test_the_method_is_reached_through_the_package():
     code = "import biresnerf; assert callable(biresnerf.refine); import sys; assert 'torch' in sys.modules"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
+def declared(*extras: str) -> set[str]:
+    """Import names of what pyproject.toml says is installed with these extras."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    lines = [
+        *project["dependencies"],
+        *(line for e in extras for line in project["optional-dependencies"][e]),
+    ]
+    names = [re.split(r"[^A-Za-z0-9_.-]", line, maxsplit=1)[0] for line in lines]
+    return set().union(*(IMPORTED_AS.get(name, {name.replace("-", "_")}) for name in names))
+
+
+def imported(package: str) -> dict[str, str]:
+    """Every third-party top-level name that a package imports anywhere, with a file that does."""
+    found: dict[str, str] = {}
+    for path in sorted((ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names = [node.module]
+            for name in names:
+                found.setdefault(name.split(".")[0], str(path.relative_to(ROOT)))
+    own = {"biresnerf", "workers", "service"}
+    return {name: file for name, file in found.items() if name not in own | sys.stdlib_module_names}
+
+
+@pytest.mark.parametrize(
+    ("package", "extras"), [("biresnerf", ["colmap"]), ("workers", ["service"]), ("service", ["service"])]
+)
+def test_a_package_imports_only_what_its_installation_brings(package, extras):
+    missing = {name: file for name, file in imported(package).items() if name not in declared(*extras)}
+    assert missing == {}

@@ -36,7 +36,7 @@ def use_threads(threads: int) -> int:
     import numba
 
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    taken = min(threads or available, numba.config.NUMBA_NUM_THREADS)
+    taken = min(threads or available, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     numba.set_num_threads(taken)
     torch.set_num_threads(1)
     return taken

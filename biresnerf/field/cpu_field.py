@@ -9,7 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from biresnerf.field.cpu import encoding, network, rays as ray_kernels
+from biresnerf.field.cpu import encoding, network
+from biresnerf.field.cpu import rays as ray_kernels
+from biresnerf.field.grid_levels import GridLevels
 from biresnerf.field.radiance_field import (
     BETA1,
     BETA2,
@@ -22,7 +24,6 @@ from biresnerf.field.radiance_field import (
     Rays,
     Rendering,
 )
-from biresnerf.field.grid_levels import GridLevels
 from biresnerf.field.spherical_harmonics import VIEW_FEATURES, spherical_harmonics
 
 f4 = np.float32
@@ -238,7 +239,7 @@ class _RenderRays(torch.autograd.Function):
     """Ties the kernels to autograd at the rays, so that poses are optimised like any other torch parameter."""
 
     @staticmethod
-    def forward(ctx, origin, direction, harmonics, field: CpuField, rays: Rays, marching, gradient):  # noqa: ANN001, ANN205
+    def forward(ctx, origin, direction, harmonics, field: CpuField, rays: Rays, marching, gradient):  # noqa: ANN001
         o, d, view = origin.detach().numpy(), direction.detach().numpy(), harmonics.detach().numpy()
         background = rays.background.numpy()
         samples = field.sample(o, d, view, rays.jitter.numpy(), marching, gradient)
@@ -253,7 +254,7 @@ class _RenderRays(torch.autograd.Function):
         return (*results, len(samples.t))
 
     @staticmethod
-    def backward(ctx, g_colour, g_opacity, _g_depth, _g_count):  # noqa: ANN001, ANN205
+    def backward(ctx, g_colour, g_opacity, _g_depth, _g_count):  # noqa: ANN001
         field, samples, o, d, view, background, colour, opacity, trained, gradient = ctx.kept
         take, n = field.buffers().take, len(samples.t)
         g_density, g_sample = take("g density", n), take("g colour", 3 * n)

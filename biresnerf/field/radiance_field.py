@@ -74,7 +74,7 @@ class PositionGradient:
 
 @dataclass(frozen=True)
 class FieldRates:
-    """Learning rates of one step: pose module and networks, reconstruction module per level, its first-layer columns."""
+    """Rates of one step: pose module and networks, reconstruction module per level, its first-layer columns."""
 
     pose: float
     networks: float

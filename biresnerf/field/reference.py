@@ -33,7 +33,7 @@ def encode(x: Tensor, table: Tensor, grid: GridLevels, smoothing: float = 0.0) -
         cell = position.detach().floor()
         smooth = straight_through_fraction(position - cell, smoothing)
         base, size = int(grid.offset[level]), int(grid.offset[level + 1] - grid.offset[level])
-        total = 0.0
+        total = x.new_zeros(1, table.shape[1])
         for corner in range(8):
             bits = [corner & 1, (corner >> 1) & 1, corner >> 2]
             vertex = cell.long() + torch.tensor(bits, device=x.device)

@@ -88,7 +88,8 @@ class JointOptimiser:
         self.generator = torch.Generator().manual_seed(options.seed)
         behind = frame.background if frame.background is not None else images.pixels.mean(0) / 255
         self.background = torch.as_tensor(behind, dtype=torch.float32, device=device)
-        self.step_index, self.switch = 0, None
+        self.step_index = 0
+        self.switch: int | None = None  # the step that stage 2 began at
         self.pose_scale = 1.0
         self.rays = max(RAYS_LEAST, self.schedule.samples(0, None) // 64)
 

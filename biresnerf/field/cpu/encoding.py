@@ -36,7 +36,7 @@ def _straight_through(fraction, smoothing):
     return ONE + smoothing * HALF_PI * cosine
 
 
-def _make_level(hashing: bool):  # noqa: ANN202
+def _make_level(hashing: bool):
     """Kernels of one level; `hashing` is fixed at compile time so that the index arithmetic stays branch-free."""
 
     @njit(inline="always")

@@ -91,7 +91,7 @@ def network_backward(
     w1, w2, w3, w4, w5, t1, t2, t3, t4, t5,
     g_density, g_colour, g_features, g_view, d1, d2, d3, d4, d5,
 ):  # fmt: skip
-    """Gradients of samples [first, last): to features [width n], to the view [16 n] and, added per worker, to the weights.
+    """Gradients of samples [first, last): to features [width n], view [16 n] and, added per worker, the weights.
 
     t1..t5 are the transposed weights, d1..d5 [workers, size] the weight gradients (left alone unless `with_weights`).
     """

@@ -27,14 +27,14 @@ KERNEL = {
 PARALLEL_KERNEL = {"parallel": True, **KERNEL}
 
 
-def _scope(builder):  # noqa: ANN001, ANN202
+def _scope(builder):
     module = builder.module
     domain = module.add_metadata([ir.MetaDataString(module, "biresnerf_domain")])
     scope = module.add_metadata([ir.MetaDataString(module, "biresnerf_read_only"), domain])
     return module.add_metadata([scope])
 
 
-def _pointer(context, builder, array_type, array, index_type, index):  # noqa: ANN001, ANN202
+def _pointer(context, builder, array_type, array, index_type, index):
     data = context.make_array(array_type)(context, builder, array).data
     if index.type.width < 64:
         extend = builder.sext if index_type.signed else builder.zext
@@ -42,16 +42,16 @@ def _pointer(context, builder, array_type, array, index_type, index):  # noqa: A
     return builder.gep(data, [index], inbounds=True)
 
 
-def _flat(array) -> bool:  # noqa: ANN001
+def _flat(array) -> bool:
     return isinstance(array, types.Array) and array.ndim == 1 and array.layout == "C"
 
 
-def _make_load(tag: str):  # noqa: ANN202
-    def load_kind(typing_context, array, index):  # noqa: ANN001, ANN202
+def _make_load(tag: str):
+    def load_kind(typing_context, array, index):
         if not _flat(array):
             return None
 
-        def codegen(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+        def codegen(context, builder, signature, arguments):
             pointer = _pointer(
                 context, builder, signature.args[0], arguments[0], signature.args[1], arguments[1]
             )
@@ -65,24 +65,24 @@ def _make_load(tag: str):  # noqa: ANN202
 
 
 @intrinsic
-def load(typing_context, array, index):  # noqa: ANN001, ANN201
+def load(typing_context, array, index):
     """Read an element of a flat array that the enclosing loop only reads."""
     return _make_load("alias.scope")(typing_context, array, index)
 
 
 @intrinsic
-def reload(typing_context, array, index):  # noqa: ANN001, ANN201
+def reload(typing_context, array, index):
     """Read an element of a flat array that the enclosing loop also writes."""
     return _make_load("noalias")(typing_context, array, index)
 
 
 @intrinsic
-def store(typing_context, array, index, value):  # noqa: ANN001, ANN201
+def store(typing_context, array, index, value):
     """Write an element of a flat array that the enclosing loop never reads with ``load``."""
     if not _flat(array):
         return None
 
-    def codegen(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+    def codegen(context, builder, signature, arguments):
         pointer = _pointer(context, builder, signature.args[0], arguments[0], signature.args[1], arguments[1])
         converted = context.cast(builder, arguments[2], signature.args[2], signature.args[0].dtype)
         builder.store(converted, pointer).set_metadata("noalias", _scope(builder))
@@ -92,10 +92,10 @@ def store(typing_context, array, index, value):  # noqa: ANN001, ANN201
 
 
 @intrinsic
-def float_from_bits(typing_context, bits):  # noqa: ANN001, ANN201
+def float_from_bits(typing_context, bits):
     """The float32 with the given uint32 pattern."""
 
-    def codegen(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+    def codegen(context, builder, signature, arguments):
         return builder.bitcast(arguments[0], ir.FloatType())
 
     return types.float32(types.uint32), codegen
