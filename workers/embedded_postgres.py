@@ -197,7 +197,8 @@ class EmbeddedPostgres:
             raise SetupError(
                 "database_version",
                 f"The database in {self.data} is of PostgreSQL {have}, the programs are {server}. "
-                f"Dump it with PostgreSQL {have} (pg_dumpall) and load it into a fresh folder, or set BIRESNERF_PG_BIN.",
+                f"Dump it with PostgreSQL {have} (pg_dumpall) and load it into a fresh folder, "
+                "or set BIRESNERF_PG_BIN.",
             )
 
     def _clear_remains(self) -> None:

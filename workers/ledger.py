@@ -73,7 +73,8 @@ async def _claim(database: Database, job_id: str, max_attempts: int) -> Claim | 
         token = uuid.uuid4()
         cursor = await connection.execute(
             "UPDATE jobs SET state = 'running', attempt = attempt + 1, run_token = %s, fraction = 0,"
-            " step = 0, stage = NULL, eta_s = NULL, message = '', started_at = coalesce(started_at, clock_timestamp())"
+            " step = 0, stage = NULL, eta_s = NULL, message = '',"
+            " started_at = coalesce(started_at, clock_timestamp())"
             " WHERE id = %s RETURNING dataset_id, attempt, options, checkpoint",
             (token, job_id),
         )

@@ -1,8 +1,8 @@
 """The program of one job's child process: `python -m workers.run JOB_FOLDER`.
 
 Reads ``job.json``, writes one line of JSON per report to standard output, everything else to standard error.
-Exit status: 0 done, 2 the user's mistake and 3 the refinement failed (details in ``error.json``), 143 stopped by
-SIGTERM after writing a checkpoint, 1 anything else.
+Exit status: 0 done; 2 the user's mistake, 3 the refinement failed (both told in ``error.json``); 143 stopped
+by SIGTERM after writing a checkpoint; 1 anything else.
 """
 
 from __future__ import annotations

@@ -1,0 +1,188 @@
+"""A real private PostgreSQL for the run, a fresh database for each test, real slot processes."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from biresnerf.config import RefineOptions
+from workers.embedded_postgres import EmbeddedPostgres
+from workers.migrate import migrate
+from workers.records import Job
+from workers.settings import Settings
+from workers.stores import Stores, open_stores
+
+ROOT = Path(__file__).parents[2]
+PROGRAM = Path(__file__).with_name("counting_program.py")
+PATIENCE_S = 30.0
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    return "asyncio"
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of a migrated database, the template of each test's own."""
+    folder = tmp_path_factory.mktemp("server")
+    open_to_server_user(folder)
+    postgres = EmbeddedPostgres(folder / "postgres")
+    migrate(postgres.start())
+    yield postgres.url
+    postgres.stop()
+
+
+def open_to_server_user(folder: Path) -> None:
+    """pytest's folders are 0700 of root; PostgreSQL runs as somebody else then."""
+    for parent in (folder, *folder.parents):
+        if os.geteuid() == 0 and parent.stat().st_uid == 0 and not parent.stat().st_mode & 0o001:
+            parent.chmod(parent.stat().st_mode | 0o011)
+
+
+@pytest.fixture
+def database_url(server: str, tmp_path: Path) -> str:
+    name = f"t{abs(hash(tmp_path))}"
+    with psycopg.connect(server.replace("/postgres?", "/template1?"), autocommit=True) as connection:
+        connection.execute(f"CREATE DATABASE {name} TEMPLATE postgres".encode())
+    return server.replace("/postgres?", f"/{name}?")
+
+
+@pytest.fixture
+def settings(database_url: str, tmp_path: Path) -> Settings:
+    return quick_settings(tmp_path / "data", database_url=database_url)
+
+
+def quick_settings(data_dir: Path, **changes: object) -> Settings:
+    """Everything that production waits for, in tenths of a second; jobs count."""
+    values = {
+        "data_dir": data_dir,
+        "beat_s": 0.3,
+        "stall_s": 1.5,
+        "poll_s": 0.3,
+        "janitor_s": 0.3,
+        "stop_grace_s": 5.0,
+        "job_command": (sys.executable, str(PROGRAM)),
+        "check_command": (sys.executable, "-c", 'print(\'{"report": {"images": 1}}\')'),
+    }
+    return Settings(**{**values, **changes})
+
+
+@pytest.fixture
+async def stores(settings: Settings) -> AsyncIterator[Stores]:
+    async with open_stores(settings) as opened:
+        yield opened
+
+
+def environment(settings: Settings) -> dict[str, str]:
+    """The settings as a process of its own finds them."""
+    said = {}
+    for name, value in settings.model_dump(mode="json", exclude_none=True).items():
+        said[f"BIRESNERF_{name.upper()}"] = value if isinstance(value, str) else json.dumps(value)
+    return {**os.environ, **said, "PYTHONPATH": str(ROOT)}
+
+
+class Slots:
+    """Starts slot processes and makes sure that none outlives the test."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.processes: list[subprocess.Popen[bytes]] = []
+
+    def start(self, settings: Settings, name: str) -> subprocess.Popen[bytes]:
+        return self.run(settings, [sys.executable, "-m", "workers.slot", "--slot", name], f"slot-{name}.log")
+
+    def run(self, settings: Settings, command: list[str], log: str) -> subprocess.Popen[bytes]:
+        with (self._folder / log).open("ab") as output:
+            process = subprocess.Popen(
+                command, env=environment(settings), stdout=output, stderr=output, start_new_session=True
+            )
+        self.processes.append(process)
+        return process
+
+    def end(self) -> None:
+        for process in self.processes:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGCONT)
+                os.kill(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+@pytest.fixture
+def slots(tmp_path: Path) -> Iterator[Slots]:
+    started = Slots(tmp_path)
+    yield started
+    started.end()
+
+
+async def _one_chunk(content: bytes) -> AsyncIterator[bytes]:
+    yield content
+
+
+async def ready_dataset(stores: Stores, files: dict[str, bytes]) -> str:
+    dataset = await stores.datasets.create("test")
+    for path, content in files.items():
+        await stores.datasets.add_file(dataset.id, path, _one_chunk(content))
+    await stores.datasets.finalize(dataset.id)
+    checked = await stores.datasets.check(dataset.id)
+    assert checked.state == "ready", checked.error
+    return dataset.id
+
+
+class Counting:
+    """A job of `counting_program` and the journal of its starts."""
+
+    def __init__(self, stores: Stores, journal: Path) -> None:
+        self.stores, self._journal = stores, journal
+        self.id = ""
+
+    async def submit(self, steps: int, step_s: float, **faults: object) -> str:
+        plan = {"steps": steps, "step_s": step_s, "journal": str(self._journal), **faults}
+        dataset_id = await ready_dataset(self.stores, {"plan.json": json.dumps(plan).encode()})
+        job, _ = await self.stores.jobs.submit(dataset_id, RefineOptions(preset="fast"))
+        self.id = job.id
+        return job.id
+
+    async def until(self, holds: Callable[[Job], bool], timeout_s: float = PATIENCE_S) -> Job:
+        """The job once ``holds``; fails the test after the timeout."""
+        end = time.monotonic() + timeout_s
+        async for update in self.stores.jobs.subscribe(self.id, heartbeat_s=1.0):
+            if update is not None and holds(update.job):
+                return update.job
+            assert time.monotonic() < end, f"waited too long: {update}"
+        raise AssertionError(f"the job ended otherwise: {await self.stores.jobs.get(self.id)}")
+
+    async def until_final(self, timeout_s: float = PATIENCE_S) -> Job:
+        return await self.until(lambda job: job.final, timeout_s)
+
+    def starts(self) -> list[dict[str, object]]:
+        return (
+            [json.loads(line) for line in self._journal.read_text().splitlines()]
+            if self._journal.exists()
+            else []
+        )
+
+    async def events(self) -> list[str]:
+        return [event.type for event in await self.stores.jobs.events(self.id)]
+
+    async def result(self) -> dict[str, object]:
+        """The published report, read from the store."""
+        (artifact,) = [
+            item for item in await self.stores.jobs.artifacts(self.id) if item.name == "report.json"
+        ]
+        return json.loads(b"".join([chunk async for chunk in self.stores.files.read(artifact.key)]))
+
+
+@pytest.fixture
+def counting(stores: Stores, tmp_path: Path) -> Counting:
+    return Counting(stores, tmp_path / "journal")

@@ -1,0 +1,77 @@
+"""A job program that counts: the same protocol as `workers.run`, with faults on order and without torch.
+
+The dataset's ``plan.json`` says how many steps, how long each takes and what goes wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+from biresnerf.progress import Progress
+
+folder = Path(sys.argv[1])
+order = json.loads((folder / "job.json").read_text())
+plan = json.loads((folder / order["input"] / "plan.json").read_text())
+output = folder / order["output"]
+state = output / "checkpoint" / "latest.json"
+stopping = []
+signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
+
+
+def tell(step: int, stage: str = "coarse", checkpoint: str | None = None) -> None:
+    total = plan["steps"]
+    progress = Progress(
+        stage=stage, step=step, steps_total=total, fraction=step / total, metrics={"loss": 1.0 / (step + 1)},
+        checkpoint=checkpoint,
+    )  # fmt: skip
+    sys.stdout.write(progress.model_dump_json() + "\n")
+    sys.stdout.flush()
+
+
+def save(step: int) -> None:
+    state.parent.mkdir(parents=True, exist_ok=True)
+    fresh = state.with_suffix(".new")
+    fresh.write_text(json.dumps({"step": step}))
+    fresh.rename(state)
+    tell(step, checkpoint="checkpoint/latest.json")
+
+
+start = json.loads(state.read_text())["step"] if state.exists() else 0
+with open(plan["journal"], "a") as journal:
+    journal.write(
+        json.dumps({"pid": os.getpid(), "from": start, "database": "BIRESNERF_DATABASE_URL" in os.environ})
+    )
+    journal.write("\n")
+sys.stderr.write(f"counting from {start}\n")
+sys.stdout.write("a line of a library that is no report\n")
+if plan.get("refuse"):
+    said = {
+        "code": "pose_file_invalid",
+        "detail": "pose 3 has NaN.",
+        "where": "transforms.json",
+        "mend": "Mend it.",
+    }
+    (folder / "error.json").write_text(json.dumps(said))
+    sys.exit(2)
+tell(start, "preparing")
+for step in range(start + 1, plan["steps"] + 1):
+    time.sleep(plan["step_s"])
+    tell(step)
+    if step % plan.get("checkpoint_every", 5) == 0:
+        save(step)
+    if plan.get("die_at") == step:
+        sys.stderr.write("dying now\n")
+        sys.stderr.flush()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if stopping and not plan.get("deaf"):
+        save(step)
+        sys.exit(143)
+(output / "report.json").write_text(json.dumps({"steps": plan["steps"], "from": start}))
+(output / "renders").mkdir()
+(output / "renders" / "one.png").write_bytes(b"\x89PNG counted")
+tell(plan["steps"], "exporting")
