@@ -5,6 +5,8 @@ from __future__ import annotations
 import struct
 import warnings
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,6 +33,17 @@ class ImageHeader(NamedTuple):
     width: int
     height: int
     orientation: int
+
+
+@contextmanager
+def quiet_pillow() -> Iterator[None]:
+    """Silences Pillow's warnings: what cannot be used is refused by an error instead.
+
+    For one thread at a time; enter it before threads are started.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"PIL\.")
+        yield
 
 
 def is_image_name(path: Path) -> bool:
@@ -61,9 +74,7 @@ def find_image(folder: Path, name: str) -> Path | None:
 def open_image(path: Path, name: str) -> Image.Image:
     """The opened, not yet decoded image. Raises InputError ``not_an_image`` or ``image_too_large``."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(path, formats=IMAGE_FORMATS)
+        image = Image.open(path, formats=IMAGE_FORMATS)
     except Image.DecompressionBombError:
         raise _too_large(name) from None
     except DAMAGED as error:
@@ -93,7 +104,7 @@ def open_image(path: Path, name: str) -> Image.Image:
 
 def read_header(path: Path, name: str) -> ImageHeader:
     """Size and orientation of an image file. Raises InputError as `open_image` does."""
-    with open_image(path, name) as image:
+    with quiet_pillow(), open_image(path, name) as image:
         try:
             orientation = image.getexif().get(EXIF_ORIENTATION, 1)
         except DAMAGED:  # broken metadata does not spoil the picture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from biresnerf.config import Background
 from biresnerf.data.area_resize import area_resize
 from biresnerf.data.background import uniform_background
 from biresnerf.data.dataset import Camera, Dataset
-from biresnerf.data.image_files import DAMAGED, open_image
+from biresnerf.data.image_files import DAMAGED, open_image, quiet_pillow
 from biresnerf.errors import InputError
 
 _ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})
@@ -98,7 +97,7 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
         pixels[part], alpha[part] = colour.reshape(-1, 3), opacity.reshape(-1)
 
     threads = min(_DECODERS, os.cpu_count() or 1, len(dataset))
-    with ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
+    with quiet_pillow(), ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
         pending = [pool.submit(fill, index) for index in range(len(dataset))]
         try:
             for job in pending:
@@ -140,10 +139,8 @@ def decode(path: Path, name: str, camera: Camera) -> NDArray[np.uint8]:
                 mend="Leave the images alone while they are being read.",
             )
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                image.load()
-                return _eight_bit(image, name)
+            image.load()
+            return _eight_bit(image, name)
         except DAMAGED:
             raise InputError(
                 "image_truncated",
