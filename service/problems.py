@@ -23,12 +23,12 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "method_not_allowed": (405, "This address does not answer that method"),
     "dataset_not_ready": (409, "The dataset is not ready for jobs"),
     "dataset_in_use": (409, "A job uses the dataset"),
-    "dataset_sealed": (409, "The dataset takes no more files"),
-    "dataset_empty": (409, "The dataset holds no files"),
-    "name_collision": (409, "Another file has this name but for case or accents"),
+    "dataset_not_open": (409, "The dataset takes no more files"),
+    "dataset_not_complete": (409, "Files of the dataset are missing"),
     "state_conflict": (409, "The state does not allow that"),
     "idempotency_in_progress": (409, "The first request with this key is still running"),
     "result_not_ready": (409, "The job has no result yet"),
+    "file_exists": (412, "The file is there already"),
     "precondition_failed": (412, "A condition of the request does not hold"),
     "body_too_large": (413, "The body is larger than the service takes"),
     "too_many_files": (413, "There are more files than the service takes"),
@@ -40,6 +40,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "invalid_options": (422, "The options are not valid"),
     "idempotency_key_reused": (422, "The key was used for a different request"),
     "unsafe_path": (422, "A file name is not safe"),
+    "name_collision": (422, "Two files have one name but for case or accents"),
     "archive_rejected": (422, "The archive cannot be taken"),
     "digest_mismatch": (422, "The bytes do not have the digest that was announced"),
     "dataset_invalid": (422, "The images and poses cannot be used"),
@@ -59,7 +60,9 @@ class FieldProblem(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    pointer: str = Field(description="JSON pointer into the body (`#/options/steps`), or `query/limit` and the like.")
+    pointer: str = Field(
+        description="JSON pointer into the body (`#/options/steps`), or `query/limit` and the like."
+    )
     detail: str
 
 
@@ -95,7 +98,9 @@ class Problem(BaseModel):
     code: str
     request_id: str | None = None
     retryable: bool = False
-    where: str | None = Field(None, description="The file or entry at fault, and the field in it where there is one.")
+    where: str | None = Field(
+        None, description="The file or entry at fault, and the field in it where there is one."
+    )
     mend: str | None = Field(None, description="What to do about it.")
     errors: list[FieldProblem] = Field(default_factory=list)
 

@@ -1,0 +1,152 @@
+"""The web application: routes put together, the engine opened once, every error told as a problem."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import RedirectResponse, Response
+from starlette.exceptions import HTTPException
+
+from biresnerf import __version__
+from biresnerf.errors import InputError
+from service import docs_page
+from service.dependencies import Service
+from service.json_body import validation_problem
+from service.problems import CATALOGUE, MEDIA_TYPE, ProblemError
+from service.request_context import RequestContext, render
+from service.routes import artifacts, datasets, events, jobs, meta
+from service.uploads import sweep_staging
+from workers.errors import EngineError, NotFound, Unavailable
+from workers.settings import Settings
+from workers.stores import open_stores
+
+logger = logging.getLogger(__name__)
+
+_DESCRIPTION = """
+Refines the camera poses of an image set.
+
+1. `POST /v1/datasets`; then `PUT …/files/{path}` for each file, or `POST …/archive` for all; then
+   `POST …/finalize`.
+2. `POST /v1/jobs` with the dataset's id (or one multipart request with an archive does both).
+3. `GET /v1/jobs/{id}` or its event stream tells how far it is.
+4. `GET /v1/jobs/{id}/artifacts` lists the refined poses, the report and the renders.
+
+Every error is `application/problem+json` (RFC 9457) with a stable `code`.
+"""
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """The application; opens the engine when it starts (needs ``settings.database_url``, migrated)."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        async with open_stores(settings) as stores:
+            service = Service(settings, stores)
+            app.state.service = service
+            swept = await asyncio.to_thread(sweep_staging, service.staging_dir)
+            if swept:
+                logger.info("removed %d unfinished uploads", swept)
+            service.keep_running(asyncio.create_task(_check_unfinished(service)))
+            try:
+                yield
+            finally:
+                service.closing.set()
+                for task in service.background:
+                    task.cancel()
+                await asyncio.gather(*service.background, return_exceptions=True)
+
+    app = FastAPI(
+        title="BiResNeRF",
+        version=__version__,
+        summary="Camera pose refinement as a service.",
+        description=_DESCRIPTION,
+        license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+    )
+    app.add_middleware(RequestContext)
+    _answer_with_problems(app)
+    for module in (datasets, jobs, events, artifacts, meta, docs_page):
+        app.include_router(module.router)
+    app.add_api_route("/", lambda: RedirectResponse("docs"), include_in_schema=False)
+    _describe_problems(app)
+    return app
+
+
+async def _check_unfinished(service: Service) -> None:
+    """Checks that a process before us began and did not end."""
+    try:
+        for dataset_id in await service.stores.datasets.unfinished():
+            await service.stores.datasets.check(dataset_id)
+    except Unavailable as error:
+        logger.warning("unfinished checks wait for the next start: %s", error.what)
+
+
+def _answer_with_problems(app: FastAPI) -> None:
+    async def problem(request: Request, error: Exception) -> Response:
+        return render(_as_problem(error), request)
+
+    for kind in (ProblemError, InputError, EngineError, RequestValidationError, HTTPException):
+        app.add_exception_handler(kind, problem)
+
+
+def _as_problem(error: Exception) -> ProblemError:
+    if isinstance(error, ProblemError):
+        return error
+    if isinstance(error, InputError):
+        return ProblemError.from_input_error(error)
+    if isinstance(error, NotFound):
+        return ProblemError("not_found", error.what)
+    if isinstance(error, EngineError):
+        code = error.code if error.code in CATALOGUE else "internal_error"
+        if code == "internal_error":
+            logger.error("engine error without a place in the catalogue: %s", error.code)
+        return ProblemError(code, error.what)
+    if isinstance(error, RequestValidationError):
+        return validation_problem([{**item, "type": item["type"]} for item in error.errors()], below="")
+    if isinstance(error, HTTPException):
+        return _from_http_exception(error)
+    raise error
+
+
+def _from_http_exception(error: HTTPException) -> ProblemError:
+    codes = {404: "not_found", 405: "method_not_allowed", 413: "body_too_large", 415: "unsupported_media"}
+    code = codes.get(error.status_code, "malformed_body" if error.status_code < 500 else "internal_error")
+    detail = {
+        "not_found": "Nothing is at this address.",
+        "method_not_allowed": "This address answers other methods; the Allow header names them.",
+    }.get(code, str(error.detail))
+    return ProblemError(code, detail, headers=dict(error.headers or {}))
+
+
+def _describe_problems(app: FastAPI) -> None:
+    """In the schema, problems have their own media type, and FastAPI's own 422 form is gone."""
+    generate = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema:
+            return app.openapi_schema
+        schema = generate()
+        for path in schema["paths"].values():
+            for operation in path.values():
+                for status, response in operation["responses"].items():
+                    content = response.get("content", {})
+                    if int(status) >= 400:
+                        response["content"] = {
+                            MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}
+                        }
+                    response["content"] = response.get("content", content)
+        for unused in ("HTTPValidationError", "ValidationError"):
+            schema["components"]["schemas"].pop(unused, None)
+        app.openapi_schema = schema
+        return schema
+
+    app.openapi = openapi  # type: ignore[method-assign]

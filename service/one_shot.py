@@ -1,0 +1,85 @@
+"""One multipart request that is a whole job: archive in, dataset checked, job queued."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+from pathlib import Path
+
+from fastapi import Request
+
+from service.dependencies import Service
+from service.intake import take_archive
+from service.json_body import fit, load_json
+from service.problems import FieldProblem, ProblemError
+from service.routes.datasets import begin_check, finish_check
+from service.schemas import JobTexts
+from service.uploads import Form, refuse_announced_excess, staging_folder
+from workers.errors import EngineError
+from workers.records import Job
+
+# Room for the text fields and the form's own lines beside the archive.
+_FORM_BYTES = 2**20
+
+
+async def submit_form(service: Service, request: Request, idempotency_key: str | None) -> tuple[Job, bool]:
+    """Takes the form (`archive`, JSON texts `options`, `labels`); returns the job and whether it is new.
+
+    A repeated request with the same key is known by the archive's digest, before anything is unpacked.
+    Where anything is wrong, the dataset made for it is deleted again.
+    """
+    limit = service.settings.max_archive_bytes + _FORM_BYTES
+    refuse_announced_excess(request.headers.get("content-length"), limit)
+    async with staging_folder(service.staging_dir) as folder:
+        archive = folder / "archive"
+        form = Form("archive", {"options", "labels"}, archive, limit)
+        await form.read(request.headers["content-type"], request.stream())
+        if not form.has_file:
+            detail = "The form has no file field `archive`."
+            raise ProblemError(
+                "invalid_request", detail, errors=[FieldProblem(pointer="#/archive", detail=detail)]
+            )
+        texts = _texts(form)
+        digest = await asyncio.to_thread(_sha256, archive)
+        if idempotency_key is not None:
+            known = await service.stores.jobs.repeated(digest, texts.options, texts.labels, idempotency_key)
+            if known is not None:
+                return known, False
+        into = folder / "content"
+        into.mkdir()
+        return await _make_job(service, archive, into, texts, digest, idempotency_key)
+
+
+async def _make_job(
+    service: Service, archive: Path, into: Path, texts: JobTexts, digest: str, idempotency_key: str | None
+) -> tuple[Job, bool]:
+    datasets = service.stores.datasets
+    dataset = await datasets.create("one-shot")
+    used = False
+    try:
+        await take_archive(service, dataset.id, archive, into)
+        await begin_check(service, dataset.id)
+        await finish_check(service, dataset.id)
+        job, used = await service.stores.jobs.submit(
+            dataset.id,
+            texts.options,
+            labels=texts.labels,
+            idempotency_key=idempotency_key,
+            request_digest=digest,
+        )
+        return job, used
+    finally:
+        if not used:
+            with contextlib.suppress(EngineError):
+                await datasets.delete(dataset.id)
+
+
+def _texts(form: Form) -> JobTexts:
+    values = {name: load_json(text) for name, text in form.texts.items() if text.strip()}
+    return fit(values, JobTexts)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,105 @@
+"""A scene on this machine as a zip that is made while it is sent: no second copy on disk."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from biresnerf.errors import InputError
+from service.safe_paths import NameSet, checked_path
+
+_CHUNK = 2**18
+_JSON = {".json"}
+# The same scene gives the same bytes, so that a repeated request can be known by its digest.
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+TRANSFORMS = "transforms.json"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Files to send: name in the archive and path here, and their bytes together."""
+
+    files: tuple[tuple[str, Path], ...]
+    total_bytes: int
+
+
+def look_at(path: Path) -> Scene:
+    """The files that make up the input at ``path``: a transforms file with its images, or images alone.
+
+    Raises:
+        InputError: the input cannot be used, or an image lies outside of its folder.
+    """
+    from biresnerf.data.folder import look_into
+    from biresnerf.data.transforms_json import read_transforms
+
+    if not path.exists():
+        raise InputError(
+            "input_missing", "does not exist.", where=str(path), mend="Give a folder or a transforms.json."
+        )
+    transforms = path
+    if path.is_dir():
+        contents = look_into(path)
+        if contents.transforms is None:
+            return _scene([(_name_below(contents.root, image), image) for image in contents.images])
+        transforms = contents.transforms
+    dataset = read_transforms(transforms)
+    images = list({frame.path.resolve(): frame.path for frame in dataset.frames}.values())
+    # The service looks for the pose file by its usual name.
+    name = transforms.name if transforms.name.startswith("transforms") else TRANSFORMS
+    return _scene([(name, transforms), *((_name_below(dataset.root, image), image) for image in images)])
+
+
+def _name_below(root: Path, path: Path) -> str:
+    try:
+        name = path.absolute().relative_to(root.absolute()).as_posix()
+        return checked_path(name)
+    except ValueError:
+        raise InputError(
+            "image_outside",
+            "lies outside of the folder of the pose file, and cannot be sent with it.",
+            where=str(path),
+            mend="Move it below that folder, or run `biresnerf refine` on this machine.",
+        ) from None
+
+
+def _scene(files: list[tuple[str, Path]]) -> Scene:
+    names = NameSet()
+    for name, _ in files:
+        names.add(name)
+    return Scene(tuple(files), sum(path.stat().st_size for _, path in files))
+
+
+def zipped(scene: Scene) -> Iterator[bytes]:
+    """The archive, piece by piece. Images go in as they are; they do not get smaller."""
+    outbox = _Outbox()
+    with zipfile.ZipFile(outbox, "w") as archive:  # type: ignore[call-overload]
+        for name, path in scene.files:
+            info = zipfile.ZipInfo(name, _EPOCH)
+            info.compress_type = zipfile.ZIP_DEFLATED if path.suffix.lower() in _JSON else zipfile.ZIP_STORED
+            info.external_attr = 0o100644 << 16
+            large = path.stat().st_size > 2**30
+            with path.open("rb") as source, archive.open(info, "w", force_zip64=large) as entry:
+                while chunk := source.read(_CHUNK):
+                    entry.write(chunk)
+                    yield outbox.taken()
+    yield outbox.taken()
+
+
+class _Outbox:
+    """Where zipfile writes to; it sees a stream that cannot seek."""
+
+    def __init__(self) -> None:
+        self._written: list[bytes] = []
+
+    def write(self, data: bytes) -> int:
+        self._written.append(bytes(data))
+        return len(data)
+
+    def flush(self) -> None:
+        """Nothing waits here."""
+
+    def taken(self) -> bytes:
+        data, self._written = b"".join(self._written), []
+        return data

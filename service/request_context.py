@@ -1,0 +1,77 @@
+"""One id per request, in and out, and the last net below every handler."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import re
+import uuid
+
+from starlette.datastructures import MutableHeaders
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.problems import MEDIA_TYPE, ProblemError
+
+logger = logging.getLogger(__name__)
+_ID = re.compile(r"^[\w.:-]{1,128}$", re.ASCII)
+
+
+def request_id(request: Request) -> str:
+    """The id of this request."""
+    found: str = request.scope.get("state", {}).get("request_id", "")
+    return found
+
+
+def render(error: ProblemError, request: Request) -> Response:
+    """The answer that tells the problem."""
+    body = error.problem(instance=request.url.path, request_id=request_id(request))
+    return Response(
+        body.model_dump_json(exclude_none=True),
+        status_code=error.status,
+        media_type=MEDIA_TYPE,
+        headers=error.response_headers(),
+    )
+
+
+class RequestContext:
+    """ASGI middleware: request ids, no content sniffing, and a problem for what nobody caught."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope, receive)
+        given = request.headers.get("x-request-id", "")
+        request.state.request_id = given if _ID.match(given) else uuid.uuid4().hex
+        started = False
+
+        async def send_with_headers(message: Message) -> None:
+            nonlocal started
+            if message["type"] == "http.response.start":
+                started = True
+                headers = MutableHeaders(scope=message)
+                headers["X-Request-ID"] = request_id(request)
+                headers.setdefault("X-Content-Type-Options", "nosniff")
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_with_headers)
+        except Exception as error:
+            if started:
+                raise
+            await render(_last_net(error, request), request)(scope, receive, send_with_headers)
+
+
+def _last_net(error: Exception, request: Request) -> ProblemError:
+    if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
+        logger.error("no room left: %s", error)
+        return ProblemError("storage_full", "The disk of the service is full.")
+    logger.exception("request %s %s %s failed", request_id(request), request.method, request.url.path)
+    return ProblemError(
+        "internal_error", "The request could not be served; the log of the service tells why."
+    )

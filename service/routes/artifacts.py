@@ -1,0 +1,133 @@
+"""The files of a result: list, download whole or in part."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+from urllib.parse import quote
+
+from fastapi import APIRouter, Header, Request
+from fastapi.responses import Response, StreamingResponse
+
+from service.conditions import byte_range, none_match
+from service.dependencies import JobId, Service, ServiceHere
+from service.problems import ProblemError, declared
+from service.schemas import ArtifactList, ArtifactView
+from workers.records import Artifact
+
+router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
+REPORT = "report.json"
+_BINARY: dict[str, Any] = {
+    "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+}
+_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The file.", **_BINARY},
+    206: {"description": "The bytes asked for.", **_BINARY},
+    304: {"description": "As you have it."},
+}
+
+
+@router.get(
+    "/artifacts",
+    operation_id="listArtifacts",
+    responses=declared("not_found", "database_unavailable", "internal_error"),
+)
+async def list_artifacts(job_id: JobId, service: ServiceHere) -> ArtifactList:
+    """All files of the result; none while the job has no result. A failed job may have `log.txt`."""
+    found = await service.stores.jobs.artifacts(job_id)
+    return ArtifactList(items=[ArtifactView.of(job_id, artifact) for artifact in found])
+
+
+_DOWNLOAD = declared(
+    "bad_range", "not_found", "range_not_satisfiable", "database_unavailable", "internal_error"
+)
+
+
+@router.get(
+    "/artifacts/{name:path}",
+    operation_id="getArtifact",
+    response_class=StreamingResponse,
+    responses={**_ANSWERS, **_DOWNLOAD},
+)
+@router.head(
+    "/artifacts/{name:path}",
+    operation_id="headArtifact",
+    response_class=StreamingResponse,
+    responses={**_ANSWERS, **_DOWNLOAD},
+)
+async def get_artifact(
+    job_id: JobId,
+    name: str,
+    request: Request,
+    service: ServiceHere,
+    range_: Annotated[str | None, Header(alias="Range", description="`bytes=first-last`")] = None,
+    if_range: Annotated[str | None, Header()] = None,
+    if_none_match: Annotated[str | None, Header()] = None,
+) -> Response:
+    """One file. Its strong ETag is the SHA-256 of its bytes."""
+    artifact = await _find(service, job_id, name)
+    etag = f'"{artifact.sha256}"'
+    headers = _headers(artifact, etag)
+    if not none_match(if_none_match, etag):
+        return Response(status_code=304, headers=headers)
+    part = byte_range(range_, if_range, etag, artifact.size) if request.method == "GET" else None
+    first, last = part or (0, artifact.size - 1)
+    headers["Content-Length"] = str(last - first + 1)
+    if part:
+        headers["Content-Range"] = f"bytes {first}-{last}/{artifact.size}"
+    status = 206 if part else 200
+    if request.method == "HEAD":
+        return Response(status_code=status, headers=headers, media_type=artifact.media_type)
+    content = await _opened(service, artifact, first, last + 1)
+    return StreamingResponse(content, status_code=status, headers=headers, media_type=artifact.media_type)
+
+
+@router.get(
+    "/report",
+    operation_id="getReport",
+    responses=declared("not_found", "result_not_ready", "database_unavailable", "internal_error"),
+)
+async def get_report(job_id: JobId, service: ServiceHere) -> Response:
+    """The machine-readable account of a finished job (the artifact `report.json`)."""
+    try:
+        artifact = await _find(service, job_id, REPORT)
+    except ProblemError:
+        job = await service.stores.jobs.get(job_id)
+        if job.final:
+            raise ProblemError("not_found", f"The job {job.state} without a report.") from None
+        raise ProblemError(
+            "result_not_ready", f"The job is {job.state}.", headers={"Retry-After": "5"}
+        ) from None
+    content = b"".join([chunk async for chunk in service.stores.files.read(artifact.key)])
+    return Response(content, media_type="application/json", headers={"ETag": f'"{artifact.sha256}"'})
+
+
+async def _find(service: Service, job_id: str, name: str) -> Artifact:
+    for artifact in await service.stores.jobs.artifacts(job_id):
+        if artifact.name == name:
+            return artifact
+    raise ProblemError("not_found", f"The job has no file {name[:200]!r}.")
+
+
+async def _opened(service: Service, artifact: Artifact, start: int, end: int) -> AsyncIterator[bytes]:
+    """The byte stream, begun: a file that is gone makes a 404, not a broken answer."""
+    await service.stores.files.head(artifact.key)
+    return service.stores.files.read(artifact.key, start, end)
+
+
+def _headers(artifact: Artifact, etag: str) -> dict[str, str]:
+    base = artifact.name.rsplit("/", 1)[-1]
+    plain = "".join(
+        char if char.isascii() and char.isprintable() and char not in '"\\' else "_" for char in base
+    )
+    digest = base64.b64encode(bytes.fromhex(artifact.sha256)).decode()
+    return {
+        "ETag": etag,
+        "Accept-Ranges": "bytes",
+        "Cache-Control": "private, max-age=31536000, immutable",
+        "Repr-Digest": f"sha-256=:{digest}:",
+        # As an attachment always: what users sent must not run as a page of this origin.
+        "Content-Disposition": f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(base, safe='')}",
+        "X-Content-Type-Options": "nosniff",
+    }

@@ -1,0 +1,268 @@
+"""Datasets: create, fill with files or an archive, finalize, look, delete."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+import re
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Header, Query, Request
+from fastapi.responses import JSONResponse, Response
+
+from biresnerf.errors import InputError
+from service.dependencies import DatasetId, Service, ServiceHere, next_link
+from service.intake import take_archive
+from service.json_body import json_content, read_json
+from service.problems import ProblemError, declared
+from service.safe_paths import NameSet, checked_path
+from service.schemas import DatasetList, DatasetView, FileList, FileView, NewDataset, dataset_url
+from service.uploads import capped, refuse_announced_excess, staging_folder, write_stream
+from workers.records import DatasetRecord, DatasetState
+
+router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
+_ALWAYS = ("database_unavailable", "internal_error")
+_RAW_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+_DIGEST = re.compile(r"sha-256=:([A-Za-z0-9+/=]+):")
+
+
+async def _new_dataset(request: Request) -> NewDataset:
+    headers = request.headers
+    return await read_json(
+        headers.get("content-type", ""), headers.get("content-length"), request.stream(), NewDataset
+    )
+
+
+@router.post(
+    "",
+    status_code=201,
+    operation_id="createDataset",
+    response_model=DatasetView,
+    responses=declared("malformed_json", "body_too_large", "unsupported_media", "invalid_request", *_ALWAYS),
+    openapi_extra={
+        "requestBody": {"required": True, "content": {"application/json": json_content(NewDataset)}}
+    },
+)
+async def create_dataset(
+    body: Annotated[NewDataset, Depends(_new_dataset)], response: Response, service: ServiceHere
+) -> DatasetView:
+    """An empty dataset, to be filled."""
+    for entry in body.manifest:
+        checked_path(entry.path)
+    dataset = await service.stores.datasets.create(body.name, body.manifest)
+    response.headers["Location"] = dataset_url(dataset.id)
+    return DatasetView.of(dataset)
+
+
+@router.get("", operation_id="listDatasets", responses=declared("bad_cursor", "invalid_request", *_ALWAYS))
+async def list_datasets(
+    request: Request,
+    response: Response,
+    service: ServiceHere,
+    state: DatasetState | None = None,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+    cursor: Annotated[str | None, Query(max_length=500)] = None,
+) -> DatasetList:
+    """Datasets, newest first."""
+    page = await service.stores.datasets.list(state=state, limit=limit, cursor=cursor)
+    response.headers.update(next_link(request, page.next_cursor))
+    return DatasetList(items=[DatasetView.of(item) for item in page.items], next_cursor=page.next_cursor)
+
+
+@router.get("/{dataset_id}", operation_id="getDataset", responses=declared("not_found", *_ALWAYS))
+async def get_dataset(dataset_id: DatasetId, service: ServiceHere) -> DatasetView:
+    """The dataset, with what the check found in it once it is final."""
+    return DatasetView.of(await service.stores.datasets.get(dataset_id))
+
+
+@router.delete(
+    "/{dataset_id}",
+    status_code=204,
+    operation_id="deleteDataset",
+    responses=declared("not_found", "dataset_in_use", *_ALWAYS),
+)
+async def delete_dataset(dataset_id: DatasetId, service: ServiceHere) -> None:
+    """Deletes the dataset and its files, unless an unfinished job uses it."""
+    await service.stores.datasets.delete(dataset_id)
+
+
+@router.get(
+    "/{dataset_id}/files",
+    operation_id="listFiles",
+    responses=declared("bad_cursor", "not_found", "invalid_request", *_ALWAYS),
+)
+async def list_files(
+    dataset_id: DatasetId,
+    request: Request,
+    response: Response,
+    service: ServiceHere,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 1000,
+    cursor: Annotated[str | None, Query(max_length=2000)] = None,
+) -> FileList:
+    """The files received, by path."""
+    page = await service.stores.datasets.files(dataset_id, limit=limit, cursor=cursor)
+    response.headers.update(next_link(request, page.next_cursor))
+    return FileList(items=[FileView.of(item) for item in page.items], next_cursor=page.next_cursor)
+
+
+_TAKES = ("not_found", "dataset_not_open", "body_too_large", "too_many_files", "unsafe_path", "storage_full")
+
+
+@router.put(
+    "/{dataset_id}/files/{path:path}",
+    status_code=201,
+    operation_id="putFile",
+    response_model=FileView,
+    responses={
+        204: {"description": "The path was there; it has these bytes now."},
+        **declared("malformed_body", "file_exists", "digest_mismatch", *_TAKES, *_ALWAYS),
+    },
+    openapi_extra=_RAW_BODY,
+)
+async def put_file(
+    dataset_id: DatasetId,
+    path: str,
+    request: Request,
+    service: ServiceHere,
+    content_length: Annotated[int | None, Header(ge=0)] = None,
+    repr_digest: Annotated[str | None, Header(description="`sha-256=:BASE64:`")] = None,
+    if_none_match: Annotated[str | None, Header(description="`*` forbids to replace a file.")] = None,
+) -> Response:
+    """One file, as raw bytes. The same request again changes nothing."""
+    limit = service.settings.max_file_bytes
+    safe = checked_path(path)
+    refuse_announced_excess(None if content_length is None else str(content_length), limit)
+    file, new = await service.stores.datasets.add_file(
+        dataset_id,
+        safe,
+        capped(request.stream(), limit),
+        sha256=_announced_digest(repr_digest),
+        overwrite=(if_none_match or "").strip() != "*",
+    )
+    if not new:
+        return Response(status_code=204)
+    return JSONResponse(FileView.of(file).model_dump(mode="json"), status_code=201)
+
+
+def _announced_digest(header: str | None) -> str | None:
+    if header is None:
+        return None
+    match = _DIGEST.search(header)
+    try:
+        digest = base64.b64decode(match[1], validate=True) if match else b""
+    except binascii.Error:
+        digest = b""
+    if len(digest) != 32:
+        raise ProblemError(
+            "malformed_body",
+            "The header holds no SHA-256.",
+            where="Repr-Digest",
+            mend="Send sha-256=:BASE64:.",
+        )
+    return digest.hex()
+
+
+@router.post(
+    "/{dataset_id}/archive",
+    operation_id="uploadArchive",
+    responses=declared(
+        "archive_too_large", "archive_rejected", "name_collision", "validation_timeout", *_TAKES, *_ALWAYS
+    ),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {
+                kind: {"schema": {"type": "string", "format": "binary"}}
+                for kind in ("application/zip", "application/x-tar", "application/gzip")
+            },
+        }
+    },
+)
+async def upload_archive(dataset_id: DatasetId, request: Request, service: ServiceHere) -> DatasetView:
+    """All files of a zip, tar or tar.gz, as the raw body. Folders that merely wrap everything are dropped.
+
+    All or nothing: where one entry is not acceptable, no file is taken.
+    """
+    limit = service.settings.max_archive_bytes
+    refuse_announced_excess(request.headers.get("content-length"), limit)
+    await service.stores.datasets.get(dataset_id)
+    async with staging_folder(service.staging_dir) as folder:
+        await write_stream(request.stream(), folder / "archive", limit)
+        into = folder / "content"
+        into.mkdir()
+        return DatasetView.of(await take_archive(service, dataset_id, folder / "archive", into))
+
+
+@router.post(
+    "/{dataset_id}/finalize",
+    operation_id="finalizeDataset",
+    response_model=DatasetView,
+    responses={
+        202: {"model": DatasetView, "description": "Under way (asked for by `Prefer: respond-async`)."},
+        **declared("not_found", "dataset_not_complete", "dataset_invalid", "name_collision", *_ALWAYS),
+    },
+)
+async def finalize_dataset(
+    dataset_id: DatasetId,
+    service: ServiceHere,
+    prefer: Annotated[str, Header(description="`respond-async` answers at once.")] = "",
+) -> Response:
+    """Freezes the files and checks them: poses, intrinsics, names, and every pixel.
+
+    Answers when the check is done: 200 with a `ready` dataset, or 422 with what is wrong and how to mend it
+    (the dataset is then `rejected`, and takes neither files nor jobs).
+    """
+    view = await begin_check(service, dataset_id)
+    if "respond-async" in prefer.lower() and view.state == "finalizing":
+        body = DatasetView.of(view).model_dump(mode="json")
+        headers = {
+            "Location": dataset_url(dataset_id),
+            "Retry-After": "2",
+            "Preference-Applied": "respond-async",
+        }
+        return JSONResponse(body, status_code=202, headers=headers)
+    checked = await finish_check(service, dataset_id)
+    return JSONResponse(DatasetView.of(checked).model_dump(mode="json"))
+
+
+async def begin_check(service: Service, dataset_id: str) -> DatasetRecord:
+    """Freezes the dataset and starts its check, which goes on when the client is gone.
+
+    Raises:
+        ProblemError: ``name_collision``; then the dataset stays open.
+    """
+    store = service.stores.datasets
+    names, cursor = NameSet(), None
+    while True:
+        page = await store.files(dataset_id, cursor=cursor)
+        for file in page.items:
+            try:
+                names.add(file.path)
+            except InputError as error:
+                raise ProblemError.from_input_error(error) from None
+        if (cursor := page.next_cursor) is None:
+            break
+    dataset = await store.finalize(dataset_id)
+    if dataset.state == "finalizing":
+        service.keep_running(asyncio.create_task(store.check(dataset_id), name=f"check {dataset_id}"))
+    return dataset
+
+
+async def finish_check(service: Service, dataset_id: str) -> DatasetRecord:
+    """Waits for the check's outcome; raises ``ProblemError`` with what it found wrong."""
+    for task in list(service.background):
+        if task.get_name() == f"check {dataset_id}":
+            await asyncio.shield(task)
+    dataset = await service.stores.datasets.check(dataset_id)
+    if dataset.state == "rejected":
+        error = dataset.error
+        if error is None:
+            raise ProblemError("dataset_invalid", "The check rejected the dataset.")
+        raise ProblemError(error.code, error.detail, where=error.where or None, mend=error.mend or None)
+    return dataset

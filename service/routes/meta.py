@@ -1,0 +1,76 @@
+"""What the service is, what may be asked for, and whether it is well."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Response
+
+from biresnerf import __version__
+from biresnerf.config import PRESETS, RefineOptions
+from service.conditions import none_match
+from service.dependencies import ServiceHere
+from service.intake import RATIO_MAX
+from service.problems import ProblemError, declared
+from service.schemas import Health, Info, OptionsView, SizeLimits
+
+router = APIRouter(tags=["service"])
+ARCHIVES = ["application/zip", "application/x-tar", "application/gzip"]
+
+
+@router.get(
+    "/v1/options",
+    operation_id="getOptions",
+    responses={304: {"description": "As you have it."}, **declared("internal_error")},
+)
+async def get_options(
+    response: Response, if_none_match: Annotated[str | None, Header()] = None
+) -> OptionsView | Any:
+    """JSON Schema of the options, and the presets with every value filled in."""
+    view = OptionsView(
+        json_schema=RefineOptions.model_json_schema(),
+        presets={name: RefineOptions(preset=name).resolved() for name in PRESETS},
+    )
+    etag = f'"{hashlib.sha256(view.model_dump_json().encode()).hexdigest()[:32]}"'
+    headers = {"ETag": etag, "Cache-Control": "max-age=300"}
+    if not none_match(if_none_match, etag):
+        return Response(status_code=304, headers=headers)
+    response.headers.update(headers)
+    return view
+
+
+@router.get("/v1/info", operation_id="getInfo", responses=declared("internal_error", "database_unavailable"))
+async def get_info(service: ServiceHere) -> Info:
+    """Version and limits of this service, and how many jobs are in each state."""
+    limits = {
+        name: getattr(service.settings, name)
+        for name in SizeLimits.model_fields
+        if name != "max_archive_ratio"
+    }
+    return Info(
+        version=__version__,
+        limits=SizeLimits(**limits, max_archive_ratio=RATIO_MAX),
+        archives=ARCHIVES,
+        job_counts=await service.stores.jobs.counts(),
+    )
+
+
+@router.get("/livez", operation_id="livez", responses=declared("internal_error"))
+async def livez() -> Health:
+    """The process runs. Says nothing about what it needs."""
+    return Health()
+
+
+@router.get(
+    "/readyz",
+    operation_id="readyz",
+    responses=declared("database_unavailable", "storage_unavailable", "internal_error"),
+)
+async def readyz(service: ServiceHere) -> Health:
+    """Database and storage answer: jobs can be taken."""
+    if not await service.stores.jobs.healthy():
+        raise ProblemError("database_unavailable", "The database does not answer.")
+    if not await service.stores.files.healthy():
+        raise ProblemError("storage_unavailable", "Files cannot be written.")
+    return Health()

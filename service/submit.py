@@ -1,0 +1,118 @@
+"""`biresnerf submit`: a scene from this machine through a service and back."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+
+from biresnerf.config import RefineOptions, parse_options
+from biresnerf.errors import BiresnerfError, InputError
+from service.client import Client, ServiceError
+from service.pack import Scene, look_at, zipped
+from service.progress_view import progress_view, watch
+from service.safe_paths import checked_path
+from service.schemas import JobView
+
+
+def options_from(preset: str | None, settings: tuple[str, ...]) -> RefineOptions:
+    """Options from a preset and ``key=value`` texts; raises `InputError`."""
+    values: dict[str, Any] = {} if preset is None else {"preset": preset}
+    for text in settings:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise InputError(
+                "invalid_options", f"{text!r} is not key=value.", where="--set", mend="Write --set seed=7."
+            )
+        values[key.strip()] = _value(value.strip())
+    return parse_options(values)
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def submit_scene(client: Client, scene: Scene, name: str, options: RefineOptions) -> JobView:
+    """Sends the scene, has it checked, queues a job. Leaves nothing behind where one of them fails."""
+    dataset = client.create_dataset(name[:200] or "scene")
+    try:
+        client.upload_archive(dataset, zipped(scene))
+        client.finalize(dataset)
+        return client.submit(dataset.id, options)
+    except BaseException:
+        _forget(client, dataset)
+        raise
+
+
+def _forget(client: Client, dataset: Any) -> None:
+    try:
+        client.delete_dataset(dataset)
+    except ServiceError as error:
+        click.echo(f"The dataset {dataset.id} stayed on the service: {error}", err=True)
+
+
+def require_empty(folder: Path) -> None:
+    """Raises `InputError` where downloads would mix with other files."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(
+            "output_not_empty",
+            "is not an empty folder.",
+            where=str(folder),
+            mend="Name a new folder for the results.",
+        )
+
+
+def download_all(client: Client, job: JobView, output: Path) -> list[Path]:
+    """All files of the result below ``output``; returns their paths. Raises `ServiceError`."""
+    written = []
+    for artifact in client.artifacts(job):
+        # The name comes from a server that we need not trust.
+        target = output / checked_path(artifact.name)
+        client.download(artifact, target)
+        written.append(target)
+    return written
+
+
+def run_submit(
+    path: Path, preset: str | None, settings: tuple[str, ...], *, wait: bool, output: Path | None, url: str
+) -> None:
+    """The command's work; raises `InputError` (the user's to mend) or another `BiresnerfError`."""
+    options = options_from(preset, settings)
+    if output is not None:
+        require_empty(output)
+    scene = look_at(path)
+    try:
+        with Client(url) as client:
+            click.echo(f"sending {len(scene.files)} files, {scene.total_bytes / 1e6:.1f} MB", err=True)
+            job = submit_scene(client, scene, path.resolve().name, options)
+            click.echo(f"{client.url}{job.links.self}")
+            if not wait and output is None:
+                return
+            with progress_view(Console(stderr=True)) as view:
+                job = watch(client, job, view)
+            _finish(client, job, output)
+    except ServiceError as error:
+        if error.users_fault:
+            raise InputError(error.code, error.what, where=error.where, mend=error.mend) from None
+        raise
+
+
+def _finish(client: Client, job: JobView, output: Path | None) -> None:
+    if job.state == "succeeded":
+        if output is not None:
+            files = download_all(client, job, output)
+            click.echo(f"{len(files)} files in {os.path.relpath(output)}")
+        return
+    error = job.error
+    if error is None:
+        raise BiresnerfError(f"The job {job.id} was {job.state}.")
+    if error.mend:
+        raise InputError(error.code, error.detail, where=error.where, mend=error.mend)
+    raise BiresnerfError(f"The job {job.id} failed ({error.code}): {error.detail}")
