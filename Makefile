@@ -6,8 +6,8 @@ EXTRAS ?= service,colmap,dev
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 # Pins for what is installed and, under the names that older and newer pips know, for what builds it.
-export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
-export PIP_BUILD_CONSTRAINT := $(CURDIR)/constraints.txt
+export PIP_CONSTRAINT := constraints.txt
+export PIP_BUILD_CONSTRAINT := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: help setup test lint format demo serve bench
@@ -34,7 +34,7 @@ demo: setup  ## a whole job over HTTP on a scene of known poses; SCENE=folder-or
 serve: setup  ## the service on this machine
 	$(BIN)/biresnerf up
 
-bench: setup  ## the measurements of docs/benchmarks.md
+bench: setup  ## the measurements; BENCH="arguments"
 	$(BIN)/python -m benchmarks $(BENCH)
 
 # Without ensurepip the venv module leaves half an environment behind, so it is looked for first.
