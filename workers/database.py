@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import re
 from collections.abc import AsyncIterator, Iterable
@@ -14,7 +15,7 @@ from procrastinate import App, PsycopgConnector
 from procrastinate.connector import Notify
 from procrastinate.exceptions import ConnectorException
 from psycopg.rows import DictRow, dict_row
-from psycopg_pool import AsyncConnectionPool, PoolTimeout
+from psycopg_pool import AsyncConnectionPool, PoolClosed, PoolTimeout
 
 from workers.errors import SetupError, Unavailable
 
@@ -26,6 +27,7 @@ AWAY = (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout)
 QUEUE = "refine"
 TASK = "refine"
 LISTEN_CHANNEL = "biresnerf_jobs"
+RECONNECT_S = 1.0
 
 
 class PatientConnector(PsycopgConnector):
@@ -93,7 +95,9 @@ async def open_database(
         min_size=1,
         max_size=connections,
         timeout=patience_s,
-        reconnect_timeout=float("inf"),
+        # The pool's own retries wait twice as long each time; after an outage of minutes it would sleep for minutes.
+        reconnect_timeout=RECONNECT_S,
+        reconnect_failed=_keep_trying,
         kwargs={"row_factory": dict_row, "connect_timeout": 5},
         connection_class=psycopg.AsyncConnection[DictRow],
         check=AsyncConnectionPool.check_connection,  # connections killed with the server are replaced unseen
@@ -115,6 +119,13 @@ async def open_database(
             yield database
     finally:
         await pool.close()
+
+
+async def _keep_trying(pool: AsyncConnectionPool[Connection]) -> None:
+    """Asking for a connection makes the pool connect again; if that fails too, it calls this again."""
+    with contextlib.suppress(PoolTimeout, PoolClosed):
+        async with pool.connection(timeout=RECONNECT_S):
+            return
 
 
 async def _require_schema(database: Database) -> None:

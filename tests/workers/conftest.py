@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
@@ -33,21 +35,24 @@ def anyio_backend() -> str:
 
 
 @pytest.fixture(scope="session")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def server() -> Iterator[str]:
     """Address of a migrated database, the template of each test's own."""
-    folder = tmp_path_factory.mktemp("server")
-    open_to_server_user(folder)
-    postgres = EmbeddedPostgres(folder / "postgres")
-    migrate(postgres.start())
-    yield postgres.url
-    postgres.stop()
+    with short_folder() as folder:
+        postgres = EmbeddedPostgres(folder / "postgres")
+        migrate(postgres.start())
+        yield postgres.url
+        postgres.stop()
 
 
-def open_to_server_user(folder: Path) -> None:
-    """pytest's folders are 0700 of root; PostgreSQL runs as somebody else then."""
-    for parent in (folder, *folder.parents):
-        if os.geteuid() == 0 and parent.stat().st_uid == 0 and not parent.stat().st_mode & 0o001:
-            parent.chmod(parent.stat().st_mode | 0o011)
+@contextlib.contextmanager
+def short_folder() -> Iterator[Path]:
+    """A folder that PostgreSQL's user can reach; pytest's own are 0700, and of root where root runs the tests."""
+    folder = Path(tempfile.mkdtemp(prefix="biresnerf-test-"))
+    folder.chmod(0o711)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture
@@ -100,10 +105,14 @@ class Slots:
         self.processes: list[subprocess.Popen[bytes]] = []
 
     def start(self, settings: Settings, name: str) -> subprocess.Popen[bytes]:
-        return self.run(settings, [sys.executable, "-m", "workers.slot", "--slot", name], f"slot-{name}.log")
+        return self.run(
+            settings,
+            [sys.executable, "-m", "workers.slot", "--slot", name],
+            self._folder / f"slot-{name}.log",
+        )
 
-    def run(self, settings: Settings, command: list[str], log: str) -> subprocess.Popen[bytes]:
-        with (self._folder / log).open("ab") as output:
+    def run(self, settings: Settings, command: list[str], log: Path) -> subprocess.Popen[bytes]:
+        with log.open("ab") as output:
             process = subprocess.Popen(
                 command, env=environment(settings), stdout=output, stderr=output, start_new_session=True
             )

@@ -1,0 +1,21 @@
+"""`biresnerf up` without HTTP: supervises a private database and the slots, then prints the database's address."""
+
+import asyncio
+import logging
+import sys
+
+from workers.settings import Settings
+from workers.supervise import ChildSpec, slot_specs, supervise
+
+
+async def ready(url: str) -> None:
+    sys.stdout.write(f"ready {url}\n")
+    sys.stdout.flush()
+
+
+logging.basicConfig(level=logging.INFO)
+settings = Settings()
+broken = (
+    [ChildSpec("broken", (sys.executable, "-c", "raise SystemExit(7)"))] if "--broken" in sys.argv else []
+)
+sys.exit(asyncio.run(supervise(settings, [*slot_specs(settings), *broken], on_ready=ready)))
