@@ -1,6 +1,6 @@
 """BiResNeRF: refine camera poses by optimising poses and a radiance field together.
 
-Importing the package loads neither torch nor numba; ``refine`` does when it is first used.
+Importing the package loads neither torch nor numba; ``refine_poses`` does when it is first used.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from biresnerf.errors import BiresnerfError, InputError, Interrupted, Refinement
 from biresnerf.progress import Progress
 
 if TYPE_CHECKING:
-    from biresnerf.pipeline import refine
+    from biresnerf.pipeline import refine_poses
 
 __version__ = "0.1.0"
 __all__ = [
@@ -22,13 +22,13 @@ __all__ = [
     "Progress",
     "RefineOptions",
     "RefinementError",
-    "refine",
+    "refine_poses",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "refine":
-        from biresnerf.pipeline import refine
+    if name == "refine_poses":
+        from biresnerf.pipeline import refine_poses
 
-        return refine
+        return refine_poses
     raise AttributeError(f"module 'biresnerf' has no attribute {name!r}")

@@ -78,9 +78,6 @@ class RefineOptions(BaseModel):
     orbit_frames: int | None = Field(
         None, ge=0, le=600, description="Frames of the orbit video; 0 leaves it out."
     )
-    render_size: int | None = Field(
-        None, ge=16, le=4096, description="Long side (px) of renders in the output."
-    )
 
     @model_validator(mode="after")
     def _ordered(self) -> RefineOptions:
@@ -129,7 +126,6 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "reconstruction_resolution_max": 1024,
         "table_size_log2": 16,
         "orbit_frames": 24,
-        "render_size": 256,
     },
     "balanced": {
         "max_image_size": 200,
@@ -147,7 +143,6 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "reconstruction_resolution_max": 2048,
         "table_size_log2": 17,
         "orbit_frames": 48,
-        "render_size": 400,
     },
     "quality": {
         "max_image_size": 400,
@@ -165,7 +160,6 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "reconstruction_resolution_max": 4096,
         "table_size_log2": 19,
         "orbit_frames": 96,
-        "render_size": 800,
     },
     # Guo et al., Appl. Sci. 2023, 13(24), 13333: Table 1 for the encodings; steps, period and floor inferred
     # from its timing tables; rates and loss inherited from BAA-NGP, which it builds on.
@@ -185,7 +179,6 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "reconstruction_resolution_max": 4096,
         "table_size_log2": 19,
         "orbit_frames": 96,
-        "render_size": 800,
     },
 }
 

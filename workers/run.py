@@ -65,13 +65,13 @@ def main(folder: Path) -> int:
 
 
 def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: threading.Event) -> None:
-    from biresnerf.pipeline import refine  # loads torch; SIGTERM during that is seen at the first step
+    from biresnerf.pipeline import refine_poses  # loads torch; SIGTERM during that is seen at the first step
 
     def tell(progress: Progress) -> None:
         protocol.write(progress.model_dump_json() + "\n")
         protocol.flush()
 
-    refine(order.input, order.output, options, on_progress=tell, should_stop=stop.is_set)
+    refine_poses(order.input, order.output, options, on_progress=tell, should_stop=stop.is_set)
 
 
 def _protocol_only() -> TextIO:

@@ -24,6 +24,7 @@ from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.geometry.camera_models import folds_inside_image
 
 ALL_PAIRS_UP_TO = 150  # images; beyond it, neighbours in the order of names are matched (11 000 pairs at 150)
+CHILD = Path(__file__).with_name("colmap_child.py")
 _POLL_S = 0.2
 _PR_SET_PDEATHSIG = 1
 # Loaded here: between fork and exec it would be too late to load anything.
@@ -82,7 +83,7 @@ def _run_child(
 ) -> dict[str, Any]:
     request_path, log_path = work / "request.json", work / "colmap.log"
     request_path.write_text(json.dumps(request), "utf-8")
-    command = [sys.executable, "-P", str(Path(__file__).with_name("colmap_child.py")), str(request_path)]
+    command = [sys.executable, "-P", str(CHILD), str(request_path)]
     with log_path.open("wb") as log:
         child = subprocess.Popen(
             command,
@@ -93,7 +94,7 @@ def _run_child(
             preexec_fn=_die_with_parent if sys.platform == "linux" else None,
         )
         try:
-            _wait(child, should_stop, limit_s)
+            _wait(child, Path(request["root"]).name, should_stop, limit_s)
         finally:
             if child.poll() is None:
                 os.killpg(child.pid, signal.SIGKILL)
@@ -106,7 +107,9 @@ def _run_child(
     return result
 
 
-def _wait(child: subprocess.Popen[bytes], should_stop: Callable[[], bool], limit_s: float) -> None:
+def _wait(
+    child: subprocess.Popen[bytes], root_name: str, should_stop: Callable[[], bool], limit_s: float
+) -> None:
     end = time.monotonic() + limit_s
     while child.poll() is None:
         if should_stop():
@@ -114,7 +117,8 @@ def _wait(child: subprocess.Popen[bytes], should_stop: Callable[[], bool], limit
         if time.monotonic() > end:
             raise InputError(
                 "seed_timeout",
-                f"COLMAP did not finish within {limit_s:.0f} s.",
+                f"COLMAP did not finish within {limit_s:g} s.",
+                where=root_name,
                 mend="Give fewer images, or a transforms.json with approximate poses.",
             )
         time.sleep(_POLL_S)

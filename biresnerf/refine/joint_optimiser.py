@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -96,10 +97,12 @@ class JointOptimiser:
     def marching(self, interval: float) -> Marching:
         return Marching(interval, self.frame.near, self.frame.far, MOST_SAMPLES, self.occupancy.occupied)
 
-    def cast(self, unit_from_cam: Tensor, image: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Origin and direction [rays, 3] in the unit frame of pixels `xy` of images, from matrices [n, 3, 4]."""
-        in_cam = directions_in_cam(self.intrinsics, image, xy)
-        matrix = unit_from_cam[image]
+    def cast(self, matrix: Tensor, image: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
+        """Origin and direction [rays, 3] in the unit frame of pixels `xy` [rays, 2] seen by cameras of images.
+
+        `matrix` [rays, 3, 4] is each ray's unit_from_cam.
+        """
+        in_cam = directions_in_cam(self.intrinsics, image, xy).float()
         direction = (matrix[:, :, :3] @ in_cam[:, :, None])[:, :, 0]
         return matrix[:, :, 3].contiguous(), direction.contiguous()
 
@@ -133,7 +136,7 @@ class JointOptimiser:
         batch = self.sampler.draw(
             self.rays, schedule.blur(t, self.switch, self.sampler.long_side), self.generator
         )
-        origin, direction = self.cast(self.poses.matrices(), batch.image, batch.xy)
+        origin, direction = self.cast(self.poses.matrices()[batch.image], batch.image, batch.xy)
         rendering = self.render(
             origin, direction, batch.trained, schedule.interval(t, self.switch),
             schedule.position_gradient(t, self.switch), jitter=True,
@@ -171,3 +174,44 @@ class JointOptimiser:
         wanted = self.rays * budget / max(1, samples)
         wanted = min(max(wanted, self.rays / 1.5), self.rays * 1.5)
         self.rays = int(min(max(wanted, RAYS_LEAST), RAYS_MOST))
+
+    def coarse_state(self) -> dict[str, Tensor]:
+        """What a rollback within stage 1 restores: all but the reconstruction module, which has not moved."""
+        return {name: tensor for name, tensor in self.state().items() if "reconstruction" not in name}
+
+    def load_coarse_state(self, state: dict[str, Tensor]) -> None:
+        """Undo the steps since `coarse_state`, but not the random draws: other pixels may do better."""
+        drawn = self.generator.get_state()
+        self._load_tensors({**self.state(), **state})
+        self.generator.set_state(drawn)
+
+    def state(self) -> dict[str, Tensor]:
+        """All tensors of the run (shared, not copied)."""
+        state = {"generator": self.generator.get_state()}
+        for part, tensors in (
+            ("field", self.field.state()),
+            ("poses", self.poses.state()),
+            ("occupancy", self.occupancy.state()),
+        ):
+            state.update({f"{part}.{name}": tensor for name, tensor in tensors.items()})
+        return state
+
+    def notes(self) -> dict[str, float | int | None]:
+        """The numbers of the run that are not tensors."""
+        return {
+            "step_index": self.step_index,
+            "switch": self.switch,
+            "rays": self.rays,
+            "pose_scale": self.pose_scale,
+        }
+
+    def load_state(self, tensors: dict[str, Tensor], notes: dict[str, Any]) -> None:
+        """Restore what `state` and `notes` gave; the next step is then the one that would have come."""
+        self._load_tensors(tensors)
+        self.step_index, self.switch = notes["step_index"], notes["switch"]
+        self.rays, self.pose_scale = notes["rays"], notes["pose_scale"]
+
+    def _load_tensors(self, tensors: dict[str, Tensor]) -> None:
+        self.generator.set_state(tensors["generator"])
+        for name, part in (("field.", self.field), ("poses.", self.poses), ("occupancy.", self.occupancy)):
+            part.load_state({k[len(name) :]: v for k, v in tensors.items() if k.startswith(name)})

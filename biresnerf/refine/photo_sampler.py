@@ -54,11 +54,15 @@ class PhotoSampler:
         self.sizes = torch.tensor(sizes, device=device)
         self.long_side = float(self.sizes[0].max())
 
-    def draw(self, rays: int, blur_px: float, generator: torch.Generator) -> PixelBatch:
-        """`rays` pixels, spread evenly over all images; `blur_px` is scaled by a random share of it."""
-        count = len(self.order)
+    def draw(
+        self, rays: int, blur_px: float, generator: torch.Generator, *, held_out_only: bool = False
+    ) -> PixelBatch:
+        """`rays` pixels, spread evenly over all images or the held-out ones, blurred by a random share of `blur_px`."""
+        first, count = (
+            (self.training, len(self.order) - self.training) if held_out_only else (0, len(self.order))
+        )
         where = (torch.arange(rays) + torch.rand(rays, generator=generator)) * (count / rays)
-        position = where.long().clamp(max=count - 1).to(self.device)
+        position = first + where.long().clamp(max=count - 1).to(self.device)
         image = self.order[position]
         size = self.sizes[0][image]
         xy = (torch.rand(rays, 2, generator=generator).to(self.device) * size).floor()

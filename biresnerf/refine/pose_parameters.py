@@ -65,6 +65,10 @@ class PoseParameters:
                 self.translation.copy_(torch.where(rows[:, None], self.translation, kept[1]))
         self.forget_gradients()
 
+    def restart_adam(self) -> None:
+        """Forget the moments: what follows is another optimisation."""
+        self._adam = torch.optim.Adam([self.rotation, self.translation], betas=BETAS, eps=EPSILON)
+
     def forget_gradients(self) -> None:
         self._adam.zero_grad(set_to_none=True)
 

@@ -1,0 +1,176 @@
+"""The folder a refinement writes to: who may use it, and what it holds at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from biresnerf.config import RefineOptions
+from biresnerf.data.atomic_file import whole_file
+from biresnerf.data.dataset import Dataset
+from biresnerf.data.images import ImageSet
+from biresnerf.data.renders import picture_stems, write_orbit, write_view
+from biresnerf.data.write import write_colmap, write_transforms
+from biresnerf.errors import InputError
+from biresnerf.geometry.pose_error import rotation_angle_deg
+from biresnerf.geometry.similarity import Similarity, align_robust
+from biresnerf.refine.checkpoint import CHECKPOINT, load_checkpoint
+from biresnerf.refine.evaluation import ViewScore
+from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.two_stages import TwoStages
+from biresnerf.report import HeldOut, ImageReport, Report, SimilarityReport
+
+REPORT, CONFIG, TRANSFORMS = "report.json", "config.json", "transforms.json"
+COLMAP, RENDERS, ORBIT = Path("colmap") / "sparse" / "0", "renders", "orbit.mp4"
+SOLID = 0.5  # opacity from which a depth means something
+_ANOTHER = "Choose another output folder, or remove this one."
+
+
+class OutputFolder:
+    """Refuses folders that hold something else; creates nothing before `claim`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+
+    def refuse_finished(self) -> None:
+        """Raise `InputError` unless the folder is new, empty, or holds an unfinished run."""
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError("output_not_a_folder", "is a file.", where=str(self.path), mend="Name a folder.")
+        if not self.path.is_dir() or not any(self.path.iterdir()) or (self.path / CHECKPOINT).is_file():
+            return
+        report = self.path / REPORT
+        if report.is_file():
+            raise InputError(
+                "output_finished", "holds a finished result.", where=str(self.path), mend=_ANOTHER
+            )
+        raise InputError(
+            "output_not_empty",
+            "is not empty, and nothing in it can be resumed.",
+            where=str(self.path),
+            mend=_ANOTHER,
+        )
+
+    def claim(self, fingerprint: str) -> None:
+        """Create the folder. Raises `InputError` if it holds a checkpoint of other input or options."""
+        checkpoint = load_checkpoint(self.path)
+        if checkpoint is not None and checkpoint[1]["fingerprint"] != fingerprint:
+            raise InputError(
+                "output_not_resumable",
+                "holds an unfinished run of other images, poses or options.",
+                where=str(self.path),
+                mend=_ANOTHER,
+            )
+        self.path.mkdir(parents=True, exist_ok=True)
+
+    def write_config(self, options: RefineOptions) -> None:
+        """config.json: every option as used."""
+        self._write_text(CONFIG, options.model_dump_json(indent=2))
+
+    def write_view(self, names: tuple[str, ...], images: ImageSet, score: ViewScore) -> None:
+        """Render, photo, difference and depth of one view."""
+        write_view(
+            self.path / RENDERS,
+            picture_stems(names)[score.image],
+            render=score.view.colour,
+            photo=images.image(score.image),
+            depth=np.where(score.view.opacity > SOLID, score.view.depth, np.nan),
+        )
+
+    def write_orbit(self, frames: Iterator[np.ndarray]) -> None:
+        """renders/orbit.mp4."""
+        write_orbit(self.path / RENDERS / ORBIT, frames)
+
+    def write_result(
+        self,
+        dataset: Dataset,
+        images: ImageSet,
+        stages: TwoStages,
+        held_out: list[int],
+        scores: list[ViewScore],
+        *,
+        threads: int,
+        state: Literal["complete", "partial"],
+    ) -> Report:
+        """Poses in the input's frame, as transforms.json and as a COLMAP model, and the report, last."""
+        optimiser = stages.optimiser
+        world_from_cam, similarity = poses_in_input_frame(dataset, optimiser)
+        write_transforms(dataset, world_from_cam, self.path / TRANSFORMS)
+        write_colmap(dataset, world_from_cam, self.path / COLMAP)
+        record = stages.record
+        report = Report(
+            version=_version(),
+            state=state,
+            options=optimiser.options,
+            images=_image_reports(dataset, world_from_cam, held_out, scores),
+            heldout=HeldOut(
+                count=len(scores),
+                psnr=float(np.mean([s.psnr for s in scores])),
+                ssim=float(np.mean([s.ssim for s in scores])),
+            )
+            if scores
+            else None,
+            steps_done=optimiser.step_index,
+            switch_step=optimiser.switch,
+            switch_reason=record.switch_reason,
+            resumed=record.resumed,
+            seconds={stage: round(seconds, 3) for stage, seconds in record.seconds.items()},
+            backend=optimiser.field.backend,
+            device=str(optimiser.device),
+            threads=threads,
+            working_size=(int(images.widths.max()), int(images.heights.max())),
+            input_from_optimised=SimilarityReport(
+                scale=similarity.scale,
+                rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
+                translation=tuple(float(v) for v in similarity.translation),
+            ),
+            warnings=dataset.warnings,
+        )
+        self._write_text(REPORT, report.model_dump_json(indent=2))
+        return report
+
+    def _write_text(self, name: str, text: str) -> None:
+        with whole_file(self.path / name) as temporary:
+            temporary.write_text(text + "\n", "utf-8")
+
+
+def poses_in_input_frame(dataset: Dataset, optimiser: JointOptimiser) -> tuple[np.ndarray, Similarity]:
+    """Refined world_from_cam [n, 4, 4] carried into the input's frame, and the similarity that does it.
+
+    The optimisation leaves frame and scale free; what ties them down is the best similarity, robust to lost
+    cameras, from the optimised centres to the given ones.
+    """
+    world_from_unit = optimiser.frame.unit_from_world.inverse()
+    optimised = world_from_unit.apply_to_poses(optimiser.poses.poses().numpy())
+    given = dataset.world_from_cam
+    input_from_optimised = align_robust(optimised, given)
+    return input_from_optimised.apply_to_poses(optimised), input_from_optimised
+
+
+def _image_reports(
+    dataset: Dataset, world_from_cam: np.ndarray, held_out: list[int], scores: list[ViewScore]
+) -> tuple[ImageReport, ...]:
+    given = dataset.world_from_cam
+    turn = rotation_angle_deg(np.swapaxes(given[:, :3, :3], 1, 2) @ world_from_cam[:, :3, :3])
+    shift = np.linalg.norm(world_from_cam[:, :3, 3] - given[:, :3, 3], axis=1)
+    scored = {score.image: score for score in scores}
+    return tuple(
+        ImageReport(
+            name=frame.name,
+            pose_source=frame.pose_source,
+            held_out=i in held_out,
+            moved_deg=float(turn[i]),
+            moved_units=float(shift[i]),
+            psnr=scored[i].psnr if i in scored else None,
+            ssim=scored[i].ssim if i in scored else None,
+        )
+        for i, frame in enumerate(dataset.frames)
+    )
+
+
+def _version() -> str:
+    from biresnerf import __version__
+
+    return __version__

@@ -1,0 +1,180 @@
+"""The whole method on one screen: read -> prepare -> stage 1 -> stage 2 -> evaluate -> write."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from biresnerf.config import RefineOptions
+from biresnerf.data.dataset import Dataset
+from biresnerf.data.images import ImageSet, load_images
+from biresnerf.data.read import read_dataset
+from biresnerf.errors import Interrupted
+from biresnerf.field.backends import choose_device, use_threads
+from biresnerf.output_folder import OutputFolder
+from biresnerf.progress import OnProgress, Progress
+from biresnerf.refine.checkpoint import CHECKPOINT, load_checkpoint
+from biresnerf.refine.evaluation import (
+    ViewScore,
+    fit_held_out_poses,
+    render_orbit,
+    score_views,
+)
+from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.scene_frame import SceneFrame, scene_frame
+from biresnerf.refine.two_stages import LAST_FRACTION, TwoStages
+from biresnerf.report import Report
+
+logger = logging.getLogger(__name__)
+
+HOLD_OUT_ONE_IN, HOLD_OUT_MOST, HOLD_OUT_FROM = 10, 10, 6
+SHOWN_WITHOUT_HELD_OUT = 2  # training views rendered when none is held out
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Everything read, before the first step."""
+
+    dataset: Dataset
+    images: ImageSet
+    frame: SceneFrame
+    held_out: list[int]
+    fingerprint: str
+
+
+def refine_poses(
+    input: Path,
+    output: Path,
+    options: RefineOptions,
+    on_progress: OnProgress | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Report:
+    """Refine the poses of an image set; all results go to the folder `output`.
+
+    Goes on by itself where a run of the same input and options left a checkpoint in `output`.
+
+    Args:
+        input: a folder of images (with or without a transforms file) or a transforms file.
+        output: a folder that is empty, new, or holds an unfinished run of the same input and options.
+        on_progress: called with a `Progress` a few times a second.
+        should_stop: asked after every step; once true, checkpoint and partial result are written.
+
+    Raises:
+        InputError: the user can mend it.
+        RefinementError: the optimisation diverged.
+        Interrupted: stopped by `should_stop`; the checkpoint and a partial result are in `output`.
+    """
+    report = on_progress or (lambda _progress: None)
+    stop = should_stop or (lambda: False)
+    options = options.resolved()
+    started = time.monotonic()
+    folder = OutputFolder(output)
+    folder.refuse_finished()
+    report(Progress(stage="preparing"))
+    device = choose_device(options.device)
+    threads = use_threads(options.threads)
+    prepared = _prepare(Path(input), options)
+    folder.claim(prepared.fingerprint)
+    report(Progress(stage="preparing", fraction=0.02, message=f"{len(prepared.dataset)} images read"))
+
+    optimiser = JointOptimiser(
+        prepared.images,
+        prepared.frame,
+        prepared.frame.unit_from_world.apply_to_poses(prepared.dataset.world_from_cam),
+        options,
+        prepared.held_out,
+        device,
+        threads,
+    )
+    stages = TwoStages(optimiser, folder.path, prepared.fingerprint, report, stop)
+    checkpoint = load_checkpoint(folder.path)
+    if checkpoint is not None:
+        stages.resume(*checkpoint)
+        logger.info("going on from step %d", optimiser.step_index)
+    stages.record.seconds["preparing"] = time.monotonic() - started
+    folder.write_config(options)
+
+    def write(scores: list[ViewScore], state: Literal["complete", "partial"]) -> Report:
+        return folder.write_result(
+            prepared.dataset, prepared.images, stages, prepared.held_out, scores, threads=threads, state=state
+        )
+
+    finished = stages.run()
+    if not finished:
+        write([], state="partial")
+        raise Interrupted(f"stopped at step {optimiser.step_index}; run again to go on")
+    scores = _evaluate(prepared, optimiser, stages, folder, report)
+    report(Progress(stage="exporting", fraction=0.99))
+    result = write(scores, state="complete")
+    shutil.rmtree(folder.path / CHECKPOINT.parent)
+    report(Progress(stage="exporting", fraction=1.0, eta_s=0.0))
+    return result
+
+
+def held_out_views(count: int, asked: int | None) -> list[int]:
+    """Evenly spread indices of the views kept from the field: a tenth, at most 10; none of fewer than 6."""
+    if asked is None:
+        asked = 0 if count < HOLD_OUT_FROM else max(1, min(HOLD_OUT_MOST, count // HOLD_OUT_ONE_IN))
+    asked = min(asked, max(0, count - 3))
+    return sorted({int((i + 0.5) * count / asked) for i in range(asked)})
+
+
+def _prepare(path: Path, options: RefineOptions) -> Prepared:
+    dataset = read_dataset(path)
+    images = load_images(dataset, options.max_image_size, options.background)
+    digest = hashlib.sha256(images.pixels.tobytes())
+    # What changes neither result nor effort may differ between a run and its continuation.
+    asked = options.model_dump(exclude={"threads", "checkpoint_every_s", "orbit_frames"})
+    digest.update(json.dumps([asked, dataset.names], sort_keys=True).encode())
+    digest.update(np.ascontiguousarray(dataset.world_from_cam).tobytes())
+    return Prepared(
+        dataset,
+        images,
+        scene_frame(dataset, images),
+        held_out_views(len(dataset), options.holdout),
+        digest.hexdigest(),
+    )
+
+
+def _evaluate(
+    prepared: Prepared, optimiser: JointOptimiser, stages: TwoStages, folder: OutputFolder, report: OnProgress
+) -> list[ViewScore]:
+    """Held-out poses fitted, views scored and rendered, orbit filmed."""
+    started = time.monotonic()
+    report(Progress(stage="evaluating", fraction=LAST_FRACTION))
+    fit_held_out_poses(optimiser, prepared.held_out)
+    views = prepared.held_out or list(range(min(SHOWN_WITHOUT_HELD_OUT, len(prepared.dataset))))
+    frames = int(optimiser.options.orbit_frames or 0)
+    work = len(views) + frames
+    scores = []
+
+    def tell(done: int) -> None:
+        share = done / max(1, work)
+        spent = time.monotonic() - started
+        report(
+            Progress(
+                stage="evaluating",
+                step=done,
+                steps_total=work,
+                fraction=LAST_FRACTION + (0.98 - LAST_FRACTION) * share,
+                eta_s=spent * (1 - share) / share if share else None,
+            )
+        )
+
+    for score in score_views(optimiser, prepared.images, views):
+        folder.write_view(prepared.dataset.names, prepared.images, score)
+        scores.append(score)
+        tell(len(scores))
+    if frames:
+        folder.write_orbit(render_orbit(optimiser, frames, lambda i: tell(len(views) + i + 1)))
+    stages.record.seconds["evaluating"] = time.monotonic() - started
+    return scores if prepared.held_out else []

@@ -1,0 +1,203 @@
+"""The two stages: step, watch the error, switch when it is stable, roll back when it diverges, keep checkpoints."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from biresnerf.errors import RefinementError
+from biresnerf.geometry.pose_error import rotation_angle_deg
+from biresnerf.progress import OnProgress, Progress
+from biresnerf.refine.checkpoint import CHECKPOINT, save_checkpoint
+from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.stability import StabilityDetector
+from biresnerf.report import SwitchReason
+
+logger = logging.getLogger(__name__)
+
+ROLLBACKS = 3
+REPORT_PERIOD_S = 0.5
+FIRST_FRACTION, LAST_FRACTION = 0.03, 0.88  # of the whole run's progress: reading before, evaluation after
+FINE_COST = 2.0  # a fine step against a coarse one, until measured
+
+
+@dataclass
+class RunRecord:
+    """What has happened so far, as kept in checkpoints."""
+
+    fingerprint: str
+    resumed: int = 0
+    rollbacks: int = 0
+    switch_reason: SwitchReason | None = None
+    seconds: dict[str, float] = field(default_factory=lambda: {"coarse": 0.0, "fine": 0.0})
+
+
+class TwoStages:
+    """Runs a `JointOptimiser` to its last step; can stop after any step and go on from a checkpoint.
+
+    Args:
+        folder: where checkpoints go.
+        fingerprint: of input and options; a checkpoint with another one is not resumed.
+    """
+
+    def __init__(
+        self,
+        optimiser: JointOptimiser,
+        folder: Path,
+        fingerprint: str,
+        on_progress: OnProgress,
+        should_stop: Callable[[], bool],
+    ) -> None:
+        self.optimiser, self.folder = optimiser, folder
+        self.on_progress, self.should_stop = on_progress, should_stop
+        self.record = RunRecord(fingerprint)
+        options = optimiser.options
+        self.detector = StabilityDetector(
+            int(options.coarse_steps_min or 0), int(options.coarse_steps_max or 0)
+        )
+        self._errors: list[float] = []
+        self._losses: list[float] = []
+        self._moved_deg = 0.0
+        self._poses_at_check = optimiser.poses.poses()
+        self._snapshot: tuple[float, dict[str, Tensor]] | None = None
+        self._step_seconds = {"coarse": 0.0, "fine": 0.0}
+
+    @property
+    def stage(self) -> str:
+        return "coarse" if self.optimiser.switch is None else "fine"
+
+    def run(self) -> bool:
+        """Step to the end; False if stopped before on request. A checkpoint is written either way.
+
+        Raises:
+            RefinementError: ``diverged`` when the error is not a number or keeps rising after all rollbacks.
+        """
+        optimiser, options = self.optimiser, self.optimiser.options
+        reported = saved = time.monotonic()
+        while optimiser.step_index < self.optimiser.schedule.steps:
+            if self.should_stop():
+                self._save()
+                return False
+            started = time.monotonic()
+            result = optimiser.step()
+            if not math.isfinite(result.loss):
+                raise RefinementError("diverged", f"The loss is not a number at step {optimiser.step_index}.")
+            self._errors.append(result.mean_squared_error)
+            self._losses.append(result.loss)
+            stage = self.stage
+            if optimiser.step_index % int(options.check_every or 1) == 0:
+                self._check()
+            now = time.monotonic()
+            self.record.seconds[stage] += now - started
+            slow = self._step_seconds[stage]
+            self._step_seconds[stage] = (now - started) if slow == 0 else 0.98 * slow + 0.02 * (now - started)
+            checkpoint = None
+            if now - saved >= options.checkpoint_every_s:
+                self._save()
+                saved, checkpoint = time.monotonic(), CHECKPOINT.as_posix()
+            if checkpoint or now - reported >= REPORT_PERIOD_S:
+                reported = now
+                self.on_progress(self._progress(checkpoint))
+        self._save()
+        return True
+
+    def _check(self) -> None:
+        """The detector's turn, at the end of each block."""
+        optimiser = self.optimiser
+        error = float(np.mean(self._errors))
+        self._errors = []
+        now = optimiser.poses.poses()
+        turn = self._poses_at_check[:, :3, :3].transpose(1, 2) @ now[:, :3, :3]
+        self._moved_deg = float(np.quantile(rotation_angle_deg(turn.numpy()), 0.9))
+        self._poses_at_check = now
+        if optimiser.switch is not None:
+            return
+        verdict = self.detector.check(optimiser.step_index, error, self._moved_deg)
+        if verdict == "diverging":
+            self._roll_back()
+            return
+        if self._snapshot is None or error < self._snapshot[0]:
+            self._snapshot = (error, {k: v.clone() for k, v in optimiser.coarse_state().items()})
+        if verdict in ("stable", "cap"):
+            self.record.switch_reason = "stable" if verdict == "stable" else "cap"
+            logger.info("stage 2 begins at step %d (%s)", optimiser.step_index, verdict)
+            self._snapshot = None
+            optimiser.start_reconstruction()
+
+    def _roll_back(self) -> None:
+        """Back to the best state so far with half the pose rate (method 4.3, DIVERGE)."""
+        self.record.rollbacks += 1
+        if self.record.rollbacks > ROLLBACKS or self._snapshot is None:
+            raise RefinementError("diverged", f"The error keeps rising at step {self.optimiser.step_index}.")
+        logger.warning("error rises at step %d: rolling back", self.optimiser.step_index)
+        self.optimiser.load_coarse_state(self._snapshot[1])
+        self.optimiser.pose_scale *= 0.5
+        self.detector.clear()
+        self._poses_at_check = self.optimiser.poses.poses()
+
+    def _progress(self, checkpoint: str | None) -> Progress:
+        optimiser, options = self.optimiser, self.optimiser.options
+        done, total = optimiser.step_index, optimiser.schedule.steps
+        coarse = self._step_seconds["coarse"] or self._step_seconds["fine"] / FINE_COST
+        fine = self._step_seconds["fine"] or coarse * FINE_COST
+        switch = int(options.coarse_steps_max or 0) if optimiser.switch is None else optimiser.switch
+        left = max(0, switch - done) * coarse + (total - max(done, switch)) * fine
+        spent = sum(self.record.seconds.values())
+        share = spent / max(spent + left, 1e-9)
+        losses, self._losses = self._losses, []
+        metrics = {"moved_deg": self._moved_deg}
+        if losses:
+            metrics["loss"] = float(np.mean(losses))
+        if self._errors:
+            metrics["psnr"] = -10 * math.log10(max(float(np.mean(self._errors)), 1e-12))
+        return Progress(
+            stage="coarse" if optimiser.switch is None else "fine",
+            step=done,
+            steps_total=total,
+            fraction=FIRST_FRACTION + (LAST_FRACTION - FIRST_FRACTION) * share,
+            eta_s=left * (1 - FIRST_FRACTION) / (LAST_FRACTION - FIRST_FRACTION),
+            metrics=metrics,
+            checkpoint=checkpoint,
+        )
+
+    def _save(self) -> None:
+        record, detector = self.record, self.detector
+        notes: dict[str, Any] = {
+            "fingerprint": record.fingerprint,
+            "resumed": record.resumed,
+            "rollbacks": record.rollbacks,
+            "switch_reason": record.switch_reason,
+            "seconds": record.seconds,
+            "detector": {
+                "decibels": detector.decibels,
+                "confirmed": detector.confirmed,
+                "rising": detector.rising,
+            },
+            "errors": self._errors,
+            "optimiser": self.optimiser.notes(),
+        }
+        tensors = {**self.optimiser.state(), "poses_at_check": self._poses_at_check}
+        save_checkpoint(self.folder, tensors, notes)
+
+    def resume(self, tensors: dict[str, Tensor], notes: dict[str, Any]) -> None:
+        """Go on where a checkpoint left off."""
+        self.optimiser.load_state(tensors, notes["optimiser"])
+        self._poses_at_check = tensors["poses_at_check"]
+        self._errors = notes["errors"]
+        self.record = RunRecord(
+            notes["fingerprint"],
+            notes["resumed"] + 1,
+            notes["rollbacks"],
+            notes["switch_reason"],
+            notes["seconds"],
+        )
+        for key, value in notes["detector"].items():
+            setattr(self.detector, key, value)
