@@ -56,6 +56,7 @@ async def _run(dataset: Path, errors: Path, settings: Settings) -> Verdict:
         )
     finally:
         child.kill()
+        await child.wait()
     try:
         answer = json.loads(said)
         if status == 0:

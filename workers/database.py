@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 Connection = psycopg.AsyncConnection[DictRow]
 # What a database that is away, or just went away, raises.
-AWAY = (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout)
+AWAY = (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout, PoolClosed)
 QUEUE = "refine"
 TASK = "refine"
 LISTEN_CHANNEL = "biresnerf_jobs"
@@ -80,22 +80,23 @@ class Database:
 
 @asynccontextmanager
 async def open_database(
-    url: str, *, connections: int = 8, patience_s: float = 10.0
+    url: str, *, connections: int = 8, patience_s: float = 10.0, opening_s: float = 30.0
 ) -> AsyncIterator[Database]:
     """Pool and queue app, closed at the end.
 
     Args:
         connections: most connections of the pool.
         patience_s: how long a caller waits for a free and living connection.
+        opening_s: how long to wait for the database at the start.
 
-    Raises `SetupError` if the database does not answer within 30 s or is not migrated.
+    Raises `SetupError` if the database does not answer in time or is not migrated.
     """
     pool: AsyncConnectionPool[Connection] = AsyncConnectionPool(
         url,
         min_size=1,
         max_size=connections,
         timeout=patience_s,
-        # The pool's own retries wait twice as long each time; after an outage of minutes it would sleep for minutes.
+        # The pool's own retries wait twice as long each time: minutes, after an outage of minutes.
         reconnect_timeout=RECONNECT_S,
         reconnect_failed=_keep_trying,
         kwargs={"row_factory": dict_row, "connect_timeout": 5},
@@ -105,7 +106,7 @@ async def open_database(
     )
     logging.getLogger("psycopg.pool").setLevel(logging.ERROR)  # it warns at every reconnect attempt
     try:
-        await pool.open(wait=True, timeout=30)
+        await pool.open(wait=True, timeout=opening_s)
     except PoolTimeout:
         await pool.close()
         raise SetupError(

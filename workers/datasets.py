@@ -95,15 +95,14 @@ class DatasetStore:
         (``body_too_large``, ``too_many_files``), `InputError` (``unsafe_path``, ``digest_mismatch``).
         Where it raises, the dataset is as before.
         """
+        # A folder of its own for each upload: one that fails or comes too late never touches an older file.
+        folder = f"datasets/{dataset_id}/files/{new_id('v')}"
+        key = _key(folder, path)
         async with self._database.transaction() as connection:
             row = await self._require_open(connection, dataset_id, path, overwrite=overwrite)
         room = min(self._settings.max_file_bytes, self._settings.max_dataset_bytes - row["bytes"])
-        # A folder of its own for each upload: one that fails or comes too late never touches an older file.
-        folder = f"datasets/{dataset_id}/files/{new_id('v')}"
         try:
-            stored = await self._files.put(
-                _key(folder, path), chunks, limit_bytes=room, expected_sha256=sha256
-            )
+            stored = await self._files.put(key, chunks, limit_bytes=room, expected_sha256=sha256)
             async with self._database.transaction() as connection:
                 await self._require_open(connection, dataset_id, path, overwrite=overwrite, size=stored.size)
                 return await _record_file(connection, dataset_id, path, stored)

@@ -1,0 +1,263 @@
+"""The job record without any worker: submitting, listing, cancelling, following."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+
+import psycopg
+import pytest
+
+from biresnerf.config import RefineOptions
+from biresnerf.errors import InputError
+from tests.workers.conftest import Slots, ready_dataset
+from workers.database import open_database
+from workers.errors import Conflict, LimitReached, NotFound, SetupError, Unavailable
+from workers.records import JobUpdate
+from workers.settings import Settings
+from workers.stores import Stores, open_stores
+
+pytestmark = pytest.mark.anyio
+FAST = RefineOptions(preset="fast")
+
+
+@pytest.fixture
+async def dataset_id(stores: Stores) -> str:
+    return await ready_dataset(stores, {"plan.json": b"{}"})
+
+
+async def rows(settings: Settings, table: str) -> int:
+    async with await psycopg.AsyncConnection.connect(settings.require_database_url()) as connection:
+        row = await (await connection.execute(f"SELECT count(*) FROM {table}".encode())).fetchone()
+        return row[0]
+
+
+async def test_a_submitted_job_is_queued_with_resolved_options(stores: Stores, dataset_id: str):
+    job, new = await stores.jobs.submit(dataset_id, FAST, labels={"scene": "fox"})
+    assert new
+    assert (job.state, job.queue_position, job.attempt, job.labels) == ("queued", 1, 0, {"scene": "fox"})
+    assert job.options["steps"] == 3000
+    assert job.id.startswith("job_")
+    assert await stores.jobs.get(job.id) == job
+
+
+async def test_a_failing_submit_leaves_neither_job_nor_queue_row(
+    stores: Stores, dataset_id: str, settings: Settings, monkeypatch: pytest.MonkeyPatch
+):
+    async def fails_after_the_queue_row(self, connection, job_id):
+        await real(self, connection, job_id)
+        raise RuntimeError("the process dies here")
+
+    from workers.database import Database
+
+    real = Database.enqueue
+    monkeypatch.setattr(Database, "enqueue", fails_after_the_queue_row)
+    with pytest.raises(RuntimeError):
+        await stores.jobs.submit(dataset_id, FAST)
+    assert [await rows(settings, table) for table in ("jobs", "procrastinate_jobs", "job_events")] == [
+        0,
+        0,
+        0,
+    ]
+
+
+async def test_job_and_queue_row_are_written_together(stores: Stores, dataset_id: str, settings: Settings):
+    await stores.jobs.submit(dataset_id, FAST)
+    assert [await rows(settings, table) for table in ("jobs", "procrastinate_jobs", "job_events")] == [
+        1,
+        1,
+        1,
+    ]
+
+
+async def test_the_same_key_gives_the_same_job_and_another_request_a_conflict(
+    stores: Stores, dataset_id: str
+):
+    first, _ = await stores.jobs.submit(dataset_id, FAST, idempotency_key="k")
+    again, new = await stores.jobs.submit(dataset_id, FAST, idempotency_key="k")
+    assert (again.id, new) == (first.id, False)
+    with pytest.raises(Conflict) as caught:
+        await stores.jobs.submit(dataset_id, RefineOptions(preset="quality"), idempotency_key="k")
+    assert caught.value.code == "idempotency_key_reused"
+
+
+async def test_the_same_key_at_the_same_time_gives_one_job(stores: Stores, dataset_id: str):
+    answers = await asyncio.gather(
+        *(stores.jobs.submit(dataset_id, FAST, idempotency_key="k") for _ in range(6))
+    )
+    assert len({job.id for job, _ in answers}) == 1
+    assert [new for _, new in answers].count(True) == 1
+
+
+async def test_a_full_queue_takes_no_more(settings: Settings):
+    async with open_stores(settings.model_copy(update={"max_queued": 2})) as stores:
+        dataset_id = await ready_dataset(stores, {"plan.json": b"{}"})
+        answers = await asyncio.gather(
+            *(stores.jobs.submit(dataset_id, FAST) for _ in range(4)), return_exceptions=True
+        )
+        refused = [answer for answer in answers if isinstance(answer, LimitReached)]
+        assert [error.code for error in refused] == ["queue_full"] * 2
+
+
+async def test_a_dataset_that_is_missing_or_not_ready_is_refused(stores: Stores):
+    with pytest.raises(NotFound):
+        await stores.jobs.submit("ds_none", FAST)
+    dataset = await stores.datasets.create("empty")
+    with pytest.raises(Conflict) as caught:
+        await stores.jobs.submit(dataset.id, FAST)
+    assert caught.value.code == "dataset_not_ready"
+
+
+async def test_lists_are_newest_first_and_pages_join(stores: Stores, dataset_id: str):
+    made = [(await stores.jobs.submit(dataset_id, FAST, labels={"n": str(n % 2)}))[0].id for n in range(5)]
+    seen, cursor = [], None
+    while True:
+        page = await stores.jobs.list(limit=2, cursor=cursor)
+        seen += [job.id for job in page.items]
+        cursor = page.next_cursor
+        if cursor is None:
+            break
+    assert seen == made[::-1]
+    odd = await stores.jobs.list(label=("n", "1"))
+    assert [job.id for job in odd.items] == [made[3], made[1]]
+    assert (await stores.jobs.list(state="running")).items == ()
+    assert [(await stores.jobs.get(job_id)).queue_position for job_id in made] == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("cursor", ["nonsense", "W10", "WyJhIl0", "WyJ4IiwieSJd", "\u00e9"])
+async def test_a_foreign_cursor_is_refused(stores: Stores, cursor: str):
+    with pytest.raises(InputError) as caught:
+        await stores.jobs.list(cursor=cursor)
+    assert caught.value.code == "bad_cursor"
+
+
+async def test_a_queued_job_is_cancelled_at_once_and_never_runs(
+    stores: Stores, dataset_id: str, settings: Settings, slots: Slots
+):
+    job, _ = await stores.jobs.submit(dataset_id, FAST)
+    cancelled = await stores.jobs.cancel(job.id)
+    assert cancelled.state == "cancelled"
+    assert (await stores.jobs.cancel(job.id)).revision == cancelled.revision, "a second time changes nothing"
+    slots.start(settings, "a")
+    await asyncio.sleep(1.5)
+    assert [event.type for event in await stores.jobs.events(job.id)] == ["queued", "cancelled"]
+
+
+async def test_only_final_jobs_are_deleted_and_their_files_follow(
+    stores: Stores, dataset_id: str, settings: Settings, slots: Slots
+):
+    job, _ = await stores.jobs.submit(dataset_id, FAST)
+    with pytest.raises(Conflict):
+        await stores.jobs.delete(job.id)
+    await stores.jobs.cancel(job.id)
+    (settings.files_dir / "jobs" / job.id / "results").mkdir(parents=True)
+    (settings.files_dir / "jobs" / job.id / "results" / "x").write_bytes(b"x")
+    await stores.jobs.delete(job.id)
+    with pytest.raises(NotFound):
+        await stores.jobs.get(job.id)
+    slots.start(settings, "a")
+    for _ in range(100):
+        if not (settings.files_dir / "jobs" / job.id).exists():
+            return
+        await asyncio.sleep(0.05)
+    raise AssertionError("the janitor did not delete the files")
+
+
+async def test_events_are_gapless_and_resume_after_any_of_them(
+    stores: Stores, dataset_id: str, database_url: str
+):
+    job, _ = await stores.jobs.submit(dataset_id, FAST)
+
+    async def write(n: int) -> None:
+        async with await psycopg.AsyncConnection.connect(database_url) as connection:
+            for _ in range(20):
+                await connection.execute("SELECT add_job_event(%s, 'stage', '{}')", (job.id,))
+                if n == 0:
+                    await connection.rollback()  # a writer that fails must not leave a gap
+                else:
+                    await connection.commit()
+
+    await asyncio.gather(*(write(n) for n in range(4)))
+    events = await stores.jobs.events(job.id)
+    assert [event.seq for event in events] == list(range(1, 62))
+    for after in (0, 1, 30, 60, 61):
+        assert [event.seq for event in await stores.jobs.events(job.id, after=after)] == list(
+            range(after + 1, 62)
+        )
+
+
+async def test_a_follower_sees_every_event_once_and_the_end(
+    stores: Stores, dataset_id: str, settings: Settings
+):
+    job, _ = await stores.jobs.submit(dataset_id, FAST)
+    seen: list[JobUpdate] = []
+
+    async def follow(from_another_process: Stores) -> None:
+        async for update in from_another_process.jobs.subscribe(job.id):
+            if update is not None:
+                seen.append(update)
+
+    async with open_stores(settings) as other:
+        following = asyncio.create_task(follow(other))
+        async with open_database(settings.require_database_url()) as database:
+            for _ in range(5):
+                await asyncio.sleep(0.05)
+                await database.fetch("SELECT add_job_event(%s, 'stage', '{}')", job.id)
+        await stores.jobs.cancel(job.id)
+        await asyncio.wait_for(following, 5)
+    assert [event.seq for update in seen for event in update.events] == [1, 2, 3, 4, 5, 6, 7]
+    assert seen[-1].job.state == "cancelled"
+
+
+async def test_a_follower_that_comes_back_gets_what_it_missed(stores: Stores, dataset_id: str):
+    job, _ = await stores.jobs.submit(dataset_id, FAST)
+    await stores.jobs.cancel(job.id)
+    updates = [update async for update in stores.jobs.subscribe(job.id, after=1)]
+    assert [event.type for update in updates for event in update.events] == ["cancelled"]
+
+
+async def test_a_quiet_job_gives_a_heartbeat_and_a_deleted_one_ends(stores: Stores, dataset_id: str):
+    job, _ = await stores.jobs.submit(dataset_id, FAST)
+    updates = stores.jobs.subscribe(job.id, heartbeat_s=0.1)
+    assert (await anext(updates)) is not None
+    assert (await anext(updates)) is None
+    await stores.jobs.cancel(job.id)
+    await stores.jobs.delete(job.id)
+
+    async def to_the_end() -> None:
+        async for _ in updates:
+            pass
+
+    with pytest.raises(NotFound):
+        await asyncio.wait_for(to_the_end(), 5)
+
+
+async def test_waiting_ends_with_the_job_or_with_the_time(stores: Stores, dataset_id: str):
+    job, _ = await stores.jobs.submit(dataset_id, FAST)
+    assert (await stores.jobs.wait(job.id, timeout_s=0.2)).state == "queued"
+    waiting = asyncio.create_task(stores.jobs.wait(job.id, timeout_s=20))
+    await asyncio.sleep(0.1)
+    await stores.jobs.cancel(job.id)
+    assert (await asyncio.wait_for(waiting, 5)).state == "cancelled"
+
+
+async def test_a_database_that_is_away_is_unavailable_and_not_a_crash(settings: Settings, tmp_path):
+    with pytest.raises(SetupError) as caught:
+        async with open_database(
+            f"postgresql://postgres@/none?host={tmp_path}", patience_s=0.2, opening_s=0.5
+        ):
+            pass
+    assert caught.value.code == "database_unreachable"
+    async with open_database(settings.require_database_url(), patience_s=0.3) as database:
+        await database.pool.close()
+        with pytest.raises(Unavailable):
+            await database.fetch("SELECT 1")
+
+
+async def test_healthy_tells_whether_the_database_answers(stores: Stores):
+    assert await stores.jobs.healthy()
+    assert await stores.files.healthy()
+    assert await stores.jobs.counts() == {}
+    with contextlib.suppress(Unavailable):
+        await stores.jobs._database.pool.close()
+    assert not await stores.jobs.healthy()
