@@ -20,7 +20,10 @@ from biresnerf.errors import InputError
 
 _ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
-_DECODERS = 4  # more threads hold more full-size pictures at once than they save time
+# More threads hold more full-size pictures at once than they save time.
+_DECODERS = 4
+_DECODING_BYTES = 2**30  # for all threads together
+_DECODING_BYTES_PER_PX = 24  # RGBA as bytes and as floats, and the float copy being shrunk
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +99,9 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
         colour, opacity = _shrink(picture, *sizes[index], behind, keep_alpha=background != "none")
         pixels[part], alpha[part] = colour.reshape(-1, 3), opacity.reshape(-1)
 
-    threads = min(_DECODERS, os.cpu_count() or 1, len(dataset))
+    largest = max(camera.width * camera.height for camera in dataset.cameras)
+    fitting = _DECODING_BYTES // (largest * _DECODING_BYTES_PER_PX)
+    threads = max(1, min(_DECODERS, os.cpu_count() or 1, len(dataset), fitting))
     with quiet_pillow(), ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
         pending = [pool.submit(fill, index) for index in range(len(dataset))]
         try:

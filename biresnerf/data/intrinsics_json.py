@@ -145,7 +145,8 @@ def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int,
             where=where,
             mend="Give the intrinsics of these images; cropped images need their own cx and cy.",
         )
-    return w, h, [f"{sizes}, the file says {w} x {h}; its intrinsics were scaled to the images"]
+    scaled = f"{w} x {h} px in the file, {header.width} x {header.height} in the images"
+    return w, h, [f"{scaled}: the intrinsics were scaled to the images"]
 
 
 def _parameters(fields: Fields, width: int, height: int) -> tuple[OpenCVParameters, list[str]]:

@@ -35,6 +35,7 @@ def read_dataset(
     """
     path = Path(path)
     if path.is_file():
+        _refuse_other_files(path)
         return read_transforms(path)
     if not path.is_dir():
         raise InputError(
@@ -49,3 +50,13 @@ def read_dataset(
     return seed_poses(
         contents.root, contents.images, should_stop=should_stop, seed=seed, limit_s=seeding_limit_s
     )
+
+
+def _refuse_other_files(path: Path) -> None:
+    if path.suffix.lower() != ".json":
+        raise InputError(
+            "input_unsupported",
+            "is neither a folder nor a .json file.",
+            where=path.name,
+            mend="Give a transforms.json, or a folder that holds one or the images.",
+        )

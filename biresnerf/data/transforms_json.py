@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -25,8 +24,12 @@ _NGP_KEYS = frozenset(
 _NERFSTUDIO_KEYS = frozenset({"camera_model", "applied_transform", "ply_file_path", "applied_scale"})
 
 
-def read_transforms(path: Path) -> Dataset:
+def read_transforms(path: Path, within: Path | None = None) -> Dataset:
     """The validated image set that the transforms file ``path`` describes; image headers are read only.
+
+    Args:
+        path: the file.
+        within: refuse images outside of this folder; for files of strangers.
 
     Raises:
         InputError: with the file, the field and the mend; codes as docs name them.
@@ -35,6 +38,8 @@ def read_transforms(path: Path) -> Dataset:
     rows = _frame_objects(document, path.name)
     source = _source_format(document, path)
     names = _names(rows, path.name)
+    if within is not None:
+        _refuse_outside(path, names, within)
     paths = _find_images(path, names)
     _refuse_missing_poses(rows, names, path.name)
     headers = [read_header(image, name) for image, name in zip(paths, names, strict=True)]
@@ -140,6 +145,27 @@ def _names(rows: list[dict[str, Any]], file: str) -> list[str]:
     return names
 
 
+def _refuse_outside(path: Path, names: list[str], within: Path) -> None:
+    """Names that lead out of ``within`` are refused before anything is looked for there, links included."""
+    limit = within.resolve()
+    for index, name in enumerate(names):
+        for spelling in (name, name.replace("\\", "/")):
+            if not _lies_in(path.parent / spelling, limit):
+                raise InputError(
+                    "unsafe_path",
+                    f"{name[:100]!r} leads out of the image set's folder.",
+                    where=f"{path.name} frames[{index}].file_path",
+                    mend="Name images by their path relative to this file, inside the folder.",
+                )
+
+
+def _lies_in(path: Path, limit: Path) -> bool:
+    try:
+        return path.resolve().is_relative_to(limit)
+    except (OSError, ValueError):  # too long, or a NUL in it: no such file anyway
+        return False
+
+
 def _find_images(path: Path, names: list[str]) -> list[Path]:
     found = [find_image(path.parent, name) for name in names]
     missing = [index for index, image in enumerate(found) if image is None]
@@ -180,13 +206,14 @@ def _cameras(
 ) -> tuple[tuple[Camera, ...], list[int], list[str]]:
     cameras: dict[Camera, int] = {}
     shared_sizes: dict[tuple[int, int], int] = {}
-    indices, notes = [], Counter[str]()
+    indices: list[int] = []
+    notes: dict[str, None] = {}
     for index, (row, header, name) in enumerate(zip(rows, headers, names, strict=True)):
         result = camera_of_frame(Fields(row, source.document, file, index), header, name)
         if not result.own:
             shared_sizes.setdefault((header.width, header.height), index)
         indices.append(cameras.setdefault(result.camera, len(cameras)))
-        notes.update(result.notes[:1] if notes else result.notes)
+        notes.update(dict.fromkeys(result.notes))
     if len(shared_sizes) > 1:
         (size_a, a), (size_b, b) = list(shared_sizes.items())[:2]
         raise InputError(
@@ -196,14 +223,7 @@ def _cameras(
             where=f"{file} frames[{b}]",
             mend="Give each frame its own fl_x, fl_y, cx, cy, w and h, or images of one size.",
         )
-    return tuple(cameras), indices, _summarised(notes)
-
-
-def _summarised(notes: Counter[str]) -> list[str]:
-    listed = list(notes)
-    if len(listed) <= 2:
-        return listed
-    return [listed[0], f"(and the same or the like for {len(listed) - 1} more images)"]
+    return tuple(cameras), indices, list(notes)
 
 
 def _poses(

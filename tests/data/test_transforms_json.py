@@ -12,6 +12,7 @@ from PIL import Image
 
 from biresnerf.data.dataset import Camera
 from biresnerf.data.read import read_dataset
+from biresnerf.data.transforms_json import read_transforms
 from biresnerf.errors import InputError
 from tests.data.scenes import (
     HEIGHT,
@@ -375,6 +376,32 @@ def test_an_image_that_would_unpack_to_gigabytes_is_refused_from_its_header(tmp_
     with pytest.raises(InputError) as caught:
         read_dataset(save(tmp_path, document))
     assert_complete(caught.value, "image_too_large", "images/001.png")
+
+
+@pytest.mark.parametrize(
+    "name", ["../secret.png", "/etc/passwd", "images/../../secret.png", "link.png", "a\\..\\..\\x"]
+)
+def test_names_that_lead_out_of_a_strangers_folder_are_refused_whether_or_not_the_file_is_there(
+    tmp_path, name
+):
+    folder = tmp_path / "set"
+    folder.mkdir()
+    write_image(tmp_path / "secret.png")
+    (folder / "link.png").symlink_to(tmp_path / "secret.png")
+    document = nerfstudio_scene(folder)
+    path = save(folder, document)
+    read_transforms(path, within=folder)
+    document["frames"][1]["file_path"] = name
+    with pytest.raises(InputError) as caught:
+        read_transforms(save(folder, document), within=folder)
+    assert_complete(caught.value, "unsafe_path", "transforms.json", "frames[1].file_path")
+
+
+def test_a_file_that_is_no_json_is_refused_by_its_name(tmp_path):
+    (tmp_path / "video.mp4").touch()
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path / "video.mp4")
+    assert_complete(caught.value, "input_unsupported", "video.mp4")
 
 
 def test_a_path_that_does_not_exist_is_refused(tmp_path):
