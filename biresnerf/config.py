@@ -20,7 +20,7 @@ PoseParametrisation = Literal["se3_world", "so3xr3"]
 class RefineOptions(BaseModel):
     """Options of one refinement. Unknown keys are refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", title="Refinement options")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, title="Refinement options")
 
     preset: PresetName = Field("balanced", description="Fills every option that is left out.")
     device: Device = Field("auto", description="Where to compute; auto takes CUDA where there is one.")
