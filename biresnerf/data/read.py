@@ -18,6 +18,7 @@ def read_dataset(
     should_stop: Callable[[], bool] | None = None,
     seed: int = 0,
     seeding_limit_s: float = 3600.0,
+    remember: Path | None = None,
 ) -> Dataset:
     """Reads a transforms file, or a folder with one, or a folder of images whose poses COLMAP then finds.
 
@@ -28,6 +29,7 @@ def read_dataset(
         should_stop: asked while COLMAP runs.
         seed: of COLMAP's random choices.
         seeding_limit_s: seconds that COLMAP may take.
+        remember: a file that keeps COLMAP's answer, so that a continued run is given the same poses again.
 
     Raises:
         InputError: the input cannot be used; says the file, the field and the mend.
@@ -48,7 +50,12 @@ def read_dataset(
     from biresnerf.data.seed_colmap import seed_poses
 
     return seed_poses(
-        contents.root, contents.images, should_stop=should_stop, seed=seed, limit_s=seeding_limit_s
+        contents.root,
+        contents.images,
+        should_stop=should_stop,
+        seed=seed,
+        limit_s=seeding_limit_s,
+        remember=remember,
     )
 
 

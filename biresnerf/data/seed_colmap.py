@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import importlib.util
 import json
 import os
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Camera, Dataset, Frame, SourceFormat
 from biresnerf.data.image_files import ImageHeader, read_header
 from biresnerf.data.transforms_json import MIN_IMAGES, few_names, orientation_notes, refuse_too_few
@@ -42,11 +44,15 @@ def seed_poses(
     should_stop: Callable[[], bool] | None = None,
     seed: int = 0,
     limit_s: float = 3600.0,
+    remember: Path | None = None,
 ) -> Dataset:
     """The images that COLMAP can place, with its poses and one shared camera (one each where sizes differ).
 
     Names are paths relative to ``root``. The frame and scale are COLMAP's own choice. Images it could not
     place are left out and named in the warnings.
+
+    COLMAP's threads make its answer differ a little from run to run. A run that is to be continued keeps it
+    in the file ``remember`` and is given the same poses again.
 
     Raises:
         InputError: ``too_few_images``, ``colmap_missing``, ``seed_failed``, ``seed_timeout``, or a code of
@@ -64,6 +70,10 @@ def seed_poses(
             where=root.name,
             mend="Run `pip install 'biresnerf[colmap]'`, or give a transforms.json.",
         )
+    key = _fingerprint(images, names, seed) if remember is not None else ""
+    known = _remembered(remember, key)
+    if known is not None:
+        return _dataset(root, headers, known)
     with tempfile.TemporaryDirectory(prefix="biresnerf-colmap-") as work:
         request = {
             "root": str(root.resolve()),
@@ -75,7 +85,28 @@ def seed_poses(
             "seed": seed,
         }
         answer = _run_child(request, Path(work), should_stop or (lambda: False), limit_s)
-    return _dataset(root, headers, answer)
+    dataset = _dataset(root, headers, answer)
+    if remember is not None:
+        with whole_file(remember) as temporary:
+            temporary.write_text(json.dumps({"key": key, "answer": answer}), "utf-8")
+    return dataset
+
+
+def _fingerprint(images: Sequence[Path], names: Sequence[str], seed: int) -> str:
+    """Of everything that COLMAP's answer depends on."""
+    digest = hashlib.sha256(json.dumps([names, seed]).encode())
+    for path in images:
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
+
+
+def _remembered(remember: Path | None, key: str) -> dict[str, Any] | None:
+    """The answer kept for the same images, if there is one; our own file, written whole."""
+    if remember is None or not remember.is_file():
+        return None
+    kept = json.loads(remember.read_text("utf-8"))
+    return kept["answer"] if kept["key"] == key else None
 
 
 def _run_child(

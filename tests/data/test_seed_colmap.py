@@ -138,3 +138,16 @@ def test_two_images_are_too_few_and_broken_ones_are_named_before_colmap_runs(tmp
     with pytest.raises(InputError) as caught:
         read_dataset(tmp_path)
     assert_complete(caught.value, "not_an_image", "2.png")
+
+
+@needs_colmap
+def test_a_continued_run_is_given_the_same_poses_until_an_image_changes(folder, tmp_path, monkeypatch):
+    kept = tmp_path / "kept" / "seeding.json"
+    first = read_dataset(folder, remember=kept)
+    monkeypatch.setattr(seed_colmap, "CHILD", tmp_path / "no_such_program.py")
+    again = read_dataset(folder, remember=kept)
+    assert np.array_equal(again.world_from_cam, first.world_from_cam)
+    assert again.cameras == first.cameras
+    write_image(folder / "images/00.png", size=(SIZE, SIZE))
+    with pytest.raises(RefinementError):  # COLMAP is asked anew
+        read_dataset(folder, remember=kept)
