@@ -94,6 +94,7 @@ class _Supervisor:
             **os.environ,
             "BIRESNERF_DATABASE_URL": url,
             "BIRESNERF_DATA_DIR": str(settings.data_dir.absolute()),
+            "BIRESNERF_SLOTS": str(settings.slots),
         }
         self._stop = asyncio.Event()
         self._now = asyncio.Event()
@@ -105,19 +106,17 @@ class _Supervisor:
             loop.add_signal_handler(number, self._asked_to_stop)
         keeping = [asyncio.create_task(self._keep(spec)) for spec in self._children]
         database = asyncio.create_task(self._keep_database())
+        url = self._environment["BIRESNERF_DATABASE_URL"]
+        ready = asyncio.create_task(on_ready(url)) if on_ready is not None else None
         try:
-            if on_ready is not None:
-                ready = asyncio.create_task(on_ready(self._environment["BIRESNERF_DATABASE_URL"]))
-                keeping.append(ready)
             await asyncio.gather(*keeping)  # children end after `_stop`, while the database still answers
             await self._stop.wait()
-        except SetupError as error:
-            log.error("%s", error.what)
-            self._status = 1
         finally:
             self._stop.set()
             await asyncio.gather(*keeping, return_exceptions=True)
             database.cancel()
+            if ready is not None:
+                ready.cancel()
             for number in (signal.SIGTERM, signal.SIGINT):
                 loop.remove_signal_handler(number)
         return self._status

@@ -11,6 +11,7 @@ from workers.supervise import ChildSpec, slot_specs, supervise
 async def ready(url: str) -> None:
     sys.stdout.write(f"ready {url}\n")
     sys.stdout.flush()
+    await asyncio.sleep(600)  # as one that waits for an API which never comes up; must not hold up the end
 
 
 logging.basicConfig(level=logging.INFO)
