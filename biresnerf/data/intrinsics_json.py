@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 from biresnerf.data.dataset import Camera
 from biresnerf.data.image_files import ImageHeader
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera_models import MODEL_IDS, OpenCVParameters, folds_inside_image, smallest_model
+from biresnerf.geometry.camera_models import MODEL_IDS, OpenCVParameters, smallest_model
+from biresnerf.geometry.lens import lens_problem
 
 _UNSUPPORTED = "camera_model_unsupported"
 # Keys of instant-ngp that mean another lens than the pinhole with radial and tangential distortion.
@@ -71,12 +72,13 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
     # nerfstudio writes OPENCV with zeros for a pinhole; PINHOLE is the same camera and more programs read it.
     elif preferred == "OPENCV" and full.k1 == full.k2 == full.p1 == full.p2 == 0.0:
         preferred = "PINHOLE"
-    if folds_inside_image(full, width, height):
+    problem = lens_problem(full, width, height)
+    if problem is not None:
         raise InputError(
             "intrinsics_invalid",
-            "the distortion folds back inside the image, so its outer pixels have no viewing ray.",
+            problem,
             where=fields.where("k1"),
-            mend="Check k1 and k2, or undistort the images.",
+            mend="Check k1, k2, p1 and p2, or undistort the images.",
         )
     model, params = smallest_model(full, preferred)
     camera = Camera(model, width, height, params).resized(header.width, header.height)
@@ -202,7 +204,7 @@ def _focal(fields: Fields, keys: tuple[str, str, str], size: int) -> tuple[float
             angle = value if key == keys[1] else math.radians(value)
             fits = 0.0 < angle < math.pi
             focal = 0.5 * size / math.tan(0.5 * angle) if fits else 0.0
-        if not fits or focal < 1e-3 * size:
+        if not fits or not 1e-3 * size < focal < 1e5 * size:
             raise InputError(
                 "intrinsics_invalid",
                 f"{value:g} is not a focal length."

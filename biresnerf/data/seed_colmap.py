@@ -23,7 +23,7 @@ from biresnerf.data.dataset import Camera, Dataset, Frame, SourceFormat
 from biresnerf.data.image_files import ImageHeader, read_header
 from biresnerf.data.transforms_json import MIN_IMAGES, few_names, orientation_notes, refuse_too_few
 from biresnerf.errors import InputError, Interrupted, RefinementError
-from biresnerf.geometry.camera_models import folds_inside_image
+from biresnerf.geometry.lens import lens_problem
 
 ALL_PAIRS_UP_TO = 150  # images; beyond it, neighbours in the order of names are matched (11 000 pairs at 150)
 CHILD = Path(__file__).with_name("colmap_child.py")
@@ -201,9 +201,9 @@ def _inverse(rigid: np.ndarray) -> np.ndarray:
 
 
 def _refuse_implausible(cameras: dict[Camera, int], root: Path) -> None:
-    """A lens that folds inside the image is what COLMAP finds where the views fix too little."""
+    """An impossible lens is what COLMAP finds where the views fix too little."""
     for camera in cameras:
-        if folds_inside_image(camera.full(), camera.width, camera.height):
+        if lens_problem(camera.full(), camera.width, camera.height) is not None:
             raise InputError(
                 "seed_failed",
                 "COLMAP found an impossible lens, so its poses mean nothing.",

@@ -6,7 +6,6 @@ k2) and two tangential ones (p1, p2). Lengths are in pixels; the centre of the f
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -72,31 +71,3 @@ def smallest_model(full: OpenCVParameters, preferred: str) -> tuple[str, tuple[f
     model = preferred if fits[preferred] else ("PINHOLE" if pinhole else "OPENCV")
     values = full._asdict() | {"f": full.fx}
     return model, tuple(values[name] for name in MODEL_PARAMETERS[model])
-
-
-def folds_inside_image(full: OpenCVParameters, width: int, height: int) -> bool:
-    """Whether the radial distortion turns back on itself before it reaches the image's farthest corner.
-
-    Pixels beyond the fold have no viewing ray. The radius r(1 + k1 r^2 + k2 r^4) stops growing at the
-    smallest positive root of 1 + 3 k1 s + 5 k2 s^2, s = r^2. The tangential part is small beside it and is
-    left out.
-    """
-    a, b, c = 5.0 * full.k2, 3.0 * full.k1, 1.0
-    roots: list[float] = []
-    if a == 0.0:
-        roots = [-c / b] if b else []
-    elif (inside := b * b - 4.0 * a * c) >= 0.0:
-        # The form without cancellation: one root by the sum, the other by the product.
-        q = -0.5 * (b + math.copysign(math.sqrt(inside), b))
-        roots = [q / a, c / q]
-    positive = [s for s in roots if s > 0.0]
-    if not positive:
-        return False
-    s = min(positive)
-    reach = math.sqrt(s) * (1.0 + full.k1 * s + full.k2 * s * s)
-    corner = max(
-        math.hypot((x - full.cx) / full.fx, (y - full.cy) / full.fy)
-        for x in (0.0, width)
-        for y in (0.0, height)
-    )
-    return corner >= 0.999 * reach
