@@ -85,6 +85,7 @@ class TwoStages:
         while optimiser.step_index < self.optimiser.schedule.steps:
             if self.should_stop():
                 self._save()
+                self.on_progress(self._progress(CHECKPOINT.as_posix()))
                 return False
             started = time.monotonic()
             result = optimiser.step()
@@ -107,6 +108,7 @@ class TwoStages:
                 reported = now
                 self.on_progress(self._progress(checkpoint))
         self._save()
+        self.on_progress(self._progress(CHECKPOINT.as_posix()))
         return True
 
     def _check(self) -> None:

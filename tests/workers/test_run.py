@@ -75,6 +75,7 @@ def test_sigterm_checkpoints_and_the_next_run_goes_on(tmp_path: Path, scene: Pat
     process.communicate(timeout=60)
     assert process.returncode == 143
     assert kept is not None
+    assert kept == progress, "the checkpoint written at the signal is reported, or nobody would keep it"
     assert (folder / "output" / str(kept.checkpoint)).is_file()
     again = run(folder)
     assert again.stdout is not None
