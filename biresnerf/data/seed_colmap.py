@@ -61,6 +61,7 @@ def seed_poses(
         RefinementError: ``seeding_crashed``: COLMAP itself failed.
     """
     names = [path.relative_to(root).as_posix() for path in images]
+    root = root.resolve()  # the name of "." is empty
     refuse_too_few(len(names), root.name)
     headers = {name: read_header(path, name) for name, path in zip(names, images, strict=True)}
     if importlib.util.find_spec("pycolmap") is None:
@@ -76,7 +77,7 @@ def seed_poses(
         return _dataset(root, headers, known)
     with tempfile.TemporaryDirectory(prefix="biresnerf-colmap-") as work:
         request = {
-            "root": str(root.resolve()),
+            "root": str(root),
             "names": names,
             "work": work,
             "answer": str(Path(work, "answer.json")),

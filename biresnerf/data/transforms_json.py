@@ -32,7 +32,7 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
         within: refuse images outside of this folder; for files of strangers.
 
     Raises:
-        InputError: with the file, the field and the mend; codes as docs name them.
+        InputError: with the file, the field and the mend; codes as in docs/input.md.
     """
     document = read_json_object(path)
     rows = _frame_objects(document, path.name)

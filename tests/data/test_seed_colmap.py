@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import shutil
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -126,6 +127,14 @@ def test_without_colmap_the_extra_is_named(folder, monkeypatch):
     with pytest.raises(InputError, match=r"pip install 'biresnerf\[colmap\]'") as caught:
         read_dataset(folder)
     assert_complete(caught.value, "colmap_missing", folder.name)
+
+
+@needs_colmap
+def test_linked_images_in_the_working_directory_keep_their_names(photos, tmp_path, monkeypatch):
+    for index in range(4):
+        (tmp_path / f"linked {index}.png").symlink_to(photos / f"images/{index:02}.png")
+    monkeypatch.chdir(tmp_path)
+    assert read_dataset(Path(".")).file_names == tuple(f"linked {index}.png" for index in range(4))
 
 
 def test_two_images_are_too_few_and_broken_ones_are_named_before_colmap_runs(tmp_path):

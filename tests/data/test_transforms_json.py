@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -91,6 +92,13 @@ def test_instant_ngp_degrees_of_view_are_read(tmp_path):
         del document[key]
     focal = 0.5 * WIDTH / math.tan(math.radians(25.0))
     assert read_dataset(save(tmp_path, document)).cameras[0].full().fx == pytest.approx(focal)
+
+
+def test_paths_relative_to_the_working_directory_are_read(tmp_path, monkeypatch):
+    save(tmp_path, nerfstudio_scene(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    for path in (Path("."), Path("transforms.json")):
+        assert read_dataset(path).file_names[0] == "images/000.jpg"
 
 
 def test_one_focal_length_serves_both_axes(tmp_path):
