@@ -26,6 +26,8 @@ log = logging.getLogger(__name__)
 
 StopReason = Literal["cancel", "shutdown"]
 EXIT_ERRORS = {2: "InputError", 3: "RefinementError"}  # deterministic: another attempt would end the same
+# Ours to mend, not the user's: a checkpoint of an older version, for example. The job starts over.
+STALE_CHECKPOINT = {"output_not_resumable", "checkpoint_invalid"}
 LOG_NAME = "log.txt"
 
 
@@ -137,7 +139,10 @@ class Attempt:
                 await self._ledger.cancelled(artifacts, *keep)
             return False
         if status in EXIT_ERRORS:
-            await self._ledger.fail(self._reported_error(), await self._upload_result(log_only=True), *keep)
+            error = self._reported_error()
+            if error.code in STALE_CHECKPOINT and self._claim.checkpoint is not None:
+                return await self._crashed(error.detail, forget_checkpoint=True)
+            await self._ledger.fail(error, await self._upload_result(log_only=True), *keep)
             return False
         if self._stop_reason == "cancel":
             await self._ledger.cancelled(await self._upload_result(), *keep)
@@ -155,11 +160,12 @@ class Attempt:
             return False
         return await self._crashed(f"exit status {status}")
 
-    async def _crashed(self, how: str) -> bool:
+    async def _crashed(self, how: str, *, forget_checkpoint: bool = False) -> bool:
         tail = log_tail(self._log)
         if self._claim.attempt < self._settings.max_attempts:
+            said = {"how": how, "log_tail": tail}
             return await self._ledger.give_back(
-                "attempt_crashed", {"how": how, "log_tail": tail}, counted=True
+                "attempt_crashed", said, counted=True, forget_checkpoint=forget_checkpoint
             )
         error = crashed_too_often(self._claim.attempt, tail)
         error = error.model_copy(update={"detail": f"{error.detail} The last time: {how}."})

@@ -7,6 +7,7 @@ import json
 import logging
 import shutil
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,9 @@ async def check_files(files: FileStore, members: Sequence[tuple[str, str]], sett
     """Run the check program on the files, given as (key, path). Its crash or timeout is a rejection too."""
     parent = settings.scratch_dir / "checks"
     parent.mkdir(parents=True, exist_ok=True)
+    for old in parent.iterdir():  # of processes that were killed
+        if time.time() - old.stat().st_mtime > 2 * settings.check_timeout_s:
+            shutil.rmtree(old, ignore_errors=True)
     folder = Path(tempfile.mkdtemp(dir=parent))
     try:
         dataset = folder / "input"

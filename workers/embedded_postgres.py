@@ -112,7 +112,12 @@ class EmbeddedPostgres:
 
     def _reachable_root(self, root: Path) -> Path:
         root = root.absolute()
-        root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        try:
+            root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        except OSError as error:
+            raise SetupError(
+                "folder_unusable", f"Cannot create {root}: {error.strerror}. Set BIRESNERF_DATA_DIR."
+            ) from error
         root = root.resolve()
         if self.user is None or reachable(root.parent, self.user, only_pass=True):
             return root
@@ -133,7 +138,12 @@ class EmbeddedPostgres:
     def _take_lock(self) -> None:
         if self._lock is not None:
             return
-        lock = (self.root / "lock").open("a")
+        try:
+            lock = (self.root / "lock").open("a")
+        except OSError as error:
+            raise SetupError(
+                "folder_unusable", f"Cannot write to {self.root}: {error.strerror}. Set BIRESNERF_DATA_DIR."
+            ) from error
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the kernel frees it, however we die
         except BlockingIOError:

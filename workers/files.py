@@ -17,7 +17,7 @@ import obstore
 from obstore.store import LocalStore
 
 from biresnerf.errors import InputError
-from workers.errors import LimitReached, NotFound, SetupError
+from workers.errors import LimitReached, NotFound, SetupError, Unavailable
 from workers.records import Record
 
 CHUNK_BYTES = 2**20
@@ -78,7 +78,10 @@ class FileStore:
                     mend="Send the file again.",
                 )
 
-        await obstore.put_async(self._store, _checked(key), measured(), chunk_size=PART_BYTES)
+        try:
+            await obstore.put_async(self._store, _checked(key), measured(), chunk_size=PART_BYTES)
+        except obstore.exceptions.BaseError as error:
+            raise Unavailable("storage_unavailable", f"Cannot store {key}: {error}") from error
         return (await self.head(key)).model_copy(update={"sha256": digest.hexdigest()})
 
     async def put_path(self, key: str, path: Path) -> StoredFile:

@@ -167,7 +167,9 @@ class Ledger:
 
         await self._fenced(write, done=None)
 
-    async def give_back(self, event: EventType, data: dict[str, Any], *, counted: bool) -> bool:
+    async def give_back(
+        self, event: EventType, data: dict[str, Any], *, counted: bool, forget_checkpoint: bool = False
+    ) -> bool:
         """Back to the queue, the attempt counted or not; False if the job was cancelled instead."""
 
         async def write(connection: Connection) -> bool:
@@ -175,8 +177,9 @@ class Ledger:
                 await _finish(connection, self.claim.job_id, "cancelled", None)
                 return False
             await connection.execute(
-                "UPDATE jobs SET state = 'queued', attempt = attempt - %s, eta_s = NULL WHERE id = %s",
-                (0 if counted else 1, self.claim.job_id),
+                "UPDATE jobs SET state = 'queued', attempt = attempt - %s, eta_s = NULL,"
+                " checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END WHERE id = %s",
+                (0 if counted else 1, forget_checkpoint, self.claim.job_id),
             )
             await _add_event(connection, self.claim.job_id, event, data)
             return True

@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import IO, TypeVar
 
 from procrastinate import JobContext, RetryStrategy
+from procrastinate.exceptions import ConnectorException
 from procrastinate.job_context import AbortReason
 from procrastinate.worker import Worker
 
 from workers.attempt import Attempt
 from workers.beat import Beat
-from workers.database import QUEUE, TASK, Database, open_database
+from workers.database import QUEUE, TASK, Database, first_line, open_database
 from workers.errors import SetupError
 from workers.files import FileStore
 from workers.janitor import Janitor, release_worker
@@ -160,7 +161,7 @@ class Slot:
         if gpu:
             variables["CUDA_VISIBLE_DEVICES"] = gpu[1]
         if self._settings.slots > 1 and "OMP_NUM_THREADS" not in os.environ:
-            share = max(1, len(os.sched_getaffinity(0)) // self._settings.slots)
+            share = max(1, (os.cpu_count() or 1) // self._settings.slots)
             variables |= {"OMP_NUM_THREADS": str(share), "NUMBA_NUM_THREADS": str(share)}
         return variables
 
@@ -192,6 +193,10 @@ def main() -> int:
     except SetupError as error:
         sys.stderr.write(f"{error.what}\n")
         return 2
+    except ConnectorException as error:
+        # Only while idle; the supervisor starts us again, and until the database is back there is no work.
+        log.error("lost the database: %s", first_line(error))
+        return 1
     return 0
 
 

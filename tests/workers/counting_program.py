@@ -49,6 +49,15 @@ with open(plan["journal"], "a") as journal:
     journal.write("\n")
 sys.stderr.write(f"counting from {start}\n")
 sys.stdout.write("a line of a library that is no report\n")
+if plan.get("outdated") and state.exists():
+    said = {
+        "code": "checkpoint_invalid",
+        "detail": "was written by another version.",
+        "where": "",
+        "mend": "",
+    }
+    (folder / "error.json").write_text(json.dumps(said))
+    sys.exit(2)
 if plan.get("refuse"):
     said = {
         "code": "pose_file_invalid",

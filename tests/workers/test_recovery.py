@@ -132,6 +132,20 @@ async def test_a_mistake_of_the_user_is_not_tried_again(counting: Counting, sett
     assert (job.error.code, job.error.where) == ("pose_file_invalid", "transforms.json")
 
 
+async def test_a_checkpoint_that_cannot_be_used_is_dropped_and_the_job_starts_over(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    first = slots.start(settings, "a")
+    await counting.submit(40, 0.03, outdated=True)
+    await counting.until(lambda job: job.progress.step >= 10)
+    first.terminate()
+    await asyncio.to_thread(first.wait, 10)
+    slots.start(settings, "a")
+    job = await counting.until_final()
+    assert job.state == "succeeded"
+    assert [start["from"] for start in counting.starts()][::2] == [0, 0]
+
+
 async def test_a_job_that_takes_too_long_ends_with_a_timeout(
     counting: Counting, settings: Settings, slots: Slots
 ):

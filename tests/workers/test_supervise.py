@@ -92,6 +92,21 @@ async def test_kill_9_of_the_database_in_mid_job_is_survived(up: Up, tmp_path: P
     assert up.process.poll() is None
 
 
+async def test_an_outage_longer_than_the_stall_time_takes_no_job_from_a_living_worker(up: Up, tmp_path: Path):
+    up.settings = up.settings.model_copy(update={"slots": 2})
+    client = await up.start()
+    async with opened(client, tmp_path / "journal") as counting:
+        await counting.submit(160, 0.05)
+        await counting.until(lambda job: job.progress.step >= 10)
+        os.kill(up.process.pid, signal.SIGSTOP)  # nobody starts the database again
+        up.one("postgres").kill()
+        await asyncio.sleep(2.5 * up.settings.stall_s)
+        os.kill(up.process.pid, signal.SIGCONT)
+        job = await counting.until_final()
+        assert (job.state, job.attempt) == ("succeeded", 1)
+        assert len(counting.starts()) == 1
+
+
 async def test_kill_9_of_the_slot_resumes_the_job_at_once(up: Up, tmp_path: Path):
     client = await up.start()
     async with opened(client, tmp_path / "journal") as counting:
