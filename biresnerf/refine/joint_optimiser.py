@@ -95,7 +95,8 @@ class JointOptimiser:
         self.rays = max(RAYS_LEAST, self.schedule.samples(0, None) // 64)
 
     def marching(self, interval: float) -> Marching:
-        return Marching(interval, self.frame.near, self.frame.far, MOST_SAMPLES, self.occupancy.occupied)
+        near = self.frame.distance * self.schedule.near(self.step_index, self.switch)
+        return Marching(interval, near, self.frame.far, MOST_SAMPLES, self.occupancy.occupied)
 
     def cast(self, matrix: Tensor, image: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
         """Origin and direction [rays, 3] in the unit frame of pixels `xy` [rays, 2] seen by cameras of images.
@@ -123,9 +124,9 @@ class JointOptimiser:
             if jitter
             else torch.full((count,), 0.5)
         )
-        rays = Rays(
-            origin, direction, self.background.expand(count, 3).contiguous(), start.to(self.device), trained
-        )
+        background = self.background.expand(count, 3).contiguous()
+        share = self.schedule.view_share(self.step_index)
+        rays = Rays(origin, direction, background, start.to(self.device), trained, share)
         return self.field.render(rays, self.marching(interval), gradient)
 
     def step(self) -> StepResult:

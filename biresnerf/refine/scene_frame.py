@@ -23,7 +23,6 @@ logger = logging.getLogger(__name__)
 CONVERGING = 0.01
 FORWARD_FACING_DEPTH = 6.0  # in spreads of the camera centres, where nothing better is known
 ALPHA_MARGIN = 1.15  # poses are noisy: the silhouettes' box is widened by this
-NEAR_SHARE = 0.05  # of the mean distance: nearer than this nothing is sampled
 FAR_BOXES = 60.0  # unbounded rays end this many inner boxes away (contracted to 1.98 of 2)
 
 
@@ -41,7 +40,6 @@ class SceneFrame:
     unbounded: bool
     distance: float
     pixel: float
-    near: float
     far: float
     background: np.ndarray | None
 
@@ -93,7 +91,6 @@ def scene_frame(dataset: Dataset, images: ImageSet) -> SceneFrame:
         unbounded=images.background is None,
         distance=distance / half,
         pixel=2 * _half_angle_tangent(images) / widest * distance / half,
-        near=NEAR_SHARE * distance / half,
         far=FAR_BOXES if images.background is None else 4 * distance / half + 4,
         background=images.background,
     )

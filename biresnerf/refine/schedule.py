@@ -11,10 +11,17 @@ from biresnerf.field.radiance_field import FieldRates, PositionGradient
 COARSE_INTERVAL = 2.5e-2  # ray marching interval at the start, unit lengths: half a cell of the pose module
 FINE_INTERVAL = 3.3e-3  # BAA-NGP's 5e-3 in a box of side 3
 INTERVAL_PIXELS = 0.4  # no finer than this share of a pixel
+NEAR_SHARES = (
+    0.4,
+    0.1,
+)  # of the cameras' distance: nothing nearer is sampled, at the start and from the switch on.
+# A field that may put colour right before each camera explains any photo from any pose.
 UNPRUNED_SHARE = 0.1  # of the least length of stage 1: until then every cell counts as occupied
 RAMP_SHARE = 0.75  # of the greatest length of stage 1: the interval has reached its fine value
 BLUR_END_SHARE = 0.6  # of the greatest length of stage 1: photos are sharp from then on
 BLUR_PIXELS = 0.03  # blur at the start, as a share of the long side (6 px of 200)
+LEVELS_OPEN_SHARE = 0.3  # of the least length of stage 1: all levels of the pose module are open from then on
+VIEW_SHARES = (0.3, 0.6)  # of the least length of stage 1: colour may depend on the view from .. fully from
 FIELD_START, POSE_START = 200, 500  # steps of the paper's 40 000 over which rates rise from zero
 POSE_DIP = 0.05  # pose rate right after the switch, as a share
 POSE_STAGE2_CAP = 1e-3
@@ -51,6 +58,12 @@ class Schedule:
             return self.fine_interval
         share = min(1.0, step / (RAMP_SHARE * self._option("coarse_steps_max")))
         return max(self.fine_interval, COARSE_INTERVAL * (self.fine_interval / COARSE_INTERVAL) ** share)
+
+    def near(self, step: int, switch: int | None) -> float:
+        """Distance that sampling starts at, as a share of the cameras' distance."""
+        start, end = NEAR_SHARES
+        share = 1.0 if switch is not None else min(1.0, step / self._option("coarse_steps_max"))
+        return start * (end / start) ** share
 
     def samples(self, step: int, switch: int | None) -> int:
         """Samples a step: half of the budget at the start of stage 1, all of it from its end."""
@@ -90,7 +103,7 @@ class Schedule:
             "field", step / self.steps
         )
         if switch is None:
-            return FieldRates(rate, rate, (), 0.0)
+            return FieldRates(self._pose_levels(rate, step), rate, (), 0.0)
         warmup = self._option("warmup_steps")
         q = (step - switch + 1) / warmup
         rate *= FIELD_DIP + (1 - FIELD_DIP) * smooth_ramp(q)
@@ -98,7 +111,18 @@ class Schedule:
         levels = int(self._option("reconstruction_levels"))
         # Level by level, about three at a time; the last opens as the warm-up ends.
         opened = [smooth_ramp(6 * q - 5 * level / max(1, levels - 1)) for level in range(levels)]
-        return FieldRates(rate, rate, tuple(high * r for r in opened), high)
+        return FieldRates(self._pose_levels(rate, step), rate, tuple(high * r for r in opened), high)
+
+    def _pose_levels(self, rate: float, step: int) -> tuple[float, ...]:
+        """The pose module's levels open one after another, coarsest first."""
+        levels, span = int(self.options.pose_levels), LEVELS_OPEN_SHARE * self._option("coarse_steps_min")
+        progress = (levels - 1) * step / span if span > 0 else levels
+        return tuple(rate * (smooth_ramp(progress - level + 1) if level else 1.0) for level in range(levels))
+
+    def view_share(self, step: int) -> float:
+        """How much colour may depend on the view: not at first, or the field explains wrong poses away."""
+        start, end = (share * self._option("coarse_steps_min") for share in VIEW_SHARES)
+        return smooth_ramp((step - start) / max(end - start, 1.0))
 
     def position_gradient(self, step: int, switch: int | None) -> PositionGradient:
         """Straight-through smoothing, and how much of the reconstruction module's gradient reaches the poses."""
