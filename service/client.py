@@ -20,7 +20,6 @@ from service.problems import Problem
 from service.schemas import ArtifactView, DatasetView, JobView
 from workers.records import FINAL_JOB_STATES
 
-_CHUNK = 2**18
 # The server's keep-alive comes every 15 s; three missed ones mean that the connection is dead.
 _SILENCE_S = 50.0
 _POLL_S = 0.5
@@ -210,7 +209,7 @@ class Client:
             if answer.status_code != (206 if start else 200):
                 answer.read()
                 raise _refusal(answer)
-            yield from answer.iter_raw(_CHUNK)
+            yield from answer.iter_raw()
 
     def _ask(self, model: type[Model], method: str, path: str, **arguments: Any) -> Model:
         return _known(model, self._send(method, path, **arguments).json())

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import logging
-import os
 import socket
 import sys
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from biresnerf.commands.settings_option import settings_option
 from biresnerf.errors import InputError
+
+if TYPE_CHECKING:
+    from workers.settings import Settings
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 
@@ -23,6 +27,33 @@ def free_port() -> int:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
+
+
+def settings_with(**given: Any) -> Settings:
+    """The settings of the environment, with those given (not None) in their place."""
+    from workers.settings import Settings
+
+    return Settings(**{name: value for name, value in given.items() if value is not None})
+
+
+@contextmanager
+def setup_problems() -> Iterator[None]:
+    """Turns what the operator has to change into an `InputError`."""
+    from pydantic import ValidationError
+
+    from workers.errors import SetupError
+
+    try:
+        yield
+    except SetupError as error:
+        raise InputError(error.code, error.what) from None
+    except ValidationError as error:
+        lines = [
+            f"BIRESNERF_{'_'.join(map(str, item['loc'])).upper()}: {item['msg']}." for item in error.errors()
+        ]
+        raise InputError(
+            "invalid_settings", " ".join(lines), mend="Change these environment variables."
+        ) from None
 
 
 @click.command("up")
@@ -42,22 +73,17 @@ def up_command(host: str | None, port: int | None, slots: int | None, data_dir: 
     """
     import asyncio
 
-    from workers.errors import SetupError
-    from workers.settings import Settings
     from workers.supervise import ChildSpec, slot_specs, supervise
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s up %(levelname)s %(message)s")
-    given = {"host": host, "port": port, "slots": slots, "data_dir": data_dir}
-    try:
-        settings = Settings(**{key: value for key, value in given.items() if value is not None})  # type: ignore[arg-type]
+    with setup_problems():
+        settings = settings_with(host=host, port=port, slots=slots, data_dir=data_dir)
         if settings.port == 0:
             settings = settings.model_copy(update={"port": free_port()})
         variables = {"BIRESNERF_HOST": settings.host, "BIRESNERF_PORT": str(settings.port)}
         api = ChildSpec("api", (sys.executable, "-m", "service.server"), variables)
         ready = _announcer(settings.host, settings.port)
         sys.exit(asyncio.run(supervise(settings, [api, *slot_specs(settings)], on_ready=ready)))
-    except (SetupError, ValueError) as error:
-        raise _setup_problem(error) from None
 
 
 def _announcer(host: str, port: int) -> Callable[[str], Coroutine[None, None, None]]:
@@ -85,13 +111,11 @@ def _answers(url: str) -> bool:
 @click.option("--port", type=click.IntRange(0, 65535), help="0 takes a free one.")
 def api_command(host: str | None, port: int | None) -> None:
     """Run the web process alone (needs BIRESNERF_DATABASE_URL and `biresnerf migrate`)."""
-    if host is not None:
-        os.environ["BIRESNERF_HOST"] = host
-    if port is not None:
-        os.environ["BIRESNERF_PORT"] = str(port)
-    from service.server import main
+    from service.server import serve
 
-    sys.exit(main())
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s api %(levelname)s %(message)s")
+    with setup_problems():
+        serve(settings_with(host=host, port=port))
 
 
 @click.command("worker")
@@ -100,6 +124,8 @@ def worker_command(slot: str) -> None:
     """Run one worker slot: one job at a time (needs BIRESNERF_DATABASE_URL and `biresnerf migrate`)."""
     from workers.slot import main
 
+    with setup_problems():
+        settings_with().require_database_url()
     sys.argv = ["biresnerf worker", "--slot", slot]
     sys.exit(main())
 
@@ -107,47 +133,32 @@ def worker_command(slot: str) -> None:
 @click.command("migrate")
 def migrate_command() -> None:
     """Bring the database at BIRESNERF_DATABASE_URL up to date."""
-    from workers.errors import SetupError
     from workers.migrate import migrate
-    from workers.settings import Settings
 
-    try:
-        applied = migrate(Settings().require_database_url())
-    except (SetupError, ValueError) as error:
-        raise _setup_problem(error) from None
+    with setup_problems():
+        applied = migrate(settings_with().require_database_url())
     click.echo("\n".join(f"applied {name}" for name in applied) or "The database is up to date.")
 
 
 @click.command("submit")
 @click.argument("path", type=click.Path(path_type=Path))
 @click.option("--preset", help="fast, balanced, quality or paper.")
-@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="An option; may be repeated.")
+@settings_option
 @click.option("--wait", is_flag=True, help="Show progress until the job is over.")
 @click.option("--output", type=click.Path(path_type=Path), help="Download the result here; implies --wait.")
 @click.option(
     "--url", envvar="BIRESNERF_URL", default=DEFAULT_URL, show_default=True, help="Where the service is."
 )
 def submit_command(
-    path: Path, preset: str | None, settings: tuple[str, ...], wait: bool, output: Path | None, url: str
+    path: Path, preset: str | None, settings: dict[str, Any], wait: bool, output: Path | None, url: str
 ) -> None:
     """Send PATH (a folder or a transforms.json with its images) to a service.
 
     Exit status: 0 done, 2 the input or options have to change, 1 anything else. Ctrl-C ends the waiting; the
     job goes on.
     """
+    from biresnerf.config import parse_options
     from service.submit import run_submit
 
-    run_submit(path, preset, settings, wait=wait, output=output, url=url)
-
-
-def _setup_problem(error: Exception) -> InputError:
-    what = getattr(error, "what", None) or "; ".join(
-        f"BIRESNERF_{'_'.join(str(part) for part in item['loc']).upper()}: {item['msg']}"
-        for item in _items(error)
-    )
-    return InputError(getattr(error, "code", "invalid_settings"), what)
-
-
-def _items(error: Exception) -> list[dict[str, Any]]:
-    errors = getattr(error, "errors", None)
-    return errors() if callable(errors) else [{"loc": ("settings",), "msg": str(error)}]
+    options = parse_options({**settings, **({"preset": preset} if preset else {})})
+    run_submit(path, options, wait=wait, output=output, url=url)

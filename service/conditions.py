@@ -7,7 +7,7 @@ import re
 from service.problems import ProblemError
 
 _ETAG = re.compile(r'(?:W/)?"[\x21\x23-\x7e\x80-\xff]*"')
-_RANGE = re.compile(r"^(\d*)-(\d*)$")
+_RANGE = re.compile(r"^(\d{0,18})-(\d{0,18})$", re.ASCII)
 
 
 def none_match(header: str | None, etag: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -53,8 +54,8 @@ def look_at(path: Path) -> Scene:
 
 def _name_below(root: Path, path: Path) -> str:
     try:
-        name = path.absolute().relative_to(root.absolute()).as_posix()
-        return checked_path(name)
+        # Not resolved: a link inside the folder may lead to wherever its owner likes.
+        name = Path(os.path.abspath(path)).relative_to(os.path.abspath(root)).as_posix()
     except ValueError:
         raise InputError(
             "image_outside",
@@ -62,6 +63,7 @@ def _name_below(root: Path, path: Path) -> str:
             where=str(path),
             mend="Move it below that folder, or run `biresnerf refine` on this machine.",
         ) from None
+    return checked_path(name)
 
 
 def _scene(files: list[tuple[str, Path]]) -> Scene:

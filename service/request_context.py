@@ -6,6 +6,7 @@ import errno
 import logging
 import re
 import uuid
+from urllib.parse import quote
 
 from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
@@ -26,7 +27,7 @@ def request_id(request: Request) -> str:
 
 def render(error: ProblemError, request: Request) -> Response:
     """The answer that tells the problem."""
-    body = error.problem(instance=request.url.path, request_id=request_id(request))
+    body = error.problem(instance=quote(request.scope["path"]), request_id=request_id(request))
     return Response(
         body.model_dump_json(exclude_none=True),
         status_code=error.status,
@@ -71,7 +72,9 @@ def _last_net(error: Exception, request: Request) -> ProblemError:
     if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
         logger.error("no room left: %s", error)
         return ProblemError("storage_full", "The disk of the service is full.")
-    logger.exception("request %s %s %s failed", request_id(request), request.method, request.url.path)
+    logger.exception(
+        "request %s %s %s failed", request_id(request), request.method, quote(request.scope["path"])
+    )
     return ProblemError(
         "internal_error", "The request could not be served; the log of the service tells why."
     )

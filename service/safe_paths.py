@@ -30,7 +30,8 @@ def checked_path(name: str) -> str:
 
 def _fault(name: str) -> str | None:
     parts = name.split("/")
-    if any(unicodedata.category(char) in {"Cc", "Cs", "Zl", "Zp"} for char in name):
+    # U+FFFD stands where bytes could not be decoded.
+    if any(char == "\ufffd" or unicodedata.category(char) in {"Cc", "Cs", "Zl", "Zp"} for char in name):
         return "The name has a control character or bytes that are not text."
     if "\\" in name:
         return "The name has a backslash."

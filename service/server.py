@@ -10,6 +10,7 @@ from types import FrameType
 
 import uvicorn
 from fastapi import FastAPI
+from pydantic import ValidationError
 
 from service.app import create_app
 from workers.errors import SetupError
@@ -77,8 +78,8 @@ def main() -> int:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s api %(levelname)s %(message)s")
     try:
         serve(Settings())
-    except SetupError as error:
-        sys.stderr.write(f"{error.what}\n")
+    except (SetupError, ValidationError) as error:
+        sys.stderr.write(f"{error}\n")
         return 2
     return 0
 

@@ -2,41 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
-from typing import Any
 
 import click
 from rich.console import Console
 
-from biresnerf.config import RefineOptions, parse_options
+from biresnerf.config import RefineOptions
 from biresnerf.errors import BiresnerfError, InputError
 from service.client import Client, ServiceError
 from service.pack import Scene, look_at, zipped
 from service.progress_view import progress_view, watch
 from service.safe_paths import checked_path
-from service.schemas import JobView
-
-
-def options_from(preset: str | None, settings: tuple[str, ...]) -> RefineOptions:
-    """Options from a preset and ``key=value`` texts; raises `InputError`."""
-    values: dict[str, Any] = {} if preset is None else {"preset": preset}
-    for text in settings:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise InputError(
-                "invalid_options", f"{text!r} is not key=value.", where="--set", mend="Write --set seed=7."
-            )
-        values[key.strip()] = _value(value.strip())
-    return parse_options(values)
-
-
-def _value(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
+from service.schemas import DatasetView, JobView
 
 
 def submit_scene(client: Client, scene: Scene, name: str, options: RefineOptions) -> JobView:
@@ -51,7 +29,7 @@ def submit_scene(client: Client, scene: Scene, name: str, options: RefineOptions
         raise
 
 
-def _forget(client: Client, dataset: Any) -> None:
+def _forget(client: Client, dataset: DatasetView) -> None:
     try:
         client.delete_dataset(dataset)
     except ServiceError as error:
@@ -80,11 +58,8 @@ def download_all(client: Client, job: JobView, output: Path) -> list[Path]:
     return written
 
 
-def run_submit(
-    path: Path, preset: str | None, settings: tuple[str, ...], *, wait: bool, output: Path | None, url: str
-) -> None:
+def run_submit(path: Path, options: RefineOptions, *, wait: bool, output: Path | None, url: str) -> None:
     """The command's work; raises `InputError` (the user's to mend) or another `BiresnerfError`."""
-    options = options_from(preset, settings)
     if output is not None:
         require_empty(output)
     scene = look_at(path)

@@ -127,14 +127,14 @@ class _Sink:
                 mend="Send smaller files.",
             )
         if self.bytes > self.budget:
-            what = (
-                f"The archive unpacks to more than {self.request.ratio_max:g} times its size."
-                if self._by_ratio
-                else f"The archive unpacks to more than {self.budget} bytes."
-            )
-            raise InputError(
-                "archive_too_large", what, where=self.current, mend="Send fewer or smaller images."
-            )
+            raise self.over_budget()
+
+    def over_budget(self) -> InputError:
+        """More came out than may."""
+        what = f"The archive unpacks to more than {self.budget} bytes."
+        if self._by_ratio:
+            what = f"The archive unpacks to more than {self.request.ratio_max:g} times its size."
+        return InputError("archive_too_large", what, where=self.current, mend="Send fewer or smaller images.")
 
     def _too_many(self) -> InputError:
         return InputError(
@@ -214,12 +214,7 @@ class _CountedReader:
         data = self._plain.read(size)
         self._left -= len(data)
         if self._left < 0:
-            raise InputError(
-                "archive_too_large",
-                "The archive unpacks to more than the service takes.",
-                where=self._sink.current,
-                mend="Send fewer or smaller images.",
-            )
+            raise self._sink.over_budget()
         self.tail = (self.tail + data)[-_TAR_BLOCK:]
         return data
 

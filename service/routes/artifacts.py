@@ -10,6 +10,7 @@ from urllib.parse import quote
 from fastapi import APIRouter, Header, Request
 from fastapi.responses import Response, StreamingResponse
 
+from biresnerf.report import Report
 from service.conditions import byte_range, none_match
 from service.dependencies import JobId, Service, ServiceHere
 from service.problems import ProblemError, declared
@@ -86,6 +87,7 @@ async def get_artifact(
 @router.get(
     "/report",
     operation_id="getReport",
+    response_model=Report,
     responses=declared("not_found", "result_not_ready", "database_unavailable", "internal_error"),
 )
 async def get_report(job_id: JobId, service: ServiceHere) -> Response:

@@ -1,0 +1,56 @@
+"""A job program for the tests: the protocol of `workers.run`, real result files, no torch.
+
+`steps` says how many steps, `seed` how many milliseconds each takes; `threads=77` fails as a diverged job does.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import sys
+import time
+from pathlib import Path
+
+from biresnerf.progress import Progress
+
+folder = Path(sys.argv[1])
+order = json.loads((folder / "job.json").read_text())
+source, output, options = folder / order["input"], folder / order["output"], order["options"]
+steps, step_s = options["steps"], options["seed"] / 1000
+stopping = []
+signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
+
+
+def tell(stage: str, step: int) -> None:
+    progress = Progress(
+        stage=stage,
+        step=step,
+        steps_total=steps,
+        fraction=step / steps,
+        eta_s=(steps - step) * step_s,
+        metrics={"loss": 1.0 / (step + 1)},
+    )
+    sys.stdout.write(progress.model_dump_json() + "\n")
+    sys.stdout.flush()
+
+
+tell("preparing", 0)
+if options["threads"] == 77:
+    said = {"code": "diverged", "detail": "The loss is not finite.", "where": "", "mend": ""}
+    (folder / "error.json").write_text(json.dumps(said))
+    sys.exit(3)
+for step in range(1, steps + 1):
+    time.sleep(step_s)
+    tell("coarse" if step < steps / 2 else "fine", step)
+    if stopping:
+        sys.exit(143)
+poses = next(source.rglob("transforms*.json"))
+shutil.copy(poses, output / "transforms.json")
+(output / "colmap" / "sparse" / "0").mkdir(parents=True)
+(output / "colmap" / "sparse" / "0" / "cameras.bin").write_bytes(bytes(8))
+(output / "renders").mkdir()
+(output / "renders" / "orbit.mp4").write_bytes(bytes(range(256)) * 40)
+(output / "renders" / "Blick über «Dach».png").write_bytes(b"\x89PNG")
+(output / "report.json").write_text(json.dumps({"state": "complete", "options": options}))
+tell("exporting", steps)
