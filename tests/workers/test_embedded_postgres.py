@@ -19,7 +19,7 @@ from tests.workers.conftest import ROOT, short_folder
 from workers.embedded_postgres import SOCKET_NAME, SOCKET_PATH_MAX, EmbeddedPostgres
 from workers.errors import SetupError
 from workers.migrate import migrate
-from workers.postgres_binaries import find_binaries, server_version
+from workers.postgres_binaries import find_binaries, server_version, unprivileged_user
 
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root has another user run the server")
 LAUNCHER = """
@@ -94,7 +94,7 @@ def test_it_dies_with_its_launcher_and_starts_over_a_forged_pid_file(folder: Pat
     assert alive == []
     pid_file = folder / "postgres" / "data" / "postmaster.pid"
     assert not pid_file.exists(), "a clean shutdown"
-    with subprocess.Popen(["sleep", "60"]) as bystander:
+    with subprocess.Popen(["sleep", "60"], user=unprivileged_user()) as bystander:
         pid_file.write_text(
             f"{bystander.pid}\n{folder}/postgres/data\n1700000000\n5432\n{folder}\n\n0 0\nready\n"
         )

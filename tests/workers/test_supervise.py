@@ -16,6 +16,7 @@ import psutil
 import pytest
 
 from tests.workers.conftest import ROOT, Counting, Slots, environment, quick_settings, short_folder
+from workers.postgres_binaries import unprivileged_user
 from workers.settings import Settings
 from workers.stores import open_stores
 
@@ -131,7 +132,7 @@ async def test_kill_9_of_the_supervisor_leaves_nothing_and_the_next_one_goes_on(
         assert alive == []
         # What a power cut leaves behind: the pid of a process that is somebody else's now.
         pid_file = up.settings.postgres_dir / "data" / "postmaster.pid"
-        bystander = subprocess.Popen(["sleep", "60"])
+        bystander = subprocess.Popen(["sleep", "60"], user=unprivileged_user())
         pid_file.write_text(f"{bystander.pid}\n{up.settings.postgres_dir}/data\n1700000000\n5432\n\n\n0 0\n")
         began = time.monotonic()
         await up.start()
