@@ -162,3 +162,28 @@ def submit_command(
 
     options = parse_options({**settings, **({"preset": preset} if preset else {})})
     run_submit(path, options, wait=wait, output=output, url=url)
+
+
+@click.command("demo")
+@click.option("--scene", type=click.Path(path_type=Path), help="Your own folder or transforms.json.")
+@click.option("--output", type=click.Path(path_type=Path), default=Path("demo-output"), show_default=True)
+@click.option("--preset", default="fast", show_default=True, help="fast, balanced, quality or paper.")
+@click.option(
+    "--views", type=click.IntRange(6, 400), default=60, show_default=True, help="Of the made scene."
+)
+@click.option(
+    "--size", type=click.IntRange(32, 800), default=100, show_default=True, help="Of its images, px."
+)
+@settings_option
+def demo_command(
+    scene: Path | None, output: Path, preset: str, views: int, size: int, settings: dict[str, Any]
+) -> None:
+    """Show a whole job: a service of its own, bad poses in, good poses out.
+
+    Without --scene a synthetic scene is made, whose true poses are known; each camera is then turned and
+    shifted at random (14 degrees on average). Everything lies in OUTPUT afterwards.
+    """
+    from biresnerf.config import parse_options
+    from service.demo import run_demo
+
+    run_demo(scene, output, parse_options({**settings, "preset": preset}), views, size)
