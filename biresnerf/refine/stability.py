@@ -19,6 +19,8 @@ SLOPE_DB = 0.15  # net change over the window that still counts as flat
 FLUCTUATION_DB = 0.35  # standard deviation about the line that still counts as calm
 CONFIRMATIONS = 2
 RISING_BLOCKS = 3  # blocks in a row with rising error that mean divergence
+# A rollback is dear, and a plateau's noise rises by itself half of the time: the rise over the window must stand out.
+RISE_DB, RISE_FLUCTUATIONS = 0.5, 4.0
 STILL_DEG = 0.05  # 90 % quantile of rotation change per block below which cameras have settled
 
 
@@ -45,7 +47,8 @@ class StabilityDetector:
             change, fluctuation, imbalance = self._trend()
             tolerance = max(SLOPE_DB, fluctuation)
             flat = abs(change) <= tolerance and fluctuation <= FLUCTUATION_DB and imbalance <= WINDOW // 2
-            self.rising = self.rising + 1 if change < -tolerance else 0
+            risen = change < -max(RISE_DB, RISE_FLUCTUATIONS * fluctuation)
+            self.rising = self.rising + 1 if risen else 0
             self.confirmed = self.confirmed + 1 if flat and moved_deg < self.motion_deg else 0
             if self.rising >= RISING_BLOCKS:
                 return "diverging"
