@@ -50,7 +50,6 @@ class Attempt:
         self._stop_reason: StopReason | None = None
         self._stop = asyncio.Event()
         self._timed_out = False
-        self._child: Child | None = None
 
     def ask_stop(self, reason: StopReason) -> None:
         """End soon: the process writes a checkpoint and exits. A cancellation outweighs a shutdown."""
@@ -70,8 +69,6 @@ class Attempt:
             log.exception("attempt %s of %s failed on our side", self._claim.name, self._claim.job_id)
             return await self._crashed(f"{type(error).__name__}: {error}")
         finally:
-            if self._child is not None:
-                self._child.kill()
             shutil.rmtree(self._folder, ignore_errors=True)
 
     async def _run_process(self) -> int | None:
@@ -83,7 +80,7 @@ class Attempt:
             return None
         await staging
         command, variables = self._settings.job_command, self._variables
-        child = self._child = await Child.start(command, self._folder, self._log, variables)
+        child = await Child.start(command, self._folder, self._log, variables)
         courier = Courier(self._ledger, self._files, self._output)
         carrying = asyncio.create_task(courier.run())
         pumping = asyncio.create_task(self._pump(child, courier))
@@ -104,6 +101,7 @@ class Attempt:
             await carrying
             return status
         finally:
+            child.kill()
             for task in (carrying, pumping, ended):
                 task.cancel()
 

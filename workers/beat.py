@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import psycopg
 
-from workers.database import first_line
+from workers.database import CONNECT, first_line
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ class Beat(threading.Thread):
                 continue
             try:
                 if connection is None or connection.closed:
-                    connection = psycopg.connect(self._url, autocommit=True, connect_timeout=5)
+                    connection = psycopg.connect(self._url, autocommit=True, **CONNECT)
                 connection.execute("SELECT procrastinate_update_heartbeat_v1(%s)", (worker_id,))
             except psycopg.Error as error:
                 log.warning("no sign of life: %s", first_line(error))

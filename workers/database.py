@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 import re
+import time
 from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
 from typing import Any, LiteralString
@@ -26,8 +27,16 @@ Connection = psycopg.AsyncConnection[DictRow]
 AWAY = (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout, PoolClosed)
 QUEUE = "refine"
 TASK = "refine"
+# A peer that vanished without a word (a host that lost power) is noticed within a minute.
+CONNECT: dict[str, Any] = {
+    "connect_timeout": 5,
+    "keepalives_idle": 30,
+    "keepalives_interval": 10,
+    "keepalives_count": 3,
+}
 LISTEN_CHANNEL = "biresnerf_jobs"
 RECONNECT_S = 1.0
+QUIET_S = 60.0  # between two warnings of the same outage
 
 
 class PatientConnector(PsycopgConnector):
@@ -35,12 +44,14 @@ class PatientConnector(PsycopgConnector):
 
     async def listen_notify(self, on_notification: Notify, channels: Iterable[str]) -> None:
         """Listen for ever; while the database is away, try again each second (polling fills the gap)."""
-        wanted = list(channels)
+        wanted, said_at = list(channels), 0.0
         while True:
             try:
                 await super().listen_notify(on_notification, wanted)
             except (ConnectorException, *AWAY) as error:
-                log.warning("queue listener lost the database (%s)", first_line(error))
+                if time.monotonic() - said_at > QUIET_S:
+                    said_at = time.monotonic()
+                    log.warning("queue listener lost the database (%s)", first_line(error.__cause__ or error))
                 await asyncio.sleep(1)
 
 
@@ -99,7 +110,7 @@ async def open_database(
         # The pool's own retries wait twice as long each time: minutes, after an outage of minutes.
         reconnect_timeout=RECONNECT_S,
         reconnect_failed=_keep_trying,
-        kwargs={"row_factory": dict_row, "connect_timeout": 5},
+        kwargs={"row_factory": dict_row, **CONNECT},
         connection_class=psycopg.AsyncConnection[DictRow],
         check=AsyncConnectionPool.check_connection,  # connections killed with the server are replaced unseen
         open=False,
@@ -113,7 +124,7 @@ async def open_database(
             "database_unreachable", f"The database at {without_password(url)} does not answer."
         ) from None
     try:
-        app = App(connector=PatientConnector(conninfo=url, kwargs={"connect_timeout": 5}))
+        app = App(connector=PatientConnector(conninfo=url, kwargs=CONNECT))
         async with app.open_async(pool):
             database = Database(url, pool, app)
             await _require_schema(database)

@@ -14,7 +14,7 @@ from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator
 
 import psycopg
 
-from workers.database import AWAY, LISTEN_CHANNEL, Database, first_line
+from workers.database import AWAY, CONNECT, LISTEN_CHANNEL, QUIET_S, Database, first_line
 from workers.errors import Unavailable
 from workers.records import JobUpdate
 
@@ -43,10 +43,11 @@ class Listener:
 
     async def run(self) -> None:
         """Listen until cancelled; reconnects for ever, and wakes everybody after a gap."""
+        said_at = 0.0
         while True:
             try:
                 async with await psycopg.AsyncConnection.connect(
-                    self._database.url, autocommit=True, connect_timeout=5
+                    self._database.url, autocommit=True, **CONNECT
                 ) as connection:
                     await connection.execute(f"LISTEN {LISTEN_CHANNEL}".encode())
                     for job_id in list(self._waiting):
@@ -54,7 +55,9 @@ class Listener:
                     async for notification in connection.notifies():
                         self._wake(notification.payload)
             except AWAY as error:
-                log.warning("event listener lost the database (%s)", first_line(error))
+                if time.monotonic() - said_at > QUIET_S:
+                    said_at = time.monotonic()
+                    log.warning("event listener lost the database (%s)", first_line(error))
             await asyncio.sleep(0.5)
 
     def _wake(self, job_id: str) -> None:

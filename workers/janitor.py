@@ -102,6 +102,10 @@ class Janitor:
         )
         for row in await cursor.fetchall():
             await release(connection, row["id"], "worker_lost")
+        await connection.execute(
+            "DELETE FROM procrastinate_workers WHERE last_heartbeat < now() - make_interval(secs => %s)",
+            (self._settings.stall_s,),
+        )
 
     async def _release_unacknowledged(self, connection: Connection) -> None:
         """Our own rows that we do not work on: the database went away between the result and the receipt."""

@@ -32,7 +32,7 @@ from workers.settings import Settings
 log = logging.getLogger(__name__)
 
 EXIT_FENCED = 75
-NEVER_S = 86_400.0
+NEVER_S = 10 * 365 * 86_400.0
 T = TypeVar("T")
 
 
@@ -94,7 +94,8 @@ class Slot:
                 concurrency=1,
                 shutdown_graceful_timeout=0.1,  # the attempt writes its checkpoint after this, see `_relay`
                 update_heartbeat_interval=NEVER_S,  # see Beat
-                stalled_worker_timeout=self._settings.stall_s,
+                # It would prune living workers at our start, right after an outage; see Janitor.
+                stalled_worker_timeout=NEVER_S,
                 fetch_job_polling_interval=self._settings.poll_s,
                 abort_job_polling_interval=self._settings.poll_s,
             )
