@@ -97,7 +97,7 @@ async def test_an_outage_longer_than_the_stall_time_takes_no_job_from_a_living_w
     up.settings = up.settings.model_copy(update={"slots": 2})
     client = await up.start()
     async with opened(client, tmp_path / "journal") as counting:
-        await counting.submit(160, 0.05)
+        await counting.submit(250, 0.05)
         await counting.until(lambda job: job.progress.step >= 10)
         (idle,) = [p for p in up.descendants() if "workers.slot" in p.cmdline() and not p.children()]
         postmaster = up.one("postgres")
