@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 
 import procrastinate
@@ -12,7 +13,9 @@ from procrastinate.job_context import AbortReason
 from procrastinate.manager import get_channel_for_queues
 from procrastinate.worker import Worker
 
-from workers.database import QUEUE, open_database
+from tests.workers.conftest import Slots
+from workers.database import QUEUE, Database, open_database
+from workers.files import FileStore
 from workers.janitor import Janitor, release, release_worker
 from workers.settings import Settings
 
@@ -83,7 +86,6 @@ async def test_two_janitors_at_once_release_a_job_once(database_url: str, tmp_pa
             queue_id = await one.enqueue(connection, "job_1")
             await connection.execute("UPDATE jobs SET queue_id = %s", (queue_id,))
             await connection.execute("UPDATE procrastinate_jobs SET status = 'doing'")
-        import asyncio
 
         async def clean(database) -> None:
             async with database.transaction() as connection:
@@ -98,8 +100,6 @@ async def test_two_janitors_at_once_release_a_job_once(database_url: str, tmp_pa
 
 @pytest.mark.anyio
 async def test_a_job_that_the_queue_lost_is_queued_again(database_url: str, settings: Settings, tmp_path):
-    from workers.files import FileStore
-
     async with open_database(database_url) as database:
         async with database.transaction() as connection:
             await connection.execute("INSERT INTO datasets (id, name, state) VALUES ('ds_1', 'x', 'ready')")
@@ -113,3 +113,36 @@ async def test_a_job_that_the_queue_lost_is_queued_again(database_url: str, sett
             "SELECT queue.status FROM jobs JOIN procrastinate_jobs AS queue ON queue.id = jobs.queue_id"
         )
         assert row["status"] == "todo"
+
+
+async def registered(database: Database) -> set[int]:
+    return {row["id"] for row in await database.fetch("SELECT id FROM procrastinate_workers")}
+
+
+@pytest.mark.anyio
+async def test_a_worker_that_starts_does_not_tidy_a_silent_one_away(settings: Settings, slots: Slots):
+    """After an outage everybody has been silent for long; the engine alone would prune the living."""
+    patient = settings.model_copy(
+        update={"stall_s": 3600.0}
+    )  # longer than this server is up: no judgement yet
+    async with open_database(settings.require_database_url()) as database:
+        await database.fetch(
+            "INSERT INTO procrastinate_workers (last_heartbeat) VALUES (now() - interval '1 day')"
+        )
+        (silent,) = await registered(database)
+        slots.start(patient, "a")
+        while len(now := await registered(database)) == 1 and silent in now:
+            await asyncio.sleep(0.05)
+        assert silent in now
+
+
+@pytest.mark.anyio
+async def test_a_silent_worker_is_tidied_away_in_the_end(settings: Settings, slots: Slots):
+    async with open_database(settings.require_database_url()) as database:
+        await database.fetch(
+            "INSERT INTO procrastinate_workers (last_heartbeat) VALUES (now() - interval '1 day')"
+        )
+        (silent,) = await registered(database)
+        slots.start(settings, "a")
+        while silent in await registered(database):
+            await asyncio.sleep(0.05)
