@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 
-from biresnerf.config import RefineOptions
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.images import ImageSet
@@ -17,7 +16,7 @@ from biresnerf.data.write import write_colmap, write_transforms
 from biresnerf.errors import InputError
 from biresnerf.geometry.pose_error import rotation_angle_deg
 from biresnerf.geometry.similarity import Similarity, align_robust
-from biresnerf.refine.checkpoint import CHECKPOINT, load_checkpoint
+from biresnerf.refine.checkpoint import CHECKPOINT, SEEDING
 from biresnerf.refine.evaluation import ViewScore
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.two_stages import TwoStages
@@ -30,7 +29,7 @@ _ANOTHER = "Choose another output folder, or remove this one."
 
 
 class OutputFolder:
-    """Refuses folders that hold something else; creates nothing before `claim`."""
+    """Refuses folders that hold something else; creates nothing before `claim` but what COLMAP answered."""
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
@@ -39,8 +38,10 @@ class OutputFolder:
         """Raise `InputError` unless the folder is new, empty, or holds an unfinished run."""
         if self.path.exists() and not self.path.is_dir():
             raise InputError("output_not_a_folder", "is a file.", where=str(self.path), mend="Name a folder.")
-        if not self.path.is_dir() or not any(self.path.iterdir()) or (self.path / CHECKPOINT).is_file():
+        if not self.path.is_dir() or (self.path / CHECKPOINT).is_file():
             return
+        if not {path.name for path in self.path.iterdir()} - {CHECKPOINT.parent.name}:
+            return  # new, or killed before the first checkpoint
         report = self.path / REPORT
         if report.is_file():
             raise InputError(
@@ -53,10 +54,20 @@ class OutputFolder:
             mend=_ANOTHER,
         )
 
-    def claim(self, fingerprint: str) -> None:
-        """Create the folder. Raises `InputError` if it holds a checkpoint of other input or options."""
-        checkpoint = load_checkpoint(self.path)
-        if checkpoint is not None and checkpoint[1]["fingerprint"] != fingerprint:
+    @property
+    def seeding(self) -> Path:
+        """The file that keeps what COLMAP answered until the run is complete."""
+        return self.path / SEEDING
+
+    def restore_seeding(self, seeding: str | None) -> None:
+        """Put back the answer that a checkpoint carried: it may have come here without its folder."""
+        if seeding is not None:
+            with whole_file(self.seeding) as temporary:
+                temporary.write_text(seeding, "utf-8")
+
+    def claim(self, fingerprint: str, resumed: str | None) -> None:
+        """Create the folder. Raises `InputError` if the fingerprint `resumed` of its checkpoint is another one."""
+        if resumed is not None and resumed != fingerprint:
             raise InputError(
                 "output_not_resumable",
                 "holds an unfinished run of other images, poses or options.",
@@ -64,10 +75,6 @@ class OutputFolder:
                 mend=_ANOTHER,
             )
         self.path.mkdir(parents=True, exist_ok=True)
-
-    def write_config(self, options: RefineOptions) -> None:
-        """config.json: every option as used."""
-        self._write_text(CONFIG, options.model_dump_json(indent=2))
 
     def write_view(self, names: tuple[str, ...], images: ImageSet, score: ViewScore) -> None:
         """Render, photo, difference and depth of one view."""
@@ -94,8 +101,9 @@ class OutputFolder:
         threads: int,
         state: Literal["complete", "partial"],
     ) -> Report:
-        """Poses in the input's frame, as transforms.json and as a COLMAP model, and the report, last."""
+        """Poses in the input's frame, as transforms.json and as a COLMAP model, the options and the report, last."""
         optimiser = stages.optimiser
+        self._write_text(CONFIG, optimiser.options.model_dump_json(indent=2))
         world_from_cam, similarity = poses_in_input_frame(dataset, optimiser)
         write_transforms(dataset, world_from_cam, self.path / TRANSFORMS)
         write_colmap(dataset, world_from_cam, self.path / COLMAP)

@@ -21,7 +21,7 @@ from biresnerf.data.read import read_dataset
 from biresnerf.errors import Interrupted
 from biresnerf.field.backends import choose_device, use_threads
 from biresnerf.output_folder import OutputFolder
-from biresnerf.progress import OnProgress, Progress
+from biresnerf.progress import OnProgress, Progress, Stage
 from biresnerf.refine.checkpoint import CHECKPOINT, load_checkpoint
 from biresnerf.refine.evaluation import (
     ViewScore,
@@ -49,6 +49,7 @@ class Prepared:
     frame: SceneFrame
     held_out: list[int]
     fingerprint: str
+    seeding: str | None  # COLMAP's answer, where the poses are COLMAP's
 
 
 def refine_poses(
@@ -71,7 +72,8 @@ def refine_poses(
     Raises:
         InputError: the user can mend it.
         RefinementError: the optimisation diverged.
-        Interrupted: stopped by `should_stop`; the checkpoint and a partial result are in `output`.
+        Interrupted: stopped by `should_stop`; the checkpoint and a partial result are in `output`, or nothing
+            yet where COLMAP was still looking for poses.
     """
     report = on_progress or (lambda _progress: None)
     stop = should_stop or (lambda: False)
@@ -79,12 +81,16 @@ def refine_poses(
     started = time.monotonic()
     folder = OutputFolder(output)
     folder.refuse_finished()
+    checkpoint = load_checkpoint(folder.path)
     report(Progress(stage="preparing"))
     device = choose_device(options.device)
     threads = use_threads(options.threads)
-    prepared = _prepare(Path(input), options)
-    folder.claim(prepared.fingerprint)
-    report(Progress(stage="preparing", fraction=0.02, message=f"{len(prepared.dataset)} images read"))
+    notes = checkpoint[1] if checkpoint is not None else {"fingerprint": None, "seeding": None}
+    folder.restore_seeding(notes["seeding"])
+    prepared = _prepare(Path(input), options, folder.seeding, report, stop)
+    folder.claim(prepared.fingerprint, notes["fingerprint"])
+    stage: Stage = "preparing" if prepared.seeding is None else "seeding"
+    report(Progress(stage=stage, fraction=0.02, message=f"{len(prepared.dataset)} images read"))
 
     optimiser = JointOptimiser(
         prepared.images,
@@ -95,13 +101,11 @@ def refine_poses(
         device,
         threads,
     )
-    stages = TwoStages(optimiser, folder.path, prepared.fingerprint, report, stop)
-    checkpoint = load_checkpoint(folder.path)
+    stages = TwoStages(optimiser, folder.path, prepared.fingerprint, report, stop, prepared.seeding)
     if checkpoint is not None:
         stages.resume(*checkpoint)
         logger.info("going on from step %d", optimiser.step_index)
     stages.record.seconds["preparing"] = time.monotonic() - started
-    folder.write_config(options)
 
     def write(scores: list[ViewScore], state: Literal["complete", "partial"]) -> Report:
         return folder.write_result(
@@ -128,8 +132,16 @@ def held_out_views(count: int, asked: int | None) -> list[int]:
     return sorted({int((i + 0.5) * count / asked) for i in range(asked)})
 
 
-def _prepare(path: Path, options: RefineOptions) -> Prepared:
-    dataset = read_dataset(path)
+def _prepare(
+    path: Path, options: RefineOptions, seeding: Path, report: OnProgress, stop: Callable[[], bool]
+) -> Prepared:
+    dataset = read_dataset(
+        path,
+        should_stop=stop,
+        seed=options.seed,
+        remember=seeding,
+        on_seeding=lambda: report(Progress(stage="seeding", message="COLMAP looks for poses")),
+    )
     images = load_images(dataset, options.max_image_size, options.background)
     digest = hashlib.sha256(images.pixels.tobytes())
     # What changes neither result nor effort may differ between a run and its continuation.
@@ -142,6 +154,7 @@ def _prepare(path: Path, options: RefineOptions) -> Prepared:
         scene_frame(dataset, images),
         held_out_views(len(dataset), options.holdout),
         digest.hexdigest(),
+        seeding.read_text("utf-8") if dataset.source.dialect == "images" else None,
     )
 
 

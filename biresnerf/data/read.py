@@ -19,6 +19,7 @@ def read_dataset(
     seed: int = 0,
     seeding_limit_s: float = 3600.0,
     remember: Path | None = None,
+    on_seeding: Callable[[], None] | None = None,
 ) -> Dataset:
     """Reads a transforms file, or a folder with one, or a folder of images whose poses COLMAP then finds.
 
@@ -30,6 +31,7 @@ def read_dataset(
         seed: of COLMAP's random choices.
         seeding_limit_s: seconds that COLMAP may take.
         remember: a file that keeps COLMAP's answer, so that a continued run is given the same poses again.
+        on_seeding: called when COLMAP is about to run.
 
     Raises:
         InputError: the input cannot be used; says the file, the field and the mend.
@@ -56,6 +58,7 @@ def read_dataset(
         seed=seed,
         limit_s=seeding_limit_s,
         remember=remember,
+        on_start=on_seeding,
     )
 
 

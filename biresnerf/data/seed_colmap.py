@@ -45,6 +45,7 @@ def seed_poses(
     seed: int = 0,
     limit_s: float = 3600.0,
     remember: Path | None = None,
+    on_start: Callable[[], None] | None = None,
 ) -> Dataset:
     """The images that COLMAP can place, with its poses and one shared camera (one each where sizes differ).
 
@@ -52,7 +53,7 @@ def seed_poses(
     place are left out and named in the warnings.
 
     COLMAP's threads make its answer differ a little from run to run. A run that is to be continued keeps it
-    in the file ``remember`` and is given the same poses again.
+    in the file ``remember`` and is given the same poses again. ``on_start`` is called only if COLMAP does run.
 
     Raises:
         InputError: ``too_few_images``, ``colmap_missing``, ``seed_failed``, ``seed_timeout``, or a code of
@@ -75,6 +76,8 @@ def seed_poses(
     known = _remembered(remember, key)
     if known is not None:
         return _dataset(root, headers, known)
+    if on_start is not None:
+        on_start()
     with tempfile.TemporaryDirectory(prefix="biresnerf-colmap-") as work:
         request = {
             "root": str(root),

@@ -67,4 +67,4 @@ class OccupancyGrid:
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         self.thickness.copy_(state["thickness"])
-        self.occupied = state["occupied"].to(self.device).contiguous()
+        self.occupied = state["occupied"].to(self.device).clone()  # not shared with a snapshot

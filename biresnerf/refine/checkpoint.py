@@ -15,6 +15,7 @@ from biresnerf.data.atomic_file import whole_file
 from biresnerf.errors import InputError
 
 CHECKPOINT = Path("checkpoint") / "latest.safetensors"
+SEEDING = CHECKPOINT.with_name("seeding.json")  # what COLMAP answered; every checkpoint carries a copy
 FORMAT = "1"
 
 

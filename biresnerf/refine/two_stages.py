@@ -24,6 +24,7 @@ from biresnerf.report import SwitchReason
 logger = logging.getLogger(__name__)
 
 ROLLBACKS = 3
+SNAPSHOT = "snapshot."  # before the names of its tensors in a checkpoint
 REPORT_PERIOD_S = 0.5
 FIRST_FRACTION, LAST_FRACTION = 0.03, 0.88  # of the whole run's progress: reading before, evaluation after
 FINE_COST = 2.0  # a fine step against a coarse one, until measured
@@ -37,6 +38,7 @@ class RunRecord:
     resumed: int = 0
     rollbacks: int = 0
     switch_reason: SwitchReason | None = None
+    seeding: str | None = None  # COLMAP's answer where poses come from it: another run would find others
     seconds: dict[str, float] = field(default_factory=lambda: {"coarse": 0.0, "fine": 0.0})
 
 
@@ -46,6 +48,7 @@ class TwoStages:
     Args:
         folder: where checkpoints go.
         fingerprint: of input and options; a checkpoint with another one is not resumed.
+        seeding: COLMAP's answer, where poses come from it; goes into every checkpoint.
     """
 
     def __init__(
@@ -55,10 +58,11 @@ class TwoStages:
         fingerprint: str,
         on_progress: OnProgress,
         should_stop: Callable[[], bool],
+        seeding: str | None = None,
     ) -> None:
         self.optimiser, self.folder = optimiser, folder
         self.on_progress, self.should_stop = on_progress, should_stop
-        self.record = RunRecord(fingerprint)
+        self.record = RunRecord(fingerprint, seeding=seeding)
         options = optimiser.options
         self.detector = StabilityDetector(
             int(options.coarse_steps_min or 0), int(options.coarse_steps_max or 0)
@@ -69,6 +73,7 @@ class TwoStages:
         self._poses_at_check = optimiser.poses.poses()
         self._snapshot: tuple[float, dict[str, Tensor]] | None = None
         self._step_seconds = {"coarse": 0.0, "fine": 0.0}
+        self._fraction = FIRST_FRACTION
 
     @property
     def stage(self) -> str:
@@ -94,7 +99,9 @@ class TwoStages:
             self._errors.append(result.mean_squared_error)
             self._losses.append(result.loss)
             stage = self.stage
-            if optimiser.step_index % int(options.check_every or 1) == 0:
+            # Also where the period does not divide the cap: stage 2 must not wait, or never come.
+            due = optimiser.step_index == self.detector.cap and optimiser.switch is None
+            if due or optimiser.step_index % int(options.check_every or 1) == 0:
                 self._check()
             now = time.monotonic()
             self.record.seconds[stage] += now - started
@@ -154,6 +161,8 @@ class TwoStages:
         left = max(0, switch - done) * coarse + (total - max(done, switch)) * fine
         spent = sum(self.record.seconds.values())
         share = spent / max(spent + left, 1e-9)
+        # An early switch makes what is left dearer; the fraction told never falls all the same.
+        self._fraction = max(self._fraction, FIRST_FRACTION + (LAST_FRACTION - FIRST_FRACTION) * share)
         losses, self._losses = self._losses, []
         metrics = {"moved_deg": self._moved_deg}
         if losses:
@@ -164,7 +173,7 @@ class TwoStages:
             stage="coarse" if optimiser.switch is None else "fine",
             step=done,
             steps_total=total,
-            fraction=FIRST_FRACTION + (LAST_FRACTION - FIRST_FRACTION) * share,
+            fraction=self._fraction,
             eta_s=left * (1 - FIRST_FRACTION) / (LAST_FRACTION - FIRST_FRACTION),
             metrics=metrics,
             checkpoint=checkpoint,
@@ -177,6 +186,7 @@ class TwoStages:
             "resumed": record.resumed,
             "rollbacks": record.rollbacks,
             "switch_reason": record.switch_reason,
+            "seeding": record.seeding,
             "seconds": record.seconds,
             "detector": {
                 "decibels": detector.decibels,
@@ -187,11 +197,19 @@ class TwoStages:
             "optimiser": self.optimiser.notes(),
         }
         tensors = {**self.optimiser.state(), "poses_at_check": self._poses_at_check}
+        if self._snapshot is not None:
+            notes["snapshot_error"] = self._snapshot[0]
+            tensors.update({SNAPSHOT + name: tensor for name, tensor in self._snapshot[1].items()})
         save_checkpoint(self.folder, tensors, notes)
 
     def resume(self, tensors: dict[str, Tensor], notes: dict[str, Any]) -> None:
         """Go on where a checkpoint left off."""
-        self.optimiser.load_state(tensors, notes["optimiser"])
+        snapshot = {k.removeprefix(SNAPSHOT): v for k, v in tensors.items() if k.startswith(SNAPSHOT)}
+        if snapshot:
+            self._snapshot = (notes["snapshot_error"], snapshot)
+        self.optimiser.load_state(
+            {k: v for k, v in tensors.items() if not k.startswith(SNAPSHOT)}, notes["optimiser"]
+        )
         self._poses_at_check = tensors["poses_at_check"]
         self._errors = notes["errors"]
         self.record = RunRecord(
@@ -199,6 +217,7 @@ class TwoStages:
             notes["resumed"] + 1,
             notes["rollbacks"],
             notes["switch_reason"],
+            notes["seeding"],
             notes["seconds"],
         )
         for key, value in notes["detector"].items():
