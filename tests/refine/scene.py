@@ -19,15 +19,15 @@ CPU = torch.device("cpu")
 
 
 def tiny_options(**changed) -> RefineOptions:
-    """Options of a run of 60 steps: stage 2 from step 30."""
+    """Options of a run of 40 steps: stage 2 from step 20."""
     values = {
         "preset": "fast",
         "device": "cpu",
         "threads": 2,
-        "steps": 60,
+        "steps": 40,
         "coarse_steps_min": 10,
-        "coarse_steps_max": 30,
-        "check_every": 10,
+        "coarse_steps_max": 20,
+        "check_every": 5,
         "max_image_size": 24,
         "samples_per_step": 4096,
         "pose_resolution_max": 24,

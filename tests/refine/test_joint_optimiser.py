@@ -1,0 +1,114 @@
+"""One step and the switch: the function is untouched by it, held-out photos never reach the field."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from biresnerf.field.radiance_field import PositionGradient
+from tests.refine.scene import tiny_optimiser, tiny_options, tiny_set
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return tiny_set(tmp_path_factory.mktemp("scene"))
+
+
+def look(optimiser) -> torch.Tensor:
+    """Colour, opacity and depth of fixed rays of all cameras."""
+    generator = torch.Generator().manual_seed(9)
+    image = torch.arange(len(optimiser.poses)).repeat(40)
+    xy = torch.rand(len(image), 2, generator=generator) * 24
+    with torch.no_grad():
+        origin, direction = optimiser.cast(optimiser.poses.matrices()[image], image, xy)
+        r = optimiser.render(origin, direction, 0, 0.02, PositionGradient(), jitter=False)
+    return torch.cat([r.colour, r.opacity[:, None], r.depth[:, None]], 1)
+
+
+def test_the_switch_leaves_every_render_as_it_was(scene):
+    optimiser = tiny_optimiser(*scene, tiny_options())
+    for _ in range(20):
+        optimiser.step()
+    with torch.no_grad():  # only the zero columns may keep the module out, not its tiny features
+        optimiser.field.reconstruction_table.uniform_(-1, 1, generator=torch.Generator().manual_seed(1))
+    before = look(optimiser)
+    assert float(before[:, :3].std()) > 0.01  # there is something to see
+    optimiser.start_reconstruction()
+    assert float((look(optimiser) - before).abs().max()) < 1e-5
+    optimiser.step()
+    optimiser.step()
+    assert float((look(optimiser) - before).abs().max()) > 1e-5  # from now on it takes part
+
+
+def test_the_switch_is_no_jump_of_the_loss(scene):
+    optimiser = tiny_optimiser(*scene, tiny_options())
+    before = [optimiser.step().mean_squared_error for _ in range(40)][-10:]
+    optimiser.start_reconstruction()
+    after = [optimiser.step().mean_squared_error for _ in range(10)]
+    assert np.mean(after) < 1.15 * np.mean(before)
+
+
+def test_steps_reduce_the_error_and_report_their_effort(scene):
+    optimiser = tiny_optimiser(*scene, tiny_options())
+    results = [optimiser.step() for _ in range(25)]
+    assert np.mean([r.mean_squared_error for r in results[-10:]]) < 0.6 * results[0].mean_squared_error
+    assert all(r.rays >= 256 and r.samples > 0 for r in results)
+    assert optimiser.step_index == 25
+
+
+def test_held_out_photos_move_their_own_pose_but_never_the_field(scene):
+    dataset, images = scene
+    runs = []
+    for shade in (0, 255):
+        photos = images.pixels.copy()
+        photos[images.offsets[2] : images.offsets[3]] = shade
+        from dataclasses import replace
+
+        optimiser = tiny_optimiser(dataset, replace(images, pixels=photos), tiny_options(), held_out=[2])
+        optimiser.background = torch.ones(3)
+        for _ in range(12):
+            optimiser.step()
+        runs.append(optimiser)
+    dark, light = runs
+    for name, tensor in dark.field.state().items():
+        assert torch.equal(light.field.state()[name], tensor), name
+    differing = [
+        i for i in range(len(dataset)) if not torch.equal(dark.poses.matrices()[i], light.poses.matrices()[i])
+    ]
+    assert differing == [2]
+
+
+def test_poses_stand_still_in_the_last_steps(scene):
+    optimiser = tiny_optimiser(*scene, tiny_options())
+    optimiser.step_index = 39
+    optimiser.start_reconstruction()
+    before = optimiser.poses.matrices().detach().clone()
+    optimiser.step()
+    assert torch.equal(optimiser.poses.matrices(), before)
+
+
+def test_a_rollback_undoes_the_steps_of_stage_1_but_not_the_random_draws(scene):
+    optimiser = tiny_optimiser(*scene, tiny_options())
+    for _ in range(5):
+        optimiser.step()
+    saved = {k: v.clone() for k, v in optimiser.coarse_state().items()}
+    for _ in range(5):
+        optimiser.step()
+    drawn = optimiser.generator.get_state()
+    optimiser.load_coarse_state(saved)
+    for name, tensor in optimiser.coarse_state().items():
+        expected = drawn if name == "generator" else saved[name]
+        assert torch.equal(tensor, expected), name
+    assert optimiser.step_index == 10
+
+
+def test_another_seed_is_another_run_and_the_same_seed_the_same(scene):
+    def run(seed: int) -> torch.Tensor:
+        optimiser = tiny_optimiser(*scene, tiny_options(seed=seed))
+        for _ in range(8):
+            optimiser.step()
+        return optimiser.poses.poses()
+
+    assert torch.equal(run(4), run(4))
+    assert not torch.equal(run(4), run(5))

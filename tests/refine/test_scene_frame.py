@@ -1,0 +1,98 @@
+"""The unit frame: the scene inside the box, whatever frame and scale the input came in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from biresnerf.geometry.similarity import Similarity
+from biresnerf.refine.scene_frame import scene_frame
+from tests.refine.scene import tiny_set
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return tiny_set(tmp_path_factory.mktemp("scene"), views=9)
+
+
+def moved(dataset, similarity: Similarity):
+    poses = similarity.apply_to_poses(dataset.world_from_cam)
+    return replace(
+        dataset,
+        frames=tuple(replace(f, world_from_cam=p) for f, p in zip(dataset.frames, poses, strict=True)),
+    )
+
+
+def unit_poses(dataset, images):
+    return scene_frame(dataset, images).unit_from_world.apply_to_poses(dataset.world_from_cam)
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1e-3, 0.0), (250.0, 1e4), (1.0, -70.0)])
+def test_scale_and_origin_of_the_input_do_not_matter(scene, scale, shift):
+    dataset, images = scene
+    other = moved(dataset, Similarity(scale, np.eye(3), np.array([shift, -shift, 0.5 * shift])))
+    np.testing.assert_allclose(unit_poses(other, images), unit_poses(dataset, images), atol=1e-6)
+    one, two = scene_frame(dataset, images), scene_frame(other, images)
+    for name in ("distance", "pixel", "far", "unbounded"):
+        assert getattr(two, name) == pytest.approx(getattr(one, name), rel=1e-6)
+
+
+def test_the_axes_of_the_input_only_turn_the_unit_frame(scene):
+    dataset, images = scene
+    turn = Rotation.from_euler("xyz", [20, 60, -130], degrees=True).as_matrix()
+    other = moved(dataset, Similarity(3.0, turn, np.array([5.0, 6.0, 7.0])))
+    expected = Similarity(1.0, turn, np.zeros(3)).apply_to_poses(unit_poses(dataset, images))
+    np.testing.assert_allclose(unit_poses(other, images), expected, atol=1e-9)
+
+
+def test_the_scene_lies_in_the_box_and_the_cameras_outside_looking_in(scene):
+    dataset, images = scene
+    frame = scene_frame(dataset, images)
+    # The synthetic scene reaches from -0.8 to 0.9 about the origin.
+    corners = np.array([[x, y, z] for x in (-0.7, 0.7) for y in (-0.7, 0.7) for z in (-0.5, 0.8)])
+    assert np.abs(frame.unit_from_world.apply(corners)).max() < 1.0
+    assert np.abs(frame.unit_from_world.apply(corners)).max() > 0.3  # and fills it
+    centres = unit_poses(dataset, images)[:, :3, 3]
+    assert np.linalg.norm(centres, axis=1).min() > 1
+    assert np.linalg.norm(centres, axis=1).mean() == pytest.approx(frame.distance, rel=0.05)
+    assert not frame.unbounded
+    np.testing.assert_allclose(frame.background, 1.0)
+
+
+def test_a_pixel_is_as_wide_as_two_neighbouring_rays_are_apart_at_the_centre(scene):
+    dataset, images = scene
+    frame = scene_frame(dataset, images)
+    fx = images.cameras[0].full().fx
+    assert frame.pixel == pytest.approx(frame.distance / fx, rel=1e-6)
+
+
+def test_photos_that_show_surroundings_make_an_unbounded_frame(scene):
+    dataset, images = scene
+    frame = scene_frame(dataset, replace(images, background=None, alpha=None))
+    assert frame.unbounded
+    assert frame.background is None
+    assert frame.far > 10 * frame.distance
+
+
+def test_parallel_cameras_see_the_scene_ahead_of_them(scene):
+    dataset, images = scene
+    rows = np.tile(np.eye(4), (len(dataset), 1, 1))
+    rows[:, :3, :3] = Rotation.from_euler("y", 30, degrees=True).as_matrix()
+    rows[:, :3, 3] = rows[:, :3, 0] * np.arange(len(dataset))[:, None] + [4.0, 5.0, 6.0]
+    frames = tuple(replace(f, world_from_cam=p) for f, p in zip(dataset.frames, rows, strict=True))
+    parallel = replace(dataset, frames=frames)
+    centre = scene_frame(parallel, images).unit_from_world.inverse().apply(np.zeros(3))
+    in_cam = (centre - rows[:, :3, 3]) @ rows[0, :3, :3]
+    assert (in_cam[:, 2] > 0).all()
+    assert in_cam[:, 2].min() > np.ptp(rows[:, :3, 3], axis=0).max() / 2
+
+
+def test_cameras_all_in_one_place_still_give_a_frame(scene):
+    dataset, images = scene
+    frames = tuple(replace(f, world_from_cam=dataset.frames[0].world_from_cam) for f in dataset.frames)
+    frame = scene_frame(replace(dataset, frames=frames), images)
+    assert np.isfinite(frame.distance)
+    assert frame.unit_from_world.scale > 0
