@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.problems import MEDIA_TYPE, ProblemError
 
 logger = logging.getLogger(__name__)
+_SAFE = {"GET", "HEAD", "OPTIONS"}
 _ID = re.compile(r"^[\w.:-]{1,128}$", re.ASCII)
 
 
@@ -61,11 +62,20 @@ class RequestContext:
             await send(message)
 
         try:
+            _refuse_other_sites(request)
             await self._app(scope, receive, send_with_headers)
+        except ProblemError as problem:
+            await render(problem, request)(scope, receive, send_with_headers)
         except Exception as error:
             if started:
                 raise
             await render(_last_net(error, request), request)(scope, receive, send_with_headers)
+
+
+def _refuse_other_sites(request: Request) -> None:
+    """Browsers send forms to any address, so any page could use a service on the reader's own machine."""
+    if request.method not in _SAFE and request.headers.get("sec-fetch-site") == "cross-site":
+        raise ProblemError("cross_site", "Requests from pages of other sites are not taken.")
 
 
 def _last_net(error: Exception, request: Request) -> ProblemError:

@@ -21,6 +21,8 @@ from service.problems import FieldProblem, ProblemError
 _FIELD_BYTES_MAX = 256 * 1024
 _HEADER_BYTES_MAX = 8 * 1024
 _LOCK = ".in-use"
+# A client that sends nothing for so long holds a connection and a folder for nothing.
+IDLE_S = 60.0
 
 
 def too_large(limit_bytes: int) -> ProblemError:
@@ -38,10 +40,24 @@ def refuse_announced_excess(content_length: str | None, limit_bytes: int) -> Non
         raise too_large(limit_bytes)
 
 
-async def capped(stream: AsyncIterator[bytes], limit_bytes: int) -> AsyncIterator[bytes]:
-    """The stream; raises ``body_too_large`` at the first byte beyond the limit."""
+async def capped(
+    stream: AsyncIterator[bytes], limit_bytes: int, idle_s: float = IDLE_S
+) -> AsyncIterator[bytes]:
+    """The stream.
+
+    Raises:
+        ProblemError: ``body_too_large`` at the first byte beyond the limit; ``body_timeout`` where nothing
+            comes for ``idle_s``.
+    """
     total = 0
-    async for chunk in stream:
+    while True:
+        try:
+            async with asyncio.timeout(idle_s):
+                chunk = await anext(stream)
+        except StopAsyncIteration:
+            return
+        except TimeoutError:
+            raise ProblemError("body_timeout", f"No byte of the body came for {idle_s:g} s.") from None
         total += len(chunk)
         if total > limit_bytes:
             raise too_large(limit_bytes)

@@ -23,6 +23,7 @@ from workers.records import DatasetRecord, DatasetState
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 _ALWAYS = ("database_unavailable", "internal_error")
+_WRITES = ("cross_site", *_ALWAYS)
 _RAW_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
@@ -44,7 +45,9 @@ async def _new_dataset(request: Request) -> NewDataset:
     status_code=201,
     operation_id="createDataset",
     response_model=DatasetView,
-    responses=declared("malformed_json", "body_too_large", "unsupported_media", "invalid_request", *_ALWAYS),
+    responses=declared(
+        "malformed_json", "body_too_large", "unsupported_media", "unsafe_path", "body_timeout", *_WRITES
+    ),
     openapi_extra={
         "requestBody": {"required": True, "content": {"application/json": json_content(NewDataset)}}
     },
@@ -85,7 +88,7 @@ async def get_dataset(dataset_id: DatasetId, service: ServiceHere) -> DatasetVie
     "/{dataset_id}",
     status_code=204,
     operation_id="deleteDataset",
-    responses=declared("not_found", "dataset_in_use", *_ALWAYS),
+    responses=declared("not_found", "dataset_in_use", *_WRITES),
 )
 async def delete_dataset(dataset_id: DatasetId, service: ServiceHere) -> None:
     """Deletes the dataset and its files, unless an unfinished job uses it."""
@@ -111,7 +114,15 @@ async def list_files(
     return FileList(items=[FileView.of(item) for item in page.items], next_cursor=page.next_cursor)
 
 
-_TAKES = ("not_found", "dataset_not_open", "body_too_large", "too_many_files", "unsafe_path", "storage_full")
+_TAKES = (
+    "body_timeout",
+    "not_found",
+    "dataset_not_open",
+    "body_too_large",
+    "too_many_files",
+    "unsafe_path",
+    "storage_full",
+)
 
 
 @router.put(
@@ -121,7 +132,7 @@ _TAKES = ("not_found", "dataset_not_open", "body_too_large", "too_many_files", "
     response_model=FileView,
     responses={
         204: {"description": "The path was there; it has these bytes now."},
-        **declared("malformed_body", "file_exists", "digest_mismatch", *_TAKES, *_ALWAYS),
+        **declared("malformed_body", "file_exists", "digest_mismatch", *_TAKES, *_WRITES),
     },
     openapi_extra=_RAW_BODY,
 )
@@ -172,7 +183,7 @@ def _announced_digest(header: str | None) -> str | None:
     "/{dataset_id}/archive",
     operation_id="uploadArchive",
     responses=declared(
-        "archive_too_large", "archive_rejected", "name_collision", "validation_timeout", *_TAKES, *_ALWAYS
+        "archive_too_large", "archive_rejected", "name_collision", "validation_timeout", *_TAKES, *_WRITES
     ),
     openapi_extra={
         "requestBody": {
@@ -205,7 +216,7 @@ async def upload_archive(dataset_id: DatasetId, request: Request, service: Servi
     response_model=DatasetView,
     responses={
         202: {"model": DatasetView, "description": "Under way (asked for by `Prefer: respond-async`)."},
-        **declared("not_found", "dataset_not_complete", "dataset_invalid", "name_collision", *_ALWAYS),
+        **declared("not_found", "dataset_not_complete", "dataset_invalid", "name_collision", *_WRITES),
     },
 )
 async def finalize_dataset(

@@ -18,6 +18,7 @@ from workers.records import Job, JobState
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 _ALWAYS = ("database_unavailable", "internal_error")
+_WRITES = ("cross_site", *_ALWAYS)
 _KEY = re.compile(r"^[\x21-\x7e]{1,255}$")
 _POLL_S = "2"
 _FORM: dict[str, Any] = {
@@ -53,7 +54,7 @@ _BODY = {
     responses=declared(
         *("malformed_json", "bad_idempotency_key", "not_found", "dataset_not_ready", "body_too_large"),
         *("unsupported_media", "invalid_options", "idempotency_key_reused", "archive_rejected", "queue_full"),
-        *("storage_full", *_ALWAYS),
+        *("storage_full", "body_timeout", *_WRITES),
     ),
 )
 async def submit_job(
@@ -144,7 +145,7 @@ async def get_job(
     response_model=JobView,
     responses={
         202: {"model": JobView, "description": "Asked for; the job ends within seconds."},
-        **declared("not_found", *_ALWAYS),
+        **declared("not_found", *_WRITES),
     },
 )
 async def cancel_job(job_id: JobId, service: ServiceHere) -> Response:
@@ -157,7 +158,7 @@ async def cancel_job(job_id: JobId, service: ServiceHere) -> Response:
     "/{job_id}",
     status_code=204,
     operation_id="deleteJob",
-    responses=declared("not_found", "state_conflict", *_ALWAYS),
+    responses=declared("not_found", "state_conflict", *_WRITES),
 )
 async def delete_job(job_id: JobId, service: ServiceHere) -> None:
     """Deletes a job that is over, with its results."""

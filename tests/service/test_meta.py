@@ -79,6 +79,18 @@ def test_a_request_id_is_kept_if_it_is_harmless(http: httpx.Client) -> None:
     assert first != second
 
 
+def test_a_page_of_another_site_cannot_use_the_service(http: httpx.Client) -> None:
+    form = {
+        "files": {"archive": b"x"},
+        "headers": {"Sec-Fetch-Site": "cross-site", "Origin": "http://evil.example"},
+    }
+    problem(http.post("/v1/jobs", **form), 403, "cross_site")
+    assert http.get("/livez", headers=form["headers"]).status_code == 200
+    assert "access-control-allow-origin" not in http.get("/livez", headers=form["headers"]).headers
+    own = http.post("/v1/datasets", json={}, headers={"Sec-Fetch-Site": "same-origin"})
+    assert own.status_code == 201
+
+
 def test_the_docs_page_works_without_any_other_host(http: httpx.Client) -> None:
     root = http.get("/")
     assert root.status_code == 307
