@@ -12,6 +12,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import RedirectResponse, Response
 from starlette.exceptions import HTTPException
+from starlette.routing import Route
 
 from biresnerf import __version__
 from biresnerf.errors import InputError
@@ -28,6 +29,7 @@ from workers.stores import open_stores
 
 logger = logging.getLogger(__name__)
 
+_ROUTERS = [module.router for module in (datasets, jobs, events, artifacts, meta, docs_page)]
 _DESCRIPTION = """
 Refines the camera poses of an image set.
 
@@ -74,8 +76,8 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.add_middleware(RequestContext)
     _answer_with_problems(app)
-    for module in (datasets, jobs, events, artifacts, meta, docs_page):
-        app.include_router(module.router)
+    for router in _ROUTERS:
+        app.include_router(router)
     app.add_api_route("/", lambda: RedirectResponse("docs"), include_in_schema=False)
     _describe_problems(app)
     return app
@@ -92,10 +94,25 @@ async def _check_unfinished(service: Service) -> None:
 
 def _answer_with_problems(app: FastAPI) -> None:
     async def problem(request: Request, error: Exception) -> Response:
-        return render(_as_problem(error), request)
+        told = _as_problem(error)
+        if told.code == "method_not_allowed":
+            # The framework names the methods of the first route at this path only.
+            told.headers["Allow"] = ", ".join(_methods_at(request))
+        return render(told, request)
 
     for kind in (ProblemError, InputError, EngineError, RequestValidationError, HTTPException):
         app.add_exception_handler(kind, problem)
+
+
+def _methods_at(request: Request) -> list[str]:
+    """All methods that the request's path answers."""
+    path: str = request.scope["path"]
+    found: set[str] = set()
+    for router in _ROUTERS:
+        for route in router.routes:
+            if isinstance(route, Route) and route.path_regex.match(path):
+                found |= route.methods or set()
+    return sorted(found)
 
 
 def _as_problem(error: Exception) -> ProblemError:

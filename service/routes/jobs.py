@@ -60,7 +60,6 @@ _BODY = {
 async def submit_job(
     request: Request,
     service: ServiceHere,
-    content_type: Annotated[str, Header()] = "",
     idempotency_key: Annotated[
         str | None, Header(description="The same key with the same request answers with the same job.")
     ] = None,
@@ -68,7 +67,7 @@ async def submit_job(
     """Queues a refinement of a ready dataset, or of the archive in a multipart form."""
     if idempotency_key is not None and not _KEY.match(idempotency_key):
         raise ProblemError("bad_idempotency_key", "The key must be 1 to 255 visible ASCII characters.")
-    kind = content_type.split(";")[0].strip().lower()
+    kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
     if kind == "multipart/form-data":
         job, new = await submit_form(service, request, idempotency_key)
     elif kind == "application/json":

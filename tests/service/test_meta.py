@@ -64,8 +64,8 @@ def test_every_wrong_address_or_question_is_a_problem(
 ) -> None:
     answer = http.request(method, path)
     body = problem(answer, status, code)
-    if status == 405:
-        assert answer.headers["allow"]
+    if path == "/v1/jobs" and status == 405:
+        assert answer.headers["allow"] == "GET, POST"
     if code == "invalid_request":
         assert body["errors"][0]["pointer"].startswith("/query/")
 

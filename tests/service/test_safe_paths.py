@@ -15,11 +15,15 @@ PIECES = st.sampled_from(
 )
 
 
-@given(
-    st.one_of(
-        st.text(max_size=300), st.lists(PIECES, max_size=8).map("/".join), st.lists(PIECES).map("".join)
-    )
+NAMES = st.one_of(
+    st.text(max_size=300),
+    st.lists(st.sampled_from(["a", "..", ".", "b.png"]), max_size=5).map("/".join),
+    st.lists(PIECES, max_size=8).map("/".join),
+    st.lists(PIECES, max_size=8).map("".join),
 )
+
+
+@given(NAMES)
 def test_what_passes_stays_below_the_folder_and_is_its_own_normal_form(name: str) -> None:
     try:
         path = checked_path(name)
