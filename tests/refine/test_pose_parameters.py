@@ -78,7 +78,7 @@ def test_poses_stay_rigid_after_many_steps(form):
         poses.step(0.1)
     rotation = poses.poses()[:, :3, :3]
     torch.testing.assert_close(
-        rotation @ rotation.transpose(1, 2), torch.eye(3).double().expand(5, 3, 3), atol=1e-5, rtol=0
+        rotation @ rotation.transpose(1, 2), torch.eye(3).double().expand(5, 3, 3), atol=1e-12, rtol=0
     )
     assert (torch.linalg.det(rotation) > 0).all()
     assert len(moved(poses, given()[:, :3].float())) == 5
