@@ -64,6 +64,8 @@ def test_seeding_is_a_stage_of_its_own(stopped):
     _, told = stopped
     stages = list(dict.fromkeys(progress.stage for progress in told))
     assert stages == ["preparing", "seeding", "coarse"]
+    fractions = [progress.fraction for progress in told]
+    assert fractions == sorted(fractions)
 
 
 def test_a_resumed_run_goes_on_from_the_poses_colmap_gave_the_first_time(
