@@ -20,6 +20,7 @@ from biresnerf.data.images import ImageSet, load_images
 from biresnerf.data.read import read_dataset
 from biresnerf.errors import Interrupted
 from biresnerf.field.backends import choose_device, use_threads
+from biresnerf.field.compile_kernels import compile_kernels
 from biresnerf.output_folder import OutputFolder
 from biresnerf.progress import OnProgress, Progress, Stage
 from biresnerf.refine.checkpoint import CHECKPOINT, load_checkpoint
@@ -77,14 +78,21 @@ def refine_poses(
     """
     report = on_progress or (lambda _progress: None)
     stop = should_stop or (lambda: False)
-    options = options.resolved()
     started = time.monotonic()
     folder = OutputFolder(output)
     folder.refuse_finished()
     checkpoint = load_checkpoint(folder.path)
     report(Progress(stage="preparing"))
     device = choose_device(options.device)
+    options = options.model_copy(update={"device": "cuda" if device.type == "cuda" else "cpu"}).resolved()
     threads = use_threads(options.threads)
+    if device.type == "cpu":
+        report(
+            Progress(
+                stage="preparing", fraction=0.005, message="loading kernels (the first run compiles them)"
+            )
+        )
+        compile_kernels()
     notes = checkpoint[1] if checkpoint is not None else {"fingerprint": None, "seeding": None}
     folder.restore_seeding(notes["seeding"])
     prepared = _prepare(Path(input), options, folder.seeding, report, stop)
@@ -140,7 +148,7 @@ def _prepare(
         should_stop=stop,
         seed=options.seed,
         remember=seeding,
-        on_seeding=lambda: report(Progress(stage="seeding", message="COLMAP looks for poses")),
+        on_seeding=lambda: report(Progress(stage="seeding", fraction=0.01, message="COLMAP looks for poses")),
     )
     images = load_images(dataset, options.max_image_size, options.background)
     digest = hashlib.sha256(images.pixels.tobytes())
@@ -170,9 +178,11 @@ def _evaluate(
     work = len(views) + frames
     scores = []
 
+    rendering_from = time.monotonic()
+
     def tell(done: int) -> None:
         share = done / max(1, work)
-        spent = time.monotonic() - started
+        spent = time.monotonic() - rendering_from
         report(
             Progress(
                 stage="evaluating",

@@ -13,7 +13,18 @@ from biresnerf.field.radiance_field import RadianceField
 
 DECAY = 0.95
 THRESHOLD = 0.01
+GROWTH_UP_TO = 60.0  # inner boxes: how far unbounded rays reach
 DENSITY_CHUNK = 1 << 18  # cells whose density is asked for at once
+
+
+def interval_growth(position: Tensor) -> Tensor:
+    """How many times longer than in the inner box an interval is at grid positions [n, 3] of an unbounded scene.
+
+    m^2, with m the largest coordinate before contraction (see `reference.grid_position` and `reference.march`).
+    """
+    contracted = (4 * position - 2).abs().amax(1)
+    m = 1 / (2 - contracted).clamp(min=1 / GROWTH_UP_TO)
+    return torch.where(contracted > 1, m * m, torch.ones_like(m))
 
 
 class OccupancyGrid:
@@ -45,7 +56,8 @@ class OccupancyGrid:
             position = (index + torch.rand(len(part), 3, generator=generator)) / self.side
             density = field.density(position.to(self.device))
             part = part.to(self.device)
-            self.thickness[part] = torch.maximum(self.thickness[part], density * step)
+            length = step * interval_growth(position.to(self.device)) if field.shape.unbounded else step
+            self.thickness[part] = torch.maximum(self.thickness[part], density * length)
         if prune:
             self._prune(dilate)
 

@@ -92,7 +92,7 @@ def march(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Live intervals of rays [rays, 3], ordered by ray: midpoint t [n], length dt [n], ray [n] (int64).
 
-    Intervals are `step` long (times m^1.5 outside the inner box of an unbounded scene), the first one starts at a
+    Intervals are `step` long (times m^2 outside the inner box of an unbounded scene), the first one starts at a
     random offset; one is live if its midpoint lies in an occupied cell of `occupied` [side, side, side] (z, y, x).
     """
     side = occupied.shape[0]
@@ -105,7 +105,7 @@ def march(
 
     def length(t: Tensor) -> Tensor:
         m = (origin + t[:, None] * direction).abs().amax(1).clamp(min=1.0)
-        return step * m**1.5 if unbounded else torch.full_like(t, step)
+        return step * m**2 if unbounded else torch.full_like(t, step)
 
     taken = torch.zeros_like(jitter, dtype=torch.long)
     rays, middles, lengths = [], [], []

@@ -145,7 +145,7 @@ class JointOptimiser:
         loss = torch.nn.functional.smooth_l1_loss(rendering.colour, batch.target)
         loss.backward()
         self.field.step(schedule.field_rates(t, self.switch))
-        rate = schedule.pose_rate(t, self.switch) * self.pose_scale
+        rate = self.pose_rate()
         if rate > 0:
             self.poses.step(rate)
         else:
@@ -154,6 +154,10 @@ class JointOptimiser:
         self._adapt_rays(rendering.samples, schedule.samples(t, self.switch))
         error = ((rendering.colour.detach() - batch.sharp) ** 2)[: batch.trained].mean()
         return StepResult(float(loss.detach()), float(error), len(origin), rendering.samples)
+
+    def pose_rate(self) -> float:
+        """Learning rate of the poses at this step."""
+        return self.schedule.pose_rate(self.step_index, self.switch) * self.pose_scale
 
     def start_reconstruction(self) -> None:
         """Switch to stage 2 at this step."""

@@ -50,7 +50,9 @@ class PoseParameters:
         """unit_from_cam [n, 4, 4] in float64, without gradient; rotations to that precision."""
         top = self.matrices().double().cpu()
         left, _, right = torch.linalg.svd(top[:, :, :3])
-        top[:, :, :3] = left @ right  # the nearest rotation: what is written must not carry float32's rounding
+        top[:, :, :3] = (
+            left @ right
+        )  # the nearest rotation: what is written must not carry float32's rounding
         bottom = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(len(top), 1, 4)
         return torch.cat([top, bottom], 1)
 

@@ -22,6 +22,9 @@ RISING_BLOCKS = 3  # blocks in a row with rising error that mean divergence
 # A rollback is dear, and a plateau's noise rises by itself half of the time: the rise over the window must stand out.
 RISE_DB, RISE_FLUCTUATIONS = 0.5, 4.0
 STILL_DEG = 0.05  # 90 % quantile of rotation change per block below which cameras have settled
+# Adam's steps have the size of the learning rate whatever the gradient: settled cameras still stagger by about
+# rate * sqrt(steps) in a block. Measured on settled rigs: 1.2 to 1.5 times that; while they move, 3 and more.
+STAGGER = 1.7
 
 
 @dataclass
@@ -40,7 +43,13 @@ class StabilityDetector:
     confirmed: int = 0
     rising: int = 0
 
-    def check(self, step: int, mean_squared_error: float, moved_deg: float) -> Verdict:
+    def still_deg(self, pose_rate: float, steps: int) -> float:
+        """Rotation within a block of `steps` steps that settled cameras may show at this learning rate (rad)."""
+        return max(self.motion_deg, STAGGER * math.degrees(pose_rate) * math.sqrt(steps))
+
+    def check(
+        self, step: int, mean_squared_error: float, moved_deg: float, still_deg: float | None = None
+    ) -> Verdict:
         """One block's result at `step`. `moved_deg`: 90 % quantile of the cameras' rotation during the block."""
         self.decibels.append(-10 * math.log10(max(mean_squared_error, 1e-12)))
         if len(self.decibels) >= WINDOW:
@@ -49,7 +58,7 @@ class StabilityDetector:
             flat = abs(change) <= tolerance and fluctuation <= FLUCTUATION_DB and imbalance <= WINDOW // 2
             risen = change < -max(RISE_DB, RISE_FLUCTUATIONS * fluctuation)
             self.rising = self.rising + 1 if risen else 0
-            self.confirmed = self.confirmed + 1 if flat and moved_deg < self.motion_deg else 0
+            self.confirmed = self.confirmed + 1 if flat and moved_deg < (still_deg or self.motion_deg) else 0
             if self.rising >= RISING_BLOCKS:
                 return "diverging"
         if step >= self.cap:

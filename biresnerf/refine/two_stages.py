@@ -129,7 +129,8 @@ class TwoStages:
         self._poses_at_check = now
         if optimiser.switch is not None:
             return
-        verdict = self.detector.check(optimiser.step_index, error, self._moved_deg)
+        still_deg = self.detector.still_deg(optimiser.pose_rate(), int(optimiser.options.check_every or 1))
+        verdict = self.detector.check(optimiser.step_index, error, self._moved_deg, still_deg)
         if verdict == "diverging":
             self._roll_back()
             return
