@@ -148,12 +148,12 @@ def poses_in_input_frame(dataset: Dataset, optimiser: JointOptimiser) -> tuple[n
     """Refined world_from_cam [n, 4, 4] carried into the input's frame, and the similarity that does it.
 
     The optimisation leaves frame and scale free; what ties them down is the best similarity, robust to lost
-    cameras, from the optimised centres to the given ones.
+    cameras, from the optimised poses to the given ones.
     """
     world_from_unit = optimiser.frame.unit_from_world.inverse()
     optimised = world_from_unit.apply_to_poses(optimiser.poses.poses().numpy())
     given = dataset.world_from_cam
-    input_from_optimised = align_robust(optimised, given)
+    input_from_optimised = align_robust(optimised, given, with_rotations=True)
     return input_from_optimised.apply_to_poses(optimised), input_from_optimised
 
 

@@ -93,8 +93,11 @@ def align_umeyama(a_from_cam: Array, b_from_cam: Array) -> Similarity:
     return _align_weighted(a, b, ones, ones)
 
 
-def align_robust(a_from_cam: Array, b_from_cam: Array) -> Similarity:
+def align_robust(a_from_cam: Array, b_from_cam: Array, *, with_rotations: bool = False) -> Similarity:
     """As `align_umeyama`, with cameras that do not follow the others weighed down.
+
+    ``with_rotations`` lets the cameras' rotations have their say in the turn beside the centres: not BARF's
+    metric, but the better estimate of a frame from noisy poses.
 
     Iteratively reweighted least squares with Cauchy weights; the scale is twice the median residual of each
     round, for centres and for rotations apart.
@@ -104,7 +107,7 @@ def align_robust(a_from_cam: Array, b_from_cam: Array) -> Similarity:
     """
     a, b = _rig_pair(a_from_cam, b_from_cam)
     weights_centre = weights_rotation = np.ones(len(a))
-    b_from_a = _align_weighted(a, b, weights_centre, weights_rotation)
+    b_from_a = _align_weighted(a, b, weights_centre, weights_rotation, with_rotations=with_rotations)
     spread = float(np.sqrt(((b[:, :3, 3] - b[:, :3, 3].mean(0)) ** 2).sum(1).mean()))
     for _ in range(_ROBUST_ROUNDS):
         moved = b_from_a.apply_to_poses(a)
@@ -113,13 +116,16 @@ def align_robust(a_from_cam: Array, b_from_cam: Array) -> Similarity:
         # Floors far below any real residual: an exact fit of the majority must not divide by zero.
         weights_centre = _cauchy(centre_residual, floor=1e-12 * max(spread, 1e-300))
         weights_rotation = _cauchy(rotation_residual, floor=1e-12)
-        last, b_from_a = b_from_a, _align_weighted(a, b, weights_centre, weights_rotation)
+        last = b_from_a
+        b_from_a = _align_weighted(a, b, weights_centre, weights_rotation, with_rotations=with_rotations)
         if _same(last, b_from_a, spread):
             break
     return b_from_a
 
 
-def _align_weighted(a: Array, b: Array, weights_centre: Array, weights_rotation: Array) -> Similarity:
+def _align_weighted(
+    a: Array, b: Array, weights_centre: Array, weights_rotation: Array, *, with_rotations: bool = False
+) -> Similarity:
     share = weights_centre / weights_centre.sum()
     centres_a, centres_b = a[:, :3, 3], b[:, :3, 3]
     middle_a, middle_b = share @ centres_a, share @ centres_b
@@ -133,7 +139,10 @@ def _align_weighted(a: Array, b: Array, weights_centre: Array, weights_rotation:
     else:
         scale = spread_b / spread_a
         correlation = (from_middle_b.T * share) @ from_middle_a / (spread_a * spread_b)
-        rotation = _rotation_of(correlation, turn)
+        # Both matrices are without unit: a trace of 1 for centres that agree, of 3 for rotations that do.
+        rotation = (
+            _nearest_rotation(correlation + turn) if with_rotations else _rotation_of(correlation, turn)
+        )
     return Similarity(scale, rotation, middle_b - scale * rotation @ middle_a)
 
 

@@ -19,7 +19,7 @@ from biresnerf.geometry.camera import Intrinsics, directions_in_cam
 from biresnerf.refine.photo_sampler import PhotoSampler
 from biresnerf.refine.pose_parameters import PoseParameters
 from biresnerf.refine.scene_frame import SceneFrame
-from biresnerf.refine.schedule import FINE_INTERVAL, INTERVAL_PIXELS, Schedule
+from biresnerf.refine.schedule import Schedule
 
 MOST_SAMPLES = 768  # per ray
 RAYS_LEAST, RAYS_MOST = 256, 1 << 15
@@ -82,7 +82,7 @@ class JointOptimiser:
             frame.distance / RIG_DISTANCE,
             device,
         )
-        self.schedule = Schedule(options, max(FINE_INTERVAL, INTERVAL_PIXELS * frame.pixel))
+        self.schedule = Schedule(options, frame.pixel, frame.unbounded)
         self.sampler = PhotoSampler(images, held_out, device)
         self.intrinsics = Intrinsics.from_cameras(images.cameras).to(device)
         self.occupancy = OccupancyGrid(64 if int(options.samples_per_step or 0) <= 2**16 else 128, device)

@@ -11,6 +11,11 @@ from biresnerf.field.radiance_field import FieldRates, PositionGradient
 COARSE_INTERVAL = 2.5e-2  # ray marching interval at the start, unit lengths: half a cell of the pose module
 FINE_INTERVAL = 3.3e-3  # BAA-NGP's 5e-3 in a box of side 3
 INTERVAL_PIXELS = 0.4  # no finer than this share of a pixel
+# Scenes with surroundings fill the whole ray with samples: coarser intervals and a double budget keep enough rays.
+OPEN_COARSE_INTERVAL, OPEN_INTERVAL_PIXELS, OPEN_SAMPLES = 3e-2, 1.0, 2
+# And without a background to stand out from, gradients say nothing until the field has formed: poses that move
+# from the first step stagger away (fox at noise 0.05: 3.9 deg became 5.1; with this wait, 1.6).
+OPEN_POSE_START = 0.5  # of the least length of stage 1
 NEAR_SHARES = (
     0.4,
     0.1,
@@ -36,10 +41,22 @@ def smooth_ramp(q: float) -> float:
 
 @dataclass(frozen=True)
 class Schedule:
-    """All schedules of a run; `options` must be resolved. `switch` is the step stage 2 began at, None before."""
+    """All schedules of a run; `options` must be resolved. `switch` is the step stage 2 began at, None before.
+
+    Attributes:
+        pixel: what a pixel spans at the scene, unit lengths.
+        unbounded: whether the scene has surroundings instead of a background.
+    """
 
     options: RefineOptions
-    fine_interval: float
+    pixel: float
+    unbounded: bool = False
+
+    @property
+    def fine_interval(self) -> float:
+        """Ray marching interval of stage 2, unit lengths."""
+        pixels = OPEN_INTERVAL_PIXELS if self.unbounded else INTERVAL_PIXELS
+        return max(FINE_INTERVAL, pixels * self.pixel)
 
     @property
     def steps(self) -> int:
@@ -57,7 +74,8 @@ class Schedule:
         if switch is not None:
             return self.fine_interval
         share = min(1.0, step / (RAMP_SHARE * self._option("coarse_steps_max")))
-        return max(self.fine_interval, COARSE_INTERVAL * (self.fine_interval / COARSE_INTERVAL) ** share)
+        start = OPEN_COARSE_INTERVAL if self.unbounded else COARSE_INTERVAL
+        return max(self.fine_interval, start * (self.fine_interval / start) ** share)
 
     def near(self, step: int, switch: int | None) -> float:
         """Distance that sampling starts at, as a share of the cameras' distance."""
@@ -70,7 +88,8 @@ class Schedule:
         share = (
             1.0 if switch is not None else min(1.0, step / (RAMP_SHARE * self._option("coarse_steps_max")))
         )
-        return int(self._option("samples_per_step") * 2 ** (share - 1))
+        budget = self._option("samples_per_step") * (OPEN_SAMPLES if self.unbounded else 1)
+        return int(budget * 2 ** (share - 1))
 
     def pruned(self, step: int) -> bool:
         """Whether empty space may be skipped."""
@@ -88,13 +107,14 @@ class Schedule:
         """Learning rate of the poses; 0 once they are frozen."""
         if step >= FREEZE_SHARE * self.steps:
             return 0.0
-        rate = smooth_ramp(step / (POSE_START / 40_000 * self.steps)) * self._decayed(
-            "pose", step / self.steps
-        )
+        rise = POSE_START / 40_000 * self.steps
+        if self.unbounded:
+            rise = max(rise, OPEN_POSE_START * self._option("coarse_steps_min"))
+        rate = smooth_ramp(step / rise) * self._decayed("pose", step / self.steps)
         if switch is not None:
             warmup = 2 * self._option("warmup_steps")
-            rise = POSE_DIP + (1 - POSE_DIP) * smooth_ramp((step - switch) / warmup)
-            rate = min(rate, POSE_STAGE2_CAP) * rise
+            share = POSE_DIP + (1 - POSE_DIP) * smooth_ramp((step - switch) / warmup)
+            rate = min(rate, POSE_STAGE2_CAP) * share
         return rate
 
     def field_rates(self, step: int, switch: int | None) -> FieldRates:

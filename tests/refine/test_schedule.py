@@ -13,7 +13,7 @@ SMALL_JUMP = 0.15  # of the largest value; the shortest ramp takes 15 steps
 
 @pytest.fixture(scope="module", params=list(PRESETS))
 def schedule(request):
-    return Schedule(RefineOptions(preset=request.param).resolved(), fine_interval=5e-3)
+    return Schedule(RefineOptions(preset=request.param).resolved(), pixel=0.0125)
 
 
 def switch_of(schedule: Schedule) -> int:

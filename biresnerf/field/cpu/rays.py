@@ -41,7 +41,8 @@ def _inside(v):
 def march(origin, direction, jitter, occupied, side, step, near, far, unbounded, t_buffer, dt_buffer, count):
     """Start and length of the live intervals of each ray: t_buffer, dt_buffer [rays, most], count [rays].
 
-    Intervals are `step` long, growing as m^2 outside the inner box (evenly in the contracted space, along rays from its centre); one is live if the cell of its midpoint is.
+    Intervals are `step` long, growing as m^2 outside the inner box (even in contracted space, along rays from its
+    centre); one is live if the cell of its midpoint is.
     """
     most = t_buffer.shape[1]
     for r in prange(origin.shape[0]):
