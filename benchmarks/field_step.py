@@ -63,7 +63,7 @@ def _step(field: RadianceField, rays: int, occupied: torch.Tensor, seed: int) ->
         batch, Marching(3.3e-3, 0.1, 12.0, 768, occupied), PositionGradient(1.0, 1.0, 1.0)
     )
     ((rendering.colour - 0.3) ** 2).mean().backward()
-    field.step(FieldRates((1e-4,) * 3, 1e-4, (1e-4,) * LEVELS, 1e-4))
+    field.step(FieldRates(1e-4, 1e-4, (1e-4,) * LEVELS, 1e-4))
     return time.perf_counter() - started, rendering.samples
 
 

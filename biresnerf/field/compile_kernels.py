@@ -29,7 +29,7 @@ def compile_kernels() -> float:
     rays = Rays(origin, direction, torch.ones(1, 3), torch.zeros(1), trained=1)
     marching = Marching(0.1, 0.1, 10.0, 64, torch.ones(4, 4, 4, dtype=torch.uint8))
     field.render(rays, marching, PositionGradient()).colour.sum().backward()
-    field.step(FieldRates((1e-3,) * 2, 1e-3, (1e-3,) * 2, 1e-3))
+    field.step(FieldRates(1e-3, 1e-3, (1e-3,) * 2, 1e-3))
     field.density(torch.full((1, 3), 0.5))
     seconds = time.monotonic() - started
     if seconds > SLOW_S:

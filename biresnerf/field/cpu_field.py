@@ -24,7 +24,7 @@ from biresnerf.field.radiance_field import (
     Rays,
     Rendering,
 )
-from biresnerf.field.spherical_harmonics import VIEW_FEATURES, view_features
+from biresnerf.field.spherical_harmonics import VIEW_FEATURES, spherical_harmonics
 
 f4 = np.float32
 
@@ -112,7 +112,7 @@ class CpuField(RadianceField):
         return features, jacobians
 
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
-        harmonics = view_features(rays.direction, rays.view_share)
+        harmonics = spherical_harmonics(rays.direction)
         colour, opacity, depth, count = _RenderRays.apply(
             rays.origin, rays.direction, harmonics, self, rays, marching, gradient
         )

@@ -37,7 +37,6 @@ class Rays:
     """Rays in the unit frame: origin, unit direction, background colour [rays, 3], jitter [rays] in [0, 1).
 
     Only the first `trained` rays give gradients to the field; all give gradients to origin and direction.
-    `view_share` scales how much colour may depend on the direction a point is seen from.
     """
 
     origin: Tensor
@@ -45,7 +44,6 @@ class Rays:
     background: Tensor
     jitter: Tensor
     trained: int
-    view_share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,7 @@ class PositionGradient:
 class FieldRates:
     """Rates of one step: pose module and networks, reconstruction module per level, its first-layer columns."""
 
-    pose: tuple[float, ...]
+    pose: float
     networks: float
     reconstruction: tuple[float, ...]
     reconstruction_columns: float
@@ -159,7 +157,7 @@ class RadianceField(ABC):
     def step(self, rates: FieldRates) -> None:
         """One Adam step from the gradients of the last backward."""
         self.steps["pose"] += 1
-        self._update_table("pose", np.asarray(rates.pose, np.float32))
+        self._update_table("pose", np.full(self.shape.pose_grid.levels, rates.pose, np.float32))
         self._step_networks(self._networks_adam, rates.networks)
         if self.reconstructing:
             self.steps["reconstruction"] += 1

@@ -21,7 +21,7 @@ from biresnerf.field.radiance_field import (
     Rays,
     Rendering,
 )
-from biresnerf.field.spherical_harmonics import view_features
+from biresnerf.field.spherical_harmonics import spherical_harmonics
 
 
 class ReferenceField(RadianceField):
@@ -62,7 +62,7 @@ class ReferenceField(RadianceField):
             )  # fmt: skip
         point = rays.origin[ray] + t[:, None] * rays.direction[ray]
         x = reference.grid_position(point, self.shape.unbounded)
-        view = view_features(rays.direction, rays.view_share)[ray]
+        view = spherical_harmonics(rays.direction)[ray]
         split = int((ray < rays.trained).sum())
         density, colour = self._sample(x[:split], view[:split], gradient, trained=True)
         if split < len(ray):

@@ -33,11 +33,3 @@ def spherical_harmonics(direction: Tensor) -> Tensor:
         ],
         -1,
     )
-
-
-def view_features(direction: Tensor, share: float) -> Tensor:
-    """The harmonics with all but the constant one scaled by `share`: at 0 colour cannot depend on the view."""
-    harmonics = spherical_harmonics(direction)
-    if share == 1.0:
-        return harmonics
-    return torch.cat([harmonics[..., :1], share * harmonics[..., 1:]], -1)

@@ -125,8 +125,7 @@ class JointOptimiser:
             else torch.full((count,), 0.5)
         )
         background = self.background.expand(count, 3).contiguous()
-        share = self.schedule.view_share(self.step_index)
-        rays = Rays(origin, direction, background, start.to(self.device), trained, share)
+        rays = Rays(origin, direction, background, start.to(self.device), trained)
         return self.field.render(rays, self.marching(interval), gradient)
 
     def step(self) -> StepResult:

@@ -25,8 +25,6 @@ UNPRUNED_SHARE = 0.1  # of the least length of stage 1: until then every cell co
 RAMP_SHARE = 0.75  # of the greatest length of stage 1: the interval has reached its fine value
 BLUR_END_SHARE = 0.6  # of the greatest length of stage 1: photos are sharp from then on
 BLUR_PIXELS = 0.03  # blur at the start, as a share of the long side (6 px of 200)
-LEVELS_OPEN_SHARE = 0.3  # of the least length of stage 1: all levels of the pose module are open from then on
-VIEW_SHARES = (0.3, 0.6)  # of the least length of stage 1: colour may depend on the view from .. fully from
 FIELD_START, POSE_START = 200, 500  # steps of the paper's 40 000 over which rates rise from zero
 POSE_DIP = 0.05  # pose rate right after the switch, as a share
 POSE_STAGE2_CAP = 1e-3
@@ -123,7 +121,7 @@ class Schedule:
             "field", step / self.steps
         )
         if switch is None:
-            return FieldRates(self._pose_levels(rate, step), rate, (), 0.0)
+            return FieldRates(rate, rate, (), 0.0)
         warmup = self._option("warmup_steps")
         q = (step - switch + 1) / warmup
         rate *= FIELD_DIP + (1 - FIELD_DIP) * smooth_ramp(q)
@@ -131,18 +129,7 @@ class Schedule:
         levels = int(self._option("reconstruction_levels"))
         # Level by level, about three at a time; the last opens as the warm-up ends.
         opened = [smooth_ramp(6 * q - 5 * level / max(1, levels - 1)) for level in range(levels)]
-        return FieldRates(self._pose_levels(rate, step), rate, tuple(high * r for r in opened), high)
-
-    def _pose_levels(self, rate: float, step: int) -> tuple[float, ...]:
-        """The pose module's levels open one after another, coarsest first."""
-        levels, span = int(self.options.pose_levels), LEVELS_OPEN_SHARE * self._option("coarse_steps_min")
-        progress = (levels - 1) * step / span if span > 0 else levels
-        return tuple(rate * (smooth_ramp(progress - level + 1) if level else 1.0) for level in range(levels))
-
-    def view_share(self, step: int) -> float:
-        """How much colour may depend on the view: not at first, or the field explains wrong poses away."""
-        start, end = (share * self._option("coarse_steps_min") for share in VIEW_SHARES)
-        return smooth_ramp((step - start) / max(end - start, 1.0))
+        return FieldRates(rate, rate, tuple(high * r for r in opened), high)
 
     def position_gradient(self, step: int, switch: int | None) -> PositionGradient:
         """Straight-through smoothing, and how much of the reconstruction module's gradient reaches the poses."""

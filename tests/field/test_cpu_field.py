@@ -86,7 +86,7 @@ def test_fast_field_equals_reference_in_values_and_all_gradients(unbounded, reco
     if trained:
         for wa, wb in zip(weights_a, weights_b, strict=True):
             _close(wb, wa)
-        rates = FieldRates((0.01,) * 3, 0.005, (0.01, 0.02, 0.0, 0.01, 0.01), 0.003)
+        rates = FieldRates(0.01, 0.005, (0.01, 0.02, 0.0, 0.01, 0.01), 0.003)
         before = slow.pose_table.detach().clone()
         slow.step(rates)
         fast.step(rates)
@@ -129,7 +129,7 @@ def test_state_restores_the_next_step_exactly():
     def step(field):
         rendering = field.render(_rays(200, 200, False), marching, gradient)
         (rendering.colour**2).mean().backward()
-        field.step(FieldRates((0.01,) * 3, 0.005, (0.01,) * 5, 0.003))
+        field.step(FieldRates(0.01, 0.005, (0.01,) * 5, 0.003))
 
     _, field = _pair(False, True)
     step(field)

@@ -16,7 +16,7 @@ from biresnerf.geometry.lie import so3_exp
 CPU = torch.device("cpu")
 FULL = torch.ones(8, 8, 8, dtype=torch.uint8)
 MARCHING = Marching(step=0.04, near=0.05, far=10.0, most=256, occupied=FULL)
-RATES = FieldRates((0.01,) * 3, 0.005, (0.01,) * 4, 0.003)
+RATES = FieldRates(0.01, 0.005, (0.01,) * 4, 0.003)
 
 
 def make(kind, unbounded: bool = False, **more):
@@ -195,12 +195,15 @@ def test_rays_that_are_not_trained_on_leave_the_field_alone():
 
 def test_a_level_with_rate_zero_stays_as_it_is():
     field = make(CpuField, workers=2)
-    grid, before = field.shape.pose_grid, field.pose_table.clone()
+    field.start_reconstruction()
+    with torch.no_grad():
+        field.reconstruction_columns.fill_(0.1)  # at zero, as they start, no gradient reaches the table
+    grid, before = field.shape.reconstruction_grid, field.reconstruction_table.clone()
     rendering = field.render(rays(60), MARCHING, PositionGradient())
     (rendering.colour**2).sum().backward()
-    field.step(FieldRates((0.01, 0.0, 0.01), 0.005, (0.0,) * 4, 0.003))
+    field.step(FieldRates(0.01, 0.005, (0.01, 0.0, 0.01, 0.0), 0.003))
     changed = [
-        bool((field.pose_table != before)[grid.offset[level] : grid.offset[level + 1]].any())
-        for level in range(3)
+        bool((field.reconstruction_table != before)[grid.offset[level] : grid.offset[level + 1]].any())
+        for level in range(4)
     ]
-    assert changed == [True, False, True]
+    assert changed == [True, False, True, False]

@@ -13,7 +13,7 @@ from scipy.special import sph_harm_y
 
 from biresnerf.field import reference
 from biresnerf.field.grid_levels import grid_levels
-from biresnerf.field.spherical_harmonics import spherical_harmonics, view_features
+from biresnerf.field.spherical_harmonics import spherical_harmonics
 
 DOUBLE = torch.float64
 
@@ -176,16 +176,6 @@ def test_harmonics_are_scipys_real_ones_up_to_sign_and_order():
     for column, values in enumerate(expected):
         sign = np.sign(ours[0, column] * values[0])
         np.testing.assert_allclose(ours[:, column], sign * values, atol=1e-12)
-
-
-def test_view_features_fade_in_around_the_constant_one():
-    directions = torch.nn.functional.normalize(random(5, 3) - 0.5, dim=1)
-    full = spherical_harmonics(directions)
-    torch.testing.assert_close(view_features(directions, 1.0), full)
-    half = view_features(directions, 0.5)
-    torch.testing.assert_close(half[:, 0], full[:, 0])
-    torch.testing.assert_close(half[:, 1:], 0.5 * full[:, 1:])
-    assert not view_features(directions, 0.0)[:, 1:].any()
 
 
 def samples():
