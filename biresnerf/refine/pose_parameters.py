@@ -57,7 +57,7 @@ class PoseParameters:
         return torch.cat([top, bottom], 1)
 
     def step(self, rate: float, rows: Tensor | None = None) -> None:
-        """One Adam step; rows not in the mask `rows` [n] keep still, as do cameras without gradient."""
+        """One Adam step; rows not in the mask `rows` [n] keep still."""
         self._adam.param_groups[0]["lr"] = rate
         kept = None
         if rows is not None:

@@ -16,11 +16,9 @@ OPEN_COARSE_INTERVAL, OPEN_INTERVAL_PIXELS, OPEN_SAMPLES = 3e-2, 1.0, 2
 # And without a background to stand out from, gradients say nothing until the field has formed: poses that move
 # from the first step stagger away (fox at noise 0.05: 3.9 deg became 5.1; with this wait, 1.6).
 OPEN_POSE_START = 0.5  # of the least length of stage 1
-NEAR_SHARES = (
-    0.4,
-    0.1,
-)  # of the cameras' distance: nothing nearer is sampled, at the start and from the switch on.
-# A field that may put colour right before each camera explains any photo from any pose.
+# Of the cameras' distance: nothing nearer is sampled, at the start and from the switch on. A field that may put
+# colour right before each camera explains any photo from any pose.
+NEAR_SHARES = (0.4, 0.1)
 UNPRUNED_SHARE = 0.1  # of the least length of stage 1: until then every cell counts as occupied
 RAMP_SHARE = 0.75  # of the greatest length of stage 1: the interval has reached its fine value
 BLUR_END_SHARE = 0.6  # of the greatest length of stage 1: photos are sharp from then on
