@@ -36,10 +36,10 @@ INPUT_FROM_TRUTH = Similarity(
 OPTIONS = RefineOptions(
     preset="fast",
     device="cpu",
-    steps=600,
-    max_image_size=40,
-    samples_per_step=8192,
-    pose_rate=0.015,
+    steps=1200,
+    max_image_size=56,
+    samples_per_step=16384,
+    pose_rate=0.008,
     pose_rate_final=0.001,
     field_rate=0.02,
     field_rate_final=0.003,
@@ -74,7 +74,7 @@ class Run:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Run:
     scene, output = tmp_path_factory.mktemp("scene"), tmp_path_factory.mktemp("results") / "out"
-    path = write_synthetic_scene(scene, VIEWS, 48, seed=1)
+    path = write_synthetic_scene(scene, VIEWS, 64, seed=1)
     dataset = read_dataset(path)
     truth = INPUT_FROM_TRUTH.apply_to_poses(synthetic_cameras(VIEWS, seed=1))
     start = INPUT_FROM_TRUTH.apply_to_poses(perturb_poses(synthetic_cameras(VIEWS, seed=1), 0.1, seed=6))
@@ -137,15 +137,15 @@ print(json.dumps({image.name: [pose(image), model.cameras[image.camera_id].width
     for index, world_from_cam in enumerate(run.refined()):
         matrix, width = images[f"train/r_{index}.png"]
         np.testing.assert_allclose(matrix, np.linalg.inv(world_from_cam)[:3], rtol=0, atol=1e-6)
-        assert width == 48  # full size, not the working size
+        assert width == 64  # full size, not the working size
 
 
 def test_the_report_is_valid_and_agrees_with_the_poses(run):
     report = Report.model_validate_json((run.output / "report.json").read_text())
     assert report == run.report
     assert report.state == "complete"
-    assert report.steps_done == 600
-    assert 0 < report.switch_step < 600
+    assert report.steps_done == OPTIONS.steps
+    assert 0 < report.switch_step < OPTIONS.steps
     assert report.switch_reason in ("stable", "cap")
     assert report.resumed == 0
     assert report.backend == "cpu"
