@@ -149,7 +149,7 @@ def test_the_report_is_valid_and_agrees_with_the_poses(run):
     assert report.switch_reason in ("stable", "cap")
     assert report.resumed == 0
     assert report.backend == "cpu"
-    assert report.working_size == (40, 40)
+    assert report.working_size == (56, 56)
     assert report.options == OPTIONS.resolved()
     assert set(report.seconds) == {"preparing", "coarse", "fine", "evaluating"}
     refined = run.refined()
@@ -183,7 +183,7 @@ def test_renders_and_the_orbit_can_be_looked_at(run):
     for picture in pictures:
         with Image.open(picture) as image:
             image.load()
-            assert min(image.size) >= 40
+            assert min(image.size) >= 56
             assert np.asarray(image).std() > 1
     assert imageio.imread(folder / "orbit.mp4", plugin="FFMPEG", index=0).std() > 1
 
