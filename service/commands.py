@@ -184,8 +184,6 @@ def demo_command(
     shifted at random (14 degrees on average). Everything lies in OUTPUT afterwards.
     """
     from biresnerf.config import parse_options
-    from service.demo import MADE_SCENE_STEPS, run_demo
+    from service.demo import run_demo
 
-    if scene is None and preset == "fast":
-        settings = {"steps": MADE_SCENE_STEPS, **settings}
     run_demo(scene, output, parse_options({**settings, "preset": preset}), views, size)
