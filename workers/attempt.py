@@ -7,7 +7,7 @@ import json
 import logging
 import mimetypes
 import shutil
-from collections.abc import Awaitable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +21,7 @@ from workers.files import FileStore
 from workers.ledger import Claim, Ledger, crashed_too_often
 from workers.records import Artifact, JobError
 from workers.settings import Settings
+from workers.waiting import first_done
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +75,7 @@ class Attempt:
     async def _run_process(self) -> int | None:
         """Exit status of the process; none where a stop came before it was started."""
         staging = asyncio.create_task(self._stage())
-        await _first(staging, self._stop.wait())
+        await first_done(staging, self._stop.wait())
         if not staging.done():
             staging.cancel()
             return None
@@ -87,7 +88,7 @@ class Attempt:
         ended = asyncio.create_task(child.wait())
         try:
             async with asyncio.timeout(self._settings.job_timeout_s):
-                await _first(ended, carrying, self._stop.wait())
+                await first_done(ended, carrying, self._stop.wait())
         except TimeoutError:
             self._timed_out = True
         try:
@@ -202,14 +203,3 @@ class Attempt:
                 )
             )
         return artifacts
-
-
-async def _first(*waits: Awaitable[object]) -> None:
-    """Until the first of them is done; coroutines among them are cancelled, tasks are left running."""
-    tasks = [asyncio.ensure_future(wait) for wait in waits]
-    try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task, wait in zip(tasks, waits, strict=True):
-            if task is not wait:
-                task.cancel()

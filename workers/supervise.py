@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from workers.database import open_database
@@ -19,6 +19,7 @@ from workers.janitor import release_worker
 from workers.migrate import migrate
 from workers.settings import Settings
 from workers.tether import tethered
+from workers.waiting import first_done
 
 log = logging.getLogger(__name__)
 
@@ -138,7 +139,7 @@ class _Supervisor:
             began, starts = time.monotonic(), starts + 1
             ended = asyncio.create_task(process.wait())
             try:
-                await _first(ended, self._stop.wait())
+                await first_done(ended, self._stop.wait())
                 if self._stop.is_set():
                     await self._end(process, ended, spec.stop_grace_s)
                     return
@@ -154,13 +155,13 @@ class _Supervisor:
                 return
             pause_s = FIRST_PAUSE_S if lived_s >= SETTLED_S else min(2 * pause_s, LONGEST_PAUSE_S)
             log.warning("%s ended with status %s; again in %.1f s", spec.name, process.returncode, pause_s)
-            await _first(asyncio.sleep(pause_s), self._stop.wait())
+            await first_done(asyncio.sleep(pause_s), self._stop.wait())
 
     async def _end(
         self, process: asyncio.subprocess.Process, ended: asyncio.Task[int], grace_s: float
     ) -> None:
         _signal_group(process.pid, signal.SIGTERM, group=False)
-        await _first(ended, asyncio.sleep(grace_s), self._now.wait())
+        await first_done(ended, asyncio.sleep(grace_s), self._now.wait())
         if not ended.done():
             log.warning("process %d did not end in time; killing it", process.pid)
             _signal_group(process.pid, signal.SIGKILL)
@@ -181,16 +182,6 @@ class _Supervisor:
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
                 log.error("%s", error.what)
                 await asyncio.sleep(pause_s)
-
-
-async def _first(*waits: Awaitable[object]) -> None:
-    tasks = [asyncio.ensure_future(wait) for wait in waits]
-    try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task, wait in zip(tasks, waits, strict=True):
-            if task is not wait:
-                task.cancel()
 
 
 def _signal_group(pid: int, number: signal.Signals, *, group: bool = True) -> None:
