@@ -66,7 +66,7 @@ class RefineOptions(BaseModel):
 
     pose_levels: int = Field(3, ge=1, le=16, description="Levels of the pose-estimation module.")
     pose_resolution_min: int = Field(16, ge=2, le=128)
-    pose_resolution_max: int = Field(72, ge=2, le=128)
+    pose_resolution_max: int = Field(72, ge=2, le=8192)
     reconstruction_levels: int | None = Field(
         None, ge=1, le=16, description="Levels of the reconstruction module."
     )

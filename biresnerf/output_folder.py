@@ -18,6 +18,7 @@ from biresnerf.geometry.pose_error import rotation_angle_deg
 from biresnerf.geometry.similarity import Similarity, align_robust
 from biresnerf.refine.checkpoint import CHECKPOINT, SEEDING
 from biresnerf.refine.evaluation import ViewScore
+from biresnerf.refine.history import HISTORY
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.two_stages import TwoStages
 from biresnerf.report import HeldOut, ImageReport, Report, SimilarityReport
@@ -40,7 +41,7 @@ class OutputFolder:
             raise InputError("output_not_a_folder", "is a file.", where=str(self.path), mend="Name a folder.")
         if not self.path.is_dir() or (self.path / CHECKPOINT).is_file():
             return
-        if not {path.name for path in self.path.iterdir()} - {CHECKPOINT.parent.name}:
+        if not {path.name for path in self.path.iterdir()} - {CHECKPOINT.parent.name, HISTORY}:
             return  # new, or killed before the first checkpoint
         report = self.path / REPORT
         if report.is_file():

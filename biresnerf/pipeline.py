@@ -30,6 +30,7 @@ from biresnerf.refine.evaluation import (
     render_orbit,
     score_views,
 )
+from biresnerf.refine.history import Observer
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene_frame import SceneFrame, scene_frame
 from biresnerf.refine.two_stages import LAST_FRACTION, TwoStages
@@ -54,21 +55,23 @@ class Prepared:
 
 
 def refine_poses(
-    input: Path,
+    input: Path | Dataset,
     output: Path,
     options: RefineOptions,
     on_progress: OnProgress | None = None,
     should_stop: Callable[[], bool] | None = None,
+    observer: Observer | None = None,
 ) -> Report:
     """Refine the poses of an image set; all results go to the folder `output`.
 
     Goes on by itself where a run of the same input and options left a checkpoint in `output`.
 
     Args:
-        input: a folder of images (with or without a transforms file) or a transforms file.
+        input: a folder of images (with or without a transforms file), a transforms file, or a set already read.
         output: a folder that is empty, new, or holds an unfinished run of the same input and options.
         on_progress: called with a `Progress` a few times a second.
         should_stop: asked after every step; once true, checkpoint and partial result are written.
+        observer: looks into the run, for comparisons with the truth.
 
     Raises:
         InputError: the user can mend it.
@@ -95,7 +98,7 @@ def refine_poses(
         compile_kernels()
     notes = checkpoint[1] if checkpoint is not None else {"fingerprint": None, "seeding": None}
     folder.restore_seeding(notes["seeding"])
-    prepared = _prepare(Path(input), options, folder.seeding, report, stop)
+    prepared = _prepare(input, options, folder.seeding, report, stop)
     folder.claim(prepared.fingerprint, notes["fingerprint"])
     stage: Stage = "preparing" if prepared.seeding is None else "seeding"
     report(Progress(stage=stage, fraction=0.02, message=f"{len(prepared.dataset)} images read"))
@@ -109,7 +112,7 @@ def refine_poses(
         device,
         threads,
     )
-    stages = TwoStages(optimiser, folder.path, prepared.fingerprint, report, stop, prepared.seeding)
+    stages = TwoStages(optimiser, folder.path, prepared.fingerprint, report, stop, prepared.seeding, observer)
     if checkpoint is not None:
         stages.resume(*checkpoint)
         logger.info("going on from step %d", optimiser.step_index)
@@ -125,6 +128,8 @@ def refine_poses(
         write([], state="partial")
         raise Interrupted(f"stopped at step {optimiser.step_index}; run again to go on")
     scores = _evaluate(prepared, optimiser, stages, folder, report)
+    if observer is not None:
+        observer.at_end(optimiser)
     report(Progress(stage="exporting", fraction=0.99))
     result = write(scores, state="complete")
     shutil.rmtree(folder.path / CHECKPOINT.parent)
@@ -141,15 +146,25 @@ def held_out_views(count: int, asked: int | None) -> list[int]:
 
 
 def _prepare(
-    path: Path, options: RefineOptions, seeding: Path, report: OnProgress, stop: Callable[[], bool]
+    given: Path | Dataset,
+    options: RefineOptions,
+    seeding: Path,
+    report: OnProgress,
+    stop: Callable[[], bool],
 ) -> Prepared:
-    dataset = read_dataset(
-        path,
-        should_stop=stop,
-        seed=options.seed,
-        remember=seeding,
-        on_seeding=lambda: report(Progress(stage="seeding", fraction=0.01, message="COLMAP looks for poses")),
-    )
+    def tell_seeding() -> None:
+        report(Progress(stage="seeding", fraction=0.01, message="COLMAP looks for poses"))
+
+    if isinstance(given, Dataset):
+        dataset = given
+    else:
+        dataset = read_dataset(
+            Path(given),
+            should_stop=stop,
+            seed=options.seed,
+            remember=seeding,
+            on_seeding=tell_seeding,
+        )
     images = load_images(dataset, options.max_image_size, options.background)
     digest = hashlib.sha256(images.pixels.tobytes())
     # What changes neither result nor effort may differ between a run and its continuation.
@@ -162,7 +177,9 @@ def _prepare(
         scene_frame(dataset, images),
         held_out_views(len(dataset), options.holdout),
         digest.hexdigest(),
-        seeding.read_text("utf-8") if dataset.source.dialect == "images" else None,
+        seeding.read_text("utf-8")
+        if dataset.source.dialect == "images" and not isinstance(given, Dataset)
+        else None,
     )
 
 

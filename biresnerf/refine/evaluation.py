@@ -11,6 +11,7 @@ from torch import Tensor
 
 from biresnerf.data.images import ImageSet
 from biresnerf.field.radiance_field import PositionGradient
+from biresnerf.geometry.camera import Intrinsics
 from biresnerf.refine.image_metrics import psnr, ssim
 from biresnerf.refine.joint_optimiser import JointOptimiser
 
@@ -58,17 +59,22 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
 
 
 @torch.no_grad()
-def render_view(optimiser: JointOptimiser, unit_from_cam: Tensor, image: int) -> RenderedView:
-    """Render what a camera at `unit_from_cam` [3, 4] with the intrinsics of `image` sees, whole."""
-    width = int(optimiser.intrinsics.width[image])
-    height = int(optimiser.intrinsics.height[image])
+def render_view(
+    optimiser: JointOptimiser, unit_from_cam: Tensor, image: int, intrinsics: Intrinsics | None = None
+) -> RenderedView:
+    """Render what a camera at `unit_from_cam` [3, 4] with the intrinsics of `image` sees, whole.
+
+    `intrinsics` are the run's images' where not given.
+    """
+    lenses = intrinsics or optimiser.intrinsics
+    width, height = int(lenses.width[image]), int(lenses.height[image])
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     pixels = torch.stack([x, y], -1).reshape(-1, 2).to(optimiser.device)
     parts = []
     for xy in pixels.split(CHUNK):
         index = torch.full((len(xy),), image, device=optimiser.device)
         origin, direction = optimiser.cast(
-            unit_from_cam.float().to(optimiser.device).expand(len(xy), 3, 4), index, xy
+            unit_from_cam.float().to(optimiser.device).expand(len(xy), 3, 4), index, xy, lenses
         )
         part = optimiser.render(
             origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=False

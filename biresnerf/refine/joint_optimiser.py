@@ -24,7 +24,7 @@ from biresnerf.refine.schedule import Schedule
 MOST_SAMPLES = 768  # per ray
 RAYS_LEAST, RAYS_MOST = 256, 1 << 15
 OCCUPANCY_PERIOD = 16
-DENSE_TABLE_LOG2 = 22  # the pose-estimation module is stored densely whatever its resolution
+DENSE_TABLE_LOG2 = 22  # the pose-estimation module is stored densely up to 159 cells a side, hashed beyond
 RIG_DISTANCE = 4.0  # BARF's rigs: learning rates of translations are for cameras this far away
 
 
@@ -98,12 +98,14 @@ class JointOptimiser:
         near = self.frame.distance * self.schedule.near(self.step_index, self.switch)
         return Marching(interval, near, self.frame.far, MOST_SAMPLES, self.occupancy.occupied)
 
-    def cast(self, matrix: Tensor, image: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
+    def cast(
+        self, matrix: Tensor, image: Tensor, xy: Tensor, intrinsics: Intrinsics | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Origin and direction [rays, 3] in the unit frame of pixels `xy` [rays, 2] seen by cameras of images.
 
-        `matrix` [rays, 3, 4] is each ray's unit_from_cam.
+        `matrix` [rays, 3, 4] is each ray's unit_from_cam; `intrinsics` are the run's images' where not given.
         """
-        in_cam = directions_in_cam(self.intrinsics, image, xy).float()
+        in_cam = directions_in_cam(intrinsics or self.intrinsics, image, xy).float()
         direction = (matrix[:, :, :3] @ in_cam[:, :, None])[:, :, 0]
         return matrix[:, :, 3].contiguous(), direction.contiguous()
 

@@ -17,7 +17,8 @@ from biresnerf.errors import RefinementError
 from biresnerf.geometry.pose_error import rotation_angle_deg
 from biresnerf.progress import OnProgress, Progress
 from biresnerf.refine.checkpoint import CHECKPOINT, save_checkpoint
-from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.history import History, Observer
+from biresnerf.refine.joint_optimiser import JointOptimiser, StepResult
 from biresnerf.refine.stability import StabilityDetector
 from biresnerf.report import SwitchReason
 
@@ -49,6 +50,7 @@ class TwoStages:
         folder: where checkpoints go.
         fingerprint: of input and options; a checkpoint with another one is not resumed.
         seeding: COLMAP's answer, where poses come from it; goes into every checkpoint.
+        observer: looks in at every check.
     """
 
     def __init__(
@@ -59,8 +61,10 @@ class TwoStages:
         on_progress: OnProgress,
         should_stop: Callable[[], bool],
         seeding: str | None = None,
+        observer: Observer | None = None,
     ) -> None:
         self.optimiser, self.folder = optimiser, folder
+        self.history, self.observer = History(folder), observer or Observer()
         self.on_progress, self.should_stop = on_progress, should_stop
         self.record = RunRecord(fingerprint, seeding=seeding)
         options = optimiser.options
@@ -87,6 +91,7 @@ class TwoStages:
         """
         optimiser, options = self.optimiser, self.optimiser.options
         reported = saved = time.monotonic()
+        self.history.cut(optimiser.step_index)
         while optimiser.step_index < self.optimiser.schedule.steps:
             if self.should_stop():
                 self._save()
@@ -102,7 +107,7 @@ class TwoStages:
             # Also where the period does not divide the cap: stage 2 must not wait, or never come.
             due = optimiser.step_index == self.detector.cap and optimiser.switch is None
             if due or optimiser.step_index % int(options.check_every or 1) == 0:
-                self._check()
+                self._check(result)
             now = time.monotonic()
             self.record.seconds[stage] += now - started
             slow = self._step_seconds[stage]
@@ -118,7 +123,7 @@ class TwoStages:
         self.on_progress(self._progress(CHECKPOINT.as_posix()))
         return True
 
-    def _check(self) -> None:
+    def _check(self, last: StepResult) -> None:
         """The detector's turn, at the end of each block."""
         optimiser = self.optimiser
         error = float(np.mean(self._errors))
@@ -127,6 +132,7 @@ class TwoStages:
         turn = self._poses_at_check[:, :3, :3].transpose(1, 2) @ now[:, :3, :3]
         self._moved_deg = float(np.quantile(rotation_angle_deg(turn.numpy()), 0.9))
         self._poses_at_check = now
+        self._write_history(error, last)
         if optimiser.switch is not None:
             return
         still_deg = self.detector.still_deg(optimiser.pose_rate(), int(optimiser.options.check_every or 1))
@@ -141,6 +147,27 @@ class TwoStages:
             logger.info("stage 2 begins at step %d (%s)", optimiser.step_index, verdict)
             self._snapshot = None
             optimiser.start_reconstruction()
+
+    def _write_history(self, mean_squared_error: float, last: StepResult) -> None:
+        optimiser = self.optimiser
+        # The error is the mean since the last check; loss, rays and samples are the last step's, rates the next's.
+        rates = optimiser.schedule.field_rates(optimiser.step_index, optimiser.switch)
+        self.history.append(
+            {
+                "step": optimiser.step_index,
+                "stage": self.stage,
+                "psnr": -10 * math.log10(max(mean_squared_error, 1e-12)),
+                "loss": last.loss,
+                "moved_deg": self._moved_deg,
+                "rays": last.rays,
+                "samples": last.samples,
+                "pose_rate": optimiser.pose_rate(),
+                "field_rate": rates.pose,
+                "reconstruction_rate": max(rates.reconstruction, default=0.0),
+                "seconds": round(sum(self.record.seconds[stage] for stage in ("coarse", "fine")), 3),
+                **self.observer.at_check(optimiser),
+            }
+        )
 
     def _roll_back(self) -> None:
         """Back to the best state so far with half the pose rate (method 4.3, DIVERGE)."""

@@ -8,6 +8,7 @@ import torch
 from biresnerf.errors import RefinementError
 from biresnerf.progress import Progress
 from biresnerf.refine.checkpoint import CHECKPOINT, load_checkpoint
+from biresnerf.refine.history import read_history
 from biresnerf.refine.two_stages import TwoStages
 from tests.refine.scene import tiny_optimiser, tiny_options, tiny_set
 
@@ -38,6 +39,11 @@ def whole(scene, tmp_path_factory):
     return stages
 
 
+def curve(stages: TwoStages) -> list[dict[str, float | str]]:
+    lines = read_history(stages.history.path)
+    return [{key: value for key, value in line.items() if key != "seconds"} for line in lines]
+
+
 @pytest.mark.parametrize("stop_at", [0, 13, 31])
 def test_a_run_stopped_anywhere_and_resumed_ends_bit_for_bit_as_an_uninterrupted_one(
     scene, tmp_path, whole, stop_at
@@ -54,6 +60,7 @@ def test_a_run_stopped_anywhere_and_resumed_ends_bit_for_bit_as_an_uninterrupted
     for name, tensor in whole.optimiser.state().items():
         assert torch.equal(resumed.optimiser.state()[name], tensor), name
     assert resumed.detector == whole.detector
+    assert curve(resumed) == curve(whole)
 
 
 def test_stage_2_begins_at_the_cap_at_the_latest(whole):
