@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import importlib.util
 import json
-import os
-import signal
-import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,18 +13,14 @@ from typing import Any
 import numpy as np
 
 from biresnerf.data.atomic_file import whole_file
+from biresnerf.data.colmap_process import run_colmap
 from biresnerf.data.dataset import Camera, Dataset, Frame, SourceFormat
 from biresnerf.data.image_files import ImageHeader, read_header
 from biresnerf.data.transforms_json import MIN_IMAGES, few_names, orientation_notes, refuse_too_few
-from biresnerf.errors import InputError, Interrupted, RefinementError
+from biresnerf.errors import InputError
 from biresnerf.geometry.lens import lens_problem
 
 ALL_PAIRS_UP_TO = 150  # images; beyond it, neighbours in the order of names are matched (11 000 pairs at 150)
-CHILD = Path(__file__).with_name("colmap_child.py")
-_POLL_S = 0.2
-_PR_SET_PDEATHSIG = 1
-# Loaded here: between fork and exec it would be too late to load anything.
-_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 _OVERLAP_MEND = (
     "Take sharp photos that overlap by more than half, of something with texture, from many places; "
     "or give a transforms.json with approximate poses."
@@ -80,6 +70,7 @@ def seed_poses(
         on_start()
     with tempfile.TemporaryDirectory(prefix="biresnerf-colmap-") as work:
         request = {
+            "task": "from_scratch",
             "root": str(root),
             "names": names,
             "work": work,
@@ -88,7 +79,7 @@ def seed_poses(
             "sequential": len(names) > ALL_PAIRS_UP_TO,
             "seed": seed,
         }
-        answer = _run_child(request, Path(work), should_stop or (lambda: False), limit_s)
+        answer = run_colmap(request, Path(work), should_stop or (lambda: False), limit_s)
     dataset = _dataset(root, headers, answer)
     if remember is not None:
         with whole_file(remember) as temporary:
@@ -111,57 +102,6 @@ def _remembered(remember: Path | None, key: str) -> dict[str, Any] | None:
         return None
     kept = json.loads(remember.read_text("utf-8"))
     return kept["answer"] if kept["key"] == key else None
-
-
-def _run_child(
-    request: dict[str, Any], work: Path, should_stop: Callable[[], bool], limit_s: float
-) -> dict[str, Any]:
-    request_path, log_path = work / "request.json", work / "colmap.log"
-    request_path.write_text(json.dumps(request), "utf-8")
-    command = [sys.executable, "-P", str(CHILD), str(request_path)]
-    with log_path.open("wb") as log:
-        child = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-            preexec_fn=_die_with_parent if sys.platform == "linux" else None,
-        )
-        try:
-            _wait(child, Path(request["root"]).name, should_stop, limit_s)
-        finally:
-            if child.poll() is None:
-                os.killpg(child.pid, signal.SIGKILL)
-                child.wait()
-    answer = Path(request["answer"])
-    if child.returncode != 0 or not answer.is_file():
-        tail = log_path.read_text("utf-8", errors="replace").strip().splitlines()[-3:]
-        raise RefinementError("seeding_crashed", f"COLMAP ended with {child.returncode}: {' | '.join(tail)}")
-    result: dict[str, Any] = json.loads(answer.read_text("utf-8"))
-    return result
-
-
-def _wait(
-    child: subprocess.Popen[bytes], root_name: str, should_stop: Callable[[], bool], limit_s: float
-) -> None:
-    end = time.monotonic() + limit_s
-    while child.poll() is None:
-        if should_stop():
-            raise Interrupted("stopped while COLMAP looked for poses")
-        if time.monotonic() > end:
-            raise InputError(
-                "seed_timeout",
-                f"COLMAP did not finish within {limit_s:g} s.",
-                where=root_name,
-                mend="Give fewer images, or a transforms.json with approximate poses.",
-            )
-        time.sleep(_POLL_S)
-
-
-def _die_with_parent() -> None:
-    assert _LIBC is not None
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _dataset(root: Path, headers: dict[str, ImageHeader], answer: dict[str, Any]) -> Dataset:

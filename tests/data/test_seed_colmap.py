@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from biresnerf.data import seed_colmap
+from biresnerf.data import colmap_process
 from biresnerf.data.read import read_dataset
 from biresnerf.data.synthetic import render_synthetic, synthetic_cameras, synthetic_focal
 from biresnerf.data.write import write_transforms
@@ -116,7 +116,7 @@ def test_the_time_limit_ends_the_child(folder):
 def test_a_crash_of_colmap_is_told_with_its_last_words(folder, monkeypatch, tmp_path):
     broken = tmp_path / "colmap_child.py"
     broken.write_text("import os, sys; print('out of luck', file=sys.stderr, flush=True); os.abort()")
-    monkeypatch.setattr(seed_colmap, "CHILD", broken)
+    monkeypatch.setattr(colmap_process, "CHILD", broken)
     with pytest.raises(RefinementError, match="out of luck") as caught:
         read_dataset(folder)
     assert caught.value.code == "seeding_crashed"
@@ -153,7 +153,7 @@ def test_two_images_are_too_few_and_broken_ones_are_named_before_colmap_runs(tmp
 def test_a_continued_run_is_given_the_same_poses_until_an_image_changes(folder, tmp_path, monkeypatch):
     kept = tmp_path / "kept" / "seeding.json"
     first = read_dataset(folder, remember=kept)
-    monkeypatch.setattr(seed_colmap, "CHILD", tmp_path / "no_such_program.py")
+    monkeypatch.setattr(colmap_process, "CHILD", tmp_path / "no_such_program.py")
     again = read_dataset(folder, remember=kept)
     assert np.array_equal(again.world_from_cam, first.world_from_cam)
     assert again.cameras == first.cameras

@@ -1,0 +1,130 @@
+"""What feature matches say about the poses of a set that has some: COLMAP, guided by the given poses."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.colmap_process import run_colmap
+from biresnerf.data.dataset import Dataset
+from biresnerf.geometry.focus import focus_point
+from biresnerf.geometry.similarity import align_robust
+
+logger = logging.getLogger(__name__)
+
+ALL_PAIRS_UP_TO = (
+    60  # images; beyond it, each is matched with those whose given poses see most nearly the same
+)
+NEIGHBOURS = 40
+LEAST_PLACED = 0.5  # of the images; a model of fewer says too little about the rig
+# Standard deviation of given positions, of the cameras' distance: holds what matches leave open (the drift of narrow
+# views, the mirror of flat scenes) and, under a robust loss, no more.
+POSITION_DEVIATION = 0.2
+WIDEST_IMAGE, MOST_FEATURES = (
+    1000,
+    2048,
+)  # a start for the optimisation needs no more, and matching costs their square
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedPoses:
+    """Poses that one way of mapping found, carried into the frame of the given ones.
+
+    Attributes:
+        mapper: ``incremental`` or ``global``.
+        world_from_cam: float64 [n, 4, 4]; images without enough matches keep their given pose.
+        placed: bool [n], whether matches gave the pose.
+        points: how many points the matches made.
+    """
+
+    mapper: str
+    world_from_cam: NDArray[np.float64]
+    placed: NDArray[np.bool_]
+    points: int
+
+
+def can_match() -> bool:
+    """Whether COLMAP is installed."""
+    return importlib.util.find_spec("pycolmap") is not None
+
+
+def poses_from_matches(
+    dataset: Dataset,
+    *,
+    should_stop: Callable[[], bool] | None = None,
+    seed: int = 0,
+    limit_s: float = 900.0,
+) -> list[MatchedPoses]:
+    """The rigs that feature matches support, best first by images placed; empty where texture does not suffice.
+
+    Intrinsics are kept as given. Image pairs whose matches contradict the given poses by far more than most do are
+    taken for repeated structure and left out.
+
+    Raises:
+        InputError: ``seed_timeout``.
+        Interrupted: ``should_stop`` said so.
+        RefinementError: ``seeding_crashed``.
+    """
+    names = list(dataset.file_names)
+    given = dataset.world_from_cam
+    with tempfile.TemporaryDirectory(prefix="biresnerf-matches-") as work:
+        request = {
+            "task": "from_given",
+            "root": str(dataset.root.resolve()),
+            "work": work,
+            "answer": str(Path(work, "answer.json")),
+            "seed": seed,
+            "cameras": [
+                {
+                    "model": camera.model,
+                    "params": list(camera.params),
+                    "names": [n for n, f in zip(names, dataset.frames, strict=True) if f.camera == i],
+                }
+                for i, camera in enumerate(dataset.cameras)
+            ],
+            "cam_from_world": dict(zip(names, np.linalg.inv(given).tolist(), strict=True)),
+            "position_deviation": POSITION_DEVIATION * focus_point(given).mean_distance,
+            "pairs": None if len(names) <= ALL_PAIRS_UP_TO else _pairs(names, given),
+            "widest_image": WIDEST_IMAGE,
+            "most_features": MOST_FEATURES,
+        }
+        answer = run_colmap(request, Path(work), should_stop or (lambda: False), limit_s)
+    found = [matched for model in answer["models"] if (matched := _carried(model, names, given)) is not None]
+    return sorted(found, key=lambda matched: (-int(matched.placed.sum()), -matched.points))
+
+
+def _pairs(names: list[str], world_from_cam: NDArray[np.float64]) -> list[tuple[str, str]]:
+    """Each image with its `NEIGHBOURS` nearest: by centre, in distances of the scene, and by viewing direction."""
+    centres = world_from_cam[:, :3, 3] / focus_point(world_from_cam).mean_distance
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    apart = apart + np.linalg.norm(world_from_cam[:, None, :3, 2] - world_from_cam[None, :, :3, 2], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    nearest = np.argsort(apart, axis=1, kind="stable")[:, :NEIGHBOURS]
+    pairs = {(min(i, int(j)), max(i, int(j))) for i in range(len(names)) for j in nearest[i]}
+    return [(names[i], names[j]) for i, j in sorted(pairs)]
+
+
+def _carried(model: dict[str, Any], names: list[str], given: NDArray[np.float64]) -> MatchedPoses | None:
+    """A model in the frame of the given poses; None where it holds too few of the images."""
+    index = {name: i for i, name in enumerate(names)}
+    rows = np.array([index[image["name"]] for image in model["images"]], dtype=np.int64)
+    logger.info("matches place %d of %d images (%s mapping)", len(rows), len(names), model["mapper"])
+    if len(rows) < max(3, LEAST_PLACED * len(names)):
+        return None
+    cam_from_model = np.tile(np.eye(4), (len(rows), 1, 1))
+    cam_from_model[:, :3] = [image["cam_from_world"] for image in model["images"]]
+    model_from_cam = np.linalg.inv(cam_from_model)
+    similarity = align_robust(model_from_cam, given[rows], with_rotations=True)
+    poses = given.copy()
+    poses[rows] = similarity.apply_to_poses(model_from_cam)
+    placed = np.zeros(len(names), dtype=np.bool_)
+    placed[rows] = True
+    return MatchedPoses(model["mapper"], poses, placed, int(model["points"]))
