@@ -15,6 +15,7 @@ PresetName = Literal["fast", "balanced", "quality", "paper"]
 Device = Literal["auto", "cpu", "cuda"]
 Background = Literal["auto", "white", "black", "none"]
 PoseParametrisation = Literal["se3_world", "so3xr3"]
+StartPoses = Literal["auto", "given"]
 
 
 class RefineOptions(BaseModel):
@@ -41,6 +42,12 @@ class RefineOptions(BaseModel):
     )
     background: Background = Field(
         "auto", description="What lies behind the scene: a colour, or none where photos show surroundings."
+    )
+
+    start: StartPoses = Field(
+        "auto",
+        description="auto: poses that feature matches support are tried against the given ones, and the better "
+        "ones are started from; given: no matches are looked for.",
     )
 
     steps: int | None = Field(None, ge=20, le=1_000_000, description="Steps of both stages together.")

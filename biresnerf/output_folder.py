@@ -20,6 +20,7 @@ from biresnerf.refine.checkpoint import CHECKPOINT, SEEDING
 from biresnerf.refine.evaluation import ViewScore
 from biresnerf.refine.history import HISTORY
 from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.start import Start
 from biresnerf.refine.two_stages import TwoStages
 from biresnerf.report import HeldOut, ImageReport, Report, SimilarityReport
 
@@ -94,6 +95,7 @@ class OutputFolder:
     def write_result(
         self,
         dataset: Dataset,
+        start: Start,
         images: ImageSet,
         stages: TwoStages,
         held_out: list[int],
@@ -113,7 +115,7 @@ class OutputFolder:
             version=_version(),
             state=state,
             options=optimiser.options,
-            images=_image_reports(dataset, world_from_cam, held_out, scores),
+            images=_image_reports(dataset, start, world_from_cam, held_out, scores),
             heldout=HeldOut(
                 count=len(scores),
                 psnr=float(np.mean([s.psnr for s in scores])),
@@ -121,6 +123,7 @@ class OutputFolder:
             )
             if scores
             else None,
+            start_trials=start.trials,
             steps_done=optimiser.step_index,
             switch_step=optimiser.switch,
             switch_reason=record.switch_reason,
@@ -135,7 +138,7 @@ class OutputFolder:
                 rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
                 translation=tuple(float(v) for v in similarity.translation),
             ),
-            warnings=dataset.warnings,
+            warnings=dataset.warnings + start.warnings,
         )
         self._write_text(REPORT, report.model_dump_json(indent=2))
         return report
@@ -159,7 +162,7 @@ def poses_in_input_frame(dataset: Dataset, optimiser: JointOptimiser) -> tuple[n
 
 
 def _image_reports(
-    dataset: Dataset, world_from_cam: np.ndarray, held_out: list[int], scores: list[ViewScore]
+    dataset: Dataset, start: Start, world_from_cam: np.ndarray, held_out: list[int], scores: list[ViewScore]
 ) -> tuple[ImageReport, ...]:
     given = dataset.world_from_cam
     turn = rotation_angle_deg(np.swapaxes(given[:, :3, :3], 1, 2) @ world_from_cam[:, :3, :3])
@@ -168,7 +171,7 @@ def _image_reports(
     return tuple(
         ImageReport(
             name=frame.name,
-            pose_source=frame.pose_source,
+            pose_source=start.source if start.placed[i] else frame.pose_source,
             held_out=i in held_out,
             moved_deg=float(turn[i]),
             moved_units=float(shift[i]),

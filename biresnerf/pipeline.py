@@ -8,21 +8,23 @@ import logging
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+import torch
 
 from biresnerf.config import RefineOptions
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.images import ImageSet, load_images
+from biresnerf.data.match_poses import can_match, poses_from_matches
 from biresnerf.data.read import read_dataset
-from biresnerf.errors import Interrupted
+from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.field.backends import choose_device, use_threads
 from biresnerf.field.compile_kernels import compile_kernels
 from biresnerf.output_folder import OutputFolder
-from biresnerf.progress import OnProgress, Progress, Stage
+from biresnerf.progress import OnProgress, Progress
 from biresnerf.refine.checkpoint import CHECKPOINT, load_checkpoint
 from biresnerf.refine.evaluation import (
     ViewScore,
@@ -32,9 +34,10 @@ from biresnerf.refine.evaluation import (
 )
 from biresnerf.refine.history import Observer
 from biresnerf.refine.joint_optimiser import JointOptimiser
-from biresnerf.refine.scene_frame import SceneFrame, scene_frame
+from biresnerf.refine.scene_frame import scene_frame
+from biresnerf.refine.start import Start, choose_start
 from biresnerf.refine.two_stages import LAST_FRACTION, TwoStages
-from biresnerf.report import Report
+from biresnerf.report import Report, StartSource
 
 logger = logging.getLogger(__name__)
 
@@ -48,7 +51,6 @@ class Prepared:
 
     dataset: Dataset
     images: ImageSet
-    frame: SceneFrame
     held_out: list[int]
     fingerprint: str
     seeding: str | None  # COLMAP's answer, where the poses are COLMAP's
@@ -77,7 +79,7 @@ def refine_poses(
         InputError: the user can mend it.
         RefinementError: the optimisation diverged.
         Interrupted: stopped by `should_stop`; the checkpoint and a partial result are in `output`, or nothing
-            yet where COLMAP was still looking for poses.
+            yet where poses to start from were still being looked for.
     """
     report = on_progress or (lambda _progress: None)
     stop = should_stop or (lambda: False)
@@ -86,33 +88,30 @@ def refine_poses(
     folder.refuse_finished()
     checkpoint = load_checkpoint(folder.path)
     report(Progress(stage="preparing"))
-    device = choose_device(options.device)
-    options = options.model_copy(update={"device": "cuda" if device.type == "cuda" else "cpu"}).resolved()
-    threads = use_threads(options.threads)
-    if device.type == "cpu":
-        report(
-            Progress(
-                stage="preparing", fraction=0.005, message="loading kernels (the first run compiles them)"
-            )
-        )
-        compile_kernels()
-    notes = checkpoint[1] if checkpoint is not None else {"fingerprint": None, "seeding": None}
+    options, device, threads = _choose_backend(options, report)
+    unstarted: dict[str, Any] = {"fingerprint": None, "seeding": None}
+    notes = checkpoint[1] if checkpoint is not None else unstarted
     folder.restore_seeding(notes["seeding"])
     prepared = _prepare(input, options, folder.seeding, report, stop)
     folder.claim(prepared.fingerprint, notes["fingerprint"])
-    stage: Stage = "preparing" if prepared.seeding is None else "seeding"
-    report(Progress(stage=stage, fraction=0.02, message=f"{len(prepared.dataset)} images read"))
+    if checkpoint is not None:
+        start = Start.from_json(notes["start"])
+    else:
+        start = _find_start(prepared, options, device, threads, report, stop)
 
-    optimiser = JointOptimiser(
-        prepared.images,
-        prepared.frame,
-        prepared.frame.unit_from_world.apply_to_poses(prepared.dataset.world_from_cam),
-        options,
-        prepared.held_out,
-        device,
-        threads,
+    frame = scene_frame(start.world_from_cam, prepared.images)
+    poses = frame.unit_from_world.apply_to_poses(start.world_from_cam)
+    optimiser = JointOptimiser(prepared.images, frame, poses, options, prepared.held_out, device, threads)
+    stages = TwoStages(
+        optimiser,
+        folder.path,
+        prepared.fingerprint,
+        report,
+        stop,
+        prepared.seeding,
+        start.as_json(),
+        observer,
     )
-    stages = TwoStages(optimiser, folder.path, prepared.fingerprint, report, stop, prepared.seeding, observer)
     if checkpoint is not None:
         stages.resume(*checkpoint)
         logger.info("going on from step %d", optimiser.step_index)
@@ -120,11 +119,17 @@ def refine_poses(
 
     def write(scores: list[ViewScore], state: Literal["complete", "partial"]) -> Report:
         return folder.write_result(
-            prepared.dataset, prepared.images, stages, prepared.held_out, scores, threads=threads, state=state
+            prepared.dataset,
+            start,
+            prepared.images,
+            stages,
+            prepared.held_out,
+            scores,
+            threads=threads,
+            state=state,
         )
 
-    finished = stages.run()
-    if not finished:
+    if not stages.run():
         write([], state="partial")
         raise Interrupted(f"stopped at step {optimiser.step_index}; run again to go on")
     scores = _evaluate(prepared, optimiser, stages, folder, report)
@@ -135,6 +140,53 @@ def refine_poses(
     shutil.rmtree(folder.path / CHECKPOINT.parent)
     report(Progress(stage="exporting", fraction=1.0, eta_s=0.0))
     return result
+
+
+def _choose_backend(options: RefineOptions, report: OnProgress) -> tuple[RefineOptions, torch.device, int]:
+    """The options resolved for the device there is, that device, and the threads taken; kernels compiled."""
+    device = choose_device(options.device)
+    options = options.model_copy(update={"device": "cuda" if device.type == "cuda" else "cpu"}).resolved()
+    threads = use_threads(options.threads)
+    if device.type == "cpu":
+        message = "loading kernels (the first run compiles them)"
+        report(Progress(stage="preparing", fraction=0.005, message=message))
+        compile_kernels()
+    return options, device, threads
+
+
+def _find_start(
+    prepared: Prepared,
+    options: RefineOptions,
+    device: torch.device,
+    threads: int,
+    report: OnProgress,
+    stop: Callable[[], bool],
+) -> Start:
+    """The given poses, or better ones by feature matches where `options.start` lets them be looked for."""
+    dataset = prepared.dataset
+    given = Start(
+        dataset.world_from_cam, dataset.frames[0].pose_source, np.zeros(len(dataset), dtype=np.bool_)
+    )
+    if options.start == "given" or prepared.seeding is not None:
+        return given
+    report(Progress(stage="seeding", fraction=0.012, message="comparing the poses with feature matches"))
+    if not can_match():
+        return replace(
+            given,
+            warnings=("COLMAP is not installed: the given poses were not compared with feature matches.",),
+        )
+    try:
+        matched = poses_from_matches(dataset, should_stop=stop, seed=options.seed)
+    except (InputError, RefinementError) as error:
+        return replace(
+            given, warnings=(f"The given poses could not be compared with feature matches: {error}",)
+        )
+    if not matched:
+        return given
+    sources: dict[str, StartSource] = {"incremental": "matches-incremental", "global": "matches-global"}
+    candidates = [given, *(Start(m.world_from_cam, sources[m.mapper], m.placed) for m in matched)]
+    report(Progress(stage="seeding", fraction=0.016, message=f"trying {len(candidates)} sets of poses"))
+    return choose_start(candidates, prepared.images, options, device, threads, stop)
 
 
 def held_out_views(count: int, asked: int | None) -> list[int]:
@@ -174,7 +226,6 @@ def _prepare(
     return Prepared(
         dataset,
         images,
-        scene_frame(dataset, images),
         held_out_views(len(dataset), options.holdout),
         digest.hexdigest(),
         seeding.read_text("utf-8")

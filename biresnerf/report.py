@@ -11,6 +11,7 @@ from biresnerf.config import RefineOptions
 _FROZEN = ConfigDict(frozen=True, extra="forbid")
 
 SwitchReason = Literal["stable", "cap"]
+StartSource = Literal["given", "colmap", "matches-incremental", "matches-global"]
 
 
 class ImageReport(BaseModel):
@@ -19,7 +20,7 @@ class ImageReport(BaseModel):
     model_config = _FROZEN
 
     name: str
-    pose_source: Literal["given", "colmap"]
+    pose_source: StartSource = Field(description="Who found the pose that the optimisation started from.")
     held_out: bool = Field(description="Never used to train the field.")
     moved_deg: float = Field(description="Rotation between the given pose and the refined one, degrees.")
     moved_units: float = Field(description="Distance between the given camera centre and the refined one.")
@@ -37,6 +38,18 @@ class HeldOut(BaseModel):
     count: int
     psnr: float
     ssim: float
+
+
+class TrialReport(BaseModel):
+    """How poses to start from did: a short training with them held still, scored on views it was not shown."""
+
+    model_config = _FROZEN
+
+    source: StartSource
+    placed: int = Field(
+        description="Images whose pose comes from feature matches; the others keep the given one."
+    )
+    psnr: float = Field(description="Mean over the unseen views, dB; only comparable within one run.")
 
 
 class SimilarityReport(BaseModel):
@@ -59,6 +72,10 @@ class Report(BaseModel):
     options: RefineOptions
     images: tuple[ImageReport, ...]
     heldout: HeldOut | None = Field(None, description="None where there were too few views to hold any out.")
+    start_trials: tuple[TrialReport, ...] = Field(
+        (),
+        description="The poses that were tried to start from, if there was a choice; the given ones first.",
+    )
     steps_done: int
     switch_step: int | None = Field(None, description="The step at which stage 2 began.")
     switch_reason: SwitchReason | None = None

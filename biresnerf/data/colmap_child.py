@@ -165,7 +165,7 @@ def map_incrementally(database: Path, images: Path, work: Path, seed: int) -> di
     options.use_prior_position = options.use_robust_loss_on_prior_position = True
     options.mapper.init_min_num_inliers, options.mapper.abs_pose_min_num_inliers = 30, 15
     options.mapper.init_min_tri_angle = 8.0
-    return pycolmap.incremental_mapping(database, images, work, options)  # type: ignore[no-any-return]
+    return pycolmap.incremental_mapping(database, images, work, options)
 
 
 def map_globally(database: Path, images: Path, work: Path, seed: int) -> dict[int, Any]:
@@ -178,7 +178,7 @@ def map_globally(database: Path, images: Path, work: Path, seed: int) -> dict[in
     adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = (
         False
     )
-    return pycolmap.global_mapping(database, images, work, options)  # type: ignore[no-any-return]
+    return pycolmap.global_mapping(database, images, work, options)
 
 
 def describe_largest(models: dict[int, Any]) -> dict[str, Any]:

@@ -121,7 +121,7 @@ def _carried(model: dict[str, Any], names: list[str], given: NDArray[np.float64]
         return None
     cam_from_model = np.tile(np.eye(4), (len(rows), 1, 1))
     cam_from_model[:, :3] = [image["cam_from_world"] for image in model["images"]]
-    model_from_cam = np.linalg.inv(cam_from_model)
+    model_from_cam = np.linalg.inv(cam_from_model).astype(np.float64)
     similarity = align_robust(model_from_cam, given[rows], with_rotations=True)
     poses = given.copy()
     poses[rows] = similarity.apply_to_poses(model_from_cam)

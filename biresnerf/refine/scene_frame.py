@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from biresnerf.data.dataset import Dataset
 from biresnerf.data.images import ImageSet
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.similarity import Similarity
@@ -65,9 +64,8 @@ def _silhouette_tangent(images: ImageSet) -> float | None:
     return float(np.quantile(reach, 0.9)) if reach else None
 
 
-def scene_frame(dataset: Dataset, images: ImageSet) -> SceneFrame:
-    """The unit frame of a set, from its given poses (noisy ones will do) and images."""
-    poses = dataset.world_from_cam
+def scene_frame(poses: np.ndarray, images: ImageSet) -> SceneFrame:
+    """The unit frame of a set, from its poses world_from_cam [n, 4, 4] (noisy ones will do) and images."""
     centres = poses[:, :3, 3]
     focus = focus_point(poses)
     centre, distance = focus.point, focus.mean_distance

@@ -40,6 +40,7 @@ class RunRecord:
     rollbacks: int = 0
     switch_reason: SwitchReason | None = None
     seeding: str | None = None  # COLMAP's answer where poses come from it: another run would find others
+    start: dict[str, Any] = field(default_factory=dict)  # the poses started from, as `Start.as_json`
     seconds: dict[str, float] = field(default_factory=lambda: {"coarse": 0.0, "fine": 0.0})
 
 
@@ -50,6 +51,7 @@ class TwoStages:
         folder: where checkpoints go.
         fingerprint: of input and options; a checkpoint with another one is not resumed.
         seeding: COLMAP's answer, where poses come from it; goes into every checkpoint.
+        start: the poses started from; goes into every checkpoint.
         observer: looks in at every check.
     """
 
@@ -61,12 +63,13 @@ class TwoStages:
         on_progress: OnProgress,
         should_stop: Callable[[], bool],
         seeding: str | None = None,
+        start: dict[str, Any] | None = None,
         observer: Observer | None = None,
     ) -> None:
         self.optimiser, self.folder = optimiser, folder
         self.history, self.observer = History(folder), observer or Observer()
         self.on_progress, self.should_stop = on_progress, should_stop
-        self.record = RunRecord(fingerprint, seeding=seeding)
+        self.record = RunRecord(fingerprint, seeding=seeding, start=start or {})
         options = optimiser.options
         self.detector = StabilityDetector(
             int(options.coarse_steps_min or 0), int(options.coarse_steps_max or 0)
@@ -215,6 +218,7 @@ class TwoStages:
             "rollbacks": record.rollbacks,
             "switch_reason": record.switch_reason,
             "seeding": record.seeding,
+            "start": record.start,
             "seconds": record.seconds,
             "detector": {
                 "decibels": detector.decibels,
@@ -246,6 +250,7 @@ class TwoStages:
             notes["rollbacks"],
             notes["switch_reason"],
             notes["seeding"],
+            notes["start"],
             notes["seconds"],
         )
         for key, value in notes["detector"].items():

@@ -51,7 +51,7 @@ def tiny_set(folder: Path, views: int = 7, size: int = 24) -> tuple[Dataset, Ima
 def tiny_optimiser(
     dataset: Dataset, images: ImageSet, options: RefineOptions, held_out: list[int] | None = None
 ) -> JointOptimiser:
-    frame = scene_frame(dataset, images)
+    frame = scene_frame(dataset.world_from_cam, images)
     start = frame.unit_from_world.apply_to_poses(dataset.world_from_cam)
     return JointOptimiser(images, frame, start, options, held_out or [], CPU, threads=2)
 

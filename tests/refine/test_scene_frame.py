@@ -27,7 +27,7 @@ def moved(dataset, similarity: Similarity):
 
 
 def unit_poses(dataset, images):
-    return scene_frame(dataset, images).unit_from_world.apply_to_poses(dataset.world_from_cam)
+    return scene_frame(dataset.world_from_cam, images).unit_from_world.apply_to_poses(dataset.world_from_cam)
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e-3, 0.0), (250.0, 1e4), (1.0, -70.0)])
@@ -35,7 +35,7 @@ def test_scale_and_origin_of_the_input_do_not_matter(scene, scale, shift):
     dataset, images = scene
     other = moved(dataset, Similarity(scale, np.eye(3), np.array([shift, -shift, 0.5 * shift])))
     np.testing.assert_allclose(unit_poses(other, images), unit_poses(dataset, images), atol=1e-6)
-    one, two = scene_frame(dataset, images), scene_frame(other, images)
+    one, two = scene_frame(dataset.world_from_cam, images), scene_frame(other.world_from_cam, images)
     for name in ("distance", "pixel", "far", "unbounded"):
         assert getattr(two, name) == pytest.approx(getattr(one, name), rel=1e-6)
 
@@ -50,7 +50,7 @@ def test_the_axes_of_the_input_only_turn_the_unit_frame(scene):
 
 def test_the_scene_lies_in_the_box_and_the_cameras_outside_looking_in(scene):
     dataset, images = scene
-    frame = scene_frame(dataset, images)
+    frame = scene_frame(dataset.world_from_cam, images)
     # The synthetic scene reaches from -0.8 to 0.9 about the origin.
     corners = np.array([[x, y, z] for x in (-0.7, 0.7) for y in (-0.7, 0.7) for z in (-0.5, 0.8)])
     assert np.abs(frame.unit_from_world.apply(corners)).max() < 1.0
@@ -64,14 +64,14 @@ def test_the_scene_lies_in_the_box_and_the_cameras_outside_looking_in(scene):
 
 def test_a_pixel_is_as_wide_as_two_neighbouring_rays_are_apart_at_the_centre(scene):
     dataset, images = scene
-    frame = scene_frame(dataset, images)
+    frame = scene_frame(dataset.world_from_cam, images)
     fx = images.cameras[0].full().fx
     assert frame.pixel == pytest.approx(frame.distance / fx, rel=1e-6)
 
 
 def test_photos_that_show_surroundings_make_an_unbounded_frame(scene):
     dataset, images = scene
-    frame = scene_frame(dataset, replace(images, background=None, alpha=None))
+    frame = scene_frame(dataset.world_from_cam, replace(images, background=None, alpha=None))
     assert frame.unbounded
     assert frame.background is None
     assert frame.far > 10 * frame.distance
@@ -84,7 +84,7 @@ def test_parallel_cameras_see_the_scene_ahead_of_them(scene):
     rows[:, :3, 3] = rows[:, :3, 0] * np.arange(len(dataset))[:, None] + [4.0, 5.0, 6.0]
     frames = tuple(replace(f, world_from_cam=p) for f, p in zip(dataset.frames, rows, strict=True))
     parallel = replace(dataset, frames=frames)
-    centre = scene_frame(parallel, images).unit_from_world.inverse().apply(np.zeros(3))
+    centre = scene_frame(parallel.world_from_cam, images).unit_from_world.inverse().apply(np.zeros(3))
     in_cam = (centre - rows[:, :3, 3]) @ rows[0, :3, :3]
     assert (in_cam[:, 2] > 0).all()
     assert in_cam[:, 2].min() > np.ptp(rows[:, :3, 3], axis=0).max() / 2
@@ -93,6 +93,6 @@ def test_parallel_cameras_see_the_scene_ahead_of_them(scene):
 def test_cameras_all_in_one_place_still_give_a_frame(scene):
     dataset, images = scene
     frames = tuple(replace(f, world_from_cam=dataset.frames[0].world_from_cam) for f in dataset.frames)
-    frame = scene_frame(replace(dataset, frames=frames), images)
+    frame = scene_frame(replace(dataset, frames=frames).world_from_cam, images)
     assert np.isfinite(frame.distance)
     assert frame.unit_from_world.scale > 0

@@ -1,0 +1,133 @@
+"""Where the optimisation starts: at the given poses, or at those feature matches support, whichever the photos prefer.
+
+The trial is short and cannot favour one side: the same field is trained for the same steps on each set of poses, held
+still, and views it was not trained on are compared with their photos.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from biresnerf.config import RefineOptions
+from biresnerf.data.images import ImageSet
+from biresnerf.errors import Interrupted
+from biresnerf.field.radiance_field import PositionGradient
+from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.scene_frame import scene_frame
+from biresnerf.report import StartSource, TrialReport
+
+logger = logging.getLogger(__name__)
+
+TRIAL_STEPS = 200
+TRIAL_SAMPLES = 1 << 15
+TRIAL_ONE_IN, TRIAL_VIEWS_MOST = 5, 16
+TRIAL_RAYS = 1 << 13
+MARGIN_DB = 0.1  # less is a tie: the given poses stay
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Poses to start from.
+
+    Attributes:
+        world_from_cam: float64 [n, 4, 4], in the frame of the given poses.
+        source: whose they are.
+        placed: bool [n], whether feature matches gave the pose.
+        trials: how every candidate did; empty if there was nothing to choose between.
+        warnings: what a user should know about how they came about.
+    """
+
+    world_from_cam: np.ndarray
+    source: StartSource
+    placed: np.ndarray
+    trials: tuple[TrialReport, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """For a checkpoint: a continued run starts from the same poses without another trial."""
+        return {
+            "world_from_cam": self.world_from_cam.tolist(),
+            "source": self.source,
+            "placed": self.placed.tolist(),
+            "trials": [trial.model_dump() for trial in self.trials],
+            "warnings": list(self.warnings),
+        }
+
+    @classmethod
+    def from_json(cls, kept: dict[str, Any]) -> Start:
+        trials = tuple(TrialReport.model_validate(trial) for trial in kept["trials"])
+        placed = np.array(kept["placed"], dtype=bool)
+        return cls(np.array(kept["world_from_cam"]), kept["source"], placed, trials, tuple(kept["warnings"]))
+
+
+def choose_start(
+    candidates: list[Start],
+    images: ImageSet,
+    options: RefineOptions,
+    device: torch.device,
+    threads: int,
+    should_stop: Callable[[], bool],
+) -> Start:
+    """The candidate whose poses let a field predict unseen views best; the first one is kept on a tie.
+
+    Raises:
+        Interrupted: ``should_stop`` said so.
+    """
+    scores = [
+        _trial(candidate.world_from_cam, images, options, device, threads, should_stop)
+        for candidate in candidates
+    ]
+    best = int(np.argmax(scores))
+    if scores[best] < scores[0] + MARGIN_DB:
+        best = 0
+    trials = tuple(
+        TrialReport(source=c.source, placed=int(c.placed.sum()), psnr=s)
+        for c, s in zip(candidates, scores, strict=True)
+    )
+    chosen = candidates[best]
+    logger.info("start: %s of %s", chosen.source, ", ".join(f"{t.source} {t.psnr:.2f} dB" for t in trials))
+    return replace(chosen, trials=trials)
+
+
+def _trial(
+    world_from_cam: np.ndarray,
+    images: ImageSet,
+    options: RefineOptions,
+    device: torch.device,
+    threads: int,
+    should_stop: Callable[[], bool],
+) -> float:
+    """Mean PSNR (dB) over views that a field trained on the others, all poses still, was not shown."""
+    count = len(world_from_cam)
+    unseen = list(range(TRIAL_ONE_IN // 2, count, max(TRIAL_ONE_IN, -(-count // TRIAL_VIEWS_MOST))))
+    frame = scene_frame(world_from_cam, images)
+    short = options.model_copy(
+        update={
+            "steps": 2 * TRIAL_STEPS,
+            "coarse_steps_min": TRIAL_STEPS,
+            "coarse_steps_max": TRIAL_STEPS,
+            "samples_per_step": TRIAL_SAMPLES,
+        }
+    )
+    poses = frame.unit_from_world.apply_to_poses(world_from_cam)
+    optimiser = JointOptimiser(images, frame, poses, short, unseen, device, threads)
+    optimiser.pose_scale = 0.0
+    for _ in range(TRIAL_STEPS):
+        if should_stop():
+            raise Interrupted("stopped while choosing the poses to start from")
+        optimiser.step()
+    batch = optimiser.sampler.draw(TRIAL_RAYS, 0.0, optimiser.generator, held_out_only=True)
+    with torch.no_grad():
+        origin, direction = optimiser.cast(optimiser.poses.matrices()[batch.image], batch.image, batch.xy)
+        rendering = optimiser.render(
+            origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=False
+        )
+    error = ((rendering.colour - batch.sharp) ** 2).mean(1)
+    per_view = [float(error[batch.image == view].mean()) for view in unseen]
+    return float(np.mean([-10 * np.log10(max(value, 1e-12)) for value in per_view]))
