@@ -98,10 +98,15 @@ def refine_poses(
         start = Start.from_json(notes["start"])
     else:
         start = _find_start(prepared, options, device, threads, report, stop)
+    sought = prepared.seeding is not None or options.start == "auto"
+    message = f"{len(prepared.dataset)} images read"
+    report(Progress(stage="seeding" if sought else "preparing", fraction=0.02, message=message))
 
     frame = scene_frame(start.world_from_cam, prepared.images)
     poses = frame.unit_from_world.apply_to_poses(start.world_from_cam)
-    optimiser = JointOptimiser(prepared.images, frame, poses, options, prepared.held_out, device, threads)
+    optimiser = JointOptimiser(
+        prepared.images, frame, poses, options, prepared.held_out, device, threads, start.mobility
+    )
     stages = TwoStages(
         optimiser,
         folder.path,

@@ -36,6 +36,7 @@ INPUT_FROM_TRUTH = Similarity(
 OPTIONS = RefineOptions(
     preset="fast",
     device="cpu",
+    start="given",
     steps=1200,
     max_image_size=56,
     samples_per_step=16384,

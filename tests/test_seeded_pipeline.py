@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from biresnerf.config import RefineOptions
-from biresnerf.data import seed_colmap
+from biresnerf.data import colmap_process
 from biresnerf.data.synthetic import render_synthetic, synthetic_cameras
 from biresnerf.errors import InputError, Interrupted
 from biresnerf.pipeline import refine_poses
@@ -57,7 +57,7 @@ def stopped(photos, tmp_path_factory) -> tuple[Path, list[Progress]]:
 @pytest.fixture
 def without_colmap(monkeypatch, tmp_path) -> None:
     """Whoever asks COLMAP from now on fails."""
-    monkeypatch.setattr(seed_colmap, "CHILD", tmp_path / "no_such_program.py")
+    monkeypatch.setattr(colmap_process, "CHILD", tmp_path / "no_such_program.py")
 
 
 def test_seeding_is_a_stage_of_its_own(stopped):

@@ -18,6 +18,8 @@ MAX_IMAGE_SIZE = 1600  # long side (px) at which features are found; more costs 
 SEQUENTIAL_OVERLAP = 12  # neighbours that each image is matched with, where all pairs would be too many
 
 
+# Small photos have few features: faint ones count as well, and fewer matches than COLMAP asks for must do.
+FAINTEST_PEAK, LEAST_MATCHES, LEAST_SEEN = 0.003, 12, 10
 PAIR_OUTLIER = 3.0  # median disagreements beyond which a pair's matches are taken for repeated structure
 PAIR_OUTLIER_DEG = 30.0  # but not below this
 
@@ -71,6 +73,8 @@ def map_from_given(request: dict[str, Any]) -> dict[str, Any]:
     extract_with_cameras(request, database, images)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.compute_relative_pose = True
+    verification.min_num_inliers = LEAST_MATCHES
+    verification.ransac.max_error *= request["error_scale"]
     if request["pairs"] is None:
         pycolmap.match_exhaustive(database, verification_options=verification)
     else:
@@ -85,7 +89,7 @@ def map_from_given(request: dict[str, Any]) -> dict[str, Any]:
     answer = []
     for mapper, run in (("incremental", map_incrementally), ("global", map_globally)):
         (work / mapper).mkdir()
-        models = run(database, images, work / mapper, request["seed"])
+        models = run(database, images, work / mapper, request)
         if models:
             best = max(models.values(), key=lambda model: model.num_reg_images())
             images_of = describe(best)["images"]
@@ -100,6 +104,8 @@ def extract_with_cameras(request: dict[str, Any], database: Path, images: Path) 
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = request["widest_image"]
     extraction.sift.max_num_features = request["most_features"]
+    extraction.sift.peak_threshold = FAINTEST_PEAK
+    extraction.sift.domain_size_pooling = extraction.sift.estimate_affine_shape = request["thorough"]
     for camera in request["cameras"]:
         if not camera["names"]:
             continue
@@ -154,26 +160,30 @@ def write_position_priors(database_path: Path, cam_from_world: dict[str, Any], d
     database.close()
 
 
-def map_incrementally(database: Path, images: Path, work: Path, seed: int) -> dict[int, Any]:
+def map_incrementally(database: Path, images: Path, work: Path, request: dict[str, Any]) -> dict[int, Any]:
     """Models by adding image to image, with position priors; few matches suffice, as images may be small."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = seed
+    options.random_seed = request["seed"]
     options.min_model_size, options.min_num_matches = 3, 10
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.use_prior_position = options.use_robust_loss_on_prior_position = True
-    options.mapper.init_min_num_inliers, options.mapper.abs_pose_min_num_inliers = 30, 15
-    options.mapper.init_min_tri_angle = 8.0
+    mapper, scale = options.mapper, request["error_scale"]
+    mapper.init_min_num_inliers, mapper.abs_pose_min_num_inliers = 3 * LEAST_SEEN, LEAST_SEEN
+    mapper.init_min_tri_angle, mapper.max_reg_trials = 8.0, 6
+    mapper.init_max_error *= scale
+    mapper.abs_pose_max_error *= scale
+    mapper.filter_max_reproj_error *= scale
     return pycolmap.incremental_mapping(database, images, work, options)
 
 
-def map_globally(database: Path, images: Path, work: Path, seed: int) -> dict[int, Any]:
+def map_globally(database: Path, images: Path, work: Path, request: dict[str, Any]) -> dict[int, Any]:
     """Models by averaging all pairs' rotations, then placing all cameras at once."""
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
-    options.random_seed = seed
+    options.random_seed = request["seed"]
     adjustment = options.mapper.bundle_adjustment
     adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = (
         False

@@ -43,8 +43,8 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
     """Fit the poses of held-out views to the frozen field by their photometric error (method 2.4, item 4)."""
     if not held_out:
         return
-    rows = torch.zeros(len(optimiser.poses), dtype=torch.bool, device=optimiser.device)
-    rows[held_out] = True
+    mobility = torch.zeros(len(optimiser.poses), device=optimiser.device)
+    mobility[held_out] = 1.0
     schedule = optimiser.schedule
     gradient = PositionGradient()
     poses = optimiser.poses
@@ -55,7 +55,7 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
         origin, direction = optimiser.cast(matrices, batch.image, batch.xy)
         rendering = optimiser.render(origin, direction, 0, schedule.fine_interval, gradient, jitter=True)
         torch.nn.functional.smooth_l1_loss(rendering.colour, batch.sharp).backward()
-        poses.step(FIT_RATE * 0.1 ** (step / FIT_STEPS), rows)
+        poses.step(FIT_RATE * 0.1 ** (step / FIT_STEPS), mobility)
 
 
 @torch.no_grad()

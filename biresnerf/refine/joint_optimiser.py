@@ -47,6 +47,7 @@ class JointOptimiser:
         unit_from_cam: start poses [n, 4, 4].
         options: resolved.
         held_out: images whose rays move their own pose but never the field.
+        mobility: each camera's factor of the pose rate [n], 1 where left out.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class JointOptimiser:
         held_out: list[int],
         device: torch.device,
         threads: int,
+        mobility: np.ndarray | None = None,
     ) -> None:
         self.frame, self.options, self.device = frame, options, device
         shape = FieldShape(
@@ -92,6 +94,9 @@ class JointOptimiser:
         self.step_index = 0
         self.switch: int | None = None  # the step that stage 2 began at
         self.pose_scale = 1.0
+        self.mobility = (
+            None if mobility is None else torch.as_tensor(mobility, dtype=torch.float32, device=device)
+        )
         self.rays = max(RAYS_LEAST, self.schedule.samples(0, None) // 64)
 
     def marching(self, interval: float) -> Marching:
@@ -148,7 +153,7 @@ class JointOptimiser:
         self.field.step(schedule.field_rates(t, self.switch))
         rate = self.pose_rate()
         if rate > 0:
-            self.poses.step(rate)
+            self.poses.step(rate, self.mobility)
         else:
             self.poses.forget_gradients()
         self.step_index += 1

@@ -56,17 +56,15 @@ class PoseParameters:
         bottom = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(len(top), 1, 4)
         return torch.cat([top, bottom], 1)
 
-    def step(self, rate: float, rows: Tensor | None = None) -> None:
-        """One Adam step; rows not in the mask `rows` [n] keep still."""
+    def step(self, rate: float, mobility: Tensor | None = None) -> None:
+        """One Adam step; `mobility` [n] is each camera's own factor of the rate, 0 keeps it still."""
         self._adam.param_groups[0]["lr"] = rate
-        kept = None
-        if rows is not None:
-            kept = (self.rotation.detach().clone(), self.translation.detach().clone())
+        before = [(p, p.detach().clone()) for p in (self.rotation, self.translation)]
         self._adam.step()
-        if rows is not None and kept is not None:
+        if mobility is not None:
             with torch.no_grad():
-                self.rotation.copy_(torch.where(rows[:, None], self.rotation, kept[0]))
-                self.translation.copy_(torch.where(rows[:, None], self.translation, kept[1]))
+                for parameter, kept in before:
+                    parameter.copy_(torch.lerp(kept, parameter, mobility[:, None]))
         self.forget_gradients()
 
     def restart_adam(self) -> None:

@@ -28,6 +28,9 @@ TRIAL_STEPS = 200
 TRIAL_SAMPLES = 1 << 15
 TRIAL_ONE_IN, TRIAL_VIEWS_MOST = 5, 16
 TRIAL_RAYS = 1 << 13
+# Of the pose rate: what cameras placed by matches may move by. They are off by tenths of a degree; at the full rate
+# the steps alone carry them further away than that before the field can tell.
+MATCHED_MOBILITY = 0.1
 MARGIN_DB = 0.1  # less is a tie: the given poses stay
 
 
@@ -48,6 +51,11 @@ class Start:
     placed: np.ndarray
     trials: tuple[TrialReport, ...] = ()
     warnings: tuple[str, ...] = ()
+
+    @property
+    def mobility(self) -> np.ndarray:
+        """Each camera's factor of the pose rate [n]."""
+        return np.where(self.placed, MATCHED_MOBILITY, 1.0)
 
     def as_json(self) -> dict[str, Any]:
         """For a checkpoint: a continued run starts from the same poses without another trial."""

@@ -93,14 +93,14 @@ def test_a_camera_that_never_met_a_gradient_keeps_still():
     assert moved(poses, start) == [1, 3]
 
 
-def test_rows_outside_the_mask_keep_still_in_spite_of_gradients_and_momentum():
+def test_cameras_without_mobility_keep_still_in_spite_of_gradients_and_momentum():
     poses = PoseParameters(given(), "se3_world", 1.0, CPU)
     pull(poses, [0, 1, 2, 3, 4])
     poses.step(0.01)
     start = poses.matrices().detach().clone()
-    rows = torch.tensor([False, True, False, False, True])
+    mobility = torch.tensor([0.0, 1.0, 0.0, 0.0, 0.5])
     pull(poses, [0, 1, 2, 3, 4])
-    poses.step(0.01, rows)
+    poses.step(0.01, mobility)
     assert moved(poses, start) == [1, 4]
 
 
