@@ -6,18 +6,16 @@ import importlib.util
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from biresnerf.config import RefineOptions
 from biresnerf.data import colmap_process
-from biresnerf.data.synthetic import render_synthetic, synthetic_cameras
 from biresnerf.errors import InputError, Interrupted
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
 from biresnerf.refine.checkpoint import CHECKPOINT
+from tests.data.scenes import textured_arc
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed (extra: colmap)"
@@ -31,14 +29,7 @@ QUICK = RefineOptions(
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("photos")
-    start = synthetic_cameras(11, 4)[5]
-    turns = Rotation.from_euler("z", 8.0 * np.arange(6)[:, None], degrees=True).as_matrix()
-    for index, turn in enumerate(turns):
-        pose = np.eye(4)
-        pose[:3] = turn @ start[:3]
-        picture = Image.fromarray(render_synthetic(pose, 320, 4)[0])
-        grey = Image.new("RGBA", picture.size, (128, 128, 128, 255))
-        Image.alpha_composite(grey, picture).convert("RGB").save(folder / f"{index}.png")
+    textured_arc(folder, 6, 320)
     return folder
 
 
@@ -76,7 +67,7 @@ def test_a_resumed_run_goes_on_from_the_poses_colmap_gave_the_first_time(
     report = refine_poses(photos, output, QUICK, told.append)
     assert report.resumed == 1
     assert {image.pose_source for image in report.images} == {"colmap"}
-    assert [image.name for image in report.images] == [f"{i}.png" for i in range(6)]
+    assert [image.name for image in report.images] == [f"{i:02}.png" for i in range(6)]
     assert not (output / "checkpoint").exists()
 
 
@@ -97,8 +88,8 @@ def test_a_run_killed_before_its_first_checkpoint_does_not_ask_again(
 
 def test_a_changed_photo_is_not_taken_for_the_same_run(photos, stopped, tmp_path):
     changed = shutil.copytree(photos, tmp_path / "photos")
-    with Image.open(changed / "0.png") as picture:
-        Image.eval(picture, lambda v: min(255, v + 3)).save(changed / "0.png")
+    with Image.open(changed / "00.png") as picture:
+        Image.eval(picture, lambda v: min(255, v + 3)).save(changed / "00.png")
     output = shutil.copytree(stopped[0], tmp_path / "out")
     with pytest.raises(InputError) as caught:
         refine_poses(changed, output, QUICK)

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from biresnerf.data.synthetic import render_synthetic, synthetic_cameras
 from biresnerf.errors import InputError
 
 WIDTH, HEIGHT = 20, 16
@@ -71,3 +72,24 @@ def assert_complete(error: InputError, code: str, *where: str) -> None:
         assert part in error.where, f"{part!r} is not in {error.where!r}"
     assert error.what.endswith("."), error.what
     assert error.mend.endswith("."), error.mend
+
+
+def arc_poses(views: int) -> np.ndarray:
+    """Cameras 8 degrees apart around the synthetic scene, so that neighbours see the same texture."""
+    start = synthetic_cameras(11, 4)[5]
+    poses = np.tile(np.eye(4), (views, 1, 1))
+    for index, turn in enumerate(np.radians(8.0 * np.arange(views))):
+        about_z = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+        poses[index, :3] = about_z @ start[:3]
+    return poses
+
+
+def textured_arc(folder: Path, views: int, size: int) -> np.ndarray:
+    """Photos 00.png ... of the arc in `folder`, over grey so that no border is too sharp; returns its poses."""
+    folder.mkdir(parents=True, exist_ok=True)
+    poses = arc_poses(views)
+    for index, pose in enumerate(poses):
+        picture = Image.fromarray(render_synthetic(pose, size, 4)[0])
+        grey = Image.new("RGBA", picture.size, (128, 128, 128, 255))
+        Image.alpha_composite(grey, picture).convert("RGB").save(folder / f"{index:02}.png")
+    return poses

@@ -13,11 +13,11 @@ from PIL import Image
 
 from biresnerf.data import colmap_process
 from biresnerf.data.read import read_dataset
-from biresnerf.data.synthetic import render_synthetic, synthetic_cameras, synthetic_focal
+from biresnerf.data.synthetic import synthetic_focal
 from biresnerf.data.write import write_transforms
 from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.geometry.pose_error import pose_error
-from tests.data.scenes import assert_complete, write_image
+from tests.data.scenes import arc_poses, assert_complete, textured_arc, write_image
 
 needs_colmap = pytest.mark.skipif(
     importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed (extra: colmap)"
@@ -25,25 +25,11 @@ needs_colmap = pytest.mark.skipif(
 VIEWS, SIZE = 10, 320
 
 
-def arc() -> np.ndarray:
-    """Cameras 8 degrees apart around the scene, so that neighbours see the same texture."""
-    start = synthetic_cameras(11, 4)[5]
-    poses = np.tile(np.eye(4), (VIEWS, 1, 1))
-    for index, turn in enumerate(np.radians(8.0 * np.arange(VIEWS))):
-        about_z = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
-        poses[index, :3] = about_z @ start[:3]
-    return poses
-
-
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
-    """A folder with images/00.png ... of the arc, over grey so that no border is too sharp."""
+    """A folder with images/00.png ... of the arc."""
     folder = tmp_path_factory.mktemp("photos")
-    (folder / "images").mkdir()
-    for index, pose in enumerate(arc()):
-        picture = Image.fromarray(render_synthetic(pose, SIZE, 4)[0])
-        grey = Image.new("RGBA", picture.size, (128, 128, 128, 255))
-        Image.alpha_composite(grey, picture).convert("RGB").save(folder / f"images/{index:02}.png")
+    textured_arc(folder / "images", VIEWS, SIZE)
     return folder
 
 
@@ -63,7 +49,7 @@ def test_poses_and_focal_length_are_found_and_a_stranger_is_left_out_by_name(fol
     assert len(dataset.cameras) == 1
     assert dataset.cameras[0].full().fx == pytest.approx(synthetic_focal(SIZE), rel=0.1)
     assert any("images/stranger 1.png" in text and "1 of 11" in text for text in dataset.warnings)
-    error = pose_error(dataset.world_from_cam, arc())
+    error = pose_error(dataset.world_from_cam, arc_poses(VIEWS))
     # A short arc of smooth textures leaves the focal length loose, and the rotations with it.
     assert error.aligned.rotation_deg.max < 3.0
     assert error.aligned.centre_percent.max < 2.0

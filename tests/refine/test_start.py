@@ -1,0 +1,78 @@
+"""Choosing the poses to start from: a short training tells good poses from noisy ones, whoever found them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from biresnerf.errors import Interrupted
+from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.refine import start as start_module
+from biresnerf.refine.start import MATCHED_MOBILITY, Start, choose_start
+from tests.refine.scene import CPU, tiny_options, tiny_set
+
+VIEWS = 9
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return tiny_set(tmp_path_factory.mktemp("scene"), views=VIEWS, size=24)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(start_module, "TRIAL_STEPS", 60)
+    monkeypatch.setattr(start_module, "TRIAL_SAMPLES", 8192)
+
+
+def candidates(dataset, first: np.ndarray, second: np.ndarray) -> list[Start]:
+    nobody, everybody = np.zeros(VIEWS, bool), np.ones(VIEWS, bool)
+    return [Start(first, "given", nobody), Start(second, "matches-incremental", everybody)]
+
+
+def choose(images, tried: list[Start]) -> Start:
+    return choose_start(tried, images, tiny_options(), CPU, 2, lambda: False)
+
+
+def test_good_matches_win_over_noisy_given_poses(scene):
+    dataset, images = scene
+    noisy = perturb_poses(dataset.world_from_cam, 0.15, seed=1)
+    chosen = choose(images, candidates(dataset, noisy, dataset.world_from_cam))
+    assert chosen.source == "matches-incremental"
+    np.testing.assert_array_equal(chosen.world_from_cam, dataset.world_from_cam)
+    assert chosen.trials[1].psnr > chosen.trials[0].psnr + 1
+    np.testing.assert_array_equal(chosen.mobility, MATCHED_MOBILITY)
+
+
+def test_good_given_poses_win_over_wrong_matches(scene):
+    dataset, images = scene
+    wrong = perturb_poses(dataset.world_from_cam, 0.15, seed=2)
+    chosen = choose(images, candidates(dataset, dataset.world_from_cam, wrong))
+    assert chosen.source == "given"
+    np.testing.assert_array_equal(chosen.mobility, 1.0)
+    assert [trial.source for trial in chosen.trials] == ["given", "matches-incremental"]
+
+
+def test_on_a_tie_the_given_poses_stay(scene):
+    dataset, images = scene
+    poses = dataset.world_from_cam
+    assert choose(images, candidates(dataset, poses, poses.copy())).source == "given"
+
+
+def test_a_stop_ends_the_trial(scene):
+    dataset, images = scene
+    tried = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
+    with pytest.raises(Interrupted):
+        choose_start(tried, images, tiny_options(), CPU, 2, lambda: True)
+
+
+def test_a_start_survives_its_checkpoint(scene):
+    dataset, images = scene
+    noisy = perturb_poses(dataset.world_from_cam, 0.15, seed=1)
+    chosen = choose(images, candidates(dataset, noisy, dataset.world_from_cam))
+    back = Start.from_json(json.loads(json.dumps(chosen.as_json())))
+    np.testing.assert_array_equal(back.world_from_cam, chosen.world_from_cam)
+    np.testing.assert_array_equal(back.placed, chosen.placed)
+    assert (back.source, back.trials, back.warnings) == (chosen.source, chosen.trials, chosen.warnings)
