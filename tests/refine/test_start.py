@@ -55,10 +55,17 @@ def test_good_given_poses_win_over_wrong_matches(scene):
     assert [trial.source for trial in chosen.trials] == ["given", "matches-incremental"]
 
 
-def test_on_a_tie_the_given_poses_stay(scene):
+def test_on_a_tie_the_given_poses_stay_if_matches_agree(scene):
     dataset, images = scene
     poses = dataset.world_from_cam
     assert choose(images, candidates(dataset, poses, poses.copy())).source == "given"
+
+
+def test_on_a_tie_matches_are_believed_if_they_do_not_agree(scene, monkeypatch):
+    dataset, images = scene
+    monkeypatch.setattr(start_module, "MARGIN_DB", 50.0)
+    noisy = perturb_poses(dataset.world_from_cam, 0.15, seed=1)
+    assert choose(images, candidates(dataset, noisy, dataset.world_from_cam)).source == "matches-incremental"
 
 
 def test_a_stop_ends_the_trial(scene):
