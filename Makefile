@@ -2,7 +2,7 @@
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
-EXTRAS ?= service,colmap,dev
+EXTRAS ?= service,colmap,compare,dev
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 # Pins for what is installed and, under the names that older and newer pips know, for what builds it.

@@ -124,7 +124,8 @@ def imported(package: str) -> dict[str, str]:
 
 
 @pytest.mark.parametrize(
-    ("package", "extras"), [("biresnerf", ["colmap"]), ("workers", ["service"]), ("service", ["service"])]
+    ("package", "extras"),
+    [("biresnerf", ["colmap", "compare"]), ("workers", ["service"]), ("service", ["service"])],
 )
 def test_a_package_imports_only_what_its_installation_brings(package, extras):
     missing = {name: file for name, file in imported(package).items() if name not in declared(*extras)}

@@ -10,6 +10,7 @@ from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.lie import se3_exp
 
 RIG_DISTANCE = 4.0  # of the cameras from the scene in the Blender sets that BARF's noise levels were made for
+LOST_DEG = (45.0, 180.0)
 
 
 def perturb_poses(world_from_cam: NDArray[np.float64], noise: float, seed: int) -> NDArray[np.float64]:
@@ -38,3 +39,33 @@ def perturb_poses(world_from_cam: NDArray[np.float64], noise: float, seed: int) 
     moved[:, :3, :3] = back @ poses[:, :3, :3]
     moved[:, :3, 3] = np.einsum("nij,nj->ni", back, centres - translation) / scale + focus.point
     return moved
+
+
+def turn_in_place(world_from_cam: NDArray[np.float64], index: int, angle_deg: float) -> NDArray[np.float64]:
+    """Poses [n, 4, 4] with camera `index` turned about its own vertical axis; 180 lets it look the other way."""
+    angle = np.radians(angle_deg)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    moved = np.array(world_from_cam, dtype=np.float64)
+    moved[index, :3, :3] = moved[index, :3, :3] @ turn
+    return moved
+
+
+def orbit_away(world_from_cam: NDArray[np.float64], indices: list[int], seed: int) -> NDArray[np.float64]:
+    """Poses [n, 4, 4] with some cameras turned about the rig's focus by 45 to 180 degrees, about random axes.
+
+    They still look at the scene, from a wrong side: the errors that cost a camera its way back.
+    """
+    poses = np.array(world_from_cam, dtype=np.float64)
+    focus = focus_point(poses).point
+    random = np.random.default_rng([seed, 3])
+    for index in indices:
+        axis = random.normal(size=3)
+        angle = np.radians(random.uniform(*LOST_DEG))
+        rotation, _ = se3_exp(
+            torch.from_numpy(axis / np.linalg.norm(axis) * angle)[None],
+            torch.zeros(1, 3, dtype=torch.float64),
+        )
+        turn = rotation[0].numpy()
+        poses[index, :3, :3] = turn @ poses[index, :3, :3]
+        poses[index, :3, 3] = turn @ (poses[index, :3, 3] - focus) + focus
+    return poses

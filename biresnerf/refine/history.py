@@ -6,9 +6,12 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from biresnerf.data.atomic_file import whole_file
-from biresnerf.refine.joint_optimiser import JointOptimiser
+
+if TYPE_CHECKING:
+    from biresnerf.refine.joint_optimiser import JointOptimiser
 
 HISTORY = "history.jsonl"
 Line = Mapping[str, float | str]

@@ -1,0 +1,120 @@
+"""Which cells a plan asks for, what makes two of them one, and how long a run at equal time is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from biresnerf.compare.cell import Cell, CellResult, StartPoses
+from biresnerf.compare.plan import Plan, Variant, run_plan, with_steps
+from biresnerf.compare.studies import STUDIES
+from biresnerf.config import RefineOptions
+from biresnerf.errors import InputError
+from tests.compare.outcomes import outcome, scene
+
+FAST = {"preset": "fast"}
+
+
+def plan(*variants: Variant, settings=FAST, equal_time=False, seeds=(1, 2)) -> Plan:
+    starts = tuple(StartPoses(seed=seed) for seed in seeds)
+    return Plan((scene("lego"), scene("ship")), starts, variants, settings, equal_time)
+
+
+def cell(**changed) -> Cell:
+    values = {"scene": scene(), "start": StartPoses(), "options": RefineOptions(**FAST)}
+    return Cell(**{**values, **changed})
+
+
+def test_every_scene_start_and_variant_is_run_once_and_the_seed_is_the_runs_too():
+    asked = []
+
+    def run(wanted: Cell, title: str) -> CellResult:
+        asked.append((wanted.scene.name, wanted.options.seed, wanted.options.pose_rate, title))
+        return CellResult(cell=wanted, outcome=outcome(0.01))
+
+    entries = run_plan(plan(Variant("a", {}), Variant("b", {"pose_rate": 0.01})), run)
+    assert len({entry.result.cell.key for entry in entries}) == len(asked) == 8
+    assert asked[1] == ("lego", 1, 0.01, "lego, noise 0.15, seed 1: b")
+    assert [(e.scene, e.start.seed, e.variant) for e in entries][-1] == ("ship", 2, "b")
+
+
+def test_a_key_is_of_what_decides_the_result():
+    same = cell(scene=scene().model_copy(update={"file": Path("elsewhere.json")}))
+    assert cell().key == same.key
+    assert cell().key == cell(options=RefineOptions(preset="fast", pose_rate=5e-3)).key  # the preset's own
+    others = [
+        cell(start=StartPoses(seed=2)),
+        cell(start=StartPoses(noise=0.1)),
+        cell(options=RefineOptions(preset="fast", pose_rate=1e-3)),
+        cell(scene=scene("other poses")),
+        cell(scene=scene().model_copy(update={"every": 2})),
+    ]
+    assert len({cell().key, *(other.key for other in others)}) == 6
+
+
+def test_a_scene_with_test_views_has_all_others_optimised():
+    tested = scene().model_copy(update={"test_file": Path("transforms_test.json"), "test_views": 5})
+    made = plan(Variant("a", {}))
+    assert made.options(made.variants[0], tested, StartPoses()).holdout == 0
+    assert made.options(made.variants[0], scene(), StartPoses()).holdout is None
+
+
+def test_a_variant_with_an_unknown_option_is_refused():
+    with pytest.raises(InputError, match="stepz: unknown option"):
+        plan(Variant("a", {"stepz": 1})).options(Variant("a", {"stepz": 1}), scene(), StartPoses())
+
+
+def test_at_equal_time_the_others_get_the_steps_that_fit_the_firsts_time():
+    def run(wanted: Cell, title: str) -> CellResult:
+        # The first takes 2 ms a step, the other 8.
+        ms = 2.0 if wanted.options.pose_rate is None else 8.0
+        steps = wanted.options.resolved().steps
+        return CellResult(cell=wanted, outcome=outcome(0.01, seconds=ms * steps / 1000))
+
+    entries = run_plan(
+        plan(Variant("a", {}), Variant("b", {"pose_rate": 0.01}), equal_time=True, seeds=(1,)), run
+    )
+    first, other = entries[0].result.cell, entries[1].result.cell
+    assert first.options.resolved().steps == 3000
+    assert first.equal_time is None
+    assert other.options.steps == 750  # 6 s at 8 ms
+    assert other.options.resolved().coarse_steps_min == 250  # of 1000 of 3000
+    assert other.equal_time.calibration_steps == 300
+    assert other.equal_time.calibration_ms_per_step == pytest.approx(8.0)
+    assert other.equal_time.seconds == pytest.approx(6.0)
+
+
+def test_without_a_first_result_there_is_no_time_to_equal():
+    entries = run_plan(
+        plan(Variant("a", {}), Variant("b", {}), equal_time=True, seeds=(1,)),
+        lambda wanted, _: CellResult(cell=wanted, error="exit status 1"),
+    )
+    assert "the first variant failed" in entries[1].result.error
+
+
+def test_a_shorter_run_keeps_its_proportions_even_where_they_were_set():
+    options = RefineOptions(
+        preset="fast", steps=2000, coarse_steps_min=500, coarse_steps_max=1000, check_every=100
+    )
+    short = with_steps(options, 200)
+    assert (short.steps, short.coarse_steps_min, short.coarse_steps_max, short.check_every) == (
+        200,
+        50,
+        100,
+        10,
+    )
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_study_has_options_that_can_be_run(name):
+    study = STUDIES[name]
+    made = plan(*study.variants, settings=study.settings({"preset": "fast", "steps": 600}))
+    for variant in study.variants:
+        options = made.options(variant, scene(), StartPoses()).resolved()
+        assert options.steps == 600
+        if study.swept:
+            assert options.coarse_steps_min == options.coarse_steps_max == 600
+            assert getattr(options, study.swept) == variant.settings[study.swept]
+    if name == "warm-up":
+        assert len({made.options(v, scene(), StartPoses()).coarse_steps_min for v in study.variants}) == 1
