@@ -20,7 +20,7 @@ from biresnerf.config import PRESETS
 from biresnerf.errors import InputError
 
 if TYPE_CHECKING:
-    from biresnerf.compare.cell import StartPoses
+    from biresnerf.compare.cell import Perturbation
     from biresnerf.compare.plan import Entry, Plan, Variant
 
 TABLES_MARKDOWN, TABLES_JSON, CELLS = "tables.md", "tables.json", "cells"
@@ -136,11 +136,11 @@ def make_plan(
     return plan
 
 
-def _start(given: dict[str, Any], noise: float, seed: int) -> StartPoses:
-    from biresnerf.compare.cell import StartPoses
+def _start(given: dict[str, Any], noise: float, seed: int) -> Perturbation:
+    from biresnerf.compare.cell import Perturbation
 
     identity = given["start"] == "identity"
-    return StartPoses(
+    return Perturbation(
         kind=given["start"],
         noise=0.0 if identity else noise,
         seed=seed,

@@ -17,7 +17,7 @@ LOST_FROM_DEG = 1.0  # a camera this far off after a run counts as not found
 CELL, RESULT, LOG, RUN = "cell.json", "result.json", "log.txt", "run"  # in the folder of a cell
 
 
-class StartPoses(BaseModel):
+class Perturbation(BaseModel):
     """How the poses that a run starts from are made of the true ones."""
 
     model_config = _FROZEN
@@ -68,7 +68,7 @@ class Cell(BaseModel):
     model_config = _FROZEN
 
     scene: Scene
-    start: StartPoses
+    start: Perturbation
     options: RefineOptions
     equal_time: EqualTime | None = None
 

@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from biresnerf.compare.cell import Cell, CellResult, EqualTime, Scene, StartPoses
+from biresnerf.compare.cell import Cell, CellResult, EqualTime, Perturbation, Scene
 from biresnerf.compare.run_cells import finished, run_in_child
 from biresnerf.config import RefineOptions, parse_options
 
@@ -34,17 +34,17 @@ class Plan:
     """
 
     scenes: tuple[Scene, ...]
-    starts: tuple[StartPoses, ...]
+    starts: tuple[Perturbation, ...]
     variants: tuple[Variant, ...]
     settings: dict[str, Any]
     equal_time: bool = False
 
-    def options(self, variant: Variant, scene: Scene, start: StartPoses) -> RefineOptions:
-        """The variant's options. The run's own seed is that of the noise, and no orbit is filmed.
-
-        A scene with test views of its own has all others optimised. Raises `InputError`.
+    def options(self, variant: Variant, scene: Scene, start: Perturbation) -> RefineOptions:
+        """The variant's options. Where they say nothing, the run's own seed is that of the noise, it starts from
+        the wrong poses themselves without asking feature matches, films no orbit, and holds out no views of a
+        scene that has test views of its own. Raises `InputError`.
         """
-        defaults: dict[str, Any] = {"seed": start.seed, "orbit_frames": 0}
+        defaults: dict[str, Any] = {"seed": start.seed, "start": "given", "orbit_frames": 0}
         if scene.test_file is not None:
             defaults["holdout"] = 0
         options = parse_options({**defaults, **self.settings, **variant.settings})
@@ -57,7 +57,7 @@ class Entry:
     """A cell's place in the comparison, and its result."""
 
     scene: str
-    start: StartPoses
+    start: Perturbation
     variant: str
     result: CellResult
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.compare.cell import Scene, StartPoses
+from biresnerf.compare.cell import Perturbation, Scene
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.folder import look_into
 from biresnerf.data.transforms_json import read_transforms, refuse_too_few
@@ -91,7 +91,7 @@ def with_poses(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> Dataset
     return replace(dataset, frames=tuple(frames))
 
 
-def starting_rig(truth: NDArray[np.float64], start: StartPoses) -> StartingRig:
+def starting_rig(truth: NDArray[np.float64], start: Perturbation) -> StartingRig:
     """True poses [n, 4, 4] made as wrong as `start` says; the same seed does the same."""
     from biresnerf.geometry.perturb import orbit_away, perturb_poses, turn_in_place
 

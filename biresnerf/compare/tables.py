@@ -43,6 +43,7 @@ METRICS = (
     Metric("psnr", "PSNR", 2, lambda o: o.views.psnr if o.views else None, tested=True),
     Metric("ssim", "SSIM", 4, lambda o: o.views.ssim if o.views else None, tested=True),
     Metric("lpips", "LPIPS", 4, lambda o: o.views.lpips if o.views else None, tested=True),
+    Metric("preparing_s", "before s", 1, lambda o: o.seconds["preparing"]),
     Metric("coarse_s", "stage 1 s", 1, lambda o: o.seconds["coarse"]),
     Metric("fine_s", "stage 2 s", 1, lambda o: o.seconds["fine"]),
     Metric("optimisation_s", "both s", 1, lambda o: o.optimisation_s, tested=True),

@@ -33,6 +33,9 @@ SETTINGS = {
     "reconstruction_resolution_max": 128,
     "table_size_log2": 10,
 }
+# Each run is a process that loads torch and kernels: seconds alone, minutes beside other work.
+LONGEST_S = 900
+pytestmark = pytest.mark.timeout(3 * LONGEST_S)
 PROGRAM = "import sys; from biresnerf.command_line import main; sys.argv[0] = 'biresnerf'; main()"
 
 
@@ -42,7 +45,7 @@ def command(*arguments: object) -> list[str]:
 
 
 def compare(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(*arguments), capture_output=True, text=True, check=False, timeout=300)
+    return subprocess.run(command(*arguments), capture_output=True, text=True, check=False, timeout=LONGEST_S)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +68,7 @@ def resumed(scene, tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[
     arguments = (scene, "-o", output, *variants)
     first = subprocess.Popen(command(*arguments), stderr=subprocess.DEVNULL, start_new_session=True)
     try:
-        end = time.monotonic() + 200
+        end = time.monotonic() + LONGEST_S
         while not list(output.glob("cells/*/result.json")):
             assert first.poll() is None
             assert time.monotonic() < end

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from biresnerf.compare.cell import CameraResult, Cell, CellResult, Outcome, Scene, StartPoses, ViewQuality
+from biresnerf.compare.cell import CameraResult, Cell, CellResult, Outcome, Perturbation, Scene, ViewQuality
 from biresnerf.compare.plan import Entry
 from biresnerf.config import RefineOptions
 from biresnerf.geometry.perturb import perturb_poses
@@ -35,7 +35,7 @@ def outcome(noise: float, seed: int = 1, psnr: float = 30.0, seconds: float = 8.
         "views": ViewQuality(kind="test", count=5, psnr=psnr, ssim=0.9, lpips_absent="no weights"),
         "switch_step": 1200,
         "switch_reason": "stable",
-        "seconds": {"coarse": 0.25 * seconds, "fine": 0.75 * seconds},
+        "seconds": {"preparing": 1.0, "coarse": 0.25 * seconds, "fine": 0.75 * seconds},
         "peak_memory_bytes": 300 * 2**20,
         "backend": "cpu",
         "device": "cpu",
@@ -46,7 +46,7 @@ def outcome(noise: float, seed: int = 1, psnr: float = 30.0, seconds: float = 8.
 
 
 def entry(name: str, seed: int, variant: str, result: Outcome | str) -> Entry:
-    start = StartPoses(noise=0.15, seed=seed)
+    start = Perturbation(noise=0.15, seed=seed)
     cell = Cell(scene=scene(name), start=start, options=RefineOptions(preset="fast", seed=seed))
     done = {"error": result} if isinstance(result, str) else {"outcome": result}
     return Entry(name, start, variant, CellResult(cell=cell, **done))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from biresnerf.compare.cell import Cell, CellResult, StartPoses
+from biresnerf.compare.cell import Cell, CellResult, Perturbation
 from biresnerf.compare.plan import Plan, Variant, run_plan, with_steps
 from biresnerf.compare.studies import STUDIES
 from biresnerf.config import RefineOptions
@@ -17,12 +17,12 @@ FAST = {"preset": "fast"}
 
 
 def plan(*variants: Variant, settings=FAST, equal_time=False, seeds=(1, 2)) -> Plan:
-    starts = tuple(StartPoses(seed=seed) for seed in seeds)
+    starts = tuple(Perturbation(seed=seed) for seed in seeds)
     return Plan((scene("lego"), scene("ship")), starts, variants, settings, equal_time)
 
 
 def cell(**changed) -> Cell:
-    values = {"scene": scene(), "start": StartPoses(), "options": RefineOptions(**FAST)}
+    values = {"scene": scene(), "start": Perturbation(), "options": RefineOptions(**FAST)}
     return Cell(**{**values, **changed})
 
 
@@ -44,8 +44,8 @@ def test_a_key_is_of_what_decides_the_result():
     assert cell().key == same.key
     assert cell().key == cell(options=RefineOptions(preset="fast", pose_rate=5e-3)).key  # the preset's own
     others = [
-        cell(start=StartPoses(seed=2)),
-        cell(start=StartPoses(noise=0.1)),
+        cell(start=Perturbation(seed=2)),
+        cell(start=Perturbation(noise=0.1)),
         cell(options=RefineOptions(preset="fast", pose_rate=1e-3)),
         cell(scene=scene("other poses")),
         cell(scene=scene().model_copy(update={"every": 2})),
@@ -56,13 +56,19 @@ def test_a_key_is_of_what_decides_the_result():
 def test_a_scene_with_test_views_has_all_others_optimised():
     tested = scene().model_copy(update={"test_file": Path("transforms_test.json"), "test_views": 5})
     made = plan(Variant("a", {}))
-    assert made.options(made.variants[0], tested, StartPoses()).holdout == 0
-    assert made.options(made.variants[0], scene(), StartPoses()).holdout is None
+    assert made.options(made.variants[0], tested, Perturbation()).holdout == 0
+    assert made.options(made.variants[0], scene(), Perturbation()).holdout is None
+
+
+def test_runs_start_from_the_wrong_poses_themselves_unless_a_variant_says_otherwise():
+    made = plan(Variant("a", {}), Variant("matches", {"start": "auto"}))
+    starts = [made.options(variant, scene(), Perturbation()).start for variant in made.variants]
+    assert starts == ["given", "auto"]
 
 
 def test_a_variant_with_an_unknown_option_is_refused():
     with pytest.raises(InputError, match="stepz: unknown option"):
-        plan(Variant("a", {"stepz": 1})).options(Variant("a", {"stepz": 1}), scene(), StartPoses())
+        plan(Variant("a", {"stepz": 1})).options(Variant("a", {"stepz": 1}), scene(), Perturbation())
 
 
 def test_at_equal_time_the_others_get_the_steps_that_fit_the_firsts_time():
@@ -111,10 +117,10 @@ def test_a_study_has_options_that_can_be_run(name):
     study = STUDIES[name]
     made = plan(*study.variants, settings=study.settings({"preset": "fast", "steps": 600}))
     for variant in study.variants:
-        options = made.options(variant, scene(), StartPoses()).resolved()
+        options = made.options(variant, scene(), Perturbation()).resolved()
         assert options.steps == 600
         if study.swept:
             assert options.coarse_steps_min == options.coarse_steps_max == 600
             assert getattr(options, study.swept) == variant.settings[study.swept]
     if name == "warm-up":
-        assert len({made.options(v, scene(), StartPoses()).coarse_steps_min for v in study.variants}) == 1
+        assert len({made.options(v, scene(), Perturbation()).coarse_steps_min for v in study.variants}) == 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from biresnerf.compare.cell import StartPoses
+from biresnerf.compare.cell import Perturbation
 from biresnerf.compare.scenes import starting_rig
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.perturb import perturb_poses
@@ -20,7 +20,7 @@ def test_the_start_is_barfs_noise_and_no_more():
     truth = dome(100, np.random.default_rng(2), radius=4.0)
     errors = []
     for seed in range(1, 13):
-        rig = starting_rig(truth, StartPoses(noise=0.15, seed=seed))
+        rig = starting_rig(truth, Perturbation(noise=0.15, seed=seed))
         assert np.array_equal(rig.world_from_cam, perturb_poses(truth, 0.15, seed))
         assert rig.displaced == ()
         errors.append(pose_error(rig.world_from_cam, truth).aligned)
@@ -29,7 +29,7 @@ def test_the_start_is_barfs_noise_and_no_more():
 
 
 def test_one_camera_is_turned_in_place_and_the_others_keep_their_noise():
-    rig = starting_rig(TRUTH, StartPoses(noise=0.1, seed=3, turn_one_deg=180))
+    rig = starting_rig(TRUTH, Perturbation(noise=0.1, seed=3, turn_one_deg=180))
     errors = camera_errors(rig.world_from_cam, perturb_poses(TRUTH, 0.1, 3))
     (turned,) = rig.displaced
     assert errors.rotation_deg[turned] == pytest.approx(180)
@@ -38,7 +38,7 @@ def test_one_camera_is_turned_in_place_and_the_others_keep_their_noise():
 
 
 def test_the_lost_share_orbits_the_scene_by_45_to_180_degrees_and_still_looks_at_it():
-    rig = starting_rig(TRUTH, StartPoses(noise=0.0, seed=5, lose_share=0.1))
+    rig = starting_rig(TRUTH, Perturbation(noise=0.0, seed=5, lose_share=0.1))
     errors = camera_errors(rig.world_from_cam, TRUTH)
     assert len(rig.displaced) == 4
     lost = np.isin(np.arange(len(TRUTH)), rig.displaced)
@@ -50,7 +50,7 @@ def test_the_lost_share_orbits_the_scene_by_45_to_180_degrees_and_still_looks_at
 
 
 def test_other_seeds_displace_other_cameras_and_the_same_seed_the_same():
-    starts = [StartPoses(noise=0.0, seed=seed, lose_share=0.1) for seed in (1, 1, 2)]
+    starts = [Perturbation(noise=0.0, seed=seed, lose_share=0.1) for seed in (1, 1, 2)]
     a, b, c = (starting_rig(TRUTH, start) for start in starts)
     assert a.displaced == b.displaced
     assert np.array_equal(a.world_from_cam, b.world_from_cam)
@@ -58,12 +58,12 @@ def test_other_seeds_displace_other_cameras_and_the_same_seed_the_same():
 
 
 def test_an_identity_start_knows_nothing():
-    rig = starting_rig(TRUTH, StartPoses(kind="identity", noise=0.0))
+    rig = starting_rig(TRUTH, Perturbation(kind="identity", noise=0.0))
     assert np.array_equal(rig.world_from_cam, np.tile(np.eye(4), (40, 1, 1)))
 
 
 def test_labels_say_what_was_done_but_not_the_seed():
-    assert StartPoses(noise=0.15, seed=7).label == "noise 0.15"
-    assert StartPoses(kind="identity").label == "identity"
-    both = StartPoses(noise=0.1, turn_one_deg=180, lose_share=0.1)
+    assert Perturbation(noise=0.15, seed=7).label == "noise 0.15"
+    assert Perturbation(kind="identity").label == "identity"
+    both = Perturbation(noise=0.1, turn_one_deg=180, lose_share=0.1)
     assert both.label == "noise 0.1, one camera turned by 180°, 10 % of the cameras lost"
