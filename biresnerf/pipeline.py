@@ -88,6 +88,7 @@ def refine_poses(
     folder.refuse_finished()
     checkpoint = load_checkpoint(folder.path)
     report(Progress(stage="preparing"))
+    asked = options
     options, device, threads = _choose_backend(options, report)
     unstarted: dict[str, Any] = {"fingerprint": None, "seeding": None}
     notes = checkpoint[1] if checkpoint is not None else unstarted
@@ -102,6 +103,7 @@ def refine_poses(
     message = f"{len(prepared.dataset)} images read"
     report(Progress(stage="seeding" if sought else "preparing", fraction=0.02, message=message))
 
+    options = start.stage_lengths(asked, options)
     frame = scene_frame(start.world_from_cam, prepared.images)
     poses = frame.unit_from_world.apply_to_poses(start.world_from_cam)
     optimiser = JointOptimiser(
@@ -169,10 +171,10 @@ def _find_start(
 ) -> Start:
     """The given poses, or better ones by feature matches where `options.start` lets them be looked for."""
     dataset = prepared.dataset
-    given = Start(
-        dataset.world_from_cam, dataset.frames[0].pose_source, np.zeros(len(dataset), dtype=np.bool_)
-    )
-    if options.start == "given" or prepared.seeding is not None:
+    by_colmap = prepared.seeding is not None
+    placed = np.full(len(dataset), by_colmap)
+    given = Start(dataset.world_from_cam, "colmap" if by_colmap else "given", placed)
+    if options.start == "given" or by_colmap:
         return given
     report(Progress(stage="seeding", fraction=0.012, message="comparing the poses with feature matches"))
     if not can_match():

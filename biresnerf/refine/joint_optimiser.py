@@ -47,7 +47,7 @@ class JointOptimiser:
         unit_from_cam: start poses [n, 4, 4].
         options: resolved.
         held_out: images whose rays move their own pose but never the field.
-        mobility: each camera's factor of the pose rate [n], 1 where left out.
+        mobility: each camera's factor of the pose rate [2, n] in stage 1 and stage 2; 1 where left out.
     """
 
     def __init__(
@@ -95,7 +95,9 @@ class JointOptimiser:
         self.switch: int | None = None  # the step that stage 2 began at
         self.pose_scale = 1.0
         self.mobility = (
-            None if mobility is None else torch.as_tensor(mobility, dtype=torch.float32, device=device)
+            torch.ones(2, len(self.poses), device=device)
+            if mobility is None
+            else torch.as_tensor(mobility, dtype=torch.float32, device=device)
         )
         self.rays = max(RAYS_LEAST, self.schedule.samples(0, None) // 64)
 
@@ -153,7 +155,7 @@ class JointOptimiser:
         self.field.step(schedule.field_rates(t, self.switch))
         rate = self.pose_rate()
         if rate > 0:
-            self.poses.step(rate, self.mobility)
+            self.poses.step(rate, self.mobility[0 if self.switch is None else 1])
         else:
             self.poses.forget_gradients()
         self.step_index += 1

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from biresnerf.config import RefineOptions
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.refine import start as start_module
@@ -43,7 +44,7 @@ def test_good_matches_win_over_noisy_given_poses(scene):
     assert chosen.source == "matches-incremental"
     np.testing.assert_array_equal(chosen.world_from_cam, dataset.world_from_cam)
     assert chosen.trials[1].psnr > chosen.trials[0].psnr + 1
-    np.testing.assert_array_equal(chosen.mobility, MATCHED_MOBILITY)
+    np.testing.assert_array_equal(chosen.mobility, np.repeat(MATCHED_MOBILITY, VIEWS).reshape(2, VIEWS))
 
 
 def test_good_given_poses_win_over_wrong_matches(scene):
@@ -66,6 +67,18 @@ def test_on_a_tie_matches_are_believed_if_they_do_not_agree(scene, monkeypatch):
     monkeypatch.setattr(start_module, "MARGIN_DB", 50.0)
     noisy = perturb_poses(dataset.world_from_cam, 0.15, seed=1)
     assert choose(images, candidates(dataset, noisy, dataset.world_from_cam)).source == "matches-incremental"
+
+
+def test_stage_1_is_shorter_where_matches_placed_the_cameras_and_its_length_was_left_open(scene):
+    dataset, _ = scene
+    given, matched = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
+    open_options = RefineOptions(preset="fast")
+    resolved = open_options.resolved()
+    assert given.stage_lengths(open_options, resolved) == resolved
+    shorter = matched.stage_lengths(open_options, resolved)
+    assert (shorter.coarse_steps_min, shorter.coarse_steps_max) == (400, 800)
+    fixed = RefineOptions(preset="fast", coarse_steps_min=500, coarse_steps_max=900)
+    assert matched.stage_lengths(fixed, fixed.resolved()) == fixed.resolved()
 
 
 def test_a_stop_ends_the_trial(scene):
