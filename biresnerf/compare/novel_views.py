@@ -14,9 +14,10 @@ from biresnerf.data.dataset import Dataset
 from biresnerf.data.images import load_images
 from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.camera import Intrinsics
+from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.refine.evaluation import FIT_RATE, FIT_RAYS, FIT_STEPS, render_view
-from biresnerf.refine.joint_optimiser import RIG_DISTANCE, JointOptimiser
+from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.pose_parameters import PoseParameters
 
 
