@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,12 +10,16 @@ from torch import Tensor
 
 from biresnerf.field.cpu import encoding, network
 from biresnerf.field.cpu import rays as ray_kernels
+from biresnerf.field.cpu.matrix_blocks import CHANNELS, from_tiles
+from biresnerf.field.cpu.samples import Samples, segments
+from biresnerf.field.cpu.segments import render_segments, render_segments_backward
 from biresnerf.field.grid_levels import GridLevels
 from biresnerf.field.radiance_field import (
     BETA1,
     BETA2,
     EPSILON,
     HIDDEN,
+    OUTPUTS,
     FieldShape,
     Marching,
     PositionGradient,
@@ -27,6 +30,11 @@ from biresnerf.field.radiance_field import (
 from biresnerf.field.spherical_harmonics import VIEW_FEATURES, spherical_harmonics
 
 f4 = np.float32
+
+
+def tasks() -> np.ndarray:
+    """The counter that the workers of one kernel call draw their tasks from."""
+    return np.zeros(1, np.int64)
 
 
 class Buffers:
@@ -44,21 +52,6 @@ class Buffers:
         return held[:size].reshape(shape)
 
 
-@dataclass(frozen=True)
-class Samples:
-    """What the forward pass leaves for the backward pass; arrays are views of `Buffers`."""
-
-    offset: np.ndarray
-    x: np.ndarray
-    t: np.ndarray
-    dt: np.ndarray
-    ray: np.ndarray
-    features: np.ndarray
-    jacobians: list[np.ndarray]
-    density: np.ndarray
-    colour: np.ndarray
-
-
 class CpuField(RadianceField):
     """Backend `cpu`."""
 
@@ -70,7 +63,7 @@ class CpuField(RadianceField):
         self._buffers = Buffers()
         largest = max(int(np.diff(g.offset).max()) for g in (shape.pose_grid, shape.reconstruction_grid))
         self._scratch = np.zeros((workers, 2 * largest), f4)
-        self._pending: tuple[Samples, np.ndarray, int] | None = None
+        self._pending: tuple[Samples, np.ndarray] | None = None
 
     def _grids(self) -> list[tuple[GridLevels, np.ndarray]]:
         grids = [(self.shape.pose_grid, self.pose_table.numpy())]
@@ -79,10 +72,10 @@ class CpuField(RadianceField):
         return grids
 
     def _width(self) -> int:
-        return -4 * (-sum(grid.width for grid, _ in self._grids()) // 4)  # whole register tiles
+        return -CHANNELS * (-sum(grid.width for grid, _ in self._grids()) // CHANNELS)  # whole register tiles
 
     def _weights(self) -> list[np.ndarray]:
-        """The five layers as contiguous arrays; input columns and colour rows padded to multiples of 4."""
+        """The five layers as contiguous arrays; input columns padded to whole tiles, colour rows to 4."""
         first = np.zeros((HIDDEN, self._width()), f4)
         low = self.shape.pose_grid.width
         first[:, :low] = self.networks[0].detach().numpy()
@@ -123,73 +116,77 @@ class CpuField(RadianceField):
         features, _ = self._encode(x, PositionGradient(), "density")
         result = np.empty(len(position), f4)
         w1, w2 = (w.reshape(-1) for w in self._weights()[:2])
-        network.network_density(features.reshape(-1), features.shape[0], w1, w2, result, self.workers)
+        network.network_density(
+            features.reshape(-1), features.shape[0], w1, w2, result, tasks(), self.workers
+        )
         return torch.from_numpy(result)
 
-    def sample(self, origin: np.ndarray, direction: np.ndarray, view: np.ndarray, jitter: np.ndarray,
-               marching: Marching, gradient: PositionGradient) -> Samples:  # fmt: skip
-        """March the rays and evaluate the field at every live sample."""
+    def march(self, origin: np.ndarray, direction: np.ndarray, jitter: np.ndarray, marching: Marching,
+              ) -> tuple[np.ndarray, ...]:  # fmt: skip
+        """Where the live intervals of rays are: offset [rays + 1], grid positions x [3 n], t, dt, ray [n]."""
         rays, take = len(origin), self._buffers.take
         t_buffer = take("march t", rays, marching.most)
         dt_buffer = take("march dt", rays, marching.most)
         count = take("count", rays, dtype=np.int32)
-        occupied = marching.occupied.numpy().reshape(-1)
         ray_kernels.march(
-            origin, direction, jitter, occupied, marching.occupied.shape[0], f4(marching.step),
-            f4(marching.near), f4(marching.far), self.shape.unbounded, t_buffer, dt_buffer, count,
+            origin, direction, jitter, marching.occupied.numpy().reshape(-1), marching.occupied.shape[0],
+            f4(marching.step), f4(marching.near), f4(marching.far), self.shape.unbounded, t_buffer, dt_buffer, count,
         )  # fmt: skip
         offset = np.zeros(rays + 1, np.int64)
         np.cumsum(count, out=offset[1:])
         n = int(offset[-1])
-        x, t, dt = take("x", 3 * n), take("t", n), take("dt", n)
-        ray = take("ray", n, dtype=np.int32)
+        x, t, dt, ray = take("x", 3 * n), take("t", n), take("dt", n), take("ray", n, dtype=np.int32)
         ray_kernels.pack(
             origin, direction, t_buffer, dt_buffer, count, offset, self.shape.unbounded, x, t, dt, ray
         )
-        features, jacobians = self._encode(x, gradient, "render")
-        density, colour = take("density", n), take("colour", 3 * n)
-        weights = [w.reshape(-1) for w in self._weights()]
-        network.network_forward(
-            features.reshape(-1),
-            features.shape[0],
-            view.reshape(-1),
-            ray,
-            *weights,
-            density,
-            colour,
-            self.workers,
-        )
-        return Samples(offset, x, t, dt, ray, features, jacobians, density, colour)
+        return offset, x, t, dt, ray
 
-    def backward_samples(self, samples: Samples, view: np.ndarray, trained_rays: int,
-                         g_density: np.ndarray, g_colour: np.ndarray, gradient: PositionGradient,
-                         ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """Gradients to grid positions [n, 3] and view harmonics [16 n]; keeps those to the field for `step`."""
-        take, n = self._buffers.take, len(samples.t)
-        width = samples.features.shape[0]
+    def render_forward(self, origin: np.ndarray, direction: np.ndarray, view: np.ndarray, rays: Rays,
+                       marching: Marching, gradient: PositionGradient,
+                       ) -> tuple[Samples, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+        """March, evaluate the field at every live sample and composite: colour [rays, 3], opacity, depth [rays]."""
+        take, count = self._buffers.take, len(origin)
+        offset, x, t, dt, ray = self.march(origin, direction, rays.jitter.numpy(), marching)
+        n = len(t)
+        features, jacobians = self._encode(x, gradient, "render")
+        segment, learning = segments(offset, rays.trained)
+        samples = Samples(
+            segment, learning, offset, x, t, dt, ray, features, jacobians,
+            take("outputs", OUTPUTS * n), take("density", n), take("alpha", n), take("kept", n, dtype=np.int32),
+            take("kept begin", count, dtype=np.int64), take("kept end", count, dtype=np.int64), take("colour", 3 * n),
+        )  # fmt: skip
+        colour, opacity, depth = np.empty((count, 3), f4), np.empty(count, f4), np.empty(count, f4)
+        render_segments(
+            segment, offset, t, dt, ray, features.reshape(-1), len(features), view.reshape(-1),
+            rays.background.numpy(), *(w.reshape(-1) for w in self._weights()),
+            samples.outputs, samples.density, samples.alpha, samples.kept, samples.kept_begin, samples.kept_end,
+            samples.colour, colour, opacity, depth, tasks(), self.workers,
+        )  # fmt: skip
+        return samples, colour, opacity, depth
+
+    def render_backward(self, s: Samples, view: np.ndarray, colour: np.ndarray, opacity: np.ndarray,
+                        g_colour: np.ndarray, g_opacity: np.ndarray, gradient: PositionGradient,
+                        ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Gradients to grid positions [3, n] and view harmonics [rays, 16]; keeps those to the field for `step`."""
+        take, n, width = self._buffers.take, len(s.t), len(s.features)
         weights = self._weights()
-        transposed = [np.ascontiguousarray(w.T).reshape(-1) for w in weights]
-        sums = [np.zeros((self.workers, w.size), f4) for w in weights]
-        g_features, g_view = take("g features", width, n), take("g view", VIEW_FEATURES * n)
-        trained = int(samples.offset[trained_rays])
-        for first, last, with_weights in ((0, trained, True), (trained, n, False)):
-            if first < last:
-                network.network_backward(
-                    samples.features.reshape(-1), width, view.reshape(-1), samples.ray, first, last, with_weights,
-                    *(w.reshape(-1) for w in weights), *transposed,
-                    g_density, g_colour, g_features.reshape(-1), g_view, *sums,
-                )  # fmt: skip
-        if trained:
+        sums = [np.zeros((max(1, s.learning), w.size), f4) for w in weights]
+        g_features, dx = take("g features", width, n), take("dx", 3, n)
+        g_view = np.empty((len(opacity), VIEW_FEATURES), f4)
+        longest = int(np.diff(s.offset[s.segment]).max(initial=0))
+        second = s.jacobians[1] if len(s.jacobians) > 1 else np.empty((0, 6, n), f4)
+        render_segments_backward(
+            s.segment, s.learning, longest, s.offset, s.dt, s.ray, s.features.reshape(-1), width, view.reshape(-1),
+            *(w.reshape(-1) for w in weights), s.outputs, s.density, s.alpha, s.kept, s.kept_begin, s.kept_end,
+            s.colour, colour, opacity, g_colour, g_opacity, s.jacobians[0], second, f4(gradient.reconstruction_share),
+            s.x, take("g density", n), take("g colour", 3 * n), g_features.reshape(-1), dx, g_view, *sums,
+            tasks(), self.workers,
+        )  # fmt: skip
+        if s.learning:
             self._keep_network_gradients(
-                [s.sum(0).reshape(w.shape) for s, w in zip(sums, weights, strict=True)]
+                [from_tiles(d.sum(0), *w.shape) for d, w in zip(sums, weights, strict=True)]
             )
-            self._pending = (samples, g_features, trained)
-        dx, row = take("dx", n, 3), 0
-        shares = (1.0, gradient.reconstruction_share)
-        for i, jacobian in enumerate(samples.jacobians):
-            height = 2 * jacobian.shape[0]
-            encoding.position_gradient(g_features[row : row + height], jacobian, f4(shares[i]), dx, i > 0)
-            row += height
+            self._pending = (s, g_features)
         return dx, g_view
 
     def _keep_network_gradients(self, gradients: list[np.ndarray]) -> None:
@@ -207,7 +204,10 @@ class CpuField(RadianceField):
     def _update_table(self, name: str, rates: np.ndarray) -> None:
         if self._pending is None:
             return
-        samples, g_features, trained = self._pending
+        samples, g_features = self._pending
+        # Kept samples lie without gaps from each segment's first sample on.
+        begin = samples.offset[samples.segment[: samples.learning]]
+        end = samples.kept_end[samples.segment[1 : samples.learning + 1] - 1]
         pose = name == "pose"
         grid = self.shape.pose_grid if pose else self.shape.reconstruction_grid
         table = self.pose_table if pose else self.reconstruction_table
@@ -222,17 +222,15 @@ class CpuField(RadianceField):
         )
         moment1, moment2 = (m.numpy().reshape(-1) for m in self.moments[name])
         encoding.update_table(
-            samples.x, trained, g_features[row : row + grid.width], grid.scale, grid.stride, grid.hashed, grid.offset,
-            table.numpy().reshape(-1), moment1, moment2, rates, adam, self._scratch, self.workers,
+            samples.x, begin, end, g_features[row : row + grid.width],
+            grid.scale, grid.stride, grid.hashed, grid.offset,
+            table.numpy().reshape(-1), moment1, moment2, rates, adam, self._scratch, tasks(), self.workers,
         )  # fmt: skip
 
     def discard_gradients(self) -> None:
         self._pending = None
         for weight in (*self.networks, self.reconstruction_columns):
             weight.grad = None
-
-    def buffers(self) -> Buffers:
-        return self._buffers
 
 
 class _RenderRays(torch.autograd.Function):
@@ -241,41 +239,23 @@ class _RenderRays(torch.autograd.Function):
     @staticmethod
     def forward(ctx, origin, direction, harmonics, field: CpuField, rays: Rays, marching, gradient):  # noqa: ANN001
         o, d, view = origin.detach().numpy(), direction.detach().numpy(), harmonics.detach().numpy()
-        background = rays.background.numpy()
-        samples = field.sample(o, d, view, rays.jitter.numpy(), marching, gradient)
-        count = len(o)
-        colour, opacity, depth = np.empty((count, 3), f4), np.empty(count, f4), np.empty(count, f4)
-        ray_kernels.composite(
-            samples.offset, samples.t, samples.dt, samples.density, samples.colour, background, colour, opacity, depth
-        )  # fmt: skip
-        ctx.kept = (field, samples, o, d, view, background, colour, opacity, rays.trained, gradient)
-        results = tuple(torch.from_numpy(a) for a in (colour, opacity, depth))
-        ctx.mark_non_differentiable(results[2])
-        return (*results, len(samples.t))
+        samples, colour, opacity, depth = field.render_forward(o, d, view, rays, marching, gradient)
+        ctx.kept = (field, samples, o, d, view, colour, opacity, gradient)
+        tensors = (torch.from_numpy(colour), torch.from_numpy(opacity), torch.from_numpy(depth))
+        samples_taken = torch.tensor(len(samples.t))
+        ctx.mark_non_differentiable(tensors[2], samples_taken)
+        return (*tensors, samples_taken)
 
     @staticmethod
     def backward(ctx, g_colour, g_opacity, _g_depth, _g_count):  # noqa: ANN001
-        field, samples, o, d, view, background, colour, opacity, trained, gradient = ctx.kept
-        take, n = field.buffers().take, len(samples.t)
-        g_density, g_sample = take("g density", n), take("g colour", 3 * n)
-        ray_kernels.composite_backward(
-            samples.offset, samples.dt, samples.density, samples.colour, background, colour, opacity,
-            np.ascontiguousarray(g_colour.numpy()), np.ascontiguousarray(g_opacity.numpy()), g_density, g_sample,
+        field, samples, o, d, view, colour, opacity, gradient = ctx.kept
+        dx, g_view = field.render_backward(
+            samples, view, colour, opacity, np.ascontiguousarray(g_colour.numpy()),
+            np.ascontiguousarray(g_opacity.numpy()), gradient,
         )  # fmt: skip
-        dx, g_view = field.backward_samples(samples, view, trained, g_density, g_sample, gradient)
         g_origin, g_direction = np.empty_like(o), np.empty_like(d)
-        g_harmonics = np.empty((len(o), VIEW_FEATURES), f4)
         ray_kernels.ray_gradients(
-            o,
-            d,
-            samples.offset,
-            samples.t,
-            dx,
-            g_view,
-            field.shape.unbounded,
-            g_origin,
-            g_direction,
-            g_harmonics,
+            o, d, samples.offset, samples.t, dx, field.shape.unbounded, g_origin, g_direction
         )
-        grads = (torch.from_numpy(a) for a in (g_origin, g_direction, g_harmonics))
+        grads = (torch.from_numpy(a) for a in (g_origin, g_direction, g_view))
         return (*grads, None, None, None, None)

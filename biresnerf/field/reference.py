@@ -14,6 +14,7 @@ from biresnerf.field.grid_levels import HASH_PRIMES, GridLevels
 
 DENSITY_SHIFT, DENSITY_CAP = 1.0, 11.0
 EDGE = 1e-6
+LEAST_TRANSMITTANCE = 1e-4  # a ray ends behind the sample that leaves less of its light (instant-ngp's value)
 
 
 def straight_through_fraction(fraction: Tensor, smoothing: float) -> Tensor:
@@ -136,15 +137,24 @@ def composite(
     """Colour [rays, 3], opacity [rays] and depth [rays] of samples ordered by ray and along it.
 
     C = sum_k T_k alpha_k c_k + T_end bg, alpha = 1 - exp(-density dt), T_k = exp(-sum_{j<k} density_j dt_j)
-    (Mildenhall et al. 2020, eq. 3); depth is the weights' mean distance.
+    (Mildenhall et al. 2020, eq. 3), over the samples with T_k >= `LEAST_TRANSMITTANCE`; depth is the weights' mean
+    distance.
     """
     rays = background.shape[0]
-    thickness = density * dt
-    inclusive = torch.cumsum(thickness, 0)
     count = torch.bincount(ray, minlength=rays)
     first = torch.cumsum(count, 0) - count
-    before = torch.cat([inclusive.new_zeros(1), inclusive])[first]
-    transmittance = torch.exp(-(inclusive - thickness - before[ray]))
+
+    def transmittance_of(thickness: Tensor) -> Tensor:
+        # Over all rays at once, so in float64: in float32 thick rays would take the digits of those after them.
+        inclusive = torch.cumsum(thickness, 0, dtype=torch.float64)
+        before = torch.cat([inclusive.new_zeros(1), inclusive])[first]
+        return torch.exp(-(inclusive - thickness - before[ray])).to(thickness.dtype)
+
+    thickness = density * dt
+    with torch.no_grad():
+        reached = transmittance_of(thickness) >= LEAST_TRANSMITTANCE
+    thickness = torch.where(reached, thickness, torch.zeros_like(thickness))
+    transmittance = transmittance_of(thickness)
     weight = transmittance * (1 - torch.exp(-thickness))
     zeros = background.new_zeros(rays)
     last = torch.exp(-zeros.index_add(0, ray, thickness))

@@ -129,13 +129,11 @@ def test_the_same_steps_give_the_same_bits():
         assert torch.equal(tensor, other[name]), name
 
 
-@pytest.mark.parametrize("workers", [1, 3, 5])
-def test_the_number_of_workers_changes_nothing_but_rounding(workers):
+@pytest.mark.parametrize("workers", [1, 5])
+def test_the_number_of_workers_does_not_change_a_bit(workers):
     one, other = three_steps(2), three_steps(workers)
-    torch.testing.assert_close(one["colour"], other["colour"], atol=2e-4, rtol=0)
     for name, tensor in one.items():
-        if name.startswith("network"):
-            assert float((tensor - other[name]).abs().mean()) < 2e-4, name
+        assert torch.equal(tensor, other[name]), name
 
 
 def smooth_field() -> CpuField:

@@ -10,7 +10,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from biresnerf.field.cpu.vector_access import KERNEL, PARALLEL_KERNEL, float_from_bits, load, reload, store
+from biresnerf.field.cpu.vector_access import (
+    KERNEL,
+    PARALLEL_KERNEL,
+    float_from_bits,
+    load,
+    next_task,
+    reload,
+    store,
+)
 
 f4, u4, i4, i8, u8 = np.float32, np.uint32, np.int32, np.int64, np.uint64
 PRIME_Y, PRIME_Z = u4(2654435761), u4(805459861)
@@ -96,11 +104,11 @@ def _make_level(hashing: bool):
             store(out1, i, y0 + fz * (y1 - y0))
 
     @njit(**KERNEL)
-    def scatter(x, gradient, scale, stride, mask, g0, g1, corner, value, count):
-        """Add the gradients of samples [0, count) to the flat [2 entries] gradient of this level."""
+    def scatter(x, gradient, scale, stride, mask, g0, g1, corner, value, first, last):
+        """Add the gradients of samples [first, last) to the flat [2 entries] gradient of this level."""
         step_y, step_z = strides(stride)
-        for begin in range(0, count, BLOCK):
-            size = min(BLOCK, count - begin)
+        for begin in range(first, last, BLOCK):
+            size = min(BLOCK, last - begin)
             for j in range(size):
                 i = begin + j
                 px = load(x, 3 * i) * scale + HALF
@@ -182,37 +190,6 @@ def encode(x, words, scale, stride, hashed, offset, smoothing, features, jacobia
             )  # fmt: skip
 
 
-@njit(**PARALLEL_KERNEL)
-def position_gradient(g, jacobian, factor, dx, accumulate):
-    """dx [n, 3] (+)= factor J^T g for feature gradients g [2 levels, n]."""
-    levels, n = jacobian.shape[0], jacobian.shape[2]
-    size = 1024
-    for task in prange((n + size - 1) // size):
-        begin = task * size
-        count = min(n, begin + size) - begin
-        a, b, c = np.zeros(size, f4), np.zeros(size, f4), np.zeros(size, f4)
-        for level in range(levels):
-            j = jacobian[level]
-            g0, g1 = g[2 * level], g[2 * level + 1]
-            j0, j1, j2, j3, j4, j5 = j[0], j[1], j[2], j[3], j[4], j[5]
-            for k in range(count):
-                i = begin + k
-                u, v = load(g0, i), load(g1, i)
-                store(a, k, reload(a, k) + u * load(j0, i) + v * load(j3, i))
-                store(b, k, reload(b, k) + u * load(j1, i) + v * load(j4, i))
-                store(c, k, reload(c, k) + u * load(j2, i) + v * load(j5, i))
-        for k in range(count):
-            i = begin + k
-            if accumulate:
-                dx[i, 0] += factor * a[k]
-                dx[i, 1] += factor * b[k]
-                dx[i, 2] += factor * c[k]
-            else:
-                dx[i, 0] = factor * a[k]
-                dx[i, 1] = factor * b[k]
-                dx[i, 2] = factor * c[k]
-
-
 @njit(**KERNEL)
 def _adam_touched(p, g, m, v, rate, beta1, beta2, eps, correction1, correction2):
     """Adam on the numbers with a gradient; whole 64-byte lines without any are skipped. Leaves g zero."""
@@ -238,9 +215,24 @@ def _adam_touched(p, g, m, v, rate, beta1, beta2, eps, correction1, correction2)
 
 @njit(**PARALLEL_KERNEL)
 def update_table(
-    x, count, g, scale, stride, hashed, offset, table, moment1, moment2, rates, adam, scratch, workers
+    x,
+    begin,
+    end,
+    g,
+    scale,
+    stride,
+    hashed,
+    offset,
+    table,
+    moment1,
+    moment2,
+    rates,
+    adam,
+    scratch,
+    counter,
+    workers,
 ):
-    """Scatter feature gradients of the first `count` points into each level and take its Adam step at once.
+    """Scatter the feature gradients of points begin[s]:end[s] into each level and take its Adam step at once.
 
     A level's gradient lives in its worker's `scratch` row (kept zero), so it stays in cache and no two workers
     write the same level: deterministic without atomics. `adam` = (beta1, beta2, eps, 1/(1-beta1^t),
@@ -249,18 +241,44 @@ def update_table(
     levels = scale.shape[0]
     for worker in prange(workers):
         corner, value = np.empty(8 * BLOCK, u4), np.empty(16 * BLOCK, f4)
-        for level in range(worker, levels, workers):
-            if rates[level] == f4(0):
-                continue
-            lo, hi = 2 * offset[level], 2 * offset[level + 1]
-            gradient = scratch[worker][: hi - lo]
-            mask = u4((hi - lo) // 2 - 1)
-            g0, g1 = g[2 * level], g[2 * level + 1]
-            if hashed[level]:
-                _scatter_hashed(x, gradient, scale[level], stride[level], mask, g0, g1, corner, value, count)
-            else:
-                _scatter_dense(x, gradient, scale[level], stride[level], mask, g0, g1, corner, value, count)
-            _adam_touched(
-                table[lo:hi], gradient, moment1[lo:hi], moment2[lo:hi],
-                rates[level], adam[0], adam[1], adam[2], adam[3], adam[4],
-            )  # fmt: skip
+        level = next_task(counter)
+        while level < levels:
+            if rates[level] != f4(0):
+                lo, hi = 2 * offset[level], 2 * offset[level + 1]
+                gradient = scratch[worker][: hi - lo]
+                mask = u4((hi - lo) // 2 - 1)
+                g0, g1 = g[2 * level], g[2 * level + 1]
+                for s in range(begin.shape[0]):
+                    if hashed[level]:
+                        _scatter_hashed(
+                            x,
+                            gradient,
+                            scale[level],
+                            stride[level],
+                            mask,
+                            g0,
+                            g1,
+                            corner,
+                            value,
+                            begin[s],
+                            end[s],
+                        )
+                    else:
+                        _scatter_dense(
+                            x,
+                            gradient,
+                            scale[level],
+                            stride[level],
+                            mask,
+                            g0,
+                            g1,
+                            corner,
+                            value,
+                            begin[s],
+                            end[s],
+                        )
+                _adam_touched(
+                    table[lo:hi], gradient, moment1[lo:hi], moment2[lo:hi],
+                    rates[level], adam[0], adam[1], adam[2], adam[3], adam[4],
+                )  # fmt: skip
+            level = next_task(counter)

@@ -1,4 +1,4 @@
-"""Ray marching through the occupancy grid, compositing and gradients to rays, in Numba.
+"""Ray marching through the occupancy grid and gradients to rays, in Numba.
 
 The definitions are in `biresnerf.field.reference`. Rays live in the unit frame; the encoding sees positions in
 [0, 1]: (x + 1) / 2 when the scene is bounded, (contract(x) + 2) / 4 when it is not.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from biresnerf.field.cpu.matrix_blocks import exponential
 from biresnerf.field.cpu.vector_access import PARALLEL_KERNEL
 
 f4, i4 = np.float32, np.int32
@@ -102,64 +101,12 @@ def pack(origin, direction, t_buffer, dt_buffer, count, offset, unbounded, x, t,
 
 
 @njit(**PARALLEL_KERNEL)
-def composite(offset, t, dt, density, colour, background, out_colour, out_opacity, out_depth):
-    """Quadrature of the volume rendering integral (Max 1995; Mildenhall et al. 2020, eq. 3) over packed samples."""
-    total = density.shape[0]
-    for r in prange(out_opacity.shape[0]):
-        transmittance, c0, c1, c2, depth = ONE, f4(0), f4(0), f4(0), f4(0)
-        for i in range(offset[r], offset[r + 1]):
-            alpha = ONE - exponential(-density[i] * dt[i])
-            weight = transmittance * alpha
-            c0 += weight * colour[i]
-            c1 += weight * colour[total + i]
-            c2 += weight * colour[2 * total + i]
-            depth += weight * t[i]
-            transmittance *= ONE - alpha
-        out_colour[r, 0] = c0 + transmittance * background[r, 0]
-        out_colour[r, 1] = c1 + transmittance * background[r, 1]
-        out_colour[r, 2] = c2 + transmittance * background[r, 2]
-        out_opacity[r] = ONE - transmittance
-        out_depth[r] = depth / max(ONE - transmittance, f4(1e-6))
-
-
-@njit(**PARALLEL_KERNEL)
-def composite_backward(
-    offset, dt, density, colour, background, out_colour, out_opacity, g_colour, g_opacity, gd, gc
-):
-    """Gradients to density gd [n] and sample colour gc [3 n], from those of the rays' colour and opacity."""
-    total = density.shape[0]
-    for r in prange(out_opacity.shape[0]):
-        g0, g1, g2 = g_colour[r, 0], g_colour[r, 1], g_colour[r, 2]
-        last = ONE - out_opacity[r]
-        g_last = -g_opacity[r]
-        transmittance = ONE
-        # What lies behind the sample at hand: sum of w_j c_j over later samples, and the background.
-        s0, s1, s2 = out_colour[r, 0], out_colour[r, 1], out_colour[r, 2]
-        for i in range(offset[r], offset[r + 1]):
-            alpha = ONE - exponential(-density[i] * dt[i])
-            weight = transmittance * alpha
-            q0, q1, q2 = colour[i], colour[total + i], colour[2 * total + i]
-            s0 -= weight * q0
-            s1 -= weight * q1
-            s2 -= weight * q2
-            gc[i], gc[total + i], gc[2 * total + i] = weight * g0, weight * g1, weight * g2
-            transmittance *= ONE - alpha
-            gd[i] = dt[i] * (
-                g0 * (transmittance * q0 - s0)
-                + g1 * (transmittance * q1 - s1)
-                + g2 * (transmittance * q2 - s2)
-                - g_last * last
-            )
-
-
-@njit(**PARALLEL_KERNEL)
-def ray_gradients(origin, direction, offset, t, dx, g_view, unbounded, g_origin, g_direction, g_harmonics):
-    """Sum the samples' gradients dx [n, 3] (to grid positions) and g_view [16 n] into their rays."""
-    total = t.shape[0]
+def ray_gradients(origin, direction, offset, t, dx, unbounded, g_origin, g_direction):
+    """Sum the samples' gradients dx [3, n] to grid positions into their rays."""
     for r in prange(g_origin.shape[0]):
         a0 = a1 = a2 = b0 = b1 = b2 = f4(0)
         for i in range(offset[r], offset[r + 1]):
-            u, v, w = dx[i, 0], dx[i, 1], dx[i, 2]
+            u, v, w = dx[0, i], dx[1, i], dx[2, i]
             if unbounded:
                 px = origin[r, 0] + t[i] * direction[r, 0]
                 py = origin[r, 1] + t[i] * direction[r, 1]
@@ -189,8 +136,3 @@ def ray_gradients(origin, direction, offset, t, dx, g_view, unbounded, g_origin,
             b2 += t[i] * w
         g_origin[r, 0], g_origin[r, 1], g_origin[r, 2] = a0, a1, a2
         g_direction[r, 0], g_direction[r, 1], g_direction[r, 2] = b0, b1, b2
-        for c in range(16):
-            s = f4(0)
-            for i in range(offset[r], offset[r + 1]):
-                s += g_view[c * total + i]
-            g_harmonics[r, c] = s
