@@ -13,6 +13,7 @@ from biresnerf.errors import InputError
 
 PresetName = Literal["fast", "balanced", "quality", "paper"]
 Device = Literal["auto", "cpu", "cuda"]
+MethodName = Literal["biresnerf", "biresnerf-paper", "baa-ngp", "nerfacc-barf", "barf"]
 Background = Literal["auto", "white", "black", "none"]
 PoseParametrisation = Literal["se3_world", "so3xr3"]
 StartPoses = Literal["auto", "given"]
@@ -24,6 +25,10 @@ class RefineOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, title="Refinement options")
 
     preset: PresetName = Field("balanced", description="Fills every option that is left out.")
+    method: MethodName = Field(
+        "biresnerf",
+        description="biresnerf, the two stages as published (biresnerf-paper), or a method it is compared with.",
+    )
     device: Device = Field("auto", description="Where to compute; auto takes CUDA where there is one.")
     seed: int = Field(0, ge=0, lt=2**31, description="Same seed, same machine, same result on the CPU.")
     threads: int = Field(0, ge=0, le=256, description="CPU threads; 0 takes all cores this process may use.")
@@ -44,8 +49,8 @@ class RefineOptions(BaseModel):
         "auto", description="What lies behind the scene: a colour, or none where photos show surroundings."
     )
 
-    start: StartPoses = Field(
-        "auto",
+    start: StartPoses | None = Field(
+        None,
         description="auto: poses that feature matches support are tried against the given ones, and the better "
         "ones are started from; given: no matches are looked for.",
     )
@@ -67,6 +72,10 @@ class RefineOptions(BaseModel):
     warmup_steps: int | None = Field(
         None, ge=1, description="Steps over which the reconstruction module's learning rate rises."
     )
+    double_pose_step: bool | None = Field(
+        None,
+        description="A second Adam, at the field's learning rate, moves the poses too (as BAA-NGP's code).",
+    )
     pose_parametrisation: PoseParametrisation = Field(
         "se3_world", description="se3_world turns cameras about the scene, so3xr3 about themselves."
     )
@@ -77,7 +86,7 @@ class RefineOptions(BaseModel):
     reconstruction_levels: int | None = Field(
         None, ge=1, le=16, description="Levels of the reconstruction module."
     )
-    reconstruction_resolution_min: int = Field(128, ge=4, le=8192)
+    reconstruction_resolution_min: int | None = Field(None, ge=4, le=8192)
     reconstruction_resolution_max: int | None = Field(None, ge=4, le=16384)
     table_size_log2: int | None = Field(None, ge=10, le=22, description="Entries of a hashed level, log2.")
 
@@ -104,11 +113,15 @@ class RefineOptions(BaseModel):
 
     def resolved(self) -> RefineOptions:
         """These options with every field left at ``None`` filled in from the preset (``holdout`` stays)."""
-        preset = PRESETS[self.preset]
+        preset = {**COMMON_VALUES, **PRESETS[self.preset], **METHOD_VALUES[self.method]}
+        if self.preset == "paper":
+            preset.update(METHOD_PAPER_VALUES[self.method])
         given = self.model_dump()
         scale = CUDA_SCALE if self.device == "cuda" and self.preset != "paper" else {}
         filled = {
-            key: preset[key] * scale.get(key, 1) if given[key] is None else given[key] for key in preset
+            key: preset[key] * scale[key] if key in scale else preset[key]
+            for key in preset
+            if given[key] is None
         }
         # A shorter run asked for by `steps` alone keeps the preset's proportions.
         if self.steps is not None:
@@ -193,6 +206,51 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "table_size_log2": 19,
         "orbit_frames": 96,
     },
+}
+
+COMMON_VALUES: dict[str, Any] = {
+    "start": "auto",
+    "reconstruction_resolution_min": 128,
+    "double_pose_step": False,
+}
+
+_BAA_NGP = {
+    "start": "given",
+    "double_pose_step": True,
+    "pose_rate": 1e-3,
+    "pose_rate_final": 1e-5,
+    "field_rate": 1e-2,
+    "field_rate_final": 1e-4,
+}
+_BARF = {
+    "start": "given",
+    "pose_rate": 1e-3,
+    "pose_rate_final": 1e-5,
+    "field_rate": 5e-4,
+    "field_rate_final": 1e-4,
+}
+
+# What a method takes instead of the preset's values, whatever the preset: its published rates and grid.
+METHOD_VALUES: dict[MethodName, dict[str, Any]] = {
+    "biresnerf": {},
+    "biresnerf-paper": _BAA_NGP,
+    "baa-ngp": {
+        **_BAA_NGP,
+        "reconstruction_levels": 16,
+        "reconstruction_resolution_min": 14,
+        "reconstruction_resolution_max": 4096,
+    },
+    "nerfacc-barf": _BARF,
+    "barf": _BARF,
+}
+
+# And in the preset `paper`: its published length and batch (1024 rays of 128 samples; pruned, of about 32).
+METHOD_PAPER_VALUES: dict[MethodName, dict[str, Any]] = {
+    "biresnerf": {},
+    "biresnerf-paper": {},
+    "baa-ngp": {},
+    "nerfacc-barf": {"steps": 200_000, "samples_per_step": 2**15},
+    "barf": {"steps": 200_000, "samples_per_step": 2**17},
 }
 
 

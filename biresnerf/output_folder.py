@@ -15,7 +15,7 @@ from biresnerf.data.renders import picture_stems, write_orbit, write_view
 from biresnerf.data.write import write_colmap, write_transforms
 from biresnerf.errors import InputError
 from biresnerf.geometry.pose_error import rotation_angle_deg
-from biresnerf.geometry.similarity import Similarity, align_robust
+from biresnerf.geometry.similarity import Similarity, align_robust, align_umeyama
 from biresnerf.refine.checkpoint import CHECKPOINT, SEEDING
 from biresnerf.refine.evaluation import ViewScore
 from biresnerf.refine.history import HISTORY
@@ -125,7 +125,7 @@ class OutputFolder:
             else None,
             start_trials=start.trials,
             steps_done=optimiser.step_index,
-            switch_step=optimiser.switch,
+            switch_step=optimiser.switch if optimiser.method.two_stages else None,
             switch_reason=record.switch_reason,
             resumed=record.resumed,
             seconds={stage: round(seconds, 3) for stage, seconds in record.seconds.items()},
@@ -152,12 +152,15 @@ def poses_in_input_frame(dataset: Dataset, optimiser: JointOptimiser) -> tuple[n
     """Refined world_from_cam [n, 4, 4] carried into the input's frame, and the similarity that does it.
 
     The optimisation leaves frame and scale free; what ties them down is the best similarity, robust to lost
-    cameras, from the optimised poses to the given ones.
+    cameras unless the method has it otherwise, from the optimised poses to the given ones.
     """
     world_from_unit = optimiser.frame.unit_from_world.inverse()
     optimised = world_from_unit.apply_to_poses(optimiser.poses.poses().numpy())
     given = dataset.world_from_cam
-    input_from_optimised = align_robust(optimised, given, with_rotations=True)
+    if optimiser.method.robust_frame:
+        input_from_optimised = align_robust(optimised, given, with_rotations=True)
+    else:
+        input_from_optimised = align_umeyama(optimised, given)
     return input_from_optimised.apply_to_poses(optimised), input_from_optimised
 
 

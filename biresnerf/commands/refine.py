@@ -140,7 +140,9 @@ def summary(report: Report, output: Path) -> str:
     moved = sorted(image.moved_deg for image in report.images)
     lines = [
         f"{len(report.images)} cameras, moved by {moved[len(moved) // 2]:.3g} deg (median), {moved[-1]:.3g} deg (most)",
-        f"stage 2 began at step {report.switch_step} of {report.steps_done} ({report.switch_reason})",
+        f"{report.options.method}: {report.steps_done} steps"
+        if report.switch_step is None
+        else f"stage 2 began at step {report.switch_step} of {report.steps_done} ({report.switch_reason})",
     ]
     if report.heldout:
         lines.append(

@@ -13,6 +13,7 @@ from biresnerf.field.cpu import rays as ray_kernels
 from biresnerf.field.cpu.matrix_blocks import CHANNELS, from_tiles
 from biresnerf.field.cpu.samples import Samples, segments
 from biresnerf.field.cpu.segments import render_segments, render_segments_backward
+from biresnerf.field.grid_field import GridField
 from biresnerf.field.grid_levels import GridLevels
 from biresnerf.field.radiance_field import (
     BETA1,
@@ -23,7 +24,6 @@ from biresnerf.field.radiance_field import (
     FieldShape,
     Marching,
     PositionGradient,
-    RadianceField,
     Rays,
     Rendering,
 )
@@ -52,7 +52,7 @@ class Buffers:
         return held[:size].reshape(shape)
 
 
-class CpuField(RadianceField):
+class CpuField(GridField):
     """Backend `cpu`."""
 
     backend = "cpu"
@@ -61,7 +61,8 @@ class CpuField(RadianceField):
         super().__init__(shape, seed, device)
         self.workers = workers
         self._buffers = Buffers()
-        largest = max(int(np.diff(g.offset).max()) for g in (shape.pose_grid, shape.reconstruction_grid))
+        sizes = [np.diff(grid.offset) for grid in (shape.pose_grid, shape.reconstruction_grid)]
+        largest = int(np.concatenate(sizes).max())
         self._scratch = np.zeros((workers, 2 * largest), f4)
         self._pending: tuple[Samples, np.ndarray] | None = None
 

@@ -56,7 +56,7 @@ class OccupancyGrid:
             position = (index + torch.rand(len(part), 3, generator=generator)) / self.side
             density = field.density(position.to(self.device))
             part = part.to(self.device)
-            length = step * interval_growth(position.to(self.device)) if field.shape.unbounded else step
+            length = step * interval_growth(position.to(self.device)) if field.unbounded else step
             self.thickness[part] = torch.maximum(self.thickness[part], density * length)
         if prune:
             self._prune(dilate)

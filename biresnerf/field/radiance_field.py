@@ -1,22 +1,13 @@
-"""The radiance field: its parameters, what it is asked for, and the optimiser step all backends share.
-
-Two encodings, named by their job as in the paper: the pose-estimation module (low resolution, dense) and the
-reconstruction module (high resolution, hashed). Their features are concatenated; the reconstruction module's
-columns of the first layer start at zero, so switching it on leaves the function exactly as it was.
-"""
+"""The radiance field's contract: what it is asked for, and in which terms."""
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import numpy as np
-import torch
 from torch import Tensor
 
-from biresnerf.field.grid_levels import FEATURES, GridLevels
-from biresnerf.field.spherical_harmonics import VIEW_FEATURES
+from biresnerf.field.grid_levels import GridLevels
 
 HIDDEN, OUTPUTS = 64, 16
 TABLE_INIT = 1e-4  # uniform +-1e-4, as tiny-cuda-nn
@@ -25,16 +16,23 @@ BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 
 @dataclass(frozen=True)
 class FieldShape:
-    """What the field is made of. `unbounded` scenes are contracted outside the inner box [-1, 1]^3."""
+    """What a field on grids is made of. `unbounded` scenes are contracted outside the inner box [-1, 1]^3.
+
+    `broadcast`: levels of the first grid open from coarse to fine, closed ones repeating the finest open one
+    (`coarse_to_fine.level_mixing`).
+    """
 
     pose_grid: GridLevels
     reconstruction_grid: GridLevels
     unbounded: bool
+    broadcast: bool = False
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays in the unit frame: origin, unit direction, background colour [rays, 3], jitter [rays] in [0, 1).
+    """Rays in the unit frame: origin, unit direction, background colour [rays, 3], jitter in [0, 1).
+
+    `jitter` says where in their interval samples start: [rays], or [rays, samples] for a stratified field.
 
     Only the first `trained` rays give gradients to the field; all give gradients to origin and direction.
     """
@@ -93,43 +91,17 @@ class Rendering:
 
 
 class RadianceField(ABC):
-    """Parameters and optimiser state; backends add `render`, `density` and the table update."""
+    """What the joint optimisation asks of a field, whatever it is made of.
+
+    Attributes:
+        unbounded: whether space outside the inner box [-1, 1]^3 is contracted.
+        stratified: samples a ray gets, one from each of as many bins; None where rays are marched through the
+            occupancy grid.
+    """
 
     backend: str
-
-    def __init__(self, shape: FieldShape, seed: int, device: torch.device) -> None:
-        self.shape, self.device = shape, device
-        self.reconstructing = False
-        generator = torch.Generator().manual_seed(seed)
-
-        def uniform(rows: int, columns: int, bound: float) -> Tensor:
-            values = torch.rand(rows, columns, generator=generator) * (2 * bound) - bound
-            return values.to(device)
-
-        def layer(rows: int, columns: int) -> Tensor:
-            return uniform(rows, columns, math.sqrt(6 / (rows + columns))).requires_grad_()  # Xavier
-
-        self.pose_table = uniform(shape.pose_grid.entries, FEATURES, TABLE_INIT)
-        self.reconstruction_table = uniform(shape.reconstruction_grid.entries, FEATURES, TABLE_INIT)
-        self.networks = [
-            layer(HIDDEN, shape.pose_grid.width),
-            layer(OUTPUTS, HIDDEN),
-            layer(HIDDEN, VIEW_FEATURES + OUTPUTS),
-            layer(HIDDEN, HIDDEN),
-            layer(3, HIDDEN),
-        ]
-        self.reconstruction_columns = torch.zeros(
-            HIDDEN, shape.reconstruction_grid.width, device=device
-        ).requires_grad_()
-        self.moments = {
-            name: (torch.zeros_like(table), torch.zeros_like(table))
-            for name, table in (("pose", self.pose_table), ("reconstruction", self.reconstruction_table))
-        }
-        self.steps = {"pose": 0, "reconstruction": 0}
-        self._networks_adam = torch.optim.Adam(self.networks, betas=(BETA1, BETA2), eps=EPSILON)
-        self._columns_adam = torch.optim.Adam(
-            [self.reconstruction_columns], betas=(BETA1, BETA2), eps=EPSILON
-        )
+    unbounded: bool
+    stratified: int | None = None
 
     @abstractmethod
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
@@ -143,70 +115,25 @@ class RadianceField(ABC):
         """Density [n] per unit length at grid positions [n, 3] in [0, 1]; no gradient."""
 
     @abstractmethod
-    def _update_table(self, name: str, rates: np.ndarray) -> None:
-        """Adam on one table from the gradients of the last backward, entries without gradient left alone."""
+    def step(self, rates: FieldRates) -> None:
+        """One optimiser step from the gradients of the last backward."""
 
     @abstractmethod
     def discard_gradients(self) -> None:
         """Forget the gradients of the last backward."""
 
-    def start_reconstruction(self) -> None:
-        """From here on the reconstruction module takes part (the switch to stage 2)."""
-        self.reconstructing = True
-
-    def step(self, rates: FieldRates) -> None:
-        """One Adam step from the gradients of the last backward."""
-        self.steps["pose"] += 1
-        self._update_table("pose", np.full(self.shape.pose_grid.levels, rates.pose, np.float32))
-        self._step_networks(self._networks_adam, rates.networks)
-        if self.reconstructing:
-            self.steps["reconstruction"] += 1
-            self._update_table("reconstruction", np.asarray(rates.reconstruction, np.float32))
-            self._step_networks(self._columns_adam, rates.reconstruction_columns)
-        self.discard_gradients()
-
-    @staticmethod
-    def _step_networks(optimiser: torch.optim.Optimizer, rate: float) -> None:
-        optimiser.param_groups[0]["lr"] = rate
-        optimiser.step()
-        optimiser.zero_grad(set_to_none=True)
-
+    @abstractmethod
     def state(self) -> dict[str, Tensor]:
         """Everything `load_state` needs to go on exactly as before, as flat named tensors."""
-        state = {"pose_table": self.pose_table, "reconstruction_table": self.reconstruction_table}
-        for name, (first, second) in self.moments.items():
-            state[f"{name}_moment1"], state[f"{name}_moment2"] = first, second
-        for i, weight in enumerate(self.networks):
-            state[f"network{i}"] = weight.detach()
-        state["reconstruction_columns"] = self.reconstruction_columns.detach()
-        for prefix, optimiser in (("networks", self._networks_adam), ("columns", self._columns_adam)):
-            for i, entry in optimiser.state_dict()["state"].items():
-                for key, value in entry.items():
-                    state[f"adam_{prefix}_{i}_{key}"] = torch.as_tensor(value)
-        counters = [self.steps["pose"], self.steps["reconstruction"], int(self.reconstructing)]
-        state["counters"] = torch.tensor(counters)
-        return state
 
+    @abstractmethod
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Restore what `state` returned, in place."""
-        with torch.no_grad():
-            self.pose_table.copy_(state["pose_table"])
-            self.reconstruction_table.copy_(state["reconstruction_table"])
-            for name, (first, second) in self.moments.items():
-                first.copy_(state[f"{name}_moment1"])
-                second.copy_(state[f"{name}_moment2"])
-            for i, weight in enumerate(self.networks):
-                weight.copy_(state[f"network{i}"])
-            self.reconstruction_columns.copy_(state["reconstruction_columns"])
-        for prefix, optimiser in (("networks", self._networks_adam), ("columns", self._columns_adam)):
-            saved = optimiser.state_dict()
-            saved["state"] = {}
-            for i in range(len(saved["param_groups"][0]["params"])):
-                head = f"adam_{prefix}_{i}_"
-                entry = {k[len(head) :]: v.clone() for k, v in state.items() if k.startswith(head)}
-                if entry:
-                    saved["state"][i] = entry
-            optimiser.load_state_dict(saved)
-        pose, reconstruction, reconstructing = state["counters"].tolist()
-        self.steps = {"pose": pose, "reconstruction": reconstruction}
-        self.reconstructing = bool(reconstructing)
+
+    def start_reconstruction(self) -> None:
+        """From here on the reconstruction module takes part (the switch to stage 2); an error where there is none."""
+        raise RuntimeError("this field has no second stage")
+
+    @abstractmethod
+    def reach(self, progress: float) -> None:
+        """Tell the share of the run that is done, 0 to 1: a field that opens from coarse to fine follows it."""

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from biresnerf.field import reference
+from biresnerf.field.grid_field import GridField
 from biresnerf.field.grid_levels import GridLevels
 from biresnerf.field.radiance_field import (
     BETA1,
@@ -17,14 +18,13 @@ from biresnerf.field.radiance_field import (
     FieldShape,
     Marching,
     PositionGradient,
-    RadianceField,
     Rays,
     Rendering,
 )
 from biresnerf.field.spherical_harmonics import spherical_harmonics
 
 
-class ReferenceField(RadianceField):
+class ReferenceField(GridField):
     """Backend `reference`."""
 
     backend = "reference"

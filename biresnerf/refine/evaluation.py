@@ -54,7 +54,7 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
         matrices = poses.matrices()[batch.image]
         origin, direction = optimiser.cast(matrices, batch.image, batch.xy)
         rendering = optimiser.render(origin, direction, 0, schedule.fine_interval, gradient, jitter=True)
-        torch.nn.functional.smooth_l1_loss(rendering.colour, batch.sharp).backward()
+        optimiser.method.loss(rendering.colour, batch.sharp).backward()
         poses.step(FIT_RATE * 0.1 ** (step / FIT_STEPS), mobility)
 
 

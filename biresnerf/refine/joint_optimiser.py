@@ -11,21 +11,19 @@ from torch import Tensor
 
 from biresnerf.config import RefineOptions
 from biresnerf.data.images import ImageSet
-from biresnerf.field.backends import make_field
-from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.occupancy import OccupancyGrid
-from biresnerf.field.radiance_field import FieldShape, Marching, PositionGradient, Rays, Rendering
+from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
 from biresnerf.geometry.camera import Intrinsics, directions_in_cam
+from biresnerf.geometry.perturb import RIG_DISTANCE
+from biresnerf.refine.methods import METHODS, build_field, occupancy_side
 from biresnerf.refine.photo_sampler import PhotoSampler
 from biresnerf.refine.pose_parameters import PoseParameters
 from biresnerf.refine.scene_frame import SceneFrame
-from biresnerf.refine.schedule import Schedule
 
 MOST_SAMPLES = 768  # per ray
-RAYS_LEAST, RAYS_MOST = 256, 1 << 15
+RAYS_MOST = 1 << 15
+FIRST_SAMPLES = 64  # per ray, as guessed for the first step
 OCCUPANCY_PERIOD = 16
-DENSE_TABLE_LOG2 = 22  # the pose-estimation module is stored densely up to 159 cells a side, hashed beyond
-RIG_DISTANCE = 4.0  # BARF's rigs: learning rates of translations are for cameras this far away
 
 
 @dataclass(frozen=True)
@@ -62,48 +60,39 @@ class JointOptimiser:
         mobility: np.ndarray | None = None,
     ) -> None:
         self.frame, self.options, self.device = frame, options, device
-        shape = FieldShape(
-            grid_levels(
-                options.pose_levels,
-                options.pose_resolution_min,
-                options.pose_resolution_max,
-                DENSE_TABLE_LOG2,
-            ),
-            grid_levels(
-                int(options.reconstruction_levels or 0),
-                options.reconstruction_resolution_min,
-                int(options.reconstruction_resolution_max or 0),
-                int(options.table_size_log2 or 0),
-            ),
-            frame.unbounded,
-        )
-        self.field = make_field(shape, options.seed, device, threads)
+        self.method = METHODS[options.method]
+        self.field = build_field(self.method, options, frame, device, threads)
         self.poses = PoseParameters(
             torch.from_numpy(unit_from_cam),
             options.pose_parametrisation,
             frame.distance / RIG_DISTANCE,
             device,
+            betas=self.method.pose_betas,
+            double_step=bool(options.double_pose_step),
         )
-        self.schedule = Schedule(options, frame.pixel, frame.unbounded)
+        self.schedule = self.method.schedule(options, frame.pixel, frame.unbounded, frame.distance)
         self.sampler = PhotoSampler(images, held_out, device)
         self.intrinsics = Intrinsics.from_cameras(images.cameras).to(device)
-        self.occupancy = OccupancyGrid(64 if int(options.samples_per_step or 0) <= 2**16 else 128, device)
+        self.occupancy = OccupancyGrid(occupancy_side(self.method, options), device)
         self.generator = torch.Generator().manual_seed(options.seed)
         behind = frame.background if frame.background is not None else images.pixels.mean(0) / 255
         self.background = torch.as_tensor(behind, dtype=torch.float32, device=device)
         self.step_index = 0
-        self.switch: int | None = None  # the step that stage 2 began at
+        # The step that stage 2 began at. What has one stage is in its last from the first step on.
+        self.switch: int | None = None if self.method.two_stages else 0
         self.pose_scale = 1.0
         self.mobility = (
             torch.ones(2, len(self.poses), device=device)
             if mobility is None
             else torch.as_tensor(mobility, dtype=torch.float32, device=device)
         )
-        self.rays = max(RAYS_LEAST, self.schedule.samples(0, None) // 64)
+        guess = self.schedule.samples(0, None) // (self.field.stratified or FIRST_SAMPLES)
+        self.rays = max(self.method.rays_least, guess)
 
     def marching(self, interval: float) -> Marching:
         near = self.frame.distance * self.schedule.near(self.step_index, self.switch)
-        return Marching(interval, near, self.frame.far, MOST_SAMPLES, self.occupancy.occupied)
+        far = self.schedule.far(self.frame.far)
+        return Marching(interval, near, far, MOST_SAMPLES, self.occupancy.occupied)
 
     def cast(
         self, matrix: Tensor, image: Tensor, xy: Tensor, intrinsics: Intrinsics | None = None
@@ -128,11 +117,8 @@ class JointOptimiser:
     ) -> Rendering:
         """Render rays over the scene's background; `jitter` randomises where sampling starts."""
         count = len(origin)
-        start = (
-            torch.rand(count, generator=self.generator).to(self.device)
-            if jitter
-            else torch.full((count,), 0.5)
-        )
+        shape = (count,) if self.field.stratified is None else (count, self.field.stratified)
+        start = torch.rand(shape, generator=self.generator) if jitter else torch.full(shape, 0.5)
         background = self.background.expand(count, 3).contiguous()
         rays = Rays(origin, direction, background, start.to(self.device), trained)
         return self.field.render(rays, self.marching(interval), gradient)
@@ -140,7 +126,8 @@ class JointOptimiser:
     def step(self) -> StepResult:
         """One step of the joint optimisation."""
         t, schedule = self.step_index, self.schedule
-        if t % OCCUPANCY_PERIOD == 0:
+        self.field.reach(t / schedule.steps)
+        if t % OCCUPANCY_PERIOD == 0 and self.method.pruned:
             self._update_occupancy(t)
         batch = self.sampler.draw(
             self.rays, schedule.blur(t, self.switch, self.sampler.long_side), self.generator
@@ -150,12 +137,14 @@ class JointOptimiser:
             origin, direction, batch.trained, schedule.interval(t, self.switch),
             schedule.position_gradient(t, self.switch), jitter=True,
         )  # fmt: skip
-        loss = torch.nn.functional.smooth_l1_loss(rendering.colour, batch.target)
+        loss = self.method.loss(rendering.colour, batch.target)
         loss.backward()
-        self.field.step(schedule.field_rates(t, self.switch))
+        rates = schedule.field_rates(t, self.switch)
+        self.field.step(rates)
         rate = self.pose_rate()
         if rate > 0:
-            self.poses.step(rate, self.mobility[0 if self.switch is None else 1])
+            mobility = self.mobility[0 if self.switch is None else 1]
+            self.poses.step(rate, mobility, field_rate=rates.networks)
         else:
             self.poses.forget_gradients()
         self.step_index += 1
@@ -173,20 +162,19 @@ class JointOptimiser:
         self.field.start_reconstruction()
 
     def _update_occupancy(self, step: int) -> None:
-        fresh = self.switch is not None and step - self.switch < 512
         self.occupancy.update(
             self.field,
             self.schedule.fine_interval,
             self.generator,
-            everywhere=step < 256 or fresh,
+            everywhere=self.schedule.looks_everywhere(step, self.switch),
             prune=self.schedule.pruned(step),
-            dilate=self.switch is None,
+            dilate=self.schedule.dilated(self.switch),
         )
 
     def _adapt_rays(self, samples: int, budget: int) -> None:
         wanted = self.rays * budget / max(1, samples)
         wanted = min(max(wanted, self.rays / 1.5), self.rays * 1.5)
-        self.rays = int(min(max(wanted, RAYS_LEAST), RAYS_MOST))
+        self.rays = int(min(max(wanted, self.method.rays_least), RAYS_MOST))
 
     def coarse_state(self) -> dict[str, Tensor]:
         """What a rollback within stage 1 restores: all but the reconstruction module, which has not moved."""
@@ -223,6 +211,7 @@ class JointOptimiser:
         self._load_tensors(tensors)
         self.step_index, self.switch = notes["step_index"], notes["switch"]
         self.rays, self.pose_scale = notes["rays"], notes["pose_scale"]
+        self.field.reach(self.step_index / self.schedule.steps)
 
     def _load_tensors(self, tensors: dict[str, Tensor]) -> None:
         self.generator.set_state(tensors["generator"])

@@ -6,9 +6,11 @@ import torch
 from torch import Tensor
 
 from biresnerf.config import PoseParametrisation
+from biresnerf.field.adam_state import adam_state, load_adam_state
 from biresnerf.geometry.lie import se3_exp, so3_exp
 
-BETAS, EPSILON = (0.9, 0.99), 1e-12
+EPSILON = 1e-12
+SECOND_EPSILON, SECOND_DECAY = 1e-15, 1e-6  # BAA-NGP's settings for the field, whose Adam owns the poses too
 
 
 class PoseParameters:
@@ -19,17 +21,28 @@ class PoseParameters:
 
     - ``se3_world``: unit_from_cam = exp(rotation, translation) unit_from_cam0; a rotation orbits the scene.
     - ``so3xr3``: R = exp(rotation) R0, c = c0 + translation; a rotation turns the camera in place.
+
+    `double_step`: a second Adam, at the field's rate, takes a step after each of the first's from the same gradient,
+    as in BAA-NGP's code.
     """
 
     def __init__(
-        self, unit_from_cam: Tensor, parametrisation: PoseParametrisation, length: float, device: torch.device
+        self,
+        unit_from_cam: Tensor,
+        parametrisation: PoseParametrisation,
+        length: float,
+        device: torch.device,
+        *,
+        betas: tuple[float, float] = (0.9, 0.99),
+        double_step: bool = False,
     ) -> None:
         self.parametrisation, self.length = parametrisation, length
         self.start = unit_from_cam[:, :3].to(torch.float32).to(device)
         count = len(unit_from_cam)
         self.rotation = torch.zeros(count, 3, device=device, requires_grad=True)
         self.translation = torch.zeros(count, 3, device=device, requires_grad=True)
-        self._adam = torch.optim.Adam([self.rotation, self.translation], betas=BETAS, eps=EPSILON)
+        self.betas, self.double_step = betas, double_step
+        self.restart_adam()
 
     def __len__(self) -> int:
         return len(self.start)
@@ -56,11 +69,14 @@ class PoseParameters:
         bottom = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(len(top), 1, 4)
         return torch.cat([top, bottom], 1)
 
-    def step(self, rate: float, mobility: Tensor | None = None) -> None:
-        """One Adam step; `mobility` [n] is each camera's own factor of the rate, 0 keeps it still."""
+    def step(self, rate: float, mobility: Tensor | None = None, field_rate: float = 0.0) -> None:
+        """A step of Adam, and of the second at `field_rate`; `mobility` [n] is each camera's own factor of both."""
         self._adam.param_groups[0]["lr"] = rate
         before = [(p, p.detach().clone()) for p in (self.rotation, self.translation)]
         self._adam.step()
+        if self._second is not None and field_rate > 0:
+            self._second.param_groups[0]["lr"] = field_rate
+            self._second.step()
         if mobility is not None:
             with torch.no_grad():
                 for parameter, kept in before:
@@ -69,7 +85,13 @@ class PoseParameters:
 
     def restart_adam(self) -> None:
         """Forget the moments: what follows is another optimisation."""
-        self._adam = torch.optim.Adam([self.rotation, self.translation], betas=BETAS, eps=EPSILON)
+        parameters = [self.rotation, self.translation]
+        self._adam = torch.optim.Adam(parameters, betas=self.betas, eps=EPSILON)
+        self._second = None
+        if self.double_step:
+            self._second = torch.optim.Adam(
+                parameters, betas=self.betas, eps=SECOND_EPSILON, weight_decay=SECOND_DECAY
+            )
 
     def forget_gradients(self) -> None:
         self._adam.zero_grad(set_to_none=True)
@@ -80,9 +102,9 @@ class PoseParameters:
             "rotation": self.rotation.detach(),
             "translation": self.translation.detach(),
         }
-        for i, entry in self._adam.state_dict()["state"].items():
-            for key, value in entry.items():
-                state[f"adam_{i}_{key}"] = torch.as_tensor(value)
+        state.update(adam_state("adam", self._adam))
+        if self._second is not None:
+            state.update(adam_state("second", self._second))
         return state
 
     def load_state(self, state: dict[str, Tensor]) -> None:
@@ -90,11 +112,6 @@ class PoseParameters:
             self.start.copy_(state["start"])
             self.rotation.copy_(state["rotation"])
             self.translation.copy_(state["translation"])
-        saved = self._adam.state_dict()
-        saved["state"] = {}
-        for i in range(2):
-            head = f"adam_{i}_"
-            entry = {k[len(head) :]: v.clone() for k, v in state.items() if k.startswith(head)}
-            if entry:
-                saved["state"][i] = entry
-        self._adam.load_state_dict(saved)
+        load_adam_state("adam", self._adam, state)
+        if self._second is not None:
+            load_adam_state("second", self._second, state)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from biresnerf.config import RefineOptions
 from biresnerf.field.radiance_field import FieldRates, PositionGradient
+from biresnerf.geometry.perturb import RIG_DISTANCE
 
 COARSE_INTERVAL = 2.5e-2  # ray marching interval at the start, unit lengths: half a cell of the pose module
 FINE_INTERVAL = 3.3e-3  # BAA-NGP's 5e-3 in a box of side 3
@@ -28,6 +29,10 @@ POSE_DIP = 0.05  # pose rate right after the switch, as a share
 POSE_STAGE2_CAP = 1e-3
 FIELD_DIP = 0.3
 FREEZE_SHARE = 0.95  # of all steps: poses stand still from then on
+FRESH_STEPS = (
+    256,
+    512,
+)  # from the start and from the switch: steps that look at all cells of the occupancy grid
 
 
 def smooth_ramp(q: float) -> float:
@@ -42,11 +47,13 @@ class Schedule:
     Attributes:
         pixel: what a pixel spans at the scene, unit lengths.
         unbounded: whether the scene has surroundings instead of a background.
+        distance: mean distance of the cameras from the scene, unit lengths.
     """
 
     options: RefineOptions
     pixel: float
     unbounded: bool = False
+    distance: float = RIG_DISTANCE
 
     @property
     def fine_interval(self) -> float:
@@ -79,6 +86,10 @@ class Schedule:
         share = 1.0 if switch is not None else min(1.0, step / self._option("coarse_steps_max"))
         return start * (end / start) ** share
 
+    def far(self, far: float) -> float:
+        """Distance that sampling ends at, of the scene's own `far`; unit lengths."""
+        return far
+
     def samples(self, step: int, switch: int | None) -> int:
         """Samples a step: half of the budget at the start of stage 1, all of it from its end."""
         share = (
@@ -90,6 +101,15 @@ class Schedule:
     def pruned(self, step: int) -> bool:
         """Whether empty space may be skipped."""
         return step >= UNPRUNED_SHARE * self._option("coarse_steps_min")
+
+    def dilated(self, switch: int | None) -> bool:
+        """Whether neighbours of occupied cells are looked into."""
+        return switch is None
+
+    def looks_everywhere(self, step: int, switch: int | None) -> bool:
+        """Whether occupancy is asked of all cells rather than of some."""
+        start, fresh = FRESH_STEPS
+        return step < start or (switch is not None and step - switch < fresh)
 
     def blur(self, step: int, switch: int | None, long_side: float) -> float:
         """Standard deviation (px) that photos are blurred with, before its random factor."""

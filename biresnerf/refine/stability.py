@@ -34,11 +34,14 @@ class StabilityDetector:
     Attributes:
         floor, cap: no switch before step `floor`; always at step `cap`.
         motion_deg: how calm cameras must be for STABLE: the 90 % quantile of their rotation within the block.
+        guarded: whether moving cameras put the switch off, and a rising error is called divergence; neither is in
+            the paper.
     """
 
     floor: int
     cap: int
     motion_deg: float = STILL_DEG
+    guarded: bool = True
     decibels: list[float] = field(default_factory=list)
     confirmed: int = 0
     rising: int = 0
@@ -58,8 +61,9 @@ class StabilityDetector:
             flat = abs(change) <= tolerance and fluctuation <= FLUCTUATION_DB and imbalance <= WINDOW // 2
             risen = change < -max(RISE_DB, RISE_FLUCTUATIONS * fluctuation)
             self.rising = self.rising + 1 if risen else 0
-            self.confirmed = self.confirmed + 1 if flat and moved_deg < (still_deg or self.motion_deg) else 0
-            if self.rising >= RISING_BLOCKS:
+            still = moved_deg < (still_deg or self.motion_deg) or not self.guarded
+            self.confirmed = self.confirmed + 1 if flat and still else 0
+            if self.rising >= RISING_BLOCKS and self.guarded:
                 return "diverging"
         if step >= self.cap:
             return "cap"

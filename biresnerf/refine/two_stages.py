@@ -72,7 +72,9 @@ class TwoStages:
         self.record = RunRecord(fingerprint, seeding=seeding, start=start or {})
         options = optimiser.options
         self.detector = StabilityDetector(
-            int(options.coarse_steps_min or 0), int(options.coarse_steps_max or 0)
+            int(options.coarse_steps_min or 0),
+            int(options.coarse_steps_max or 0),
+            guarded=optimiser.method.guards,
         )
         self._errors: list[float] = []
         self._losses: list[float] = []

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 
@@ -16,7 +14,7 @@ SIDE = 8
 class Slab:
     """A density of 50 where x of the grid position is in the fourth eighth, else `elsewhere`."""
 
-    shape = SimpleNamespace(unbounded=False)
+    unbounded = False
 
     def __init__(self, elsewhere: float = 0.0) -> None:
         self.elsewhere, self.asked = elsewhere, 0
