@@ -15,7 +15,8 @@ PresetName = Literal["fast", "balanced", "quality", "paper"]
 Device = Literal["auto", "cpu", "cuda"]
 MethodName = Literal["biresnerf", "biresnerf-paper", "baa-ngp", "nerfacc-barf", "barf"]
 Background = Literal["auto", "white", "black", "none"]
-PoseParametrisation = Literal["se3_world", "so3xr3"]
+DetectorName = Literal["trend", "counter", "variance"]
+PoseParametrisation = Literal["se3_world", "so3xr3", "so3xr3_camp"]
 StartPoses = Literal["auto", "given"]
 
 
@@ -61,6 +62,10 @@ class RefineOptions(BaseModel):
     check_every: int | None = Field(
         None, ge=5, description="Steps between two looks of the stability detector."
     )
+    detector: DetectorName = Field(
+        "trend",
+        description="What calls the error stable: a flat line through it, as many rises as falls, or a small variance.",
+    )
     samples_per_step: int | None = Field(
         None, ge=1024, le=2**22, description="Field samples a step at the end of the coarse-to-fine ramp."
     )
@@ -77,7 +82,9 @@ class RefineOptions(BaseModel):
         description="A second Adam, at the field's learning rate, moves the poses too (as BAA-NGP's code).",
     )
     pose_parametrisation: PoseParametrisation = Field(
-        "se3_world", description="se3_world turns cameras about the scene, so3xr3 about themselves."
+        "se3_world",
+        description="se3_world turns cameras about the scene, so3xr3 about themselves, so3xr3_camp with CamP's "
+        "preconditioner.",
     )
 
     pose_levels: int = Field(3, ge=1, le=16, description="Levels of the pose-estimation module.")

@@ -25,7 +25,7 @@ from biresnerf.field.radiance_field import (
     Rendering,
 )
 
-HIDDEN, LAYERS, SKIP, COLOUR_HIDDEN = 256, 8, 4, 128
+LAYERS, SKIP = 8, 4
 POSITION_BANDS, VIEW_BANDS = 10, 4
 LAST_INTERVAL = 1e10  # BARF's last sample reaches to infinity: it learns the background
 CHUNK = 1 << 16  # samples evaluated at once where no gradient is kept
@@ -44,6 +44,7 @@ class MlpField(RadianceField):
     """Backend `torch`.
 
     Args:
+        hidden: units of a layer; half as many before the colour.
         length: one unit of length inside, in units of the unit frame.
         stratified: samples per ray, or None to march through the occupancy grid.
     """
@@ -51,7 +52,14 @@ class MlpField(RadianceField):
     backend = "torch"
 
     def __init__(
-        self, seed: int, device: torch.device, *, unbounded: bool, length: float, stratified: int | None
+        self,
+        seed: int,
+        device: torch.device,
+        *,
+        hidden: int,
+        unbounded: bool,
+        length: float,
+        stratified: int | None,
     ) -> None:
         self.device, self.unbounded, self.length, self.stratified = device, unbounded, length, stratified
         self.progress = 0.0
@@ -67,11 +75,11 @@ class MlpField(RadianceField):
             self.parameters += [weight.to(device), torch.zeros(rows, device=device)]
 
         for i in range(LAYERS):
-            columns = position if i == 0 else HIDDEN + position * (i == SKIP)
+            columns = position if i == 0 else hidden + position * (i == SKIP)
             last = i == LAYERS - 1
-            layer(HIDDEN + last, columns, plain_rows=int(last))
-        layer(COLOUR_HIDDEN, HIDDEN + view)
-        layer(3, COLOUR_HIDDEN, plain_rows=3)
+            layer(hidden + last, columns, plain_rows=int(last))
+        layer(hidden // 2, hidden + view)
+        layer(3, hidden // 2, plain_rows=3)
         for parameter in self.parameters:
             parameter.requires_grad_()
         self._adam = torch.optim.Adam(self.parameters)

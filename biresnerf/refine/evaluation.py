@@ -49,8 +49,9 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
     gradient = PositionGradient()
     poses = optimiser.poses
     poses.restart_adam()
+    rays = min(FIT_RAYS, optimiser.rays) if optimiser.method.network else FIT_RAYS
     for step in range(FIT_STEPS):
-        batch = optimiser.sampler.draw(FIT_RAYS, 0.0, optimiser.generator, held_out_only=True)
+        batch = optimiser.sampler.draw(rays, 0.0, optimiser.generator, held_out_only=True)
         matrices = poses.matrices()[batch.image]
         origin, direction = optimiser.cast(matrices, batch.image, batch.xy)
         rendering = optimiser.render(origin, direction, 0, schedule.fine_interval, gradient, jitter=True)

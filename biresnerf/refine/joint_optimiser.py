@@ -15,6 +15,7 @@ from biresnerf.field.occupancy import OccupancyGrid
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
 from biresnerf.geometry.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.perturb import RIG_DISTANCE
+from biresnerf.refine.camp_preconditioner import camp_preconditioner
 from biresnerf.refine.methods import METHODS, build_field, occupancy_side
 from biresnerf.refine.photo_sampler import PhotoSampler
 from biresnerf.refine.pose_parameters import PoseParameters
@@ -62,17 +63,10 @@ class JointOptimiser:
         self.frame, self.options, self.device = frame, options, device
         self.method = METHODS[options.method]
         self.field = build_field(self.method, options, frame, device, threads)
-        self.poses = PoseParameters(
-            torch.from_numpy(unit_from_cam),
-            options.pose_parametrisation,
-            frame.distance / RIG_DISTANCE,
-            device,
-            betas=self.method.pose_betas,
-            double_step=bool(options.double_pose_step),
-        )
+        self.intrinsics = Intrinsics.from_cameras(images.cameras).to(device)
+        self.poses = self._pose_parameters(torch.from_numpy(unit_from_cam))
         self.schedule = self.method.schedule(options, frame.pixel, frame.unbounded, frame.distance)
         self.sampler = PhotoSampler(images, held_out, device)
-        self.intrinsics = Intrinsics.from_cameras(images.cameras).to(device)
         self.occupancy = OccupancyGrid(occupancy_side(self.method, options), device)
         self.generator = torch.Generator().manual_seed(options.seed)
         behind = frame.background if frame.background is not None else images.pixels.mean(0) / 255
@@ -83,11 +77,29 @@ class JointOptimiser:
         self.pose_scale = 1.0
         self.mobility = (
             torch.ones(2, len(self.poses), device=device)
-            if mobility is None
+            if mobility is None or not self.method.additions
             else torch.as_tensor(mobility, dtype=torch.float32, device=device)
         )
         guess = self.schedule.samples(0, None) // (self.field.stratified or FIRST_SAMPLES)
         self.rays = max(self.method.rays_least, guess)
+
+    def _pose_parameters(self, unit_from_cam: Tensor) -> PoseParameters:
+        options, distance = self.options, self.frame.distance
+        length = distance / RIG_DISTANCE
+        preconditioner = None
+        if options.pose_parametrisation == "so3xr3_camp":
+            preconditioner = camp_preconditioner(
+                unit_from_cam, self.intrinsics, distance, length, options.seed
+            )
+        return PoseParameters(
+            unit_from_cam,
+            options.pose_parametrisation,
+            length,
+            self.device,
+            betas=self.method.pose_betas,
+            double_step=bool(options.double_pose_step),
+            preconditioner=preconditioner,
+        )
 
     def marching(self, interval: float) -> Marching:
         near = self.frame.distance * self.schedule.near(self.step_index, self.switch)

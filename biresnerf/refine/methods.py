@@ -24,7 +24,7 @@ from biresnerf.refine.scene_frame import SceneFrame
 from biresnerf.refine.schedule import Schedule
 
 DENSE_TABLE_LOG2 = 22  # the pose-estimation module is stored densely up to 159 cells a side, hashed beyond
-BARF_SAMPLES = 128  # per ray
+BARF_HIDDEN, BARF_SAMPLES = 256, 128  # units of a layer, samples per ray
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,8 @@ class Method:
         field: two grid encodings; one, opening from coarse to fine; BARF's network, marched or sampled in strata.
         two_stages: whether there is a switch; a run without one is in its last stage from the first step.
         pose_betas: of the poses' Adam.
-        guards: our additions around the switch: cameras must be still, rising errors are rolled back.
+        additions: ours around the switch: cameras must be still, rising errors are rolled back, cameras placed by
+            matches move less, and stage 1 is shorter for them.
         robust_frame: results return to the input's frame by a similarity robust to lost cameras, or by the least
             squares of camera centres alone.
         rays_least: fewest rays a step.
@@ -47,10 +48,15 @@ class Method:
     loss: Callable[[Tensor, Tensor], Tensor]
     two_stages: bool = False
     pose_betas: tuple[float, float] = (0.9, 0.999)
-    guards: bool = False
+    additions: bool = False
     robust_frame: bool = False
     rays_least: int = 256
     fine_occupancy: bool = True
+
+    @property
+    def network(self) -> bool:
+        """Whether the field is one large network, whose samples cost tens of times those of a grid."""
+        return self.field in ("network", "stratified network")
 
     @property
     def pruned(self) -> bool:
@@ -60,7 +66,7 @@ class Method:
 
 METHODS: dict[MethodName, Method] = {
     "biresnerf": Method(
-        "two grids", Schedule, smooth_l1_loss, two_stages=True, pose_betas=(0.9, 0.99), guards=True,
+        "two grids", Schedule, smooth_l1_loss, two_stages=True, pose_betas=(0.9, 0.99), additions=True,
         robust_frame=True, fine_occupancy=False,
     ),
     # Guo et al. 2023 as far as it is known, its gaps filled from BAA-NGP, which it builds on.
@@ -78,11 +84,12 @@ def build_field(
     method: Method, options: RefineOptions, frame: SceneFrame, device: torch.device, threads: int
 ) -> RadianceField:
     """The method's radiance field at its start; `options` must be resolved."""
-    if method.field in ("network", "stratified network"):
+    if method.network:
         torch.set_num_threads(threads)  # matrix products are all it does, and the kernels are at rest
         return MlpField(
             options.seed,
             device,
+            hidden=BARF_HIDDEN,
             unbounded=frame.unbounded,
             length=frame.distance / RIG_DISTANCE,
             stratified=BARF_SAMPLES if method.field == "stratified network" else None,

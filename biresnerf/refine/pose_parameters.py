@@ -16,11 +16,13 @@ SECOND_EPSILON, SECOND_DECAY = 1e-15, 1e-6  # BAA-NGP's settings for the field, 
 class PoseParameters:
     """Increments on given poses ``unit_from_cam0`` [n, 4, 4], zero at the start, one row per image.
 
-    Two parametrisations (method: BARF's and the decoupled one), both with rotation in radians and translation in
-    quarters of the rig's distance, so that one learning rate suits every scene:
+    Three parametrisations, with rotation in radians and translation in quarters of the rig's distance, so that one
+    learning rate suits every scene:
 
     - ``se3_world``: unit_from_cam = exp(rotation, translation) unit_from_cam0; a rotation orbits the scene.
     - ``so3xr3``: R = exp(rotation) R0, c = c0 + translation; a rotation turns the camera in place.
+    - ``so3xr3_camp``: the same of `preconditioner` [n, 6, 6] times the parameters (`camp_preconditioner`), which are
+      then shifts of the picture, in sizes of it.
 
     `double_step`: a second Adam, at the field's rate, takes a step after each of the first's from the same gradient,
     as in BAA-NGP's code.
@@ -35,12 +37,16 @@ class PoseParameters:
         *,
         betas: tuple[float, float] = (0.9, 0.99),
         double_step: bool = False,
+        preconditioner: Tensor | None = None,
     ) -> None:
+        if (parametrisation == "so3xr3_camp") != (preconditioner is not None):
+            raise ValueError("a preconditioner goes with so3xr3_camp, and with it alone")
         self.parametrisation, self.length = parametrisation, length
         self.start = unit_from_cam[:, :3].to(torch.float32).to(device)
         count = len(unit_from_cam)
         self.rotation = torch.zeros(count, 3, device=device, requires_grad=True)
         self.translation = torch.zeros(count, 3, device=device, requires_grad=True)
+        self.preconditioner = None if preconditioner is None else preconditioner.float().to(device)
         self.betas, self.double_step = betas, double_step
         self.restart_adam()
 
@@ -50,12 +56,16 @@ class PoseParameters:
     def matrices(self) -> Tensor:
         """unit_from_cam [n, 3, 4], differentiable."""
         rotation0, centre0 = self.start[:, :, :3], self.start[:, :, 3]
-        shift = self.translation * self.length
+        turn, shift = self.rotation, self.translation
+        if self.preconditioner is not None:
+            both = self.preconditioner @ torch.cat([turn, shift], 1)[:, :, None]
+            turn, shift = both[:, :3, 0], both[:, 3:, 0]
+        shift = shift * self.length
         if self.parametrisation == "se3_world":
-            rotation, translation = se3_exp(self.rotation, shift)
+            rotation, translation = se3_exp(turn, shift)
             centre = (rotation @ centre0[:, :, None])[:, :, 0] + translation
         else:
-            rotation, centre = so3_exp(self.rotation), centre0 + shift
+            rotation, centre = so3_exp(turn), centre0 + shift
         return torch.cat([rotation @ rotation0, centre[:, :, None]], 2)
 
     @torch.no_grad()
@@ -102,6 +112,8 @@ class PoseParameters:
             "rotation": self.rotation.detach(),
             "translation": self.translation.detach(),
         }
+        if self.preconditioner is not None:
+            state["preconditioner"] = self.preconditioner
         state.update(adam_state("adam", self._adam))
         if self._second is not None:
             state.update(adam_state("second", self._second))
@@ -112,6 +124,8 @@ class PoseParameters:
             self.start.copy_(state["start"])
             self.rotation.copy_(state["rotation"])
             self.translation.copy_(state["translation"])
+            if self.preconditioner is not None:
+                self.preconditioner.copy_(state["preconditioner"])
         load_adam_state("adam", self._adam, state)
         if self._second is not None:
             load_adam_state("second", self._second, state)

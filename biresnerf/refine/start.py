@@ -20,6 +20,7 @@ from biresnerf.errors import Interrupted
 from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.pose_error import rotation_angle_deg
 from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.methods import METHODS
 from biresnerf.refine.scene_frame import scene_frame
 from biresnerf.report import StartSource, TrialReport
 
@@ -68,7 +69,7 @@ class Start:
 
     def stage_lengths(self, asked: RefineOptions, resolved: RefineOptions) -> RefineOptions:
         """`resolved` with a shorter stage 1 where matches have placed most cameras, unless one was `asked` for."""
-        if self.placed.mean() < MOSTLY_PLACED:
+        if self.placed.mean() < MOSTLY_PLACED or not METHODS[resolved.method].additions:
             return resolved
         names = [n for n in ("coarse_steps_min", "coarse_steps_max") if getattr(asked, n) is None]
         shorter = {name: round(MATCHED_COARSE_SHARE * int(getattr(resolved, name))) for name in names}

@@ -74,7 +74,8 @@ class TwoStages:
         self.detector = StabilityDetector(
             int(options.coarse_steps_min or 0),
             int(options.coarse_steps_max or 0),
-            guarded=optimiser.method.guards,
+            options.detector,
+            guarded=optimiser.method.additions,
         )
         self._errors: list[float] = []
         self._losses: list[float] = []
