@@ -64,25 +64,33 @@ def map_from_scratch(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def map_from_given(request: dict[str, Any]) -> dict[str, Any]:
-    """Features and matches with known intrinsics; models by both ways of mapping, guided by given poses."""
+    """Features and matches with known intrinsics; models by both ways of mapping, guided by given poses.
+
+    One thread in every step: with more, the answer differs from run to run.
+    """
     import pycolmap
 
     work = Path(request["work"])
     database, images = work / "database.db", Path(request["root"])
     pycolmap.set_random_seed(request["seed"])
     extract_with_cameras(request, database, images)
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = 1
     verification = pycolmap.TwoViewGeometryOptions()
     verification.compute_relative_pose = True
     verification.min_num_inliers = LEAST_MATCHES
+    verification.ransac.random_seed = request["seed"]
     verification.ransac.max_error *= request["error_scale"]
     if request["pairs"] is None:
-        pycolmap.match_exhaustive(database, verification_options=verification)
+        pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification)
     else:
         listed = work / "pairs.txt"
         listed.write_text("".join(f"{a} {b}\n" for a, b in request["pairs"]), "utf-8")
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = str(listed)
-        pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+        pycolmap.match_image_pairs(
+            database, matching_options=matching, pairing_options=pairing, verification_options=verification
+        )
     drop_contradicting_pairs(database, request["cam_from_world"])
     write_position_priors(database, request["cam_from_world"], request["position_deviation"])
 
@@ -103,6 +111,7 @@ def extract_with_cameras(request: dict[str, Any], database: Path, images: Path) 
 
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = request["widest_image"]
+    extraction.num_threads = 1
     extraction.sift.max_num_features = request["most_features"]
     extraction.sift.peak_threshold = FAINTEST_PEAK
     extraction.sift.domain_size_pooling = extraction.sift.estimate_affine_shape = request["thorough"]
@@ -165,7 +174,7 @@ def map_incrementally(database: Path, images: Path, work: Path, request: dict[st
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = request["seed"]
+    options.random_seed, options.num_threads = request["seed"], 1
     options.min_model_size, options.min_num_matches = 3, 10
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.use_prior_position = options.use_robust_loss_on_prior_position = True
@@ -183,7 +192,8 @@ def map_globally(database: Path, images: Path, work: Path, request: dict[str, An
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
-    options.random_seed = request["seed"]
+    options.random_seed, options.num_threads = request["seed"], 1
+    options.mapper.random_seed, options.mapper.num_threads = request["seed"], 1
     adjustment = options.mapper.bundle_adjustment
     adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = (
         False

@@ -35,12 +35,15 @@ def run_colmap(
     request_path, log_path = work / "request.json", work / "colmap.log"
     request_path.write_text(json.dumps(request), "utf-8")
     command = [sys.executable, "-P", str(CHILD), str(request_path)]
+    # Sums over threads come out in another order each time; a guided mapping promises the same poses again.
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"} if request["task"] == "from_given" else None
     with log_path.open("wb") as log:
         child = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
+            env=environment,
             start_new_session=True,
             preexec_fn=_die_with_parent if sys.platform == "linux" else None,
         )

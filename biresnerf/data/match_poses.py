@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from biresnerf.data.colmap_process import run_colmap
 from biresnerf.data.dataset import Dataset
 from biresnerf.geometry.focus import focus_point
+from biresnerf.geometry.pose_error import rotation_angle_deg
 from biresnerf.geometry.similarity import align_robust
 
 logger = logging.getLogger(__name__)
@@ -28,6 +29,9 @@ LEAST_PLACED = 0.5  # of the images; a model of fewer says too little about the 
 # Standard deviation of given positions, of the cameras' distance: holds what matches leave open (the drift of narrow
 # views, the mirror of flat scenes) and, under a robust loss, no more.
 POSITION_DEVIATION = 0.2
+# A camera that leaves its given pose by far more than the others do was placed by wrong matches (global mapping turned
+# one of lego's by 92 deg where the others moved by 12): this many medians, but not below these floors.
+STRAY, STRAY_DEG, STRAY_SHARE = 4.0, 30.0, 0.05
 # A start for the optimisation needs no more, and matching costs the features' square.
 WIDEST_IMAGE, MOST_FEATURES = 1000, 2048
 # COLMAP's bounds on reprojection errors are made for photos of thousands of px. At 200 px they let wrong matches pass:
@@ -131,8 +135,14 @@ def _carried(model: dict[str, Any], names: list[str], given: NDArray[np.float64]
     cam_from_model[:, :3] = [image["cam_from_world"] for image in model["images"]]
     model_from_cam = np.linalg.inv(cam_from_model).astype(np.float64)
     similarity = align_robust(model_from_cam, given[rows], with_rotations=True)
+    found = similarity.apply_to_poses(model_from_cam)
+    turned = rotation_angle_deg(np.swapaxes(found[:, :3, :3], 1, 2) @ given[rows][:, :3, :3])
+    shifted = np.linalg.norm(found[:, :3, 3] - given[rows][:, :3, 3], axis=1)
+    trusted = (turned <= max(STRAY_DEG, STRAY * float(np.median(turned)))) & (
+        shifted <= STRAY * max(float(np.median(shifted)), STRAY_SHARE * focus_point(given).mean_distance)
+    )
     poses = given.copy()
-    poses[rows] = similarity.apply_to_poses(model_from_cam)
+    poses[rows[trusted]] = found[trusted]
     placed = np.zeros(len(names), dtype=np.bool_)
-    placed[rows] = True
+    placed[rows[trusted]] = True
     return MatchedPoses(model["mapper"], poses, placed, int(model["points"]))

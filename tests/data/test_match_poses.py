@@ -69,6 +69,28 @@ def test_the_result_lies_in_the_frame_of_the_given_poses(found, noisy):
     assert rotation_angle_deg(between.rotation[None])[0] < 15
 
 
+def test_the_same_request_gives_the_same_poses(found, noisy):
+    again = poses_from_matches(noisy)
+    assert [m.mapper for m in again] == [m.mapper for m in found]
+    for one, other in zip(found, again, strict=True):
+        np.testing.assert_array_equal(one.world_from_cam, other.world_from_cam)
+
+
+def test_a_camera_that_strays_alone_is_not_believed(noisy, truth):
+    names = list(noisy.file_names)
+    cam_from_world = np.linalg.inv(truth.world_from_cam)
+    cam_from_world[3, :3, :3] = np.diag([-1.0, 1, -1]) @ cam_from_world[3, :3, :3]
+    images = [
+        {"name": name, "cam_from_world": pose[:3].tolist()}
+        for name, pose in zip(names, cam_from_world, strict=True)
+    ]
+    model = {"mapper": "global", "images": images, "points": 100}
+    carried = match_poses._carried(model, names, noisy.world_from_cam)
+    assert carried is not None
+    assert np.flatnonzero(~carried.placed).tolist() == [3]
+    np.testing.assert_array_equal(carried.world_from_cam[3], noisy.world_from_cam[3])
+
+
 def test_images_that_matches_do_not_place_keep_their_given_pose(found, noisy):
     for matched in found:
         kept = ~matched.placed
