@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from biresnerf.data.area_resize import area_resize
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.images import ImageSet
 from biresnerf.data.renders import picture_stems, write_orbit, write_view
 from biresnerf.data.write import write_colmap, write_transforms
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera import Intrinsics
 from biresnerf.geometry.pose_error import rotation_angle_deg
 from biresnerf.geometry.similarity import Similarity, align_robust, align_umeyama
 from biresnerf.refine.checkpoint import CHECKPOINT, SEEDING
-from biresnerf.refine.evaluation import ViewScore
+from biresnerf.refine.evaluation import ViewScore, render_view
 from biresnerf.refine.history import HISTORY
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.start import Start
@@ -26,6 +29,7 @@ from biresnerf.report import HeldOut, ImageReport, Report, SimilarityReport
 
 REPORT, CONFIG, TRANSFORMS = "report.json", "config.json", "transforms.json"
 COLMAP, RENDERS, ORBIT = Path("colmap") / "sparse" / "0", "renders", "orbit.mp4"
+PREVIEW = "preview"
 SOLID = 0.5  # opacity from which a depth means something
 _ANOTHER = "Choose another output folder, or remove this one."
 
@@ -87,6 +91,29 @@ class OutputFolder:
             photo=images.image(score.image),
             depth=np.where(score.view.opacity > SOLID, score.view.depth, np.nan),
         )
+
+    def write_preview(self, dataset: Dataset, images: ImageSet, optimiser: JointOptimiser, view: int) -> None:
+        """How far the run is: poses so far, and one view at half the working size."""
+        world_from_cam, _ = poses_in_input_frame(dataset, optimiser)
+        write_transforms(dataset, world_from_cam, self.path / PREVIEW / TRANSFORMS)
+        halves = [
+            camera.resized(max(1, camera.width // 2), max(1, camera.height // 2)) for camera in images.cameras
+        ]
+        intrinsics = Intrinsics.from_cameras(halves).to(optimiser.device)
+        pose = optimiser.poses.matrices()[view].detach()
+        rendered = render_view(optimiser, pose, view, intrinsics)
+        write_view(
+            self.path / PREVIEW,
+            picture_stems(dataset.names)[view],
+            render=rendered.colour,
+            photo=area_resize(images.image(view), halves[view].width, halves[view].height) / 255,
+            depth=np.where(rendered.opacity > SOLID, rendered.depth, np.nan),
+        )
+
+    def drop_traces(self) -> None:
+        """Remove what only a run that goes on needs."""
+        for name in (CHECKPOINT.parent, PREVIEW):
+            shutil.rmtree(self.path / name, ignore_errors=True)
 
     def write_orbit(self, frames: Iterator[np.ndarray]) -> None:
         """renders/orbit.mp4."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ from biresnerf.field.backends import choose_device, use_threads
 from biresnerf.field.compile_kernels import compile_kernels
 from biresnerf.output_folder import OutputFolder
 from biresnerf.progress import OnProgress, Progress
-from biresnerf.refine.checkpoint import CHECKPOINT, load_checkpoint
+from biresnerf.refine.checkpoint import load_checkpoint
 from biresnerf.refine.evaluation import (
     ViewScore,
     fit_held_out_poses,
@@ -118,6 +117,9 @@ def refine_poses(
         prepared.seeding,
         start.as_json(),
         observer,
+        lambda: folder.write_preview(
+            prepared.dataset, prepared.images, optimiser, (prepared.held_out or [0])[0]
+        ),
     )
     if checkpoint is not None:
         stages.resume(*checkpoint)
@@ -144,7 +146,7 @@ def refine_poses(
         observer.at_end(optimiser)
     report(Progress(stage="exporting", fraction=0.99))
     result = write(scores, state="complete")
-    shutil.rmtree(folder.path / CHECKPOINT.parent)
+    folder.drop_traces()
     report(Progress(stage="exporting", fraction=1.0, eta_s=0.0))
     return result
 

@@ -53,6 +53,7 @@ class TwoStages:
         seeding: COLMAP's answer, where poses come from it; goes into every checkpoint.
         start: the poses started from; goes into every checkpoint.
         observer: looks in at every check.
+        after_checkpoint: called after each checkpoint on the way.
     """
 
     def __init__(
@@ -65,10 +66,12 @@ class TwoStages:
         seeding: str | None = None,
         start: dict[str, Any] | None = None,
         observer: Observer | None = None,
+        after_checkpoint: Callable[[], None] = lambda: None,
     ) -> None:
         self.optimiser, self.folder = optimiser, folder
         self.history, self.observer = History(folder), observer or Observer()
         self.on_progress, self.should_stop = on_progress, should_stop
+        self.after_checkpoint = after_checkpoint
         self.record = RunRecord(fingerprint, seeding=seeding, start=start or {})
         options = optimiser.options
         self.detector = StabilityDetector(
@@ -121,6 +124,7 @@ class TwoStages:
             checkpoint = None
             if now - saved >= options.checkpoint_every_s:
                 self._save()
+                self.after_checkpoint()
                 saved, checkpoint = time.monotonic(), CHECKPOINT.as_posix()
             if checkpoint or now - reported >= REPORT_PERIOD_S:
                 reported = now
