@@ -138,11 +138,14 @@ class OutputFolder:
         write_transforms(dataset, world_from_cam, self.path / TRANSFORMS)
         write_colmap(dataset, world_from_cam, self.path / COLMAP)
         record = stages.record
+        lost = [i for i, flag in enumerate(optimiser.camera_errors.lost.tolist()) if flag]
         report = Report(
             version=_version(),
             state=state,
             options=optimiser.options,
-            images=_image_reports(dataset, start, world_from_cam, held_out, scores),
+            images=_image_reports(
+                dataset, start, world_from_cam, held_out, scores, lost, stages.repair.repaired
+            ),
             heldout=HeldOut(
                 count=len(scores),
                 psnr=float(np.mean([s.psnr for s in scores])),
@@ -165,7 +168,7 @@ class OutputFolder:
                 rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
                 translation=tuple(float(v) for v in similarity.translation),
             ),
-            warnings=dataset.warnings + start.warnings,
+            warnings=dataset.warnings + start.warnings + _lost_warnings(dataset, lost),
         )
         self._write_text(REPORT, report.model_dump_json(indent=2))
         return report
@@ -191,8 +194,21 @@ def poses_in_input_frame(dataset: Dataset, optimiser: JointOptimiser) -> tuple[n
     return input_from_optimised.apply_to_poses(optimised), input_from_optimised
 
 
+def _lost_warnings(dataset: Dataset, lost: list[int]) -> tuple[str, ...]:
+    if not lost:
+        return ()
+    names = ", ".join(dataset.names[i] for i in lost)
+    return (f"{len(lost)} of {len(dataset)} images agree with no pose that was found: {names}.",)
+
+
 def _image_reports(
-    dataset: Dataset, start: Start, world_from_cam: np.ndarray, held_out: list[int], scores: list[ViewScore]
+    dataset: Dataset,
+    start: Start,
+    world_from_cam: np.ndarray,
+    held_out: list[int],
+    scores: list[ViewScore],
+    lost: list[int],
+    repaired: list[int],
 ) -> tuple[ImageReport, ...]:
     given = dataset.world_from_cam
     turn = rotation_angle_deg(np.swapaxes(given[:, :3, :3], 1, 2) @ world_from_cam[:, :3, :3])
@@ -205,6 +221,8 @@ def _image_reports(
             held_out=i in held_out,
             moved_deg=float(turn[i]),
             moved_units=float(shift[i]),
+            lost=i in lost,
+            repaired=i in repaired,
             psnr=scored[i].psnr if i in scored else None,
             ssim=scored[i].ssim if i in scored else None,
         )

@@ -24,6 +24,13 @@ class ImageReport(BaseModel):
     held_out: bool = Field(description="Never used to train the field.")
     moved_deg: float = Field(description="Rotation between the given pose and the refined one, degrees.")
     moved_units: float = Field(description="Distance between the given camera centre and the refined one.")
+    lost: bool = Field(
+        False,
+        description="Its pose never agreed with the others' field, and no better one was found: do not trust it.",
+    )
+    repaired: bool = Field(
+        False, description="It was lost and took up its way again from a pose found by trying many."
+    )
     psnr: float | None = Field(
         None, description="Render against photo at working size, dB; held-out views only."
     )

@@ -16,7 +16,7 @@ from biresnerf.errors import InputError
 
 CHECKPOINT = Path("checkpoint") / "latest.safetensors"
 SEEDING = CHECKPOINT.with_name("seeding.json")  # what COLMAP answered; every checkpoint carries a copy
-FORMAT = "1"
+FORMAT = "2"
 
 
 def save_checkpoint(folder: Path, tensors: dict[str, Tensor], notes: dict[str, Any]) -> Path:

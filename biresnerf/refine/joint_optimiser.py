@@ -15,9 +15,11 @@ from biresnerf.field.occupancy import OccupancyGrid
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
 from biresnerf.geometry.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.perturb import RIG_DISTANCE
+from biresnerf.refine.camera_errors import CameraErrors
 from biresnerf.refine.camp_preconditioner import camp_preconditioner
 from biresnerf.refine.methods import METHODS, build_field, occupancy_side
-from biresnerf.refine.photo_sampler import PhotoSampler
+from biresnerf.refine.photo_sampler import PhotoSampler, PixelBatch
+from biresnerf.refine.pose_hypotheses import photo_distances
 from biresnerf.refine.pose_parameters import PoseParameters
 from biresnerf.refine.scene_frame import SceneFrame
 
@@ -67,6 +69,8 @@ class JointOptimiser:
         self.poses = self._pose_parameters(torch.from_numpy(unit_from_cam))
         self.schedule = self.method.schedule(options, frame.pixel, frame.unbounded, frame.distance)
         self.sampler = PhotoSampler(images, held_out, device)
+        self.photo_distances = photo_distances(images)
+        self.camera_errors = CameraErrors(images, held_out, device)
         self.occupancy = OccupancyGrid(occupancy_side(self.method, options), device)
         self.generator = torch.Generator().manual_seed(options.seed)
         behind = frame.background if frame.background is not None else images.pixels.mean(0) / 255
@@ -100,6 +104,16 @@ class JointOptimiser:
             double_step=bool(options.double_pose_step),
             preconditioner=preconditioner,
         )
+
+    def replace_pose(self, camera: int, unit_from_cam: Tensor) -> None:
+        """Start one camera over from another pose [3, 4]: as free as any, with nothing known of it yet."""
+        self.poses.replace(camera, unit_from_cam)
+        self.camera_errors.forget(camera)
+        self.mobility[:, camera] = 1.0
+        if self.poses.preconditioner is not None:
+            fresh = self._pose_parameters(self.poses.poses()).preconditioner
+            assert fresh is not None
+            self.poses.preconditioner[camera] = fresh[camera]
 
     def marching(self, interval: float) -> Marching:
         near = self.frame.distance * self.schedule.near(self.step_index, self.switch)
@@ -149,7 +163,7 @@ class JointOptimiser:
             origin, direction, batch.trained, schedule.interval(t, self.switch),
             schedule.position_gradient(t, self.switch), jitter=True,
         )  # fmt: skip
-        loss = self.method.loss(rendering.colour, batch.target)
+        loss = self._loss(rendering.colour, batch)
         loss.backward()
         rates = schedule.field_rates(t, self.switch)
         self.field.step(rates)
@@ -161,8 +175,18 @@ class JointOptimiser:
             self.poses.forget_gradients()
         self.step_index += 1
         self._adapt_rays(rendering.samples, schedule.samples(t, self.switch))
+        self.camera_errors.add(
+            batch.image, rendering.colour.detach(), batch.target, rendering.opacity.detach()
+        )
         error = ((rendering.colour.detach() - batch.sharp) ** 2)[: batch.trained].mean()
         return StepResult(float(loss.detach()), float(error), len(origin), rendering.samples)
+
+    def _loss(self, colour: Tensor, batch: PixelBatch) -> Tensor:
+        weights = self.camera_errors.weights
+        if weights is None or not self.method.additions:
+            return self.method.loss(colour, batch.target)
+        loss = torch.nn.functional.smooth_l1_loss(colour, batch.target, reduction="none")
+        return (loss * weights[batch.image][:, None]).mean()
 
     def pose_rate(self) -> float:
         """Learning rate of the poses at this step."""
@@ -205,6 +229,7 @@ class JointOptimiser:
             ("field", self.field.state()),
             ("poses", self.poses.state()),
             ("occupancy", self.occupancy.state()),
+            ("camera_errors", self.camera_errors.state()),
         ):
             state.update({f"{part}.{name}": tensor for name, tensor in tensors.items()})
         return state
@@ -227,5 +252,10 @@ class JointOptimiser:
 
     def _load_tensors(self, tensors: dict[str, Tensor]) -> None:
         self.generator.set_state(tensors["generator"])
-        for name, part in (("field.", self.field), ("poses.", self.poses), ("occupancy.", self.occupancy)):
+        for name, part in (
+            ("field.", self.field),
+            ("poses.", self.poses),
+            ("occupancy.", self.occupancy),
+            ("camera_errors.", self.camera_errors),
+        ):
             part.load_state({k[len(name) :]: v for k, v in tensors.items() if k.startswith(name)})

@@ -36,7 +36,7 @@ class Method:
         two_stages: whether there is a switch; a run without one is in its last stage from the first step.
         pose_betas: of the poses' Adam.
         additions: ours around the switch: cameras must be still, rising errors are rolled back, cameras placed by
-            matches move less, and stage 1 is shorter for them.
+            matches move less, and stage 1 is shorter for them; lost cameras weigh less and are repaired.
         robust_frame: results return to the input's frame by a similarity robust to lost cameras, or by the least
             squares of camera centres alone.
         rays_least: fewest rays a step.

@@ -73,6 +73,10 @@ class PhotoSampler:
         target = sharp if sigma <= LEVEL_SIGMA else self._blurred(image, xy, sigma)
         return PixelBatch(image, xy, target, sharp, int((position < self.training).sum()))
 
+    def colours(self, image: Tensor, xy: Tensor, sigma: float) -> Tensor:
+        """Colours [rays, 3] of pixels with centres `xy` [rays, 2], blurred by `sigma` px."""
+        return self._blurred(image, xy, sigma) if sigma > LEVEL_SIGMA else self._bilinear(0, image, xy)
+
     def _blurred(self, image: Tensor, xy: Tensor, sigma: float) -> Tensor:
         level = min(math.log2(sigma / LEVEL_SIGMA), PYRAMID_LEVELS - 1.0)
         lower = int(level)

@@ -103,6 +103,17 @@ class PoseParameters:
                 parameters, betas=self.betas, eps=SECOND_EPSILON, weight_decay=SECOND_DECAY
             )
 
+    @torch.no_grad()
+    def replace(self, row: int, unit_from_cam: Tensor) -> None:
+        """Start one camera over from another pose [3, 4], without the momentum of its way so far."""
+        self.start[row] = unit_from_cam
+        for parameter in (self.rotation, self.translation):
+            parameter[row] = 0
+            for adam in (self._adam, self._second):
+                for moment in adam.state.get(parameter, {}).values() if adam is not None else ():
+                    if moment.shape == parameter.shape:
+                        moment[row] = 0
+
     def forget_gradients(self) -> None:
         self._adam.zero_grad(set_to_none=True)
 

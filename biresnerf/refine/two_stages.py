@@ -19,6 +19,7 @@ from biresnerf.progress import OnProgress, Progress
 from biresnerf.refine.checkpoint import CHECKPOINT, save_checkpoint
 from biresnerf.refine.history import History, Observer
 from biresnerf.refine.joint_optimiser import JointOptimiser, StepResult
+from biresnerf.refine.lost_cameras import LostCameraRepair
 from biresnerf.refine.stability import StabilityDetector
 from biresnerf.report import SwitchReason
 
@@ -73,6 +74,7 @@ class TwoStages:
         self.on_progress, self.should_stop = on_progress, should_stop
         self.after_checkpoint = after_checkpoint
         self.record = RunRecord(fingerprint, seeding=seeding, start=start or {})
+        self.repair = LostCameraRepair(optimiser)
         options = optimiser.options
         self.detector = StabilityDetector(
             int(options.coarse_steps_min or 0),
@@ -108,6 +110,9 @@ class TwoStages:
                 return False
             started = time.monotonic()
             result = optimiser.step()
+            stepped = (
+                time.monotonic() - started
+            )  # a repair within the check says nothing of the steps to come
             if not math.isfinite(result.loss):
                 raise RefinementError("diverged", f"The loss is not a number at step {optimiser.step_index}.")
             self._errors.append(result.mean_squared_error)
@@ -120,7 +125,7 @@ class TwoStages:
             now = time.monotonic()
             self.record.seconds[stage] += now - started
             slow = self._step_seconds[stage]
-            self._step_seconds[stage] = (now - started) if slow == 0 else 0.98 * slow + 0.02 * (now - started)
+            self._step_seconds[stage] = stepped if slow == 0 else 0.98 * slow + 0.02 * stepped
             checkpoint = None
             if now - saved >= options.checkpoint_every_s:
                 self._save()
@@ -142,8 +147,10 @@ class TwoStages:
         turn = self._poses_at_check[:, :3, :3].transpose(1, 2) @ now[:, :3, :3]
         self._moved_deg = float(np.quantile(rotation_angle_deg(turn.numpy()), 0.9))
         self._poses_at_check = now
+        optimiser.camera_errors.close_block()
         self._write_history(error, last)
         if optimiser.switch is not None:
+            self._repair_if_due()
             return
         still_deg = self.detector.still_deg(optimiser.pose_rate(), int(optimiser.options.check_every or 1))
         verdict = self.detector.check(optimiser.step_index, error, self._moved_deg, still_deg)
@@ -153,10 +160,22 @@ class TwoStages:
         if self._snapshot is None or error < self._snapshot[0]:
             self._snapshot = (error, {k: v.clone() for k, v in optimiser.coarse_state().items()})
         if verdict in ("stable", "cap"):
+            self._repair(switching=True)
             self.record.switch_reason = "stable" if verdict == "stable" else "cap"
             logger.info("stage 2 begins at step %d (%s)", optimiser.step_index, verdict)
             self._snapshot = None
             optimiser.start_reconstruction()
+        else:
+            self._repair_if_due()
+
+    def _repair_if_due(self) -> None:
+        if self.repair.due():
+            self._repair()
+
+    def _repair(self, *, switching: bool = False) -> None:
+        """Lost cameras brought home; what that moves is no motion of the block."""
+        self.repair.run(switching=switching)
+        self._poses_at_check = self.optimiser.poses.poses()
 
     def _write_history(self, mean_squared_error: float, last: StepResult) -> None:
         optimiser = self.optimiser
@@ -169,6 +188,7 @@ class TwoStages:
                 "psnr": -10 * math.log10(max(mean_squared_error, 1e-12)),
                 "loss": last.loss,
                 "moved_deg": self._moved_deg,
+                "lost": int(optimiser.camera_errors.lost.sum()),
                 "rays": last.rays,
                 "samples": last.samples,
                 "pose_rate": optimiser.pose_rate(),
@@ -233,6 +253,7 @@ class TwoStages:
                 "rising": detector.rising,
             },
             "errors": self._errors,
+            "repair": self.repair.notes(),
             "optimiser": self.optimiser.notes(),
         }
         tensors = {**self.optimiser.state(), "poses_at_check": self._poses_at_check}
@@ -251,6 +272,7 @@ class TwoStages:
         )
         self._poses_at_check = tensors["poses_at_check"]
         self._errors = notes["errors"]
+        self.repair.load_notes(notes["repair"])
         self.record = RunRecord(
             notes["fingerprint"],
             notes["resumed"] + 1,

@@ -1,0 +1,164 @@
+"""How well each camera agrees with the field, from the training batches themselves; which ones stand out as lost."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from biresnerf.data.images import ImageSet
+
+STANDS_OUT = 2.0  # times the median error
+STANDS_OUT_UNTRAINED = 4.0  # for held-out views too few to be compared with each other
+DEVIATIONS = 4.0  # and this many standard deviations, estimated as 1.4826 x the median absolute deviation
+SUSPECT_DEVIATIONS = 2.0  # enough to try other poses: those are judged by themselves
+# A photo that is hard to render stands out late in a run, when others are nearly exact (0.03 at most on lego and
+# temple); a camera in a wrong place leaves this share of its photo's variance unexplained (0.12 and more there).
+UNEXPLAINED = 0.08
+MAD_TO_DEVIATION = 1.4826
+OWN_YARDSTICK_FROM = 4  # held-out views
+IN_A_ROW = 2  # blocks
+COVERAGE = 0.1  # of the photo's share that is no background: rendering less has lost the scene from sight
+SMOOTHING = 0.5  # share of the newest block in the moving average
+BACKGROUND_TOLERANCE = 0.05  # colours nearer to the background than this count as background
+LEAST_FOREGROUND = 0.02
+
+
+def foreground_shares(images: ImageSet) -> np.ndarray:
+    """The share [n] of each photo that shows the scene: opaque, or unlike the background; 1 without background."""
+    shares = np.ones(len(images))
+    if images.background is None:
+        return shares
+    for i in range(len(images)):
+        alpha = images.alpha_image(i)
+        if alpha is not None:
+            shares[i] = alpha.mean() / 255
+        else:
+            difference = np.abs(images.image(i) / np.float32(255) - images.background).max(-1)
+            shares[i] = (difference > BACKGROUND_TOLERANCE).mean()
+    return np.maximum(shares, LEAST_FOREGROUND)
+
+
+def outliers(
+    errors: Tensor,
+    held_out: Tensor,
+    deviations: float = DEVIATIONS,
+    untrained: float = STANDS_OUT_UNTRAINED,
+) -> Tensor:
+    """Mask [n] of the errors [n] that stand out.
+
+    Held-out views, which the field never saw, are measured by their own median where there are enough of them;
+    else they must exceed `untrained` times that of the others.
+    """
+    training = errors[~held_out]
+    median, spread = _middle(training)
+    result = errors > torch.maximum(STANDS_OUT * median, median + deviations * spread)
+    if bool(held_out.any()):
+        factor, own = untrained, errors[held_out]
+        if len(own) >= OWN_YARDSTICK_FROM:
+            factor = STANDS_OUT
+            own_median, own_spread = _middle(own)
+            median, spread = torch.maximum(median, own_median), torch.maximum(spread, own_spread)
+        bound = torch.maximum(factor * median, median + deviations * spread)
+        result = torch.where(held_out, errors > bound, result)
+    return result
+
+
+def _middle(errors: Tensor) -> tuple[Tensor, Tensor]:
+    """Median and robust standard deviation; both zero of nothing."""
+    if len(errors) == 0:
+        return errors.new_zeros(()), errors.new_zeros(())
+    median = errors.median()
+    return median, MAD_TO_DEVIATION * (errors - median).abs().median()
+
+
+class CameraErrors:
+    """Collects the squared errors of each camera's rays block by block (a block ends at each check).
+
+    Errors are against the (blurred) targets and per ray that shows the scene, so that a small object does not
+    make for a small error.
+
+    Attributes:
+        shares: see `foreground_shares`.
+        errors: moving average [n] over blocks; infinite where there is none yet.
+        lost: mask [n] of cameras that stood out for `IN_A_ROW` blocks.
+        weights: of each camera's rays in the loss [n], None where all weigh the same.
+    """
+
+    def __init__(self, images: ImageSet, held_out: list[int], device: torch.device) -> None:
+        count = len(images)
+        self.shares = torch.from_numpy(foreground_shares(images)).float().to(device)
+        variances = [(images.image(i) / np.float32(255)).reshape(-1, 3).var(0).mean() for i in range(count)]
+        # Per ray that shows the scene, as the errors are.
+        self._hard = UNEXPLAINED * torch.tensor(variances, device=device) / self.shares
+        self.bounded = images.background is not None
+        self.held_out = torch.zeros(count, dtype=torch.bool, device=device)
+        self.held_out[held_out] = True
+        self.errors = torch.full((count,), torch.inf, device=device)
+        self.weights: Tensor | None = None
+        self._stood_out = torch.zeros(count, dtype=torch.int64, device=device)
+        self._sums = torch.zeros(3, count, device=device)  # rays, squared errors, opacities
+
+    @property
+    def lost(self) -> Tensor:
+        return self._stood_out >= IN_A_ROW
+
+    @property
+    def suspects(self) -> Tensor:
+        """Mask [n] of cameras that other poses should be tried for: the lost ones, and those that nearly are."""
+        return self.lost | self._outliers(SUSPECT_DEVIATIONS, STANDS_OUT)
+
+    @property
+    def relative(self) -> Tensor:
+        """Errors [n] over the median of the training cameras; infinite where there is none yet."""
+        known = self.errors[~self.held_out & self.errors.isfinite()]
+        return self.errors / known.median().clamp(min=1e-12) if len(known) else self.errors
+
+    def _weigh(self) -> None:
+        """A lost camera must not fog the field where it believes it stands."""
+        self.weights = None
+        if bool(self.lost.any()):
+            weights = 1 / self.relative.clamp(min=1)
+            self.weights = torch.where(self.lost, weights, torch.ones_like(weights))
+
+    def add(self, image: Tensor, colour: Tensor, target: Tensor, opacity: Tensor) -> None:
+        """One batch: image [rays], colours [rays, 3] rendered and wanted, opacity [rays]."""
+        squared = ((colour - target) ** 2).mean(1)
+        for total, values in zip(self._sums, (torch.ones_like(squared), squared, opacity), strict=True):
+            total += torch.bincount(image, values, len(self.errors))
+
+    def close_block(self) -> None:
+        """Take the block's errors into the moving average and look who stands out."""
+        rays, squared, opacity = self._sums
+        measured = rays > 0
+        block = squared / rays.clamp(min=1) / self.shares
+        smoothed = torch.where(self.errors.isfinite(), self.errors + SMOOTHING * (block - self.errors), block)
+        self.errors = torch.where(measured, smoothed, self.errors)
+        out = self._outliers(DEVIATIONS, STANDS_OUT_UNTRAINED)
+        if self.bounded:
+            out |= measured & (opacity / rays.clamp(min=1) < COVERAGE * self.shares)
+        self._stood_out = torch.where(out, self._stood_out + 1, torch.zeros_like(self._stood_out))
+        self._sums.zero_()
+        self._weigh()
+
+    def _outliers(self, deviations: float, untrained: float) -> Tensor:
+        known = self.errors.isfinite()
+        out = torch.zeros_like(known)
+        out[known] = outliers(self.errors[known], self.held_out[known], deviations, untrained)
+        return out & (self.errors > self._hard)
+
+    def forget(self, camera: int) -> None:
+        """Start over with one camera: its pose is another one now."""
+        self.errors[camera] = torch.inf
+        self._stood_out[camera] = 0
+        self._sums[:, camera] = 0
+        self._weigh()
+
+    def state(self) -> dict[str, Tensor]:
+        return {"errors": self.errors, "stood_out": self._stood_out, "sums": self._sums}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self.errors.copy_(state["errors"])
+        self._stood_out.copy_(state["stood_out"])
+        self._sums.copy_(state["sums"])
+        self._weigh()
