@@ -25,13 +25,15 @@ ALL_PAIRS_UP_TO = (
     60  # images; beyond it, each is matched with those whose given poses see most nearly the same
 )
 NEIGHBOURS = 40
-LEAST_PLACED = 0.5  # of the images; a model of fewer says too little about the rig
+LEAST_PLACED = 0.6  # of the images; a model of fewer says too little about the rig
 # Standard deviation of given positions, of the cameras' distance: holds what matches leave open (the drift of narrow
 # views, the mirror of flat scenes) and, under a robust loss, no more.
 POSITION_DEVIATION = 0.2
 # A camera that leaves its given pose by far more than the others do was placed by wrong matches (global mapping turned
 # one of lego's by 92 deg where the others moved by 12): this many medians, but not below these floors.
 STRAY, STRAY_DEG, STRAY_SHARE = 4.0, 30.0, 0.05
+# A model with more of them is wrong as a whole (lego at 100 px: 23 of 78 stray, and the others are off by 17 deg).
+STRAY_MOST = 0.15
 # A start for the optimisation needs no more, and matching costs the features' square.
 WIDEST_IMAGE, MOST_FEATURES = 1000, 2048
 # COLMAP's bounds on reprojection errors are made for photos of thousands of px. At 200 px they let wrong matches pass:
@@ -141,6 +143,11 @@ def _carried(model: dict[str, Any], names: list[str], given: NDArray[np.float64]
     trusted = (turned <= max(STRAY_DEG, STRAY * float(np.median(turned)))) & (
         shifted <= STRAY * max(float(np.median(shifted)), STRAY_SHARE * focus_point(given).mean_distance)
     )
+    if trusted.sum() < LEAST_PLACED * len(names) or trusted.mean() < 1 - STRAY_MOST:
+        logger.info(
+            "not believed: %d of them leave their given pose by far more than the others", (~trusted).sum()
+        )
+        return None
     poses = given.copy()
     poses[rows[trusted]] = found[trusted]
     placed = np.zeros(len(names), dtype=np.bool_)

@@ -91,6 +91,19 @@ def test_a_camera_that_strays_alone_is_not_believed(noisy, truth):
     np.testing.assert_array_equal(carried.world_from_cam[3], noisy.world_from_cam[3])
 
 
+def test_a_model_with_many_strays_is_not_offered(noisy, truth):
+    names = list(noisy.file_names)
+    cam_from_world = np.linalg.inv(truth.world_from_cam)
+    for i in (1, 4, 8):
+        cam_from_world[i, :3, :3] = np.diag([-1.0, 1, -1]) @ cam_from_world[i, :3, :3]
+    images = [
+        {"name": name, "cam_from_world": pose[:3].tolist()}
+        for name, pose in zip(names, cam_from_world, strict=True)
+    ]
+    model = {"mapper": "global", "images": images, "points": 100}
+    assert match_poses._carried(model, names, noisy.world_from_cam) is None
+
+
 def test_images_that_matches_do_not_place_keep_their_given_pose(found, noisy):
     for matched in found:
         kept = ~matched.placed
@@ -99,7 +112,7 @@ def test_images_that_matches_do_not_place_keep_their_given_pose(found, noisy):
 
 def test_models_of_too_few_images_are_not_offered(found):
     for matched in found:
-        assert matched.placed.sum() >= VIEWS / 2
+        assert matched.placed.sum() >= 0.6 * VIEWS
 
 
 def test_pictures_without_texture_give_no_poses(noisy, tmp_path):
