@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from biresnerf.field.occupancy import DECAY, OccupancyGrid
+from biresnerf.field.occupancy import DECAY, OccupancyGrid, dilated
 
 CPU = torch.device("cpu")
 SIDE = 8
@@ -51,6 +51,12 @@ def test_dilation_adds_the_neighbours():
     grid = OccupancyGrid(SIDE, CPU)
     update(grid, Slab(), dilate=True)
     assert columns(grid) == [2, 3, 4]
+
+
+def test_dilation_takes_all_26_neighbours_and_stops_at_the_border():
+    cells = (torch.rand(9, 9, 9, generator=torch.Generator().manual_seed(2)) < 0.05).to(torch.uint8)
+    pooled = torch.nn.functional.max_pool3d(cells.float()[None, None], 3, stride=1, padding=1)[0, 0]
+    assert torch.equal(dilated(cells), pooled.to(torch.uint8))
 
 
 def test_nothing_is_pruned_before_it_is_asked_for():
