@@ -7,6 +7,8 @@ import json
 import platform
 from pathlib import Path
 
+import torch
+
 from benchmarks import field_step
 
 
@@ -17,10 +19,14 @@ def main() -> None:
     parser.add_argument("--json", type=Path, default=Path("benchmarks/results.json"))
     arguments = parser.parse_args()
     rows = field_step.run(arguments.rays, arguments.rounds)
-    print(f"{'stage':8}{'samples':>9}{'kernels':>12}{'plain torch':>14}{'ratio':>8}{'ns/sample':>11}")
+    if torch.cuda.is_available():
+        from benchmarks import cuda_step
+
+        rows += cuda_step.run(8 * arguments.rays, arguments.rounds)
+    print(f"{'stage':12}{'samples':>9}{'kernels':>12}{'plain torch':>14}{'ratio':>8}{'ns/sample':>11}")
     for row in rows:
         print(
-            f"{row['stage']:8}{row['samples']:>9}{row['kernels_ms']:>9.1f} ms{row['torch_ms']:>11.1f} ms"
+            f"{row['stage']:12}{row['samples']:>9}{row['kernels_ms']:>9.1f} ms{row['torch_ms']:>11.1f} ms"
             f"{row['ratio']:>8.1f}{row['kernels_ns_per_sample']:>11.0f}"
         )
     result = {"machine": platform.platform(), "rays": arguments.rays, "field_step": rows}

@@ -21,6 +21,7 @@ IMPORTED_AS = {
     "psycopg": {"psycopg", "psycopg_pool"},  # by its extra `pool`
     "numba": {"numba", "llvmlite"},  # which pins its version
     "fastapi": {"fastapi", "starlette"},  # built on it, and documented so
+    "torch": {"torch", "triton"},  # in its CUDA builds, where alone it is used
 }
 HEAVY = ("torch", "numba", "numpy", "scipy", "PIL", "pycolmap")
 

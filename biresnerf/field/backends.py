@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Callable
 
 import torch
+from torch import Tensor
 
 from biresnerf.config import Device
 from biresnerf.errors import InputError
+from biresnerf.field.device_occupancy import DeviceOccupancyGrid
+from biresnerf.field.occupancy import OccupancyGrid
 from biresnerf.field.radiance_field import FieldShape, RadianceField
+from biresnerf.geometry.camera import Intrinsics, directions_in_cam
 
 logger = logging.getLogger(__name__)
+
+Directions = Callable[[Intrinsics, Tensor, Tensor], Tensor]
 
 
 def choose_device(device: Device) -> torch.device:
@@ -42,16 +49,30 @@ def use_threads(threads: int) -> int:
     return taken
 
 
+def make_occupancy(side: int, device: torch.device) -> OccupancyGrid:
+    """The occupancy grid; on CUDA the one whose updates never wait for the device."""
+    return DeviceOccupancyGrid(side, device) if device.type == "cuda" else OccupancyGrid(side, device)
+
+
+def directions_for(device: torch.device) -> Directions:
+    """`directions_in_cam`, on CUDA the form that never waits for the device."""
+    if device.type == "cuda":
+        from biresnerf.field.cuda.lens import directions_in_cam as on_device
+
+        return on_device
+    return directions_in_cam
+
+
 def make_field(shape: FieldShape, seed: int, device: torch.device, threads: int) -> RadianceField:
-    """The fastest backend for the device: Numba kernels on the CPU, plain torch elsewhere."""
+    """The fastest backend for the device: Numba kernels on the CPU, Triton kernels on CUDA."""
     field: RadianceField
     if device.type == "cpu":
         from biresnerf.field.cpu_field import CpuField
 
         field = CpuField(shape, seed, device, threads)
     else:
-        from biresnerf.field.reference_field import ReferenceField
+        from biresnerf.field.cuda_field import CudaField
 
-        field = ReferenceField(shape, seed, device)
+        field = CudaField(shape, seed, device)
     logger.info("field backend %s on %s, %d threads", field.backend, device, threads)
     return field

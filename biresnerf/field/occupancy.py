@@ -12,6 +12,7 @@ from torch import Tensor
 from biresnerf.field.radiance_field import RadianceField
 
 DECAY = 0.95
+LOOKED_AT = 0.25  # of the cells that are not occupied, at a partial update
 THRESHOLD = 0.01
 GROWTH_UP_TO = 60.0  # inner boxes: how far unbounded rays reach
 DENSITY_CHUNK = 1 << 18  # cells whose density is asked for at once
@@ -61,12 +62,11 @@ class OccupancyGrid:
         """Look again at all cells, or at a random quarter and the occupied ones, at a random point in each."""
         cells = torch.arange(self.side**3)
         if not everywhere:
-            chosen = torch.rand(len(cells), generator=generator) < 0.25
+            chosen = torch.rand(len(cells), generator=generator) < LOOKED_AT
             cells = cells[chosen | self.occupied.reshape(-1).cpu().bool()]
         self.thickness *= DECAY
         for part in cells.split(DENSITY_CHUNK):
-            index = torch.stack([part % self.side, part // self.side % self.side, part // self.side**2], 1)
-            position = (index + torch.rand(len(part), 3, generator=generator)) / self.side
+            position = self._points(part, generator)
             density = field.density(position.to(self.device))
             part = part.to(self.device)
             length = step * interval_growth(position.to(self.device)) if field.unbounded else step
@@ -74,8 +74,13 @@ class OccupancyGrid:
         if prune:
             self._prune(dilate)
 
+    def _points(self, cells: Tensor, generator: torch.Generator) -> Tensor:
+        """A random point [n, 3] in each cell, on the generator's device."""
+        index = torch.stack([cells % self.side, cells // self.side % self.side, cells // self.side**2], 1)
+        return (index + torch.rand(len(cells), 3, generator=generator, device=generator.device)) / self.side
+
     def _prune(self, dilate: bool) -> None:
-        bound = min(float(self.thickness.mean()), THRESHOLD)
+        bound = self.thickness.mean().clamp(max=THRESHOLD)
         occupied = (self.thickness > bound).to(torch.uint8).reshape(self.side, self.side, self.side)
         # A camera that is still off must meet density a cell away, or it has no gradient to come back by.
         self.occupied = dilated(occupied) if dilate else occupied

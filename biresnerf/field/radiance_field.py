@@ -114,6 +114,13 @@ class RadianceField(ABC):
     def density(self, position: Tensor) -> Tensor:
         """Density [n] per unit length at grid positions [n, 3] in [0, 1]; no gradient."""
 
+    def density_of_first(self, count: Tensor, position: Tensor) -> Tensor:
+        """Density [n] at positions [n, 3], of which only the first `count` [1] matter; no gradient.
+
+        The others' densities mean nothing. A backend that can leaves them out without asking the device for `count`.
+        """
+        return self.density(position)
+
     @abstractmethod
     def step(self, rates: FieldRates) -> None:
         """One optimiser step from the gradients of the last backward."""

@@ -16,7 +16,7 @@ from torch import Tensor
 from biresnerf.geometry.camera_models import full_parameters
 
 # Newton doubles the digits at each step; lenses that do not fold inside the image need five or six.
-_NEWTON_STEPS = 20
+NEWTON_STEPS = 20
 # In units of the focal length: under 1e-9 px for any real camera.
 _NEWTON_DONE = 1e-13
 
@@ -153,7 +153,7 @@ def _undistort(x_distorted: Tensor, y_distorted: Tensor, distortion: Tensor) -> 
     """The inverse of `_distort`: Newton's method in two unknowns, started at the distorted position."""
     k1, k2, p1, p2 = distortion.unbind(-1)
     x, y = x_distorted, y_distorted
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(NEWTON_STEPS):
         x_now, y_now = _distort(x, y, distortion)
         error_x, error_y = x_now - x_distorted, y_now - y_distorted
         r2 = x * x + y * y

@@ -11,12 +11,13 @@ from torch import Tensor
 
 from biresnerf.config import RefineOptions
 from biresnerf.data.images import ImageSet
-from biresnerf.field.occupancy import OccupancyGrid
+from biresnerf.field.backends import directions_for, make_occupancy
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
-from biresnerf.geometry.camera import Intrinsics, directions_in_cam
+from biresnerf.geometry.camera import Intrinsics
 from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.refine.camera_errors import CameraErrors
 from biresnerf.refine.camp_preconditioner import camp_preconditioner
+from biresnerf.refine.late_figures import LateFigures
 from biresnerf.refine.methods import METHODS, build_field, occupancy_side
 from biresnerf.refine.photo_sampler import PhotoSampler, PixelBatch
 from biresnerf.refine.pose_hypotheses import photo_distances
@@ -31,7 +32,10 @@ OCCUPANCY_PERIOD = 16
 
 @dataclass(frozen=True)
 class StepResult:
-    """Loss against the (blurred) targets, mean squared error of training rays against the sharp photos, and effort."""
+    """Loss against the (blurred) targets, mean squared error of training rays against the sharp photos, and effort.
+
+    On CUDA the first two are those of the step before (see `LateFigures`).
+    """
 
     loss: float
     mean_squared_error: float
@@ -71,8 +75,12 @@ class JointOptimiser:
         self.sampler = PhotoSampler(images, held_out, device)
         self.photo_distances = photo_distances(images)
         self.camera_errors = CameraErrors(images, held_out, device)
-        self.occupancy = OccupancyGrid(occupancy_side(self.method, options), device)
+        self.directions, self.figures = directions_for(device), LateFigures(device)
+        self.occupancy = make_occupancy(occupancy_side(self.method, options), device)
         self.generator = torch.Generator().manual_seed(options.seed)
+        # What a step draws, it draws on the device: the host's draws would have to be waited for.
+        on_device = None if device.type == "cpu" else torch.Generator(device).manual_seed(options.seed)
+        self.draws = on_device or self.generator
         behind = frame.background if frame.background is not None else images.pixels.mean(0) / 255
         self.background = torch.as_tensor(behind, dtype=torch.float32, device=device)
         self.step_index = 0
@@ -127,7 +135,7 @@ class JointOptimiser:
 
         `matrix` [rays, 3, 4] is each ray's unit_from_cam; `intrinsics` are the run's images' where not given.
         """
-        in_cam = directions_in_cam(intrinsics or self.intrinsics, image, xy).float()
+        in_cam = self.directions(intrinsics or self.intrinsics, image, xy).float()
         direction = (matrix[:, :, :3] @ in_cam[:, :, None])[:, :, 0]
         return matrix[:, :, 3].contiguous(), direction.contiguous()
 
@@ -144,9 +152,13 @@ class JointOptimiser:
         """Render rays over the scene's background; `jitter` randomises where sampling starts."""
         count = len(origin)
         shape = (count,) if self.field.stratified is None else (count, self.field.stratified)
-        start = torch.rand(shape, generator=self.generator) if jitter else torch.full(shape, 0.5)
+        start = (
+            torch.rand(shape, generator=self.draws, device=self.device)
+            if jitter
+            else torch.full(shape, 0.5, device=self.device)
+        )
         background = self.background.expand(count, 3).contiguous()
-        rays = Rays(origin, direction, background, start.to(self.device), trained)
+        rays = Rays(origin, direction, background, start, trained)
         return self.field.render(rays, self.marching(interval), gradient)
 
     def step(self) -> StepResult:
@@ -156,7 +168,7 @@ class JointOptimiser:
         if t % OCCUPANCY_PERIOD == 0 and self.method.pruned:
             self._update_occupancy(t)
         batch = self.sampler.draw(
-            self.rays, schedule.blur(t, self.switch, self.sampler.long_side), self.generator
+            self.rays, schedule.blur(t, self.switch, self.sampler.long_side), self.draws
         )
         origin, direction = self.cast(self.poses.matrices()[batch.image], batch.image, batch.xy)
         rendering = self.render(
@@ -182,7 +194,8 @@ class JointOptimiser:
             batch.image, rendering.colour.detach(), batch.target, rendering.opacity.detach()
         )
         error = ((rendering.colour.detach() - batch.sharp) ** 2)[: batch.trained].mean()
-        return StepResult(float(loss.detach()), float(error), len(origin), rendering.samples)
+        told_loss, told_error = self.figures.read(loss.detach(), error)
+        return StepResult(told_loss, told_error, len(origin), rendering.samples)
 
     def _loss(self, colour: Tensor, batch: PixelBatch) -> Tensor:
         weights = self.camera_errors.weights
@@ -204,7 +217,7 @@ class JointOptimiser:
         self.occupancy.update(
             self.field,
             self.schedule.fine_interval,
-            self.generator,
+            self.draws,
             everywhere=self.schedule.looks_everywhere(step, self.switch),
             prune=self.schedule.pruned(step),
             dilate=self.schedule.dilated(self.switch),
@@ -251,6 +264,8 @@ class JointOptimiser:
         self._load_tensors(tensors)
         self.step_index, self.switch = notes["step_index"], notes["switch"]
         self.rays, self.pose_scale = notes["rays"], notes["pose_scale"]
+        if self.draws is not self.generator:
+            self.draws.manual_seed(self.options.seed + self.step_index)  # its state is not kept
         self.field.reach(self.step_index / self.schedule.steps)
 
     def _load_tensors(self, tensors: dict[str, Tensor]) -> None:

@@ -53,25 +53,55 @@ class PhotoSampler:
         self.offsets = torch.tensor(offsets, device=device)
         self.sizes = torch.tensor(sizes, device=device)
         self.long_side = float(self.sizes[0].max())
+        self._corners = torch.tensor([[[0, 0], [0, 1]], [[1, 0], [1, 1]]], device=device)
+        self._host: torch.Generator | None = None
 
     def draw(
         self, rays: int, blur_px: float, generator: torch.Generator, *, held_out_only: bool = False
     ) -> PixelBatch:
         """`rays` pixels, spread evenly over all images or the held-out ones, blurred by a random share of `blur_px`."""
-        first, count = (
-            (self.training, len(self.order) - self.training) if held_out_only else (0, len(self.order))
-        )
-        where = (torch.arange(rays) + torch.rand(rays, generator=generator)) * (count / rays)
-        position = first + where.long().clamp(max=count - 1).to(self.device)
+        position, trained = self._positions(rays, generator, held_out_only)
         image = self.order[position]
         size = self.sizes[0][image]
-        xy = (torch.rand(rays, 2, generator=generator).to(self.device) * size).floor()
+        share = torch.rand(rays, 2, generator=generator, device=generator.device).to(self.device)
+        xy = (share * size).floor()
         index = self.offsets[0][image] + (xy[:, 1] * size[:, 0] + xy[:, 0]).long()
         sharp = self.pixels[index].float() / 255
         xy = xy + 0.5
-        sigma = blur_px * float(torch.rand((), generator=generator))
+        sigma = blur_px * self._share(generator)
         target = sharp if sigma <= LEVEL_SIGMA else self._blurred(image, xy, sigma)
-        return PixelBatch(image, xy, target, sharp, int((position < self.training).sum()))
+        return PixelBatch(image, xy, target, sharp, trained)
+
+    def _positions(self, rays: int, generator: torch.Generator, held_out_only: bool) -> tuple[Tensor, int]:
+        """Places in `order`, evenly spread and in turn, and how many are of training views."""
+        views = len(self.order)
+        if held_out_only:
+            return self._spread(rays, self.training, views, generator), 0
+        if generator.device.type == "cpu":
+            position = self._spread(rays, 0, views, generator)
+            return position, int((position < self.training).sum())
+        # On a GPU the host would have to wait for that sum, so it chooses it: the same to a ray.
+        trained = round(rays * self.training / views)
+        parts = (
+            self._spread(trained, 0, self.training, generator),
+            self._spread(rays - trained, self.training, views, generator),
+        )
+        return torch.cat(parts), trained
+
+    def _spread(self, rays: int, first: int, end: int, generator: torch.Generator) -> Tensor:
+        """`rays` places in [first, end): one at random in each of as many equal parts."""
+        at = generator.device
+        where = torch.arange(rays, device=at) + torch.rand(rays, generator=generator, device=at)
+        where = where * ((end - first) / max(1, rays))
+        return first + where.long().clamp(max=end - first - 1).to(self.device)
+
+    def _share(self, generator: torch.Generator) -> float:
+        """A random number in [0, 1); on a GPU from a generator of the host's, which need not wait for it."""
+        if generator.device.type == "cpu":
+            return float(torch.rand((), generator=generator))
+        if self._host is None:
+            self._host = torch.Generator().manual_seed(generator.initial_seed())
+        return float(torch.rand((), generator=self._host))
 
     def colours(self, image: Tensor, xy: Tensor, sigma: float) -> Tensor:
         """Colours [rays, 3] of pixels with centres `xy` [rays, 2], blurred by `sigma` px."""
@@ -94,7 +124,7 @@ class PhotoSampler:
         total = torch.zeros(len(image), 3, device=self.device)
         for dx in (0, 1):
             for dy in (0, 1):
-                corner = (low + torch.tensor([dx, dy], device=self.device)).long()
+                corner = (low + self._corners[dx, dy]).long()
                 corner = torch.minimum(corner.clamp(min=0), size - 1)
                 index = self.offsets[level][image] + corner[:, 1] * size[:, 0] + corner[:, 0]
                 wx = fraction[:, 0] if dx else 1 - fraction[:, 0]

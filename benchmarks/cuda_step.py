@@ -1,0 +1,83 @@
+"""One optimisation step of the field on a GPU: the Triton kernels against the plain-torch definition."""
+
+from __future__ import annotations
+
+import statistics
+import time
+
+import torch
+
+from biresnerf.field.cuda_field import CudaField
+from biresnerf.field.grid_levels import grid_levels
+from biresnerf.field.radiance_field import (
+    FieldRates,
+    FieldShape,
+    Marching,
+    PositionGradient,
+    RadianceField,
+    Rays,
+)
+from biresnerf.field.reference_field import ReferenceField
+
+LEVELS, SIDE = 16, 128
+DEVICE = torch.device("cuda")
+
+
+def _rays(count: int) -> Rays:
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, device=DEVICE), dim=1)
+    origin = (torch.rand(count, 3, device=DEVICE) - 0.5) * 0.6 - 2.6 * direction
+    return Rays(
+        origin.requires_grad_(),
+        direction.requires_grad_(),
+        torch.ones(count, 3, device=DEVICE),
+        torch.rand(count, device=DEVICE),
+        count,
+    )
+
+
+def _shell() -> torch.Tensor:
+    """Live in a spherical shell: about 40 samples a ray, as after pruning."""
+    centre = (torch.arange(SIDE, device=DEVICE) + 0.5) / SIDE - 0.5
+    z, y, x = torch.meshgrid(centre, centre, centre, indexing="ij")
+    return (((x * x + y * y + z * z).sqrt() - 0.33).abs() < 0.02).to(torch.uint8)
+
+
+def _steps(field: RadianceField, rays: int, steps: int, occupied: torch.Tensor) -> tuple[float, int]:
+    """Seconds a step, with the host free to run ahead as it is in a run, and samples of the last."""
+    batch, marching, samples = _rays(rays), Marching(3.3e-3, 0.1, 12.0, 768, occupied), 0
+    torch.cuda.synchronize()
+    started = time.perf_counter()
+    for _ in range(steps):
+        rendering = field.render(batch, marching, PositionGradient(1.0, 1.0, 1.0))
+        ((rendering.colour - 0.3) ** 2).mean().backward()
+        field.step(FieldRates(1e-4, 1e-4, (1e-4,) * LEVELS, 1e-4))
+        samples = rendering.samples
+    torch.cuda.synchronize()
+    return (time.perf_counter() - started) / steps, samples
+
+
+def run(rays: int, rounds: int) -> list[dict[str, float | str | int]]:
+    """Rows for stage 1 and stage 2 at the paper's encodings (Table 1), T = 2^19: medians, in turn."""
+    shape = FieldShape(grid_levels(3, 16, 72, 22), grid_levels(LEVELS, 128, 4096, 19), unbounded=False)
+    kernels, plain = CudaField(shape, 0, DEVICE), ReferenceField(shape, 0, DEVICE)
+    occupied, rows = _shell(), []
+    for stage in ("coarse", "fine"):
+        if stage == "fine":
+            kernels.start_reconstruction()
+            plain.start_reconstruction()
+        for field in (kernels, plain):
+            _steps(field, rays, 3, occupied)
+        pairs = [
+            (_steps(kernels, rays, 50, occupied), _steps(plain, rays, 2, occupied)) for _ in range(rounds)
+        ]
+        rows.append(
+            {
+                "stage": f"{stage} cuda",
+                "samples": pairs[-1][1][1],
+                "kernels_ms": 1e3 * statistics.median(fast for (fast, _), _ in pairs),
+                "torch_ms": 1e3 * statistics.median(slow for _, (slow, _) in pairs),
+                "ratio": statistics.median(slow / fast for (fast, _), (slow, _) in pairs),
+                "kernels_ns_per_sample": 1e9 * statistics.median(fast / n for (fast, n), _ in pairs),
+            }
+        )
+    return rows

@@ -1,0 +1,194 @@
+"""Hash and dense grid encodings in Triton: forward with Jacobian, gradient to positions, table gradient, table Adam.
+
+The definition is `biresnerf.field.reference.encode`. Layout: features [2 levels, capacity], Jacobian [levels, 6,
+capacity] (d feature 0 / dxyz, d feature 1 / dxyz), so that neighbouring threads touch neighbouring samples. Both
+features of an entry are read as one 8-byte word. Programs run level by level, so that one level's table stays in the
+L2 cache.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+PRIME_Y = tl.constexpr(2654435761)
+PRIME_Z = tl.constexpr(805459861)
+
+
+@triton.jit
+def _locate(x, i, here, capacity, scale):
+    """Cell and fraction within it of samples' positions, per axis."""
+    px = tl.load(x + i, mask=here, other=0.5) * scale + 0.5
+    py = tl.load(x + capacity + i, mask=here, other=0.5) * scale + 0.5
+    pz = tl.load(x + 2 * capacity + i, mask=here, other=0.5) * scale + 0.5
+    ix, iy, iz = px.to(tl.int32), py.to(tl.int32), pz.to(tl.int32)
+    fx, fy, fz = px - ix.to(tl.float32), py - iy.to(tl.float32), pz - iz.to(tl.float32)
+    return ix.to(tl.uint32), iy.to(tl.uint32), iz.to(tl.uint32), fx, fy, fz
+
+
+@triton.jit
+def _index(ix, iy, iz, hashed, stride, size):
+    """Entry of a vertex within its level."""
+    side = stride.to(tl.uint32)
+    y = iy * tl.where(hashed, PRIME_Y, side)
+    z = iz * tl.where(hashed, PRIME_Z, side * side)
+    mixed = (ix ^ y ^ z) & (size - 1).to(tl.uint32)
+    return tl.where(hashed, mixed, ix + y + z).to(tl.int64)
+
+
+@triton.jit
+def _straight_through(fraction, smoothing):
+    """1 + smoothing (pi/2) sin(pi w): the factor on d w / dx of Heo et al. 2023."""
+    return 1.0 + smoothing * 1.5707963267948966 * tl.sin(fraction * 3.141592653589793)
+
+
+@triton.jit
+def encode(
+    x, words, scale, stride, hashed, offset, taken, smoothing, features, jacobian, row, capacity,
+    WITH_JACOBIAN: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Features of `taken` points x [3, capacity] from row `row` on; `words` is the table, an entry per int64."""
+    n = tl.load(taken)
+    begin = tl.program_id(0) * BLOCK
+    if begin >= n:
+        return
+    level = tl.program_id(1)
+    i = begin + tl.arange(0, BLOCK)
+    here = i < n
+    s, side, by_hash = tl.load(scale + level), tl.load(stride + level), tl.load(hashed + level) != 0
+    base = tl.load(offset + level)
+    size = (tl.load(offset + level + 1) - base).to(tl.int32)
+    ix, iy, iz, fx, fy, fz = _locate(x, i, here, capacity, s)
+    f0 = tl.zeros([BLOCK], tl.float32)
+    f1, x0, x1, y0, y1, z0, z1 = f0, f0, f0, f0, f0, f0, f0
+    for corner in tl.static_range(8):
+        index = _index(ix + (corner & 1), iy + ((corner >> 1) & 1), iz + (corner >> 2), by_hash, side, size)
+        word = tl.load(words + base + index, mask=here, other=0)
+        p = word.to(tl.uint32).to(tl.float32, bitcast=True)
+        q = (word >> 32).to(tl.uint32).to(tl.float32, bitcast=True)
+        wx = fx if corner & 1 else 1.0 - fx
+        wy = fy if (corner >> 1) & 1 else 1.0 - fy
+        wz = fz if corner >> 2 else 1.0 - fz
+        f0 += wx * wy * wz * p
+        f1 += wx * wy * wz * q
+        if WITH_JACOBIAN:
+            ux = wy * wz if corner & 1 else -wy * wz
+            uy = wx * wz if (corner >> 1) & 1 else -wx * wz
+            uz = wx * wy if corner >> 2 else -wx * wy
+            x0, x1 = x0 + ux * p, x1 + ux * q
+            y0, y1 = y0 + uy * p, y1 + uy * q
+            z0, z1 = z0 + uz * p, z1 + uz * q
+    out = features + (row + 2 * level).to(tl.int64) * capacity + i
+    tl.store(out, f0, mask=here)
+    tl.store(out + capacity, f1, mask=here)
+    if WITH_JACOBIAN:
+        smooth = tl.load(smoothing)
+        sx = s * _straight_through(fx, smooth)
+        sy = s * _straight_through(fy, smooth)
+        sz = s * _straight_through(fz, smooth)
+        j = jacobian + (6 * level).to(tl.int64) * capacity + i
+        tl.store(j, sx * x0, mask=here)
+        tl.store(j + capacity, sy * y0, mask=here)
+        tl.store(j + 2 * capacity, sz * z0, mask=here)
+        tl.store(j + 3 * capacity, sx * x1, mask=here)
+        tl.store(j + 4 * capacity, sy * y1, mask=here)
+        tl.store(j + 5 * capacity, sz * z1, mask=here)
+
+
+@triton.jit
+def position_gradient(
+    g_features, jacobian, share, taken, g_x, row, levels, capacity, ACCUMULATE: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """g_x [3, capacity] (+)= share J^T g for feature gradients from row `row` on."""
+    n = tl.load(taken)
+    begin = tl.program_id(0) * BLOCK
+    if begin >= n:
+        return
+    i = begin + tl.arange(0, BLOCK)
+    here = i < n
+    a = tl.zeros([BLOCK], tl.float32)
+    b, c = a, a
+    for level in range(levels):
+        g = g_features + (row + 2 * level).to(tl.int64) * capacity + i
+        j = jacobian + tl.cast(6 * level, tl.int64) * capacity + i
+        u = tl.load(g, mask=here, other=0.0)
+        v = tl.load(g + capacity, mask=here, other=0.0)
+        a += u * tl.load(j, mask=here, other=0.0) + v * tl.load(j + 3 * capacity, mask=here, other=0.0)
+        b += u * tl.load(j + capacity, mask=here, other=0.0) + v * tl.load(
+            j + 4 * capacity, mask=here, other=0.0
+        )
+        c += u * tl.load(j + 2 * capacity, mask=here, other=0.0) + v * tl.load(
+            j + 5 * capacity, mask=here, other=0.0
+        )
+    factor = tl.load(share)
+    a, b, c = factor * a, factor * b, factor * c
+    if ACCUMULATE:
+        a += tl.load(g_x + i, mask=here, other=0.0)
+        b += tl.load(g_x + capacity + i, mask=here, other=0.0)
+        c += tl.load(g_x + 2 * capacity + i, mask=here, other=0.0)
+    tl.store(g_x + i, a, mask=here)
+    tl.store(g_x + capacity + i, b, mask=here)
+    tl.store(g_x + 2 * capacity + i, c, mask=here)
+
+
+@triton.jit
+def table_gradient(
+    x, g_features, scale, stride, hashed, offset, ray_offset, trained_rays, taken, gradient, row, capacity,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Add the trained samples' feature gradients to the table's gradient [entries, 2], by atomic additions."""
+    n = tl.minimum(tl.load(ray_offset + tl.load(trained_rays).to(tl.int32)), tl.load(taken))
+    begin = tl.program_id(0) * BLOCK
+    if begin >= n:
+        return
+    level = tl.program_id(1)
+    i = begin + tl.arange(0, BLOCK)
+    here = i < n
+    base = tl.load(offset + level)
+    size = (tl.load(offset + level + 1) - base).to(tl.int32)
+    side, by_hash = tl.load(stride + level), tl.load(hashed + level) != 0
+    ix, iy, iz, fx, fy, fz = _locate(x, i, here, capacity, tl.load(scale + level))
+    g = g_features + (row + 2 * level).to(tl.int64) * capacity + i
+    u = tl.load(g, mask=here, other=0.0)
+    v = tl.load(g + capacity, mask=here, other=0.0)
+    for corner in tl.static_range(8):
+        index = _index(ix + (corner & 1), iy + ((corner >> 1) & 1), iz + (corner >> 2), by_hash, side, size)
+        weight = fx if corner & 1 else 1.0 - fx
+        weight = weight * (fy if (corner >> 1) & 1 else 1.0 - fy)
+        weight = weight * (fz if corner >> 2 else 1.0 - fz)
+        entry = gradient + 2 * (base + index)
+        tl.atomic_add(entry, weight * u, mask=here, sem="relaxed")
+        tl.atomic_add(entry + 1, weight * v, mask=here, sem="relaxed")
+
+
+@triton.jit
+def adam_touched(
+    table, gradient, moment1, moment2, offset, rates, corrections, BETA1: tl.constexpr, BETA2: tl.constexpr,
+    EPSILON: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Adam on the numbers of a table whose gradient is not zero; leaves the gradient zero.
+
+    `rates` per level, 0 leaves a level alone; `corrections` = 1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t).
+    """
+    level = tl.program_id(1)
+    base = 2 * tl.load(offset + level)
+    n = 2 * tl.load(offset + level + 1) - base
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    g = tl.load(gradient + base + i, mask=i < n, other=0.0)
+    touched = g != 0.0
+    if tl.max(touched.to(tl.int32), 0) == 0:
+        return
+    tl.store(gradient + base + i, 0.0 * g, mask=touched)
+    rate = tl.load(rates + level)
+    if rate == 0.0:
+        return
+    first = tl.load(moment1 + base + i, mask=touched, other=0.0)
+    second = tl.load(moment2 + base + i, mask=touched, other=0.0)
+    p = tl.load(table + base + i, mask=touched, other=0.0)
+    first = BETA1 * first + (1.0 - BETA1) * g
+    second = BETA2 * second + (1.0 - BETA2) * g * g
+    p -= rate * (first * tl.load(corrections)) / (tl.sqrt(second) * tl.load(corrections + 1) + EPSILON)
+    tl.store(moment1 + base + i, first, mask=touched)
+    tl.store(moment2 + base + i, second, mask=touched)
+    tl.store(table + base + i, p, mask=touched)

@@ -1,0 +1,272 @@
+"""Ray marching through the occupancy grid, compositing, view harmonics and gradients to rays, in Triton.
+
+The definitions are in `biresnerf.field.reference`. Rays live in the unit frame, positions in [0, 1]. Every sum over
+the samples of a ray is taken by one program in a fixed order.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from biresnerf.field.reference import LEAST_TRANSMITTANCE
+
+LEAST = tl.constexpr(LEAST_TRANSMITTANCE)
+OPAQUE = tl.constexpr(100.0)  # e^-100 is 0 in float32; larger numbers would cost the sums their last digits
+
+
+@triton.jit
+def _contraction(px, py, pz, UNBOUNDED: tl.constexpr):
+    """What a point is multiplied with on its way to [-0.5, 0.5]^3, and its largest coordinate m."""
+    m = tl.maximum(tl.abs(px), tl.maximum(tl.abs(py), tl.abs(pz)))
+    factor = m * 0.0 + 0.5
+    if UNBOUNDED:
+        outside = tl.maximum(m, 1.0)
+        factor = (2.0 - 1.0 / outside) / outside * 0.25
+    return factor, m
+
+
+@triton.jit
+def _length(px, py, pz, step, UNBOUNDED: tl.constexpr):
+    """Length of the interval that starts at a point."""
+    m = tl.maximum(tl.abs(px), tl.maximum(tl.abs(py), tl.abs(pz)))
+    dt = m * 0.0 + step
+    if UNBOUNDED:
+        outside = tl.maximum(m, 1.0)
+        dt = step * outside * outside
+    return dt
+
+
+@triton.jit
+def _cell(v, side):
+    return tl.minimum(tl.maximum((v * side).to(tl.int32), 0), side - 1)
+
+
+@triton.jit
+def _axis(o, d, t, t_end):
+    """Narrow [t, t_end] to where a ray is within [-1, 1] of one axis."""
+    d = tl.where(tl.abs(d) < 1e-9, 1e-9, d)
+    ta, tb = (-1.0 - o) / d, (1.0 - o) / d
+    return tl.maximum(t, tl.minimum(ta, tb)), tl.minimum(t_end, tl.maximum(ta, tb))
+
+
+@triton.jit
+def march(
+    origin, direction, jitter, occupied, ray_count, interval, near, far, start, count, side, most, ray_capacity,
+    UNBOUNDED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Start of every live interval, start [rays, most], and how many a ray has, count [rays]; a thread per ray."""
+    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = r < tl.load(ray_count).to(tl.int32)
+    ox, oy, oz = (
+        tl.load(origin + 3 * r, mask=here, other=0.0),
+        tl.load(origin + 3 * r + 1, mask=here, other=0.0),
+        tl.load(origin + 3 * r + 2, mask=here, other=0.0),
+    )
+    dx, dy, dz = (
+        tl.load(direction + 3 * r, mask=here, other=1.0),
+        tl.load(direction + 3 * r + 1, mask=here, other=1.0),
+        tl.load(direction + 3 * r + 2, mask=here, other=1.0),
+    )
+    step = tl.load(interval)
+    t = ox * 0.0 + tl.load(near)
+    t_end = ox * 0.0 + tl.load(far)
+    if not UNBOUNDED:
+        t, t_end = _axis(ox, dx, t, t_end)
+        t, t_end = _axis(oy, dy, t, t_end)
+        t, t_end = _axis(oz, dz, t, t_end)
+    # A random start within the first interval decorrelates the rays.
+    shift = tl.load(jitter + r, mask=here, other=0.0)
+    shift = shift * _length(ox + t * dx, oy + t * dy, oz + t * dz, step, UNBOUNDED)
+    t = tl.where(t < t_end, t + shift, t)
+    n = tl.zeros([BLOCK], tl.int32)
+    active = here & (t < t_end)
+    row = r.to(tl.int64) * most
+    while tl.max(active.to(tl.int32), 0) > 0:
+        dt = _length(ox + t * dx, oy + t * dy, oz + t * dz, step, UNBOUNDED)
+        middle = t + 0.5 * dt
+        px, py, pz = ox + middle * dx, oy + middle * dy, oz + middle * dz
+        factor, _m = _contraction(px, py, pz, UNBOUNDED)
+        ix = _cell(px * factor + 0.5, side)
+        iy = _cell(py * factor + 0.5, side)
+        iz = _cell(pz * factor + 0.5, side)
+        active = active & (middle < t_end)
+        live = tl.load(occupied + (iz * side + iy) * side + ix, mask=active, other=0) != 0
+        tl.store(start + row + n, t, mask=live)
+        n += live.to(tl.int32)
+        t = tl.where(active, t + dt, t)
+        active = active & (t < t_end) & (n < most)
+    tl.store(count + r, n, mask=r < ray_capacity)
+
+
+@triton.jit
+def _span(ray_offset, r, capacity):
+    """Samples [begin, end) of ray r; a ray whose samples do not all fit the buffers has none."""
+    begin, end = tl.load(ray_offset + r), tl.load(ray_offset + r + 1)
+    return begin, tl.where(end <= capacity, end, begin)
+
+
+@triton.jit
+def pack(
+    origin, direction, start, ray_offset, ray_count, interval, taken, x, t, dt, ray, most, capacity,
+    UNBOUNDED: tl.constexpr, CHUNK: tl.constexpr,
+):  # fmt: skip
+    """The live intervals one after another: x [3, capacity] grid positions of midpoints, t, dt, ray; one ray each.
+
+    Whichever ray is the last that fits writes how many samples there are, `taken` [1] (zero before).
+    """
+    r = tl.program_id(0)
+    rays = tl.load(ray_count).to(tl.int32)
+    if r >= rays:
+        return
+    begin, end = _span(ray_offset, r, capacity)
+    ox, oy, oz = tl.load(origin + 3 * r), tl.load(origin + 3 * r + 1), tl.load(origin + 3 * r + 2)
+    dx, dy, dz = tl.load(direction + 3 * r), tl.load(direction + 3 * r + 1), tl.load(direction + 3 * r + 2)
+    step = tl.load(interval)
+    row = r.to(tl.int64) * most
+    for first in range(begin, end, CHUNK):
+        i = first + tl.arange(0, CHUNK)
+        here = i < end
+        s = tl.load(start + row + (i - begin), mask=here, other=0.0)
+        length = _length(ox + s * dx, oy + s * dy, oz + s * dz, step, UNBOUNDED)
+        middle = s + 0.5 * length
+        px, py, pz = ox + middle * dx, oy + middle * dy, oz + middle * dz
+        factor, _m = _contraction(px, py, pz, UNBOUNDED)
+        tl.store(x + i, tl.minimum(tl.maximum(px * factor + 0.5, 1e-6), 1.0 - 1e-6), mask=here)
+        tl.store(x + capacity + i, tl.minimum(tl.maximum(py * factor + 0.5, 1e-6), 1.0 - 1e-6), mask=here)
+        tl.store(x + 2 * capacity + i, tl.minimum(tl.maximum(pz * factor + 0.5, 1e-6), 1.0 - 1e-6), mask=here)
+        tl.store(t + i, middle, mask=here)
+        tl.store(dt + i, length, mask=here)
+        tl.store(ray + i, r, mask=here)
+    full = tl.load(ray_offset + r + 1) > capacity
+    next_full = tl.load(ray_offset + r + 2, mask=r + 1 < rays, other=capacity + 1) > capacity
+    if (full == 0) & next_full:
+        tl.store(taken, end)
+
+
+@triton.jit
+def composite(
+    ray_offset, t, dt, density, colour, background, ray_count, ray_colour, opacity, depth, capacity,
+    CHUNK: tl.constexpr,
+):  # fmt: skip
+    """Quadrature of the volume rendering integral (Mildenhall et al. 2020, eq. 3) over packed samples, a ray each."""
+    r = tl.program_id(0)
+    if r >= tl.load(ray_count).to(tl.int32):
+        return
+    begin, end = _span(ray_offset, r, capacity)
+    c0 = tl.zeros([CHUNK], tl.float32)
+    c1 = tl.zeros([CHUNK], tl.float32)
+    c2 = tl.zeros([CHUNK], tl.float32)
+    distance = tl.zeros([CHUNK], tl.float32)
+    before = tl.sum(c0, 0)  # thickness in front of the chunk
+    taken_in = before  # and of the samples that light reaches
+    for first in range(begin, end, CHUNK):
+        i = first + tl.arange(0, CHUNK)
+        here = i < end
+        thickness = tl.load(density + i, mask=here, other=0.0) * tl.load(dt + i, mask=here, other=0.0)
+        thickness = tl.minimum(thickness, OPAQUE)
+        reaching = tl.exp(thickness - tl.cumsum(thickness, 0) - before)
+        weight = tl.where(reaching >= LEAST, reaching * (1.0 - tl.exp(-thickness)), 0.0)
+        c0 += weight * tl.load(colour + i, mask=here, other=0.0)
+        c1 += weight * tl.load(colour + capacity + i, mask=here, other=0.0)
+        c2 += weight * tl.load(colour + 2 * capacity + i, mask=here, other=0.0)
+        distance += weight * tl.load(t + i, mask=here, other=0.0)
+        before += tl.sum(thickness, 0)
+        taken_in += tl.sum(tl.where(reaching >= LEAST, thickness, 0.0), 0)
+    last = tl.exp(-taken_in)
+    tl.store(ray_colour + 3 * r, tl.sum(c0, 0) + last * tl.load(background + 3 * r))
+    tl.store(ray_colour + 3 * r + 1, tl.sum(c1, 0) + last * tl.load(background + 3 * r + 1))
+    tl.store(ray_colour + 3 * r + 2, tl.sum(c2, 0) + last * tl.load(background + 3 * r + 2))
+    tl.store(opacity + r, 1.0 - last)
+    tl.store(depth + r, tl.sum(distance, 0) / tl.maximum(1.0 - last, 1e-6))
+
+
+@triton.jit
+def composite_backward(
+    ray_offset, dt, density, colour, ray_count, ray_colour, opacity, g_ray_colour, g_opacity, g_density, g_colour,
+    capacity, CHUNK: tl.constexpr,
+):  # fmt: skip
+    """Gradients to density and sample colour from those of the rays' colour and opacity, a ray each."""
+    r = tl.program_id(0)
+    if r >= tl.load(ray_count).to(tl.int32):
+        return
+    begin, end = _span(ray_offset, r, capacity)
+    g0, g1, g2 = (
+        tl.load(g_ray_colour + 3 * r),
+        tl.load(g_ray_colour + 3 * r + 1),
+        tl.load(g_ray_colour + 3 * r + 2),
+    )
+    # What lies behind the sample at hand, background included, weighed by the colour's gradient.
+    behind = g0 * tl.load(ray_colour + 3 * r) + g1 * tl.load(ray_colour + 3 * r + 1)
+    behind += g2 * tl.load(ray_colour + 3 * r + 2)
+    through = tl.load(g_opacity + r) * (1.0 - tl.load(opacity + r))
+    before = behind * 0.0
+    for first in range(begin, end, CHUNK):
+        i = first + tl.arange(0, CHUNK)
+        here = i < end
+        length = tl.load(dt + i, mask=here, other=0.0)
+        thickness = tl.minimum(tl.load(density + i, mask=here, other=0.0) * length, OPAQUE)
+        inclusive = before + tl.cumsum(thickness, 0)
+        reached = tl.exp(thickness - inclusive) >= LEAST
+        weight = tl.where(reached, tl.exp(thickness - inclusive) * (1.0 - tl.exp(-thickness)), 0.0)
+        q = g0 * tl.load(colour + i, mask=here, other=0.0)
+        q += g1 * tl.load(colour + capacity + i, mask=here, other=0.0)
+        q += g2 * tl.load(colour + 2 * capacity + i, mask=here, other=0.0)
+        later = behind - tl.cumsum(weight * q, 0)
+        g = tl.where(reached, length * (tl.exp(-inclusive) * q - later + through), 0.0)
+        tl.store(g_density + i, g, mask=here)
+        tl.store(g_colour + i, weight * g0, mask=here)
+        tl.store(g_colour + capacity + i, weight * g1, mask=here)
+        tl.store(g_colour + 2 * capacity + i, weight * g2, mask=here)
+        behind -= tl.sum(weight * q, 0)
+        before += tl.sum(thickness, 0)
+
+
+@triton.jit
+def ray_gradients(
+    origin, direction, ray_offset, ray_count, t, g_x, g_view, g_origin, g_direction, g_harmonics, capacity,
+    UNBOUNDED: tl.constexpr, CHUNK: tl.constexpr,
+):  # fmt: skip
+    """Sum the samples' gradients to grid positions g_x [3, n] and view harmonics g_view [16, n] into their rays."""
+    r = tl.program_id(0)
+    if r >= tl.load(ray_count).to(tl.int32):
+        return
+    begin, end = _span(ray_offset, r, capacity)
+    ox, oy, oz = tl.load(origin + 3 * r), tl.load(origin + 3 * r + 1), tl.load(origin + 3 * r + 2)
+    dx, dy, dz = tl.load(direction + 3 * r), tl.load(direction + 3 * r + 1), tl.load(direction + 3 * r + 2)
+    lane, k = tl.arange(0, CHUNK), tl.arange(0, 16)
+    a0 = tl.zeros([CHUNK], tl.float32)
+    a1, a2, b0, b1, b2 = a0, a0, a0, a0, a0
+    harmonics = tl.zeros([16], tl.float32)
+    for first in range(begin, end, CHUNK):
+        i = first + lane
+        here = i < end
+        at = tl.load(t + i, mask=here, other=0.0)
+        u = tl.load(g_x + i, mask=here, other=0.0)
+        v = tl.load(g_x + capacity + i, mask=here, other=0.0)
+        w = tl.load(g_x + 2 * capacity + i, mask=here, other=0.0)
+        px, py, pz = ox + at * dx, oy + at * dy, oz + at * dz
+        factor, m = _contraction(px, py, pz, UNBOUNDED)
+        if UNBOUNDED:
+            # y = f(m) x, f = (2 - 1/m)/m: J^T g = f g + f'(m) sign(x_k) (x . g) e_k, k the largest axis.
+            inverse = 1.0 / tl.maximum(m, 1.0)
+            along = 0.25 * (2.0 * inverse - 2.0) * inverse * inverse * (px * u + py * v + pz * w)
+            first_axis = tl.abs(px) == m
+            second_axis = (tl.abs(py) == m) & (first_axis == 0)
+            third_axis = (first_axis == 0) & (second_axis == 0)
+            u = factor * u + tl.where(first_axis, tl.where(px > 0, along, -along), 0.0)
+            v = factor * v + tl.where(second_axis, tl.where(py > 0, along, -along), 0.0)
+            w = factor * w + tl.where(third_axis, tl.where(pz > 0, along, -along), 0.0)
+        else:
+            u, v, w = factor * u, factor * v, factor * w
+        a0, a1, a2 = a0 + u, a1 + v, a2 + w
+        b0, b1, b2 = b0 + at * u, b1 + at * v, b2 + at * w
+        tile = tl.load(g_view + k[:, None] * capacity + i[None, :], mask=here[None, :], other=0.0)
+        harmonics += tl.sum(tile, 1)
+    tl.store(g_origin + 3 * r, tl.sum(a0, 0))
+    tl.store(g_origin + 3 * r + 1, tl.sum(a1, 0))
+    tl.store(g_origin + 3 * r + 2, tl.sum(a2, 0))
+    tl.store(g_direction + 3 * r, tl.sum(b0, 0))
+    tl.store(g_direction + 3 * r + 1, tl.sum(b1, 0))
+    tl.store(g_direction + 3 * r + 2, tl.sum(b2, 0))
+    tl.store(g_harmonics + 16 * r + k, harmonics)

@@ -1,0 +1,152 @@
+"""The device memory of a field's kernels: buffers of fixed capacity, under the names of the kernels' parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from biresnerf.field.cuda.launches import Plan
+from biresnerf.field.grid_field import GridField
+from biresnerf.field.grid_levels import GridLevels
+from biresnerf.field.radiance_field import OUTPUTS
+from biresnerf.field.spherical_harmonics import VIEW_FEATURES
+
+MODULES = ("pose", "reconstruction")
+CONTROLS = (
+    "ray_count", "trained_rays", "interval", "near", "far",
+    "pose_smoothing", "reconstruction_smoothing", "pose_share", "reconstruction_share",
+)  # fmt: skip
+PROGRAMS_ELSEWHERE = 3
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """Rays and samples that fit, samples a ray may have, and cells a side of the occupancy grid."""
+
+    rays: int
+    samples: int
+    most: int
+    side: int
+
+    def holds(self, other: Capacity) -> bool:
+        fits = self.rays >= other.rays and self.samples >= other.samples and self.most >= other.most
+        return fits and self.side == other.side
+
+
+class Workspace:
+    """Buffers of one capacity and the plans bound to them. A field makes another when it needs a larger one."""
+
+    def __init__(self, field: GridField, capacity: Capacity) -> None:
+        self.capacity, self.shape, self.device = capacity, field.shape, field.device
+        self.modules = MODULES if field.reconstructing else MODULES[:1]
+        self.grids: dict[str, GridLevels] = dict(
+            zip(MODULES, (self.shape.pose_grid, self.shape.reconstruction_grid), strict=True)
+        )
+        self.width = sum(self.grids[name].width for name in self.modules)
+        self.programs = (
+            torch.cuda.get_device_properties(self.device).multi_processor_count
+            if self.device.type == "cuda"
+            else PROGRAMS_ELSEWHERE
+        )
+        columns = [field.reconstruction_columns] if field.reconstructing else []
+        # In the order in which the two backward kernels sum their gradients.
+        self.density_weights = [*field.networks[:2], *columns]
+        self.colour_weights = field.networks[2:]
+        self.controls = torch.zeros(len(CONTROLS), device=self.device)
+        self.buffers: dict[str, Tensor] = {
+            **self._rays(),
+            **self._samples(),
+            **{name: self.controls[i : i + 1] for i, name in enumerate(CONTROLS)},
+            **dict(zip(("w1", "w2", "w3", "w4", "w5"), field.networks, strict=True)),
+            "columns": field.reconstruction_columns,
+        }
+        self.tables = {
+            name: _level_buffers(self.grids[name], table, field.moments[name])
+            for name, table in zip(MODULES, (field.pose_table, field.reconstruction_table), strict=True)
+            if name in self.modules
+        }
+        self._plans: dict[Callable[[Workspace], list[Any]], Plan] = {}
+
+    def plan(self, launches: Callable[[Workspace], list[Any]]) -> Plan:
+        """The plan that `launches` makes of this workspace, made once."""
+        if launches not in self._plans:
+            self._plans[launches] = Plan(launches(self), self.device)
+        return self._plans[launches]
+
+    def write_controls(self, values: dict[str, float]) -> None:
+        """Set what changes from step to step."""
+        # Memory that is not pinned is copied aside before the call returns, so the host neither waits nor races.
+        self.controls.copy_(torch.tensor([values[name] for name in CONTROLS]), non_blocking=True)
+
+    def record(self) -> None:
+        """Make graphs of all plans that have run."""
+        for plan in self._plans.values():
+            plan.record()
+
+    def weight_gradients(self) -> list[Tensor]:
+        """The gradients of the density and the colour weights, as views of the buffers that hold them."""
+        gradients = []
+        for name, weights in (
+            ("g_density_weights", self.density_weights),
+            ("g_colour_weights", self.colour_weights),
+        ):
+            parts = self.buffers[name].split([weight.numel() for weight in weights])
+            gradients += [part.view(weight.shape) for part, weight in zip(parts, weights, strict=True)]
+        return gradients
+
+    def _rays(self) -> dict[str, Tensor]:
+        n = self.capacity.rays
+        shapes = {
+            "origin": (n, 3), "direction": (n, 3), "background": (n, 3), "jitter": (n,),
+            "start": (n, self.capacity.most), "view": (n, VIEW_FEATURES),
+            "ray_colour": (n, 3), "opacity": (n,), "depth": (n,), "g_ray_colour": (n, 3), "g_opacity": (n,),
+            "g_origin": (n, 3), "g_direction": (n, 3), "g_harmonics": (n, VIEW_FEATURES),
+        }  # fmt: skip
+        side = self.capacity.side
+        return {
+            **{name: torch.empty(shape, device=self.device) for name, shape in shapes.items()},
+            "count": torch.zeros(n, dtype=torch.int32, device=self.device),
+            "ray_offset": torch.zeros(n + 1, dtype=torch.int32, device=self.device),
+            "taken": torch.zeros(1, dtype=torch.int32, device=self.device),
+            "occupied": torch.zeros(side, side, side, dtype=torch.uint8, device=self.device),
+        }
+
+    def _samples(self) -> dict[str, Tensor]:
+        n = self.capacity.samples
+        density = sum(weight.numel() for weight in self.density_weights)
+        colour = sum(weight.numel() for weight in self.colour_weights)
+        shapes = {
+            "x": (3, n), "t": (n,), "dt": (n,), "density": (n,), "colour": (3, n), "features": (self.width, n),
+            "g_density": (n,), "g_colour": (3, n), "g_features": (self.width, n), "g_view": (VIEW_FEATURES, n),
+            "g_x": (3, n), "outputs": (OUTPUTS, n), "g_outputs": (OUTPUTS, n),
+            "density_sums": (self.programs, density), "g_density_weights": (density,),
+            "colour_sums": (self.programs, colour), "g_colour_weights": (colour,),
+            **{f"{name}_jacobian": (self.grids[name].levels, 6, n) for name in self.modules},
+        }  # fmt: skip
+        buffers = {name: torch.empty(shape, device=self.device) for name, shape in shapes.items()}
+        return {**buffers, "ray": torch.empty(n, dtype=torch.int32, device=self.device)}
+
+
+def _level_buffers(grid: GridLevels, table: Tensor, moments: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
+    """A module's table (an entry of two float32 also as one int64), its optimiser state and its geometry."""
+
+    def on_device(values: Any, dtype: torch.dtype) -> Tensor:
+        return torch.as_tensor(values).to(dtype).to(table.device)
+
+    return {
+        "table": table,
+        "words": table.view(torch.int64).reshape(-1),
+        "gradient": torch.zeros_like(table),
+        "moment1": moments[0],
+        "moment2": moments[1],
+        "rates": torch.zeros(grid.levels, device=table.device),
+        "corrections": torch.zeros(2, device=table.device),
+        "scale": on_device(grid.scale, torch.float32),
+        "stride": on_device(grid.stride.astype("int64"), torch.int32),
+        "hashed": on_device(grid.hashed, torch.int32),
+        "offset": on_device(grid.offset, torch.int64),
+    }
