@@ -20,6 +20,7 @@ from biresnerf.geometry.pose_error import rotation_angle_deg
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.pose_hypotheses import pose_hypotheses
 from biresnerf.refine.pose_parameters import PoseParameters
+from biresnerf.refine.shared_views import shared_shares
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +33,9 @@ DISTINCT_DEG = 8.0  # poses nearer than this to a better one are not tried besid
 LEAST_INTERVAL = 1.2e-2  # unit lengths: scoring needs no finer samples
 BETTER, NEAR_MEDIAN = 0.7, 1.5  # a pose is taken below this share of the old error and of the others' median;
 FAR_BETTER = 0.25  # or below this share of the old error alone: better than to stay where nothing is seen
+ALONE = 0.2  # sharing less of its view than this, a camera of an open scene must go elsewhere, however small its error
+ALONE_SIDE = 8  # as seen by 8 x 8 pixels
+ALONE_MOST = 0.2  # of all cameras: where more are alone, the photos were taken so
 FIRST_SHARE = 0.5  # of the least length of stage 1: the field has formed (open scenes: all of it)
 LAST_SHARE = 0.6  # of all steps: the repair within stage 2
 SETTLED_SHARE = 1 / 3  # of stage 2, at the least before that
@@ -73,50 +77,86 @@ class LostCameraRepair:
         if not optimiser.method.additions:
             return
         self._times = 3 if switching else self._times + 1 if optimiser.switch is None else 4
-        watch = optimiser.camera_errors
-        suspects = watch.suspects
-        relative = torch.where(suspects, watch.relative, -torch.inf)
-        worst_first = relative.argsort(descending=True, stable=True)[: int(suspects.sum())].tolist()
-        if not worst_first:
-            return
         total = float(optimiser.schedule.samples(optimiser.schedule.steps, 0)) * optimiser.schedule.steps
         allowance = min(self._spent + EVENT_SHARE * total, RUN_SHARE * total)
         self._marching = self._coarse_marching()
-        median = self._reference_error()
+        alone = self._alone()
+        suspects = optimiser.camera_errors.suspects | alone
+        relative = torch.where(suspects, optimiser.camera_errors.relative, -torch.inf)
+        worst_first = relative.argsort(descending=True, stable=True)[: int(suspects.sum())].tolist()
+        median = self._reference_error(suspects) if worst_first else 0.0
         for camera in worst_first:
             if self._spent >= allowance:
                 logger.info("no budget left to repair camera %d", camera)
                 break
-            self._repair(camera, median)
+            self._repair(camera, median, ~suspects, alone=bool(alone[camera]))
 
     @torch.no_grad()
-    def _reference_error(self) -> float:
+    def _alone(self) -> Tensor:
+        """Mask [n] of training cameras that look where nearly nobody else does: no error tells them."""
+        optimiser = self.optimiser
+        alone = torch.zeros(len(optimiser.poses), dtype=torch.bool, device=optimiser.device)
+        if not optimiser.frame.unbounded:
+            return alone  # the scene ends at its box, and who looks elsewhere sees nothing
+        everyone = torch.arange(len(alone), device=optimiser.device)
+        unshared = self._shared(optimiser.poses.matrices(), everyone) < ALONE
+        unshared &= ~optimiser.camera_errors.held_out
+        return unshared if float(unshared.float().mean()) <= ALONE_MOST else alone
+
+    @torch.no_grad()
+    def _shared(self, matrices: Tensor, image: Tensor) -> Tensor:
+        """How much [k] of what cameras of photos `image` [k] would see from poses [k, 3, 4] others see, too."""
+        optimiser, points = self.optimiser, []
+        for part in torch.arange(len(image), device=optimiser.device).split(CHUNK // ALONE_SIDE**2):
+            owner = part.repeat_interleave(ALONE_SIDE**2)
+            xy = self._grid(image[owner], ALONE_SIDE)
+            origin, direction = optimiser.cast(matrices[owner], image[owner], xy)
+            rendering = self._render(matrices[owner], image[owner], xy, PositionGradient())
+            self._spent += FORWARD_COST * rendering.samples
+            points.append((origin + rendering.depth[:, None] * direction).reshape(len(part), -1, 3))
+        return shared_shares(torch.cat(points), image, optimiser.poses.matrices(), optimiser.intrinsics)
+
+    def _grid(self, image: Tensor, side: int) -> Tensor:
+        """Centres [rays, 2] of `side` x `side` pixels spread over each photo; `image` [rays] names it that often."""
+        along = (torch.arange(side, device=image.device) + 0.5) / side
+        grid = torch.stack(torch.meshgrid(along, along, indexing="xy"), -1).reshape(-1, 2)
+        size = self.optimiser.sampler.sizes[0][image]
+        return (grid.repeat(len(image) // len(grid), 1) * size).floor() + 0.5
+
+    @torch.no_grad()
+    def _reference_error(self, suspects: Tensor) -> float:
         """Median score of cameras that are not lost."""
-        watch = self.optimiser.camera_errors
-        trusted = torch.nonzero(~watch.suspects & ~watch.held_out)[:, 0]
+        trusted = torch.nonzero(~suspects & ~self.optimiser.camera_errors.held_out)[:, 0]
         if len(trusted) == 0:
             return 0.0
         chosen = trusted[torch.linspace(0, len(trusted) - 1, min(REFERENCES, len(trusted))).long()]
         return float(self._scores(self.optimiser.poses.matrices()[chosen], chosen).median())
 
-    def _repair(self, camera: int, median: float) -> None:
-        optimiser, watch = self.optimiser, self.optimiser.camera_errors
+    def _repair(self, camera: int, median: float, trusted: Tensor, *, alone: bool) -> None:
+        optimiser = self.optimiser
         now = optimiser.poses.poses().numpy()
         hypotheses = pose_hypotheses(
-            self._given, now, camera, ~watch.suspects.cpu().numpy(), optimiser.photo_distances[camera]
+            self._given, now, camera, trusted.cpu().numpy(), optimiser.photo_distances[camera]
         )
         tried = torch.from_numpy(np.concatenate([now[camera : camera + 1], hypotheses])[:, :3])
         tried = tried.float().to(optimiser.device)
         image = torch.full((len(tried),), camera, device=optimiser.device)
         scores = self._scores(tried, image)
         old = float(scores[0])
+        bound = min(BETTER * old, max(NEAR_MEDIAN * median, FAR_BETTER * old))
+        if alone:  # its own error says nothing, nor does that of another pose with a view of its own
+            bound = NEAR_MEDIAN * median
+            shared = self._shared(tried, image) >= ALONE
+            if not bool(shared.any()):
+                return
+            tried, scores = tried[shared], scores[shared]
         for keep, rays, steps in ROUNDS:
             chosen = _distinct(tried, scores, keep)
             tried = self._optimised(tried[chosen], camera, rays, steps)
             scores = self._scores(tried, image[: len(tried)])
             best = int(scores.argmin())
             error = float(scores[best])
-            taken = error < BETTER * old and error < max(NEAR_MEDIAN * median, FAR_BETTER * old)
+            taken = error < bound
             if taken and (optimiser.switch is None or error < median):
                 break  # the run itself brings it the rest of the way
         logger.info(
@@ -131,12 +171,9 @@ class LostCameraRepair:
     def _scores(self, matrices: Tensor, image: Tensor) -> Tensor:
         """Mean squared error [k] of photos `image` [k] seen from poses [k, 3, 4], on a fixed grid of pixels."""
         optimiser = self.optimiser
-        side = (torch.arange(SCORE_SIDE, device=optimiser.device) + 0.5) / SCORE_SIDE
-        grid = torch.stack(torch.meshgrid(side, side, indexing="xy"), -1).reshape(-1, 2)
-        owner = torch.arange(len(image), device=optimiser.device).repeat_interleave(len(grid))
+        owner = torch.arange(len(image), device=optimiser.device).repeat_interleave(SCORE_SIDE**2)
         rays = image[owner]
-        size = optimiser.sampler.sizes[0][rays]
-        xy = (grid.repeat(len(image), 1) * size).floor() + 0.5
+        xy = self._grid(rays, SCORE_SIDE)
         target = optimiser.sampler.colours(rays, xy, self._blur())
         errors = []
         for part in torch.arange(len(rays), device=optimiser.device).split(CHUNK):
