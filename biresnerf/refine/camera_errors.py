@@ -125,7 +125,7 @@ class CameraErrors:
         """One batch: image [rays], colours [rays, 3] rendered and wanted, opacity [rays]."""
         squared = ((colour - target) ** 2).mean(1)
         for total, values in zip(self._sums, (torch.ones_like(squared), squared, opacity), strict=True):
-            total += torch.bincount(image, values, len(self.errors))
+            total.index_add_(0, image, values)
 
     def close_block(self) -> None:
         """Take the block's errors into the moving average and look who stands out."""

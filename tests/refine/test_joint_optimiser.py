@@ -112,3 +112,32 @@ def test_another_seed_is_another_run_and_the_same_seed_the_same(scene):
 
     assert torch.equal(run(4), run(4))
     assert not torch.equal(run(4), run(5))
+
+
+def test_a_camera_given_another_pose_starts_over_as_free_as_any(scene):
+    optimiser = tiny_optimiser(*scene, tiny_options(pose_parametrisation="so3xr3_camp"))
+    optimiser.mobility[:, 2] = 0.0
+    for _ in range(3):
+        optimiser.step()
+    other = optimiser.poses.start[4].clone()
+    kept = optimiser.poses.preconditioner.clone()
+    optimiser.replace_pose(2, other)
+    assert torch.allclose(optimiser.poses.matrices()[2], other)
+    assert bool((optimiser.mobility == 1).all())
+    # Its coordinates are those of where it stands now, and where another camera started.
+    assert torch.allclose(optimiser.poses.preconditioner[2], kept[4], atol=1e-4)
+    assert torch.equal(optimiser.poses.preconditioner[[0, 1, 3, 4]], kept[[0, 1, 3, 4]])
+
+
+def test_lost_cameras_weigh_less_in_our_loss_and_in_no_other_methods(scene):
+    for method, weighed in (("biresnerf", True), ("biresnerf-paper", False)):
+        losses = []
+        for lost in (False, True):
+            optimiser = tiny_optimiser(*scene, tiny_options(method=method))
+            watch = optimiser.camera_errors
+            if lost:
+                weights = torch.ones(7)
+                weights[3] = 0.0
+                watch.weights = weights
+            losses.append(float(optimiser.step().loss))
+        assert (losses[1] < 0.99 * losses[0]) == weighed

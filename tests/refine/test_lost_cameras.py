@@ -14,11 +14,13 @@ from biresnerf.data.images import ImageSet
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_robust
+from biresnerf.output_folder import OutputFolder
 from biresnerf.refine import lost_cameras
 from biresnerf.refine.checkpoint import load_checkpoint
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.pose_parameters import PoseParameters
 from biresnerf.refine.scene_frame import scene_frame
+from biresnerf.refine.start import Start
 from biresnerf.refine.two_stages import TwoStages
 from tests.refine.scene import CPU, tiny_options, tiny_set
 
@@ -155,6 +157,21 @@ def test_in_an_open_scene_a_camera_that_looks_where_nobody_does_is_brought_home(
     assert (
         errors_deg(stages, truth)[TURNED] < 60
     )  # the field has hardly formed: the view is found, not yet the pose
+
+
+def test_the_report_names_those_that_stay_lost(scene, tmp_path):
+    stages = start(scene, tmp_path, true_poses(scene), stop_at=1)
+    stages.run()
+    stages.optimiser.camera_errors._stood_out[TURNED] = 2
+    stages.repair.repaired = [ORBITED]
+    dataset, images = scene
+    given = Start(dataset.world_from_cam, "given", np.zeros(len(dataset), bool))
+    report = OutputFolder(tmp_path).write_result(
+        dataset, given, images, stages, HELD_OUT, [], threads=1, state="partial"
+    )
+    assert [image.name for image in report.images if image.lost] == [dataset.names[TURNED]]
+    assert [image.name for image in report.images if image.repaired] == [dataset.names[ORBITED]]
+    assert [dataset.names[TURNED] in warning for warning in report.warnings] == [True]
 
 
 def test_a_replaced_pose_has_no_momentum_and_others_keep_theirs():
