@@ -11,7 +11,7 @@ import click
 from biresnerf.errors import InputError
 
 if TYPE_CHECKING:
-    from biresnerf.geometry.pose_error import PoseError, Spread
+    from biresnerf.geometry.pose_error import FrameError, PoseError, Spread
 
 _ROWS = (
     ("rotation_deg", "rotation (deg)"),
@@ -19,24 +19,31 @@ _ROWS = (
     ("translation", "translation t of cam_from_world"),
     ("translation_table", "  the same x100 at distance 4"),
 )
+_TITLES = {
+    "aligned": "aligned",
+    "aligned_robust": "robust",
+    "own_frame": "own frame",
+    "paper_compat": "paper compat",
+}
 
 
 @click.command("pose-error")
 @click.argument("result", type=click.Path(path_type=Path))
 @click.argument("truth", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")
-def pose_error_command(result: Path, truth: Path, as_json: bool) -> None:
+@click.option("--paper-compat", is_flag=True, help="Add the alignment of BARF's and BAA-NGP's code.")
+def pose_error_command(result: Path, truth: Path, as_json: bool, paper_compat: bool) -> None:
     """Compare the poses of RESULT with those of TRUTH.
 
     Both are transforms.json files or folders that hold one. Images are matched by name, with or without
     extension; they need not be there. "aligned" is after the best similarity of the camera centres, as
     published tables have it; "robust" after one that single lost cameras do not drag along; "own frame"
-    without any alignment.
+    without any alignment. --paper-compat adds the alignment of the published code with its flaw on flat rigs.
     """
     import numpy as np
 
     from biresnerf.data.pose_file import read_poses
-    from biresnerf.geometry.pose_error import pose_error
+    from biresnerf.geometry.pose_error import paper_compat_error, pose_error
 
     estimated, true = read_poses(result), read_poses(truth)
     pairs = matched_names(list(estimated), list(true))
@@ -47,14 +54,16 @@ def pose_error_command(result: Path, truth: Path, as_json: bool) -> None:
             where=str(result),
             mend="Compare files of the same images; file_path decides.",
         )
-    error = pose_error(
-        np.stack([estimated[name] for name, _ in pairs]), np.stack([true[name] for _, name in pairs])
-    )
+    both = np.stack([estimated[name] for name, _ in pairs]), np.stack([true[name] for _, name in pairs])
+    error = pose_error(*both)
+    frames = {"aligned": error.aligned, "aligned_robust": error.aligned_robust, "own_frame": error.own_frame}
+    if paper_compat:
+        frames["paper_compat"] = paper_compat_error(*both)
     left_out = {"result": len(estimated) - len(pairs), "truth": len(true) - len(pairs)}
     if as_json:
-        click.echo(json.dumps(_as_json(error, [name for name, _ in pairs], left_out)))
+        click.echo(json.dumps(_as_json(error, frames, [name for name, _ in pairs], left_out)))
     else:
-        click.echo(_as_table(error, [name for name, _ in pairs], left_out))
+        click.echo(_as_table(error, frames, [name for name, _ in pairs], left_out))
 
 
 def matched_names(estimated: list[str], true: list[str]) -> list[tuple[str, str]]:
@@ -88,24 +97,23 @@ def _bare(name: str) -> str:
     return str(Path(name).with_suffix("")) if is_image_name(Path(name)) else name
 
 
-def _as_json(error: PoseError, names: list[str], left_out: dict[str, int]) -> dict[str, Any]:
-    values = error.model_dump()
-    for frame in ("aligned", "aligned_robust", "own_frame"):
-        values[frame]["worst"] = names[values[frame]["worst"]]
-    return {**values, "left_out": left_out}
+def _as_json(
+    error: PoseError, frames: dict[str, FrameError], names: list[str], left_out: dict[str, int]
+) -> dict[str, Any]:
+    named = {key: {**frame.model_dump(), "worst": names[frame.worst]} for key, frame in frames.items()}
+    return {**error.model_dump(), **named, "left_out": left_out}
 
 
-def _as_table(error: PoseError, names: list[str], left_out: dict[str, int]) -> str:
+def _as_table(
+    error: PoseError, frames: dict[str, FrameError], names: list[str], left_out: dict[str, int]
+) -> str:
     lines = [f"{error.cameras} cameras; distance {error.reference_distance:.6g} ({error.reference})"]
     if any(left_out.values()):
         lines.append(
             f"left out: {left_out['result']} only in the result, {left_out['truth']} only in the truth"
         )
-    for title, frame in (
-        ("aligned", error.aligned),
-        ("robust", error.aligned_robust),
-        ("own frame", error.own_frame),
-    ):
+    for key, frame in frames.items():
+        title = _TITLES[key]
         lines.append(f"\n{title:<34}{'mean':>12}{'median':>12}{'max':>12}   worst {names[frame.worst]}")
         for key, label in _ROWS:
             spread: Spread = getattr(frame, key)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.geometry.focus import focus_point
-from biresnerf.geometry.similarity import Similarity, align_robust, align_umeyama
+from biresnerf.geometry.similarity import Similarity, align_robust, align_row_flip, align_umeyama
 
 Array = NDArray[np.float64]
 
@@ -115,29 +115,39 @@ def pose_error(estimate: Array, truth: Array) -> PoseError:
     estimate, truth = np.asarray(estimate, dtype=np.float64), np.asarray(truth, dtype=np.float64)
     truth_from_estimate = align_umeyama(estimate, truth)
     robust_truth_from_estimate = align_robust(estimate, truth)
-    origin, distance, reference = _reference(truth)
+    _, distance, reference = _reference(truth)
+    return PoseError(
+        cameras=len(truth),
+        aligned=_frame_error(truth_from_estimate.apply_to_poses(estimate), truth),
+        aligned_robust=_frame_error(robust_truth_from_estimate.apply_to_poses(estimate), truth),
+        own_frame=_frame_error(estimate, truth),
+        reference_distance=distance,
+        reference=reference,
+    )
+
+
+def paper_compat_error(estimate: Array, truth: Array) -> FrameError:
+    """Errors after the alignment of BARF's and BAA-NGP's code, its flaw included (`align_row_flip`).
+
+    Args and errors as `pose_error`.
+    """
+    estimate, truth = np.asarray(estimate, dtype=np.float64), np.asarray(truth, dtype=np.float64)
+    return _frame_error(align_row_flip(estimate, truth).apply_to_poses(estimate), truth)
+
+
+def _frame_error(moved: Array, truth: Array) -> FrameError:
+    origin, distance, _ = _reference(truth)
     table_from_truth = Similarity(
         _TABLE_DISTANCE / distance, np.eye(3), -origin * (_TABLE_DISTANCE / distance)
     )
-
-    def in_frame(moved: Array) -> FrameError:
-        errors = camera_errors(moved, truth)
-        table = camera_errors(table_from_truth.apply_to_poses(moved), table_from_truth.apply_to_poses(truth))
-        return FrameError(
-            rotation_deg=_spread(errors.rotation_deg),
-            translation=_spread(errors.translation),
-            translation_table=_spread(100.0 * table.translation),
-            centre_percent=_spread(100.0 * errors.centre / distance),
-            worst=int(errors.rotation_deg.argmax()),
-        )
-
-    return PoseError(
-        cameras=len(truth),
-        aligned=in_frame(truth_from_estimate.apply_to_poses(estimate)),
-        aligned_robust=in_frame(robust_truth_from_estimate.apply_to_poses(estimate)),
-        own_frame=in_frame(estimate),
-        reference_distance=distance,
-        reference=reference,
+    errors = camera_errors(moved, truth)
+    table = camera_errors(table_from_truth.apply_to_poses(moved), table_from_truth.apply_to_poses(truth))
+    return FrameError(
+        rotation_deg=_spread(errors.rotation_deg),
+        translation=_spread(errors.translation),
+        translation_table=_spread(100.0 * table.translation),
+        centre_percent=_spread(100.0 * errors.centre / distance),
+        worst=int(errors.rotation_deg.argmax()),
     )
 
 

@@ -93,6 +93,27 @@ def align_umeyama(a_from_cam: Array, b_from_cam: Array) -> Similarity:
     return _align_weighted(a, b, ones, ones)
 
 
+def align_row_flip(a_from_cam: Array, b_from_cam: Array) -> Similarity:
+    """As `align_umeyama` with the published code's way out of a reflection: the third row of the rotation negated.
+
+    It is no best rotation then: on flat rigs that are tilted in b it is wrong by tens of degrees. Only to compare with
+    figures made by BARF's or BAA-NGP's evaluation.
+
+    Raises:
+        ValueError: as `align_umeyama`.
+    """
+    a, b = _rig_pair(a_from_cam, b_from_cam)
+    best = align_umeyama(a, b)
+    from_middle_a = a[:, :3, 3] - a[:, :3, 3].mean(0)
+    from_middle_b = b[:, :3, 3] - b[:, :3, 3].mean(0)
+    left, _, right_t = np.linalg.svd(from_middle_b.T @ from_middle_a)
+    rotation = left @ right_t
+    if np.linalg.det(rotation) < 0:
+        rotation[2] *= -1
+    middle_b = b[:, :3, 3].mean(0)
+    return Similarity(best.scale, rotation, middle_b - best.scale * rotation @ a[:, :3, 3].mean(0))
+
+
 def align_robust(a_from_cam: Array, b_from_cam: Array, *, with_rotations: bool = False) -> Similarity:
     """As `align_umeyama`, with cameras that do not follow the others weighed down.
 

@@ -49,6 +49,20 @@ def test_a_turned_camera_is_found_in_a_moved_frame_under_names_without_extension
     assert error["left_out"] == {"result": 0, "truth": 0}
 
 
+def test_the_published_alignment_is_added_on_request_only(tmp_path):
+    rng = np.random.default_rng(0)
+    truth = dome(9, rng)
+    estimate = truth.copy()
+    estimate[2, :3, 3] += 0.3
+    files = write(tmp_path / "a.json", estimate), write(tmp_path / "b.json", truth)
+    error = json.loads(run(*files, "--json", "--paper-compat"))
+    # A rig with depth has no reflection to mend: both alignments are one.
+    assert error["paper_compat"]["rotation_deg"] == pytest.approx(error["aligned"]["rotation_deg"])
+    assert "paper_compat" not in json.loads(run(*files, "--json"))
+    assert "paper compat" in run(*files, "--paper-compat")
+    assert "paper compat" not in run(*files)
+
+
 def test_applied_transform_and_scale_are_undone(tmp_path):
     truth = dome(6, np.random.default_rng(1))
     applied = np.eye(4)

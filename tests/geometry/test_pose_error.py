@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from biresnerf.geometry.pose_error import camera_errors, pose_error, rotation_angle_deg
+from biresnerf.geometry.pose_error import camera_errors, paper_compat_error, pose_error, rotation_angle_deg
 from tests.geometry.rigs import dome, jitter, look_at, similar
 
 
@@ -73,6 +73,27 @@ def test_a_tilted_flat_rig_is_measured_right_where_negating_a_row_measures_nonse
         flipped.append(rotation.mean() > 15)
     # The sign of a plane's third direction is noise: about half of the rigs meet the defect.
     assert 5 < sum(flipped) < 25
+
+
+def test_the_published_alignment_is_kept_with_its_flaw_and_right_without_it():
+    flipped = 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        truth = flat_rig(45, rng)
+        estimate = jitter(truth, rng, 0.01, 0.05)
+        published = paper_compat_error(estimate, truth).rotation_deg
+        if published.mean > 15:
+            flipped += 1
+        else:
+            assert published.mean == pytest.approx(
+                pose_error(estimate, truth).aligned.rotation_deg.mean, rel=1e-6
+            )
+    assert 5 < flipped < 25
+    rng = np.random.default_rng(1)
+    truth = dome(20, rng)
+    estimate = jitter(truth, rng, 0.05, 0.2)
+    rotation, _ = barf_errors(estimate, truth, "row")
+    assert paper_compat_error(estimate, truth).rotation_deg.mean == pytest.approx(rotation.mean(), rel=1e-6)
 
 
 @settings(deadline=None, max_examples=40)
