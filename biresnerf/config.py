@@ -15,6 +15,7 @@ PresetName = Literal["fast", "balanced", "quality", "paper"]
 Device = Literal["auto", "cpu", "cuda"]
 MethodName = Literal["biresnerf", "biresnerf-paper", "baa-ngp", "nerfacc-barf", "barf"]
 Background = Literal["auto", "white", "black", "none"]
+Wiring = Literal["concat", "replace", "residual"]
 DetectorName = Literal["trend", "counter", "variance"]
 PoseParametrisation = Literal["se3_world", "so3xr3", "so3xr3_camp"]
 StartPoses = Literal["auto", "given"]
@@ -87,6 +88,11 @@ class RefineOptions(BaseModel):
         "preconditioner.",
     )
 
+    wiring: Wiring = Field(
+        "concat",
+        description="How the reconstruction module joins: beside the pose-estimation module's features, in their "
+        "place with fresh networks, or with networks of its own whose outputs are added.",
+    )
     pose_levels: int = Field(3, ge=1, le=16, description="Levels of the pose-estimation module.")
     pose_resolution_min: int = Field(16, ge=2, le=128)
     pose_resolution_max: int = Field(72, ge=2, le=8192)

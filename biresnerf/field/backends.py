@@ -64,9 +64,16 @@ def directions_for(device: torch.device) -> Directions:
 
 
 def make_field(shape: FieldShape, seed: int, device: torch.device, threads: int) -> RadianceField:
-    """The fastest backend for the device: Numba kernels on the CPU, Triton kernels on CUDA."""
+    """The fastest backend for the device: Numba kernels on the CPU, Triton kernels on CUDA.
+
+    Two heads (the wiring `residual`) are in plain torch alone.
+    """
     field: RadianceField
-    if device.type == "cpu":
+    if shape.wiring == "residual":
+        from biresnerf.field.reference_field import ReferenceField
+
+        field = ReferenceField(shape, seed, device)
+    elif device.type == "cpu":
         from biresnerf.field.cpu_field import CpuField
 
         field = CpuField(shape, seed, device, threads)

@@ -1,8 +1,14 @@
 """The field on grid encodings: its parameters, and the optimiser step all its backends share.
 
 Two encodings, named by their job as in the paper: the pose-estimation module (low resolution, dense) and the
-reconstruction module (high resolution, hashed). Their features are concatenated; the reconstruction module's
-columns of the first layer start at zero, so switching it on leaves the function exactly as it was.
+reconstruction module (high resolution, hashed). How the second joins in stage 2 is the shape's `wiring`:
+
+- `concat`: the features stand side by side; the reconstruction module's columns of the first layer start at zero, so
+  switching it on leaves the function exactly as it was.
+- `replace`: the networks start afresh on the reconstruction module alone. The pose-estimation module's columns are
+  zero from then on, and it learns no more.
+- `residual`: the reconstruction module has networks of its own; their outputs, zero at first, are added to the others'
+  before density and colour are made of them.
 
 A field of one encoding has its grid in the place of the pose-estimation module, and no levels in the other.
 """
@@ -39,27 +45,18 @@ class GridField(RadianceField):
     def __init__(self, shape: FieldShape, seed: int, device: torch.device) -> None:
         self.shape, self.device, self.unbounded = shape, device, shape.unbounded
         self.reconstructing = False
-        generator = torch.Generator().manual_seed(seed)
-
-        def uniform(rows: int, columns: int, bound: float) -> Tensor:
-            values = torch.rand(rows, columns, generator=generator) * (2 * bound) - bound
-            return values.to(device)
-
-        def layer(rows: int, columns: int) -> Tensor:
-            return uniform(rows, columns, math.sqrt(6 / (rows + columns))).requires_grad_()  # Xavier
-
-        self.pose_table = uniform(shape.pose_grid.entries, FEATURES, TABLE_INIT)
-        self.reconstruction_table = uniform(shape.reconstruction_grid.entries, FEATURES, TABLE_INIT)
-        self.networks = [
-            layer(HIDDEN, shape.pose_grid.width),
-            layer(OUTPUTS, HIDDEN),
-            layer(HIDDEN, VIEW_FEATURES + OUTPUTS),
-            layer(HIDDEN, HIDDEN),
-            layer(3, HIDDEN),
-        ]
-        self.reconstruction_columns = torch.zeros(
-            HIDDEN, shape.reconstruction_grid.width, device=device
-        ).requires_grad_()
+        self._generator = torch.Generator().manual_seed(seed)
+        self.pose_table = self._uniform(shape.pose_grid.entries, FEATURES, TABLE_INIT)
+        self.reconstruction_table = self._uniform(shape.reconstruction_grid.entries, FEATURES, TABLE_INIT)
+        self.networks = self._draw_networks(shape.pose_grid.width)
+        high = shape.reconstruction_grid.width
+        self.reconstruction_columns = torch.zeros(HIDDEN, high, device=device).requires_grad_()
+        self.reconstruction_head: list[Tensor] = []  # of `residual`: what follows those columns
+        if shape.wiring == "residual":
+            self.reconstruction_columns, *self.reconstruction_head = self._draw_networks(high)
+            with torch.no_grad():
+                self.reconstruction_head[0][0] = 0.0  # the density's row
+                self.reconstruction_head[-1].zero_()  # the colour
         self.moments = {
             name: (torch.zeros_like(table), torch.zeros_like(table))
             for name, table in (("pose", self.pose_table), ("reconstruction", self.reconstruction_table))
@@ -72,13 +69,30 @@ class GridField(RadianceField):
         if shape.broadcast:
             self._first = self.networks[0].detach().clone().requires_grad_()
             self.reach(0.0)
-        fused = True if device.type == "cuda" else None  # one launch instead of a dozen
-        self._networks_adam = torch.optim.Adam(
-            [self._first, *self.networks[1:]], betas=(BETA1, BETA2), eps=EPSILON, fused=fused
+        self._networks_adam = self._adam([self._first, *self.networks[1:]])
+        self._columns_adam = self._adam([self.reconstruction_columns, *self.reconstruction_head])
+
+    def _uniform(self, rows: int, columns: int, bound: float) -> Tensor:
+        values = torch.rand(rows, columns, generator=self._generator) * (2 * bound) - bound
+        return values.to(self.device)
+
+    def _draw_networks(self, width: int) -> list[Tensor]:
+        """The five layers on `width` features, Xavier."""
+        sizes = (
+            (HIDDEN, width),
+            (OUTPUTS, HIDDEN),
+            (HIDDEN, VIEW_FEATURES + OUTPUTS),
+            (HIDDEN, HIDDEN),
+            (3, HIDDEN),
         )
-        self._columns_adam = torch.optim.Adam(
-            [self.reconstruction_columns], betas=(BETA1, BETA2), eps=EPSILON, fused=fused
-        )
+        return [
+            self._uniform(rows, columns, math.sqrt(6 / (rows + columns))).requires_grad_()
+            for rows, columns in sizes
+        ]
+
+    def _adam(self, parameters: list[Tensor]) -> torch.optim.Optimizer:
+        fused = True if self.device.type == "cuda" else None  # one launch instead of a dozen
+        return torch.optim.Adam(parameters, betas=(BETA1, BETA2), eps=EPSILON, fused=fused)
 
     @abstractmethod
     def _update_table(self, name: str, rates: np.ndarray) -> None:
@@ -97,11 +111,29 @@ class GridField(RadianceField):
 
     def start_reconstruction(self) -> None:
         self.reconstructing = True
+        if self.shape.wiring == "replace":
+            columns, *others = self._draw_networks(self.shape.reconstruction_grid.width)
+            with torch.no_grad():
+                self.networks[0].zero_()
+                for old, new in zip(
+                    [self.reconstruction_columns, *self.networks[1:]], [columns, *others], strict=True
+                ):
+                    old.copy_(new)
+            self._forget_first_layer()
+
+    def _forget_first_layer(self) -> None:
+        """The pose-estimation module's columns stay at zero; the networks' moments start afresh."""
+        self._networks_adam = self._adam(self.networks[1:])
+
+    @property
+    def _replaced(self) -> bool:
+        return self.reconstructing and self.shape.wiring == "replace"
 
     def step(self, rates: FieldRates) -> None:
         """One Adam step from the gradients of the last backward."""
-        self.steps["pose"] += 1
-        self._update_table("pose", np.full(self.shape.pose_grid.levels, rates.pose, np.float32))
+        if not self._replaced:
+            self.steps["pose"] += 1
+            self._update_table("pose", np.full(self.shape.pose_grid.levels, rates.pose, np.float32))
         if self._mixing is not None and self.networks[0].grad is not None:
             self._first.grad = self.networks[0].grad @ self._mixing.T
         self._step_networks(self._networks_adam, rates.networks)
@@ -128,6 +160,8 @@ class GridField(RadianceField):
         for i, weight in enumerate(self._learnt()):
             state[f"network{i}"] = weight.detach()
         state["reconstruction_columns"] = self.reconstruction_columns.detach()
+        for i, weight in enumerate(self.reconstruction_head):
+            state[f"reconstruction_head{i}"] = weight.detach()
         state.update(adam_state("adam_networks", self._networks_adam))
         state.update(adam_state("adam_columns", self._columns_adam))
         counters = [self.steps["pose"], self.steps["reconstruction"], int(self.reconstructing)]
@@ -144,9 +178,13 @@ class GridField(RadianceField):
             for i, weight in enumerate(self._learnt()):
                 weight.copy_(state[f"network{i}"])
             self.reconstruction_columns.copy_(state["reconstruction_columns"])
-        load_adam_state("adam_networks", self._networks_adam, state)
-        load_adam_state("adam_columns", self._columns_adam, state)
-        self._mix()
+            for i, weight in enumerate(self.reconstruction_head):
+                weight.copy_(state[f"reconstruction_head{i}"])
         pose, reconstruction, reconstructing = state["counters"].tolist()
         self.steps = {"pose": pose, "reconstruction": reconstruction}
         self.reconstructing = bool(reconstructing)
+        if self._replaced:
+            self._forget_first_layer()
+        load_adam_state("adam_networks", self._networks_adam, state)
+        load_adam_state("adam_columns", self._columns_adam, state)
+        self._mix()

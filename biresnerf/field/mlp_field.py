@@ -130,8 +130,17 @@ class MlpField(RadianceField):
                 marching.step, marching.near, marching.far, self.unbounded, marching.most,
             )  # fmt: skip
         x = self._contracted(rays.origin[ray] + t[:, None] * rays.direction[ray])
-        density, colour = self._query(x, rays.direction[ray], int((ray < rays.trained).sum()))
-        rgb, opacity, depth = reference.composite(density, colour, t, dt, ray, rays.background)
+        split = int((ray < rays.trained).sum())
+        density, colour = self._query(x, rays.direction[ray], split)
+        # Apart, so that not even the rounding of a sum takes anything from the other rays to the trained ones.
+        parts = [
+            reference.composite(density[s], colour[s], t[s], dt[s], ray[s] - first, rays.background[r])
+            for s, r, first in (
+                (slice(None, split), slice(None, rays.trained), 0),
+                (slice(split, None), slice(rays.trained, None), rays.trained),
+            )
+        ]
+        rgb, opacity, depth = (torch.cat(pair) for pair in zip(*parts, strict=True))
         return Rendering(rgb, opacity, depth.detach(), len(ray))
 
     def _render_stratified(self, rays: Rays, marching: Marching, bins: int) -> Rendering:

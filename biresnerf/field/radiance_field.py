@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from biresnerf.config import Wiring
 from biresnerf.field.grid_levels import GridLevels
 
 HIDDEN, OUTPUTS = 64, 16
@@ -18,6 +19,7 @@ BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 class FieldShape:
     """What a field on grids is made of. `unbounded` scenes are contracted outside the inner box [-1, 1]^3.
 
+    `wiring` says how the second grid joins the first in stage 2 (`GridField`).
     `broadcast`: levels of the first grid open from coarse to fine, closed ones repeating the finest open one
     (`coarse_to_fine.level_mixing`).
     """
@@ -26,6 +28,7 @@ class FieldShape:
     reconstruction_grid: GridLevels
     unbounded: bool
     broadcast: bool = False
+    wiring: Wiring = "concat"
 
 
 @dataclass(frozen=True)

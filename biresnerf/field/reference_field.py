@@ -34,25 +34,21 @@ class ReferenceField(GridField):
         self.pose_table.requires_grad_()
         self.reconstruction_table.requires_grad_()
 
-    def _features(self, x: Tensor, gradient: PositionGradient) -> Tensor:
-        features = [reference.encode(x, self.pose_table, self.shape.pose_grid, gradient.pose_smoothing)]
-        if self.reconstructing:
-            share = gradient.reconstruction_share
-            passed = x.detach() + share * (x - x.detach())
-            features.append(
-                reference.encode(
-                    passed,
-                    self.reconstruction_table,
-                    self.shape.reconstruction_grid,
-                    gradient.reconstruction_smoothing,
-                )
-            )
-        return torch.cat(features, 1)
-
-    def _first_layer(self) -> Tensor:
-        if self.reconstructing:
-            return torch.cat([self.networks[0], self.reconstruction_columns], 1)
-        return self.networks[0]
+    def _heads(self, x: Tensor, gradient: PositionGradient) -> list[tuple[Tensor, list[Tensor]]]:
+        """Features [n, width] and the networks they go to; the outputs of all heads are added."""
+        low = reference.encode(x, self.pose_table, self.shape.pose_grid, gradient.pose_smoothing)
+        if not self.reconstructing:
+            return [(low, self.networks)]
+        passed = x.detach() + gradient.reconstruction_share * (x - x.detach())
+        grid, table = self.shape.reconstruction_grid, self.reconstruction_table
+        high = reference.encode(passed, table, grid, gradient.reconstruction_smoothing)
+        if self.shape.wiring == "residual":
+            return [
+                (low, self.networks),
+                (high, [self.reconstruction_columns, *self.reconstruction_head]),
+            ]
+        first = torch.cat([self.networks[0], self.reconstruction_columns], 1)
+        return [(torch.cat([low, high], 1), [first, *self.networks[1:]])]
 
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
         with torch.no_grad():
@@ -75,25 +71,26 @@ class ReferenceField(GridField):
         self, x: Tensor, view: Tensor, gradient: PositionGradient, trained: bool
     ) -> tuple[Tensor, Tensor]:
         parameters = [self.pose_table, self.reconstruction_table, self.reconstruction_columns]
-        parameters += self.networks
-        if trained:
-            return reference.network(
-                self._features(x, gradient), view, [self._first_layer(), *self.networks[1:]]
-            )
+        parameters += [*self.networks, *self.reconstruction_head]
         for parameter in parameters:
-            parameter.requires_grad_(False)
-        result = reference.network(
-            self._features(x, gradient), view, [self._first_layer(), *self.networks[1:]]
-        )
+            parameter.requires_grad_(trained)
+        logits = [
+            reference.network_logits(features, view, weights)
+            for features, weights in self._heads(x, gradient)
+        ]
         for parameter in parameters:
             parameter.requires_grad_()
-        return result
+        density = torch.stack([head[0] for head in logits]).sum(0)
+        colour = torch.stack([head[1] for head in logits]).sum(0)
+        return reference.density_of(density), torch.sigmoid(colour)
 
     @torch.no_grad()
     def density(self, position: Tensor) -> Tensor:
-        features = self._features(position, PositionGradient())
-        outputs = torch.relu(features @ self._first_layer().T) @ self.networks[1].T
-        return reference.density_of(outputs[:, 0])
+        logits = [
+            (torch.relu(features @ weights[0].T) @ weights[1].T)[:, 0]
+            for features, weights in self._heads(position, PositionGradient())
+        ]
+        return reference.density_of(torch.stack(logits).sum(0))
 
     @torch.no_grad()
     def _update_table(self, name: str, rates: np.ndarray) -> None:
@@ -106,7 +103,7 @@ class ReferenceField(GridField):
 
     def discard_gradients(self) -> None:
         self.pose_table.grad = self.reconstruction_table.grad = None
-        for weight in (*self.networks, self.reconstruction_columns):
+        for weight in (*self.networks, self.reconstruction_columns, *self.reconstruction_head):
             weight.grad = None
 
 

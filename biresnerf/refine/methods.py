@@ -84,8 +84,9 @@ def build_field(
     method: Method, options: RefineOptions, frame: SceneFrame, device: torch.device, threads: int
 ) -> RadianceField:
     """The method's radiance field at its start; `options` must be resolved."""
+    if method.network or options.wiring == "residual":
+        torch.set_num_threads(threads)  # in plain torch, and the kernels are at rest
     if method.network:
-        torch.set_num_threads(threads)  # matrix products are all it does, and the kernels are at rest
         return MlpField(
             options.seed,
             device,
@@ -106,7 +107,7 @@ def build_field(
         dense = grid_levels(
             options.pose_levels, options.pose_resolution_min, options.pose_resolution_max, DENSE_TABLE_LOG2
         )
-        shape = FieldShape(dense, hashed, frame.unbounded)
+        shape = FieldShape(dense, hashed, frame.unbounded, wiring=options.wiring)
     return make_field(shape, options.seed, device, threads)
 
 
