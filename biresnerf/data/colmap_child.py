@@ -20,6 +20,7 @@ SEQUENTIAL_OVERLAP = 12  # neighbours that each image is matched with, where all
 
 # Small photos have few features: faint ones count as well, and fewer matches than COLMAP asks for must do.
 FAINTEST_PEAK, LEAST_MATCHES, LEAST_SEEN = 0.003, 12, 10
+ENOUGH_PLACED = 0.8  # of the images: no other way of mapping is tried then
 PAIR_OUTLIER = 3.0  # median disagreements beyond which a pair's matches are taken for repeated structure
 PAIR_OUTLIER_DEG = 30.0  # but not below this
 
@@ -64,7 +65,9 @@ def map_from_scratch(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def map_from_given(request: dict[str, Any]) -> dict[str, Any]:
-    """Features and matches with known intrinsics; models by both ways of mapping, guided by given poses.
+    """Features and matches with known intrinsics; the largest model of image by image mapping, guided by given poses.
+
+    Where that one leaves out many images, global mapping's model as well: it places more and makes more mistakes.
 
     One thread in every step: with more, the answer differs from run to run.
     """
@@ -102,6 +105,8 @@ def map_from_given(request: dict[str, Any]) -> dict[str, Any]:
             best = max(models.values(), key=lambda model: model.num_reg_images())
             images_of = describe(best)["images"]
             answer.append({"mapper": mapper, "images": images_of, "points": best.num_points3D()})
+            if len(images_of) >= ENOUGH_PLACED * len(request["cam_from_world"]):
+                break
     return {"models": answer}
 
 
