@@ -10,6 +10,7 @@ from torch import Tensor
 
 from biresnerf.field.cpu import encoding, network
 from biresnerf.field.cpu import rays as ray_kernels
+from biresnerf.field.cpu.harmonics import add_harmonics_gradient, harmonics
 from biresnerf.field.cpu.matrix_blocks import CHANNELS, from_tiles
 from biresnerf.field.cpu.samples import Samples, segments
 from biresnerf.field.cpu.segments import render_segments, render_segments_backward
@@ -27,7 +28,7 @@ from biresnerf.field.radiance_field import (
     Rays,
     Rendering,
 )
-from biresnerf.field.spherical_harmonics import VIEW_FEATURES, spherical_harmonics
+from biresnerf.field.spherical_harmonics import VIEW_FEATURES
 
 f4 = np.float32
 
@@ -106,9 +107,8 @@ class CpuField(GridField):
         return features, jacobians
 
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
-        harmonics = spherical_harmonics(rays.direction)
         colour, opacity, depth, count = _RenderRays.apply(
-            rays.origin, rays.direction, harmonics, self, rays, marching, gradient
+            rays.origin, rays.direction, self, rays, marching, gradient
         )
         return Rendering(colour, opacity, depth, int(count))
 
@@ -238,8 +238,10 @@ class _RenderRays(torch.autograd.Function):
     """Ties the kernels to autograd at the rays, so that poses are optimised like any other torch parameter."""
 
     @staticmethod
-    def forward(ctx, origin, direction, harmonics, field: CpuField, rays: Rays, marching, gradient):  # noqa: ANN001
-        o, d, view = origin.detach().numpy(), direction.detach().numpy(), harmonics.detach().numpy()
+    def forward(ctx, origin, direction, field: CpuField, rays: Rays, marching, gradient):  # noqa: ANN001
+        o, d = origin.detach().numpy(), direction.detach().numpy()
+        view = np.empty((len(d), VIEW_FEATURES), f4)
+        harmonics(d, view)
         samples, colour, opacity, depth = field.render_forward(o, d, view, rays, marching, gradient)
         ctx.kept = (field, samples, o, d, view, colour, opacity, gradient)
         tensors = (torch.from_numpy(colour), torch.from_numpy(opacity), torch.from_numpy(depth))
@@ -258,5 +260,5 @@ class _RenderRays(torch.autograd.Function):
         ray_kernels.ray_gradients(
             o, d, samples.offset, samples.t, dx, field.shape.unbounded, g_origin, g_direction
         )
-        grads = (torch.from_numpy(a) for a in (g_origin, g_direction, g_view))
-        return (*grads, None, None, None, None)
+        add_harmonics_gradient(d, g_view, g_direction)
+        return torch.from_numpy(g_origin), torch.from_numpy(g_direction), None, None, None, None
