@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import os
 from collections.abc import Callable
@@ -18,21 +19,43 @@ from biresnerf.geometry.camera import Intrinsics, directions_in_cam
 
 logger = logging.getLogger(__name__)
 
+LEAST_CAPABILITY = (8, 0)  # TF32, and shared memory enough for the networks' backward pass
+
 Directions = Callable[[Intrinsics, Tensor, Tensor], Tensor]
 
 
 def choose_device(device: Device) -> torch.device:
-    """The torch device asked for; `auto` takes CUDA where there is one. Raises `InputError` for CUDA without one."""
-    if device == "cuda" and not torch.cuda.is_available():
+    """The torch device asked for; `auto` takes CUDA where it can be used, and logs why where it cannot.
+
+    Raises `InputError` for CUDA that cannot be used.
+    """
+    if device == "cpu":
+        return torch.device("cpu")
+    problem = _cuda_problem()
+    if problem is None:
+        return torch.device("cuda")
+    if device == "cuda":
         raise InputError(
             "device_unavailable",
-            "CUDA was asked for, but torch finds no CUDA device.",
+            f"CUDA was asked for, but {problem}.",
             where="device",
-            mend="Use --device auto or cpu, or install torch with CUDA.",
+            mend="Use --device auto or cpu, or install torch with CUDA and, where it does not bring it, Triton.",
         )
-    if device == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    return torch.device(device)
+    if torch.cuda.is_available():
+        logger.warning("computing on the CPU: %s", problem)
+    return torch.device("cpu")
+
+
+def _cuda_problem() -> str | None:
+    """Why the CUDA backend cannot run here."""
+    if not torch.cuda.is_available():
+        return "torch finds no CUDA device"
+    if importlib.util.find_spec("triton") is None:
+        return "Triton, which its kernels are written in, is not installed"
+    capability = torch.cuda.get_device_capability()
+    if capability < LEAST_CAPABILITY:
+        return f"the GPU's compute capability is {capability[0]}.{capability[1]}, and the kernels need 8.0"
+    return None
 
 
 def use_threads(threads: int) -> int:

@@ -38,8 +38,10 @@ def _index(ix, iy, iz, hashed, stride, size):
 
 @triton.jit
 def _straight_through(fraction, smoothing):
-    """1 + smoothing (pi/2) sin(pi w): the factor on d w / dx of Heo et al. 2023."""
-    return 1.0 + smoothing * 1.5707963267948966 * tl.sin(fraction * 3.141592653589793)
+    """1 + smoothing (pi/2) sin(pi w): Heo et al. 2023's factor on d w/dx. cos series of w - 1/2, error 5e-7."""
+    q = (fraction - 0.5) * (fraction - 0.5) * 9.869604401089358
+    cosine = 1.0 - q * (0.5 - q * (1 / 24 - q * (1 / 720 - q * (1 / 40320 - q * (1 / 3628800)))))
+    return 1.0 + smoothing * 1.5707963267948966 * cosine
 
 
 @triton.jit
