@@ -61,12 +61,13 @@ def _fitted(
     length = optimiser.frame.distance / RIG_DISTANCE
     pose = PoseParameters(torch.from_numpy(unit_from_cam[None]), "se3_world", length, device)
     height, width = photo.shape[:2]
-    which = torch.full((FIT_RAYS,), index, device=device)
+    rays = min(FIT_RAYS, optimiser.rays)  # no more than a step of the run takes
+    which = torch.full((rays,), index, device=device)
     for step in range(FIT_STEPS):
-        x = torch.randint(width, (FIT_RAYS,), generator=optimiser.generator)
-        y = torch.randint(height, (FIT_RAYS,), generator=optimiser.generator)
+        x = torch.randint(width, (rays,), generator=optimiser.generator)
+        y = torch.randint(height, (rays,), generator=optimiser.generator)
         xy = torch.stack([x, y], 1).to(device) + 0.5
-        matrices = pose.matrices().expand(FIT_RAYS, 3, 4)
+        matrices = pose.matrices().expand(rays, 3, 4)
         origin, direction = optimiser.cast(matrices, which, xy, intrinsics)
         rendering = optimiser.render(
             origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=True
