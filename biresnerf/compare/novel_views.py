@@ -16,7 +16,7 @@ from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.camera import Intrinsics
 from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.geometry.similarity import align_robust
-from biresnerf.refine.evaluation import FIT_RATE, FIT_RAYS, FIT_STEPS, render_view
+from biresnerf.refine.evaluation import FIT_RATE, FIT_STEPS, fit_rays, render_view
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.pose_parameters import PoseParameters
 
@@ -61,7 +61,7 @@ def _fitted(
     length = optimiser.frame.distance / RIG_DISTANCE
     pose = PoseParameters(torch.from_numpy(unit_from_cam[None]), "se3_world", length, device)
     height, width = photo.shape[:2]
-    rays = min(FIT_RAYS, optimiser.rays)  # no more than a step of the run takes
+    rays = fit_rays(optimiser)
     which = torch.full((rays,), index, device=device)
     for step in range(FIT_STEPS):
         x = torch.randint(width, (rays,), generator=optimiser.generator)
@@ -72,6 +72,6 @@ def _fitted(
         rendering = optimiser.render(
             origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=True
         )
-        torch.nn.functional.smooth_l1_loss(rendering.colour, photo[y, x].to(device)).backward()
+        optimiser.method.loss(rendering.colour, photo[y, x].to(device)).backward()
         pose.step(FIT_RATE * 0.1 ** (step / FIT_STEPS))
     return pose.matrices().detach()[0]

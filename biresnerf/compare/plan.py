@@ -12,7 +12,8 @@ from biresnerf.compare.cell import Cell, CellResult, EqualTime, Perturbation, Sc
 from biresnerf.compare.run_cells import finished, run_in_child
 from biresnerf.config import RefineOptions, parse_options
 
-CALIBRATION_SHARE, CALIBRATION_LEAST = 0.1, 100  # of a variant's own steps; and no fewer steps than this
+# At equal time a variant's speed is measured by a probe, then by a run of about this share of the time.
+PROBE_STEPS, CALIBRATION_SHARE = 20, 0.1
 _SCALED = ("coarse_steps_min", "coarse_steps_max", "check_every", "warmup_steps")
 
 
@@ -118,27 +119,32 @@ def _entries(plan: Plan, run: Callable[[Cell, str], CellResult]) -> Iterator[Ent
 def _run_in_same_time(
     cell: Cell, first: CellResult, run: Callable[[Cell, str], CellResult], title: str
 ) -> CellResult:
-    """The cell with as many steps as fit into what the first variant took, judged by a short run of its own."""
+    """The cell with as many steps as fit into what the first variant took, judged by short runs of its own."""
     if first.outcome is None:
         return CellResult(cell=cell, error="the first variant failed, so there is no time to equal")
-    own_steps = int(cell.options.resolved().steps or 0)
-    steps = max(CALIBRATION_LEAST, round(own_steps * CALIBRATION_SHARE))
-    short = Cell(
-        scene=cell.scene.model_copy(update={"test_file": None, "test_views": 0}),
-        start=cell.start,
-        options=with_steps(cell.options, steps),
-    )
-    calibration = run(short, f"{title}, calibration")
-    if calibration.outcome is None:
-        return CellResult(cell=cell, error=f"calibration failed: {calibration.error}")
-    ms_per_step = 1000 * calibration.outcome.optimisation_s / steps
     seconds = first.outcome.optimisation_s
-    fitting = max(20, round(1000 * seconds / ms_per_step / 10) * 10)
+    steps, ms_per_step = PROBE_STEPS, 0.0
+    while True:
+        short = Cell(
+            scene=cell.scene.model_copy(update={"test_file": None, "test_views": 0}),
+            start=cell.start,
+            options=with_steps(cell.options, steps),
+        )
+        calibration = run(short, f"{title}, {steps} steps to measure its speed")
+        if calibration.outcome is None:
+            return CellResult(cell=cell, error=f"calibration failed: {calibration.error}")
+        ms_per_step = 1000 * calibration.outcome.optimisation_s / steps
+        # A probe of few steps says how long a measurement may be that takes a tenth of the time.
+        longer = round(CALIBRATION_SHARE * 1000 * seconds / ms_per_step)
+        if steps > PROBE_STEPS or longer < 2 * PROBE_STEPS:
+            break
+        steps = longer
+    fitting = max(PROBE_STEPS, round(1000 * seconds / ms_per_step / 10) * 10)
     equal = EqualTime(seconds=seconds, calibration_steps=steps, calibration_ms_per_step=round(ms_per_step, 3))
-    longer = Cell(
+    whole = Cell(
         scene=cell.scene, start=cell.start, options=with_steps(cell.options, fitting), equal_time=equal
     )
-    return run(longer, f"{title}, {fitting} steps")
+    return run(whole, f"{title}, {fitting} steps")
 
 
 def _in_short(result: CellResult) -> str:

@@ -39,6 +39,11 @@ class ViewScore:
     ssim: float
 
 
+def fit_rays(optimiser: JointOptimiser) -> int:
+    """Rays of one step of fitting poses to the frozen field: as BARF, but no more than a large network can afford."""
+    return min(FIT_RAYS, optimiser.rays) if optimiser.method.network else FIT_RAYS
+
+
 def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
     """Fit the poses of held-out views to the frozen field by their photometric error (method 2.4, item 4)."""
     if not held_out:
@@ -49,7 +54,7 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
     gradient = PositionGradient()
     poses = optimiser.poses
     poses.restart_adam()
-    rays = min(FIT_RAYS, optimiser.rays) if optimiser.method.network else FIT_RAYS
+    rays = fit_rays(optimiser)
     for step in range(FIT_STEPS):
         batch = optimiser.sampler.draw(rays, 0.0, optimiser.generator, held_out_only=True)
         matrices = poses.matrices()[batch.image]

@@ -11,6 +11,7 @@ from biresnerf.compare.novel_views import render_test_views
 from biresnerf.compare.scenes import with_poses
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import Similarity
+from biresnerf.refine import evaluation
 from biresnerf.refine.evaluation import render_view
 from biresnerf.refine.image_metrics import psnr
 from tests.refine.scene import tiny_optimiser, tiny_options, tiny_set
@@ -47,7 +48,7 @@ def test_fitting_makes_up_for_a_frame_that_is_a_little_off(trained, monkeypatch)
         pairs = render_test_views(optimiser, off, dataset.world_from_cam)
         return float(np.mean([psnr(pair.render, pair.photo) for pair in pairs]))
 
-    monkeypatch.setattr(novel_views, "FIT_RAYS", 256)
+    monkeypatch.setattr(evaluation, "FIT_RAYS", 256)
     monkeypatch.setattr(novel_views, "FIT_STEPS", 0)
     unfitted = decibels()
     monkeypatch.setattr(novel_views, "FIT_STEPS", 40)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from biresnerf.compare.cell import Cell, CellResult, Perturbation
 from biresnerf.compare.plan import Plan, Variant, run_plan, with_steps
 from biresnerf.compare.studies import STUDIES
-from biresnerf.config import RefineOptions
+from biresnerf.config import MethodName, RefineOptions
 from biresnerf.errors import InputError
 from tests.compare.outcomes import outcome, scene
 
@@ -71,23 +72,26 @@ def test_a_variant_with_an_unknown_option_is_refused():
         plan(Variant("a", {"stepz": 1})).options(Variant("a", {"stepz": 1}), scene(), Perturbation())
 
 
-def test_at_equal_time_the_others_get_the_steps_that_fit_the_firsts_time():
-    def run(wanted: Cell, title: str) -> CellResult:
-        # The first takes 2 ms a step, the other 8.
-        ms = 2.0 if wanted.options.pose_rate is None else 8.0
-        steps = wanted.options.resolved().steps
-        return CellResult(cell=wanted, outcome=outcome(0.01, seconds=ms * steps / 1000))
+@pytest.mark.parametrize(("ms", "measured", "fitting"), [(8.0, [20, 75], 750), (300.0, [20], 20)])
+def test_at_equal_time_the_others_get_the_steps_that_fit_the_firsts_time(ms, measured, fitting):
+    asked = []
 
-    entries = run_plan(
-        plan(Variant("a", {}), Variant("b", {"pose_rate": 0.01}), equal_time=True, seeds=(1,)), run
-    )
+    def run(wanted: Cell, title: str) -> CellResult:
+        # The first takes 2 ms a step.
+        steps = wanted.options.resolved().steps
+        asked.append(steps)
+        each = 2.0 if wanted.options.pose_rate is None else ms
+        return CellResult(cell=wanted, outcome=outcome(0.01, seconds=each * steps / 1000))
+
+    variants = (Variant("a", {}), Variant("b", {"pose_rate": 0.01}))
+    one_scene = Plan((scene(),), (Perturbation(),), variants, FAST, equal_time=True)
+    entries = run_plan(one_scene, run)
     first, other = entries[0].result.cell, entries[1].result.cell
-    assert first.options.resolved().steps == 3000
+    assert asked == [3000, *measured, fitting]
     assert first.equal_time is None
-    assert other.options.steps == 750  # 6 s at 8 ms
-    assert other.options.resolved().coarse_steps_min == 250  # of 1000 of 3000
-    assert other.equal_time.calibration_steps == 300
-    assert other.equal_time.calibration_ms_per_step == pytest.approx(8.0)
+    assert other.options.steps == fitting  # 6 s at so many ms
+    assert other.equal_time.calibration_steps == measured[-1]
+    assert other.equal_time.calibration_ms_per_step == pytest.approx(ms)
     assert other.equal_time.seconds == pytest.approx(6.0)
 
 
@@ -110,6 +114,13 @@ def test_a_shorter_run_keeps_its_proportions_even_where_they_were_set():
         100,
         10,
     )
+
+
+@pytest.mark.parametrize("method", get_args(MethodName))
+def test_every_method_is_a_variant_that_can_be_shortened(method):
+    options = plan().options(Variant(method, {"method": method}), scene(), Perturbation())
+    assert options.method == method
+    assert with_steps(options, 300).resolved().steps == 300
 
 
 @pytest.mark.parametrize("name", STUDIES)
