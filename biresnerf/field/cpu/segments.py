@@ -211,7 +211,7 @@ def _spread(block, channels, kept, begin, n, start, target, stride):
 
 
 @njit(**KERNEL)
-def _add_position_gradient(g, row, stride, jacobian, begin, count, factor, dx):
+def add_position_gradient(g, row, stride, jacobian, begin, count, factor, dx):
     """dx [3, count] (row stride `stride`) += factor J^T g over all levels, for samples from `begin` on."""
     if factor == f4(0):
         return
@@ -290,8 +290,8 @@ def render_segments_backward(
                         i = kept[q]
                         x[3 * q], x[3 * q + 1], x[3 * q + 2] = x[3 * i], x[3 * i + 1], x[3 * i + 2]
             d_position[:] = f4(0)
-            _add_position_gradient(spread, 0, longest, jacobian, begin, count, ONE, d_position)
-            _add_position_gradient(
+            add_position_gradient(spread, 0, longest, jacobian, begin, count, ONE, d_position)
+            add_position_gradient(
                 spread,
                 2 * jacobian.shape[0],
                 longest,

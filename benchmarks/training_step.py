@@ -1,0 +1,107 @@
+"""A whole training step: ours against plain torch, and what its parts take."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks import scene
+from benchmarks.clock import Clock, interleave, peak_memory, ratio, summary, timed
+from benchmarks.torch_forms import UnrolledField, VectorisedField
+from biresnerf.field import cpu_field
+from biresnerf.field.reference_field import ReferenceField
+from biresnerf.refine.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
+from biresnerf.refine.photo_sampler import PhotoSampler
+from biresnerf.refine.pose_parameters import PoseParameters
+
+OPERATIONS = [
+    (PhotoSampler, "draw", "draw pixels"),
+    (PoseParameters, "matrices", "pose matrices"),
+    (JointOptimiser, "cast", "cast rays"),
+    (cpu_field, "harmonics", "view harmonics"),
+    (cpu_field.ray_kernels, "march", "march"),
+    (cpu_field.ray_kernels, "pack", "pack samples"),
+    (cpu_field.CpuField, "_encode", "encode, both modules"),
+    (cpu_field, "render_segments", "networks forward, composite"),
+    (cpu_field, "render_segments_backward", "composite and networks back, position gradient"),
+    (cpu_field.ray_kernels, "ray_gradients", "sum into rays"),
+    (cpu_field.encoding, "update_table", "table gradient and Adam"),
+    (PoseParameters, "step", "Adam on poses"),
+]
+FORWARD_MACS = 64 * 16 + 32 * 64 + 64 * 64 + 64 * 4  # of both networks but for the first layer
+
+
+def _flops(width: int) -> float:
+    """Of both networks per sample: forward once, again but for two products on the way back, twice for gradients."""
+    forward = FORWARD_MACS + 64 * width
+    again = forward - 64 * 16 - 64 * 4
+    return 2.0 * (forward + again + 2 * forward)
+
+
+def _rivals(ours: JointOptimiser, stage: str, definition: bool) -> dict[str, JointOptimiser]:
+    """The same optimisation on other fields; photos and poses are shared."""
+    kinds: dict[str, Any] = {"unrolled": UnrolledField, "vectorised": VectorisedField}
+    if definition:
+        kinds["definition"] = ReferenceField
+    made = {}
+    for name, kind in kinds.items():
+        rival, field = copy.copy(ours), kind(ours.field.shape, 0, scene.CPU)
+        if stage == "fine":
+            field.start_reconstruction()
+        rival.field = field
+        made[name] = rival
+    return made
+
+
+def run(
+    rays: int, rounds: int, threads: int, clock: Clock, limit: dict[str, float], definition: bool
+) -> list[dict]:
+    """One row per stage, at the paper's encodings."""
+    rows: list[dict[str, Any]] = []
+    for stage in ("coarse", "fine"):
+        ours = scene.optimiser(stage, 100, threads, rays)
+        samples = [scene.step(ours, rays) for _ in range(3)][-1]
+
+        def torch_step(rival: JointOptimiser) -> None:
+            torch.set_num_threads(threads)
+            scene.step(rival, rays)
+            torch.set_num_threads(1)
+
+        rivals = _rivals(ours, stage, definition)
+        competitors = {"kernels": lambda ours=ours: scene.step(ours, rays)}
+        competitors |= {name: lambda r=rival: torch_step(r) for name, rival in rivals.items()}
+        seconds = interleave(competitors, rounds, clock)
+        with peak_memory() as slow_memory:
+            torch_step(rivals["unrolled"])
+        parts: dict[str, list[float]] = {}
+        with peak_memory() as memory:
+            for _ in range(3 * rounds):
+                with timed(OPERATIONS, clock) as spent:
+                    scene.step(ours, rays)
+                for label, value in spent.items():
+                    parts.setdefault(label, []).append(value)
+        started = clock()
+        kept = ours.occupancy.occupied
+        ours._update_occupancy(ours.step_index)
+        occupancy = (clock() - started) / OCCUPANCY_PERIOD
+        ours.occupancy.occupied = kept
+        medians = {label: 1e3 * float(np.median(values)) for label, values in parts.items()}
+        medians["occupancy update, per step"] = 1e3 * occupancy
+        fast = float(np.median(seconds["kernels"])) + occupancy
+        width = ours.field.shape.pose_grid.width + (
+            ours.field.shape.reconstruction_grid.width if stage == "fine" else 0
+        )
+        network_s = 1e-3 * (medians[OPERATIONS[7][2]] + medians[OPERATIONS[8][2]])
+        rows.append({
+            "stage": stage, "rays": rays, "samples": samples, "kernels": summary(seconds["kernels"]),
+            "ns_per_sample": 1e9 * fast / samples, "samples_per_s": samples / fast, "rays_per_s": rays / fast,
+            "rivals": {name: summary(v) for name, v in seconds.items() if name != "kernels"},
+            "times_faster": {n: ratio(v, seconds["kernels"]) for n, v in seconds.items() if n != "kernels"},
+            "parts_ms": medians, "share_of_gflops": _flops(width) * samples / network_s / 1e9 / limit["gflops"],
+            "peak_added_mib": memory["added_mib"], "peak_added_mib_unrolled": slow_memory["added_mib"],
+        })  # fmt: skip
+        del rivals, competitors
+    return rows

@@ -1,0 +1,57 @@
+"""What the benchmarks compare against computes the same thing."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.torch_forms import encode_unrolled, encode_vectorised, march_at_once
+from benchmarks.yardstick import build_yardstick, check_yardstick
+from biresnerf.field import reference
+from biresnerf.field.grid_levels import grid_levels
+from biresnerf.field.radiance_field import Marching, Rays
+
+DENSE, HASHED = grid_levels(3, 8, 20, 14), grid_levels(4, 64, 200, 12)
+
+
+@pytest.mark.parametrize("encode", [encode_unrolled, encode_vectorised])
+@pytest.mark.parametrize("grid", [DENSE, HASHED])
+def test_the_torch_forms_encode_as_the_definition_does(encode, grid):
+    generator = torch.Generator().manual_seed(0)
+    x, table = torch.rand(333, 3, generator=generator), torch.rand(grid.entries, 2, generator=generator)
+    upstream = torch.rand(333, grid.width, generator=generator)
+    gradients = []
+    for form in (encode, reference.encode):
+        points, entries = x.clone().requires_grad_(), table.clone().requires_grad_()
+        features = form(points, entries, grid, 0.7)
+        features.backward(upstream)
+        gradients.append((features.detach(), points.grad, entries.grad))
+    for ours, theirs in zip(*gradients, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=2e-4 * float(theirs.abs().max()), rtol=0)
+
+
+def test_the_march_of_all_intervals_at_once_takes_the_definitions_samples():
+    generator = torch.Generator().manual_seed(1)
+    direction = torch.nn.functional.normalize(torch.randn(100, 3, generator=generator), dim=1)
+    origin = (torch.rand(100, 3, generator=generator) - 0.5) - 2.5 * direction
+    occupied = (torch.rand(8, 8, 8, generator=generator) < 0.5).to(torch.uint8)
+    rays = Rays(origin, direction, torch.ones(100, 3), torch.rand(100, generator=generator), 100)
+    t, dt, ray = march_at_once(rays, Marching(0.05, 0.1, 10.0, 256, occupied))
+    expected = reference.march(origin, direction, rays.jitter, occupied, 0.05, 0.1, 10.0, False, 256)
+    assert abs(len(t) - len(expected[0])) <= 5  # midpoints on cell faces
+    count, other = (np.bincount(r.numpy(), minlength=100) for r in (ray, expected[2]))
+    same = count == other
+    assert same.mean() > 0.95
+    assert float(dt.mean()) == pytest.approx(0.05)
+    assert float(t.mean()) == pytest.approx(float(expected[0].mean()), abs=1e-2)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
+@pytest.mark.parametrize("grid", [DENSE, HASHED])
+def test_the_yardstick_in_cpp_computes_what_the_definition_does(grid):
+    library = build_yardstick()
+    assert library is not None
+    check_yardstick(library, grid)
