@@ -101,6 +101,8 @@ class LostCameraRepair:
         everyone = torch.arange(len(alone), device=optimiser.device)
         unshared = self._shared(optimiser.poses.matrices(), everyone) < ALONE
         unshared &= ~optimiser.camera_errors.held_out
+        # Whoever was placed by matches shares a view, whatever the depth of a young field says.
+        unshared &= optimiser.mobility[0] > 0
         return unshared if float(unshared.float().mean()) <= ALONE_MOST else alone
 
     @torch.no_grad()

@@ -22,7 +22,7 @@ from biresnerf.refine.pose_parameters import PoseParameters
 from biresnerf.refine.scene_frame import scene_frame
 from biresnerf.refine.start import Start
 from biresnerf.refine.two_stages import TwoStages
-from tests.refine.scene import CPU, tiny_options, tiny_set
+from tests.refine.scene import CPU, tiny_optimiser, tiny_options, tiny_set
 
 SIZE, STEPS, PERIOD = 32, 160, 8
 TURNED, ORBITED, HELD_OUT = 5, 3, [3, 8]
@@ -191,3 +191,19 @@ def test_a_replaced_pose_has_no_momentum_and_others_keep_theirs():
     after = poses.matrices().detach()
     assert torch.equal(after[1], new)
     assert bool(((after - before).abs().amax((1, 2))[[0, 2]] > 1e-4).all())
+
+
+def test_cameras_placed_by_matches_are_not_sent_elsewhere_for_looking_alone(tmp_path, monkeypatch):
+    dataset, images = tiny_set(tmp_path)
+    optimiser = tiny_optimiser(
+        dataset, dataclasses.replace(images, background=None, alpha=None), tiny_options()
+    )
+    assert optimiser.frame.unbounded
+    shared = torch.ones(len(dataset))
+    shared[[2, 4]] = 0.0
+    monkeypatch.setattr(lost_cameras, "ALONE_MOST", 0.5)
+    repair = lost_cameras.LostCameraRepair(optimiser)
+    monkeypatch.setattr(repair, "_shared", lambda _matrices, _image: shared)
+    assert repair._alone().nonzero()[:, 0].tolist() == [2, 4]
+    optimiser.mobility[0, 4] = 0.0
+    assert repair._alone().nonzero()[:, 0].tolist() == [2]
