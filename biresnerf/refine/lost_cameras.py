@@ -81,7 +81,9 @@ class LostCameraRepair:
         allowance = min(self._spent + EVENT_SHARE * total, RUN_SHARE * total)
         self._marching = self._coarse_marching()
         alone = self._alone()
-        suspects = optimiser.camera_errors.suspects | alone
+        # Matches are better evidence than a young field's error: cameras they placed stay (dtu's were 2 deg off, and
+        # 7 to 9 deg where repair sent them).
+        suspects = (optimiser.camera_errors.suspects | alone) & (optimiser.mobility[0] > 0)
         relative = torch.where(suspects, optimiser.camera_errors.relative, -torch.inf)
         worst_first = relative.argsort(descending=True, stable=True)[: int(suspects.sum())].tolist()
         median = self._reference_error(suspects) if worst_first else 0.0
@@ -101,8 +103,6 @@ class LostCameraRepair:
         everyone = torch.arange(len(alone), device=optimiser.device)
         unshared = self._shared(optimiser.poses.matrices(), everyone) < ALONE
         unshared &= ~optimiser.camera_errors.held_out
-        # Whoever was placed by matches shares a view, whatever the depth of a young field says.
-        unshared &= optimiser.mobility[0] > 0
         return unshared if float(unshared.float().mean()) <= ALONE_MOST else alone
 
     @torch.no_grad()
