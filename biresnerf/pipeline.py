@@ -103,24 +103,11 @@ def refine_poses(
     report(Progress(stage="seeding" if sought else "preparing", fraction=0.02, message=message))
 
     options = start.stage_lengths(asked, options)
-    frame = scene_frame(start.world_from_cam, prepared.images)
-    poses = frame.unit_from_world.apply_to_poses(start.world_from_cam)
-    optimiser = JointOptimiser(
-        prepared.images, frame, poses, options, prepared.held_out, device, threads, start.mobility
-    )
+    optimiser = _optimiser(prepared, start, options, device, threads)
     stages = TwoStages(
-        optimiser,
-        folder.path,
-        prepared.fingerprint,
-        report,
-        stop,
-        prepared.seeding,
-        start.as_json(),
-        observer,
-        lambda: folder.write_preview(
-            prepared.dataset, prepared.images, optimiser, (prepared.held_out or [0])[0]
-        ),
-    )
+        optimiser, folder.path, prepared.fingerprint, report, stop, prepared.seeding, start.as_json(), observer,
+        lambda: folder.write_preview(prepared.dataset, prepared.images, optimiser, (prepared.held_out or [0])[0]),
+    )  # fmt: skip
     if checkpoint is not None:
         stages.resume(*checkpoint)
         logger.info("going on from step %d", optimiser.step_index)
@@ -128,15 +115,8 @@ def refine_poses(
 
     def write(scores: list[ViewScore], state: Literal["complete", "partial"]) -> Report:
         return folder.write_result(
-            prepared.dataset,
-            start,
-            prepared.images,
-            stages,
-            prepared.held_out,
-            scores,
-            threads=threads,
-            state=state,
-        )
+            prepared.dataset, start, prepared.images, stages, prepared.held_out, scores, threads=threads, state=state,
+        )  # fmt: skip
 
     if not stages.run():
         write([], state="partial")
@@ -149,6 +129,17 @@ def refine_poses(
     folder.drop_traces()
     report(Progress(stage="exporting", fraction=1.0, eta_s=0.0))
     return result
+
+
+def _optimiser(
+    prepared: Prepared, start: Start, options: RefineOptions, device: torch.device, threads: int
+) -> JointOptimiser:
+    """The optimisation at its first step, in the unit frame of the poses it starts from."""
+    frame = scene_frame(start.world_from_cam, prepared.images)
+    poses = frame.unit_from_world.apply_to_poses(start.world_from_cam)
+    return JointOptimiser(
+        prepared.images, frame, poses, options, prepared.held_out, device, threads, start.mobility
+    )
 
 
 def _choose_backend(options: RefineOptions, report: OnProgress) -> tuple[RefineOptions, torch.device, int]:

@@ -16,8 +16,6 @@ from typing import Any
 
 MAX_IMAGE_SIZE = 1600  # long side (px) at which features are found; more costs time and adds little
 SEQUENTIAL_OVERLAP = 12  # neighbours that each image is matched with, where all pairs would be too many
-
-
 # Small photos have few features: faint ones count as well, and fewer matches than COLMAP asks for must do.
 FAINTEST_PEAK, LEAST_MATCHES, LEAST_SEEN = 0.003, 12, 10
 ENOUGH_PLACED = 0.8  # of the images: no other way of mapping is tried then

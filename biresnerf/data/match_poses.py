@@ -21,9 +21,8 @@ from biresnerf.geometry.similarity import align_robust
 
 logger = logging.getLogger(__name__)
 
-ALL_PAIRS_UP_TO = (
-    60  # images; beyond it, each is matched with those whose given poses see most nearly the same
-)
+# Images; beyond it, each is matched with those whose given poses see most nearly the same.
+ALL_PAIRS_UP_TO = 60
 NEIGHBOURS = 40
 LEAST_PLACED = 0.6  # of the images; a model of fewer says too little about the rig
 # Standard deviation of given positions, of the cameras' distance: holds what matches leave open (the drift of narrow
@@ -39,9 +38,8 @@ WIDEST_IMAGE, MOST_FEATURES = 1000, 2048
 # COLMAP's bounds on reprojection errors are made for photos of thousands of px. At 200 px they let wrong matches pass:
 # with 0.35 of them temple's mean rotation error went from 6.8 to 1.4 deg, entry-P10's from 4.9 to 0.8.
 ERROR_SIZE = 1600  # px, long side at which COLMAP's own bounds hold; they shrink with the root of the size
-THOROUGH_UP_TO = (
-    10e6  # pixels in all: affine shapes and pooled scales find more and cost several times as much
-)
+# Pixels in all: affine shapes and pooled scales find more and cost several times as much.
+THOROUGH_UP_TO = 10e6
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,9 +39,8 @@ MATCHED_MOBILITY = (0.0, 0.3)
 # Where most cameras are placed, stage 1 has only to form the field: its lengths shrink to this share.
 MOSTLY_PLACED, MATCHED_COARSE_SHARE = 0.8, 0.4
 MARGIN_DB = 0.3  # less is a tie
-DISAGREE_DEG = (
-    2.0  # on a tie, matches are believed if the given poses differ from them by more than this (median)
-)
+# On a tie, matches are believed if the given poses differ from them by more than this (median).
+DISAGREE_DEG = 2.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -110,9 +110,8 @@ class TwoStages:
                 return False
             started = time.monotonic()
             result = optimiser.step()
-            stepped = (
-                time.monotonic() - started
-            )  # a repair within the check says nothing of the steps to come
+            # Without the check: a repair within it says nothing of the steps to come.
+            stepped = time.monotonic() - started
             if not math.isfinite(result.loss):
                 raise RefinementError("diverged", f"The loss is not a number at step {optimiser.step_index}.")
             self._errors.append(result.mean_squared_error)
