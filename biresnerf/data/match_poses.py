@@ -81,14 +81,19 @@ def poses_from_matches(
         Interrupted: ``should_stop`` said so.
         RefinementError: ``seeding_crashed``.
     """
-    names = list(dataset.file_names)
+    # COLMAP's list of pairs knows no spaces, so photos go by numbers there.
+    names = [f"{i:06}{frame.path.suffix}" for i, frame in enumerate(dataset.frames)]
     given = dataset.world_from_cam
     sizes = [dataset.camera_of(i) for i in range(len(names))]
     widest = min(WIDEST_IMAGE, float(np.median([max(c.width, c.height) for c in sizes])))
     with tempfile.TemporaryDirectory(prefix="biresnerf-matches-") as work:
+        photos = Path(work, "photos")
+        photos.mkdir()
+        for name, frame in zip(names, dataset.frames, strict=True):
+            (photos / name).symlink_to(frame.path.resolve())
         request = {
             "task": "from_given",
-            "root": str(dataset.root.resolve()),
+            "root": str(photos),
             "work": work,
             "answer": str(Path(work, "answer.json")),
             "seed": seed,

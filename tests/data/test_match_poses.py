@@ -162,3 +162,14 @@ def test_the_request_is_plain_json(monkeypatch, noisy, tmp_path):
     assert poses_from_matches(replace(noisy, cameras=(first, second), frames=frames)) == []
     assert [len(camera["names"]) for camera in asked["cameras"]] == [VIEWS // 2, VIEWS // 2]
     assert asked["cameras"][1]["params"] == [150.0, 80.0, 80.0]
+
+
+def test_names_with_spaces_are_matched_when_pairs_are_listed(monkeypatch, noisy, tmp_path):
+    monkeypatch.setattr(match_poses, "ALL_PAIRS_UP_TO", 3)
+    frames = []
+    for i, frame in enumerate(noisy.frames):
+        path = tmp_path / f"my photo {i:02}.png"
+        path.write_bytes(frame.path.read_bytes())
+        frames.append(replace(frame, path=path, name=path.name))
+    (matched, *_) = poses_from_matches(replace(noisy, root=tmp_path, frames=tuple(frames)))
+    assert matched.placed.all()
