@@ -102,20 +102,22 @@ class UnrolledField(ReferenceField):
         }
 
     def _features(self, x: Tensor, gradient: PositionGradient) -> Tensor:
-        features = [self.encode(x, self.pose_table, self.shape.pose_grid, gradient.pose_smoothing)]
-        if self.reconstructing:
-            smoothing = gradient.reconstruction_smoothing
-            features.append(
-                self.encode(x, self.reconstruction_table, self.shape.reconstruction_grid, smoothing)
-            )
-        return torch.cat(features, 1)
+        low = self.encode(x, self.pose_table, self.shape.pose_grid, gradient.pose_smoothing)
+        if not self.reconstructing:
+            return low
+        passed = x.detach() + gradient.reconstruction_share * (x - x.detach())
+        grid, table = self.shape.reconstruction_grid, self.reconstruction_table
+        return torch.cat([low, self.encode(passed, table, grid, gradient.reconstruction_smoothing)], 1)
 
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
         with torch.no_grad():
             t, dt, ray = march_at_once(rays, marching)
         x = reference.grid_position(rays.origin[ray] + t[:, None] * rays.direction[ray], unbounded=False)
         view = spherical_harmonics(rays.direction)[ray]
-        weights = [self._first_layer(), *self.networks[1:]]
+        first = self.networks[0]
+        if self.reconstructing:
+            first = torch.cat([first, self.reconstruction_columns], 1)
+        weights = [first, *self.networks[1:]]
         density, colour = reference.network(self._features(x, gradient), view, weights)
         rgb, opacity, depth = reference.composite(density, colour, t, dt, ray, rays.background)
         return Rendering(rgb, opacity, depth.detach(), len(ray))
