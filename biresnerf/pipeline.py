@@ -19,6 +19,7 @@ from biresnerf.data.dataset import Dataset
 from biresnerf.data.images import ImageSet, load_images
 from biresnerf.data.match_poses import can_match, poses_from_matches
 from biresnerf.data.read import read_dataset
+from biresnerf.data.seed_colmap import seed_poses
 from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.field.backends import choose_device, use_threads
 from biresnerf.field.compile_kernels import compile_kernels
@@ -204,18 +205,17 @@ def _prepare(
     report: OnProgress,
     stop: Callable[[], bool],
 ) -> Prepared:
-    def tell_seeding() -> None:
-        report(Progress(stage="seeding", fraction=0.01, message="COLMAP looks for poses"))
-
-    if isinstance(given, Dataset):
-        dataset = given
-    else:
-        dataset = read_dataset(
-            Path(given),
+    dataset = given if isinstance(given, Dataset) else read_dataset(Path(given))
+    unposed = not dataset.posed.all()
+    if unposed:
+        dataset = seed_poses(
+            dataset,
             should_stop=stop,
             seed=options.seed,
             remember=seeding,
-            on_seeding=tell_seeding,
+            on_start=lambda: report(
+                Progress(stage="seeding", fraction=0.01, message="COLMAP looks for poses")
+            ),
         )
     images = load_images(dataset, options.max_image_size, options.background)
     digest = hashlib.sha256(images.pixels.tobytes())
@@ -228,9 +228,7 @@ def _prepare(
         images,
         held_out_views(len(dataset), options.holdout),
         digest.hexdigest(),
-        seeding.read_text("utf-8")
-        if dataset.source.dialect == "images" and not isinstance(given, Dataset)
-        else None,
+        seeding.read_text("utf-8") if unposed else None,
     )
 
 

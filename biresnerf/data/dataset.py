@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from biresnerf.geometry.camera_models import OpenCVParameters, full_parameters, smallest_model
 
 PoseSource = Literal["given", "colmap"]
+IntrinsicsSource = Literal["given", "exif", "colmap", "guessed"]
 Dialect = Literal["nerfstudio", "instant-ngp", "blender", "images"]
 
 
@@ -52,17 +53,20 @@ class Frame:
         name: exactly what the user's file calls the image, or its path relative to the folder of images.
         path: the image file.
         camera: index into ``Dataset.cameras``.
-        world_from_cam: float64 [4, 4], a rigid motion; OpenCV axes (x right, y down, z forward).
-        pose_source: who found the pose.
+        world_from_cam: float64 [4, 4], a rigid motion; OpenCV axes (x right, y down, z forward). None where
+            nobody has said yet where the image was taken.
+        pose_source: who found the pose; None where there is none.
         raw: the frame as the user's file has it (empty for a folder of images).
+        mask: a file that says which pixels count: where it is black they do not.
     """
 
     name: str
     path: Path
     camera: int
-    world_from_cam: NDArray[np.float64]
-    pose_source: PoseSource
+    world_from_cam: NDArray[np.float64] | None
+    pose_source: PoseSource | None
     raw: dict[str, Any] = field(default_factory=dict)
+    mask: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,13 +92,23 @@ class SourceFormat:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A validated set of images with poses. ``root`` is the folder that image names are relative to."""
+    """A validated set of images with poses, or with some or all of them still to be found.
+
+    Attributes:
+        root: the folder that image names are relative to.
+        cameras: the intrinsics that frames refer to.
+        frames: in the user's order.
+        source: how the input was written.
+        warnings: what the user should know about how it was read.
+        intrinsics_sources: who found each camera's intrinsics; empty where the user gave them all.
+    """
 
     root: Path
     cameras: tuple[Camera, ...]
     frames: tuple[Frame, ...]
     source: SourceFormat
     warnings: tuple[str, ...] = ()
+    intrinsics_sources: tuple[IntrinsicsSource, ...] = ()
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -110,9 +124,17 @@ class Dataset:
         return tuple(Path(os.path.relpath(frame.path, self.root)).as_posix() for frame in self.frames)
 
     @property
+    def posed(self) -> NDArray[np.bool_]:
+        """Which frames have a pose, bool [n]."""
+        return np.array([frame.world_from_cam is not None for frame in self.frames], dtype=np.bool_)
+
+    @property
     def world_from_cam(self) -> NDArray[np.float64]:
-        """All poses, float64 [n, 4, 4]."""
-        return np.stack([frame.world_from_cam for frame in self.frames])
+        """All poses, float64 [n, 4, 4]. Raises ValueError while one is missing."""
+        poses = [frame.world_from_cam for frame in self.frames if frame.world_from_cam is not None]
+        if len(poses) != len(self.frames):
+            raise ValueError(f"{len(self.frames) - len(poses)} of {len(self.frames)} frames have no pose yet")
+        return np.stack(poses)
 
     def camera_of(self, index: int) -> Camera:
         """The camera of frame ``index``, at full size."""

@@ -13,6 +13,7 @@ from PIL import Image
 
 from biresnerf.data import colmap_process
 from biresnerf.data.read import read_dataset
+from biresnerf.data.seed_colmap import seed_poses
 from biresnerf.data.synthetic import synthetic_focal
 from biresnerf.data.write import write_transforms
 from biresnerf.errors import InputError, Interrupted, RefinementError
@@ -23,6 +24,11 @@ needs_colmap = pytest.mark.skipif(
     importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed (extra: colmap)"
 )
 VIEWS, SIZE = 10, 320
+
+
+def seeded(folder, **how):
+    """What a folder of images becomes once COLMAP has placed them."""
+    return seed_poses(read_dataset(folder), **how)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +48,7 @@ def folder(photos, tmp_path):
 @needs_colmap
 def test_poses_and_focal_length_are_found_and_a_stranger_is_left_out_by_name(folder):
     write_image(folder / "images/stranger 1.png", seed=9, size=(SIZE, SIZE))
-    dataset = read_dataset(folder)
+    dataset = seeded(folder)
     assert dataset.names == tuple(f"images/{i:02}.png" for i in range(VIEWS))
     assert {frame.pose_source for frame in dataset.frames} == {"colmap"}
     assert dataset.source.dialect == "images"
@@ -66,7 +72,7 @@ def test_images_of_two_sizes_get_cameras_of_their_own(folder):
     for index in range(0, VIEWS, 2):
         path = folder / f"images/{index:02}.png"
         Image.open(path).resize((SIZE * 3 // 4, SIZE * 3 // 4), Image.Resampling.LANCZOS).save(path)
-    dataset = read_dataset(folder)
+    dataset = seeded(folder)
     sizes = [dataset.camera_of(index).width for index in range(len(dataset))]
     assert set(sizes) == {SIZE, SIZE * 3 // 4}
     assert len(dataset.cameras) >= 2
@@ -79,7 +85,7 @@ def test_images_that_show_nothing_in_common_are_refused_with_counts(tmp_path):
     for index in range(4):
         write_image(tmp_path / f"{index}.png", index, size=(64, 48))
     with pytest.raises(InputError) as caught:
-        read_dataset(tmp_path)
+        seeded(tmp_path)
     assert_complete(caught.value, "seed_failed", tmp_path.name)
     assert "0 of 4" in caught.value.what
 
@@ -88,13 +94,13 @@ def test_images_that_show_nothing_in_common_are_refused_with_counts(tmp_path):
 def test_a_wish_to_stop_ends_the_child_at_once(folder):
     began = time.monotonic()
     with pytest.raises(Interrupted):
-        read_dataset(folder, should_stop=lambda: time.monotonic() > began + 0.5)
+        seeded(folder, should_stop=lambda: time.monotonic() > began + 0.5)
 
 
 @needs_colmap
 def test_the_time_limit_ends_the_child(folder):
     with pytest.raises(InputError) as caught:
-        read_dataset(folder, seeding_limit_s=0.3)
+        seeded(folder, limit_s=0.3)
     assert_complete(caught.value, "seed_timeout", folder.name)
 
 
@@ -104,14 +110,14 @@ def test_a_crash_of_colmap_is_told_with_its_last_words(folder, monkeypatch, tmp_
     broken.write_text("import os, sys; print('out of luck', file=sys.stderr, flush=True); os.abort()")
     monkeypatch.setattr(colmap_process, "CHILD", broken)
     with pytest.raises(RefinementError, match="out of luck") as caught:
-        read_dataset(folder)
+        seeded(folder)
     assert caught.value.code == "seeding_crashed"
 
 
 def test_without_colmap_the_extra_is_named(folder, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'biresnerf\[colmap\]'") as caught:
-        read_dataset(folder)
+        seeded(folder)
     assert_complete(caught.value, "colmap_missing", folder.name)
 
 
@@ -120,29 +126,29 @@ def test_linked_images_in_the_working_directory_keep_their_names(photos, tmp_pat
     for index in range(4):
         (tmp_path / f"linked {index}.png").symlink_to(photos / f"images/{index:02}.png")
     monkeypatch.chdir(tmp_path)
-    assert read_dataset(Path(".")).file_names == tuple(f"linked {index}.png" for index in range(4))
+    assert seeded(Path(".")).file_names == tuple(f"linked {index}.png" for index in range(4))
 
 
 def test_two_images_are_too_few_and_broken_ones_are_named_before_colmap_runs(tmp_path):
     for index in range(2):
         write_image(tmp_path / f"{index}.png", index)
     with pytest.raises(InputError) as caught:
-        read_dataset(tmp_path)
+        seeded(tmp_path)
     assert_complete(caught.value, "too_few_images", tmp_path.name)
     (tmp_path / "2.png").write_bytes(b"no image")
     with pytest.raises(InputError) as caught:
-        read_dataset(tmp_path)
+        seeded(tmp_path)
     assert_complete(caught.value, "not_an_image", "2.png")
 
 
 @needs_colmap
 def test_a_continued_run_is_given_the_same_poses_until_an_image_changes(folder, tmp_path, monkeypatch):
     kept = tmp_path / "kept" / "seeding.json"
-    first = read_dataset(folder, remember=kept)
+    first = seeded(folder, remember=kept)
     monkeypatch.setattr(colmap_process, "CHILD", tmp_path / "no_such_program.py")
-    again = read_dataset(folder, remember=kept)
+    again = seeded(folder, remember=kept)
     assert np.array_equal(again.world_from_cam, first.world_from_cam)
     assert again.cameras == first.cameras
     write_image(folder / "images/00.png", size=(SIZE, SIZE))
     with pytest.raises(RefinementError):  # COLMAP is asked anew
-        read_dataset(folder, remember=kept)
+        seeded(folder, remember=kept)
