@@ -58,6 +58,8 @@ class Frame:
         pose_source: who found the pose; None where there is none.
         raw: the frame as the user's file has it (empty for a folder of images).
         mask: a file that says which pixels count: where it is black they do not.
+        orientation: EXIF orientation (1 to 8) by which stored pixels are turned first; camera, pose and mask are
+            for the turned picture. 1 where they are for pixels as stored.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Frame:
     pose_source: PoseSource | None
     raw: dict[str, Any] = field(default_factory=dict)
     mask: Path | None = None
+    orientation: int = 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from PIL import Image
+from PIL.TiffImagePlugin import TiffImageFile
 
 from biresnerf.errors import InputError
 
@@ -19,6 +20,12 @@ IMAGE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 MAX_IMAGE_PIXELS = 150_000_000  # beyond any camera; a guard against files that unpack to gigabytes
 EXIF_ORIENTATION = 0x0112
+_TIFF_WIDTH, _TIFF_HEIGHT = 0x0100, 0x0101
+_EXIF_SUB_IFD = 0x8769
+_FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
+_PIXEL_X, _PIXEL_Y = 0xA002, 0xA003
+_FOCAL_PLANE_X, _FOCAL_PLANE_Y, _FOCAL_PLANE_UNIT = 0xA20E, 0xA20F, 0xA210
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # inch, cm, mm, um
 
 # What Pillow raises on damaged files, gathered from its own fuzz corpus.
 DAMAGED: tuple[type[Exception], ...] = (
@@ -27,12 +34,34 @@ DAMAGED: tuple[type[Exception], ...] = (
 )
 
 
+class FocalPlane(NamedTuple):
+    """EXIF's focal plane resolution: px per mm of the sensor, of a picture of `width` x `height` px (0: not said)."""
+
+    px_per_mm_x: float
+    px_per_mm_y: float
+    width: int
+    height: int
+
+
 class ImageHeader(NamedTuple):
-    """Stored size (px) and EXIF orientation (1 = as stored)."""
+    """What a file says of its picture, as stored; EXIF's claims are unchecked but positive.
+
+    Attributes:
+        width, height: stored size, px.
+        orientation: EXIF's, 1 to 8; 1 = show as stored, 5 to 8 exchange width and height.
+        focal_mm: focal length.
+        focal_35mm: the focal length, mm, that sees as much on 35 mm film (36 x 24 mm).
+        focal_plane: the sensor's resolution, which makes pixels of `focal_mm`.
+        several: the file holds more pages or frames than the first one.
+    """
 
     width: int
     height: int
-    orientation: int
+    orientation: int = 1
+    focal_mm: float | None = None
+    focal_35mm: float | None = None
+    focal_plane: FocalPlane | None = None
+    several: bool = False
 
 
 @contextmanager
@@ -103,13 +132,54 @@ def open_image(path: Path, name: str) -> Image.Image:
 
 
 def read_header(path: Path, name: str) -> ImageHeader:
-    """Size and orientation of an image file. Raises InputError as `open_image` does."""
+    """Size, EXIF orientation and focal length of an image file. Raises InputError as `open_image` does."""
     with quiet_pillow(), open_image(path, name) as image:
+        header = ImageHeader(*stored_size(image), several=_holds_several(image))
+        # Pillow would decode a whole PNG in search of EXIF behind its pixels.
+        if image.format == "PNG" and "exif" not in image.info:
+            return header
         try:
-            orientation = image.getexif().get(EXIF_ORIENTATION, 1)
+            return _with_exif(header, image.getexif())
         except DAMAGED:  # broken metadata does not spoil the picture
-            orientation = 1
-        return ImageHeader(image.width, image.height, orientation if isinstance(orientation, int) else 1)
+            return header
+
+
+def stored_size(image: Image.Image) -> tuple[int, int]:
+    """Width and height (px) of the pixels as stored; Pillow tells those of a turned TIFF as shown."""
+    if isinstance(image, TiffImageFile):
+        return int(image.tag_v2[_TIFF_WIDTH]), int(image.tag_v2[_TIFF_HEIGHT])
+    return image.size
+
+
+def _holds_several(image: Image.Image) -> bool:
+    # Phones put previews and depth maps behind a JPEG; they are no pages of it.
+    return image.format in ("TIFF", "WEBP", "PNG") and bool(getattr(image, "is_animated", False))
+
+
+def _with_exif(header: ImageHeader, exif: Image.Exif) -> ImageHeader:
+    details = exif.get_ifd(_EXIF_SUB_IFD)
+    orientation = exif.get(EXIF_ORIENTATION, 1)
+    unit = _UNIT_MM.get(details.get(_FOCAL_PLANE_UNIT, 2))
+    x, y = _positive(details.get(_FOCAL_PLANE_X)), _positive(details.get(_FOCAL_PLANE_Y))
+    plane = None
+    if unit and (x or y):
+        width, height = (_positive(details.get(key)) or 0 for key in (_PIXEL_X, _PIXEL_Y))
+        plane = FocalPlane((x or y or 0) / unit, (y or x or 0) / unit, int(width), int(height))
+    return header._replace(
+        orientation=orientation if orientation in range(1, 9) else 1,
+        focal_mm=_positive(details.get(_FOCAL_LENGTH)),
+        focal_35mm=_positive(details.get(_FOCAL_LENGTH_35MM)),
+        focal_plane=plane,
+    )
+
+
+def _positive(value: object) -> float | None:
+    """A finite number above zero, or None: cameras write 0, 0/0 and worse for what they do not know."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if 0 < number < 1e9 else None
 
 
 def _too_large(name: str) -> InputError:

@@ -9,7 +9,8 @@ import numpy as np
 
 from biresnerf.data.dataset import Camera, Dataset, Frame, SourceFormat
 from biresnerf.data.image_files import read_header
-from biresnerf.data.transforms_json import orientation_notes, refuse_too_few
+from biresnerf.data.orientation import orientation_notes, page_notes
+from biresnerf.data.transforms_json import refuse_too_few
 
 GUESSED_FOCAL = 1.2  # of the long side, as COLMAP guesses: a field of view of 45 degrees, a normal lens
 
@@ -37,6 +38,6 @@ def read_image_folder(root: Path, images: Sequence[Path]) -> Dataset:
         tuple(cameras),
         tuple(frames),
         SourceFormat("images", None, {}, np.eye(4)),
-        tuple(orientation_notes(headers, names)),
+        (*orientation_notes(headers, [1] * len(headers), names), *page_notes(headers, names)),
         tuple("guessed" for _ in cameras),
     )

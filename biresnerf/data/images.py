@@ -5,20 +5,17 @@ from __future__ import annotations
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from biresnerf.config import Background
 from biresnerf.data.area_resize import area_resize
 from biresnerf.data.background import uniform_background
 from biresnerf.data.dataset import Camera, Dataset
-from biresnerf.data.image_files import DAMAGED, open_image, quiet_pillow
-from biresnerf.errors import InputError
+from biresnerf.data.decode import decode
+from biresnerf.data.image_files import quiet_pillow
 
-_ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 # More threads hold more full-size pictures at once than they save time.
 _DECODERS = 4
@@ -95,7 +92,7 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
 
     def fill(index: int) -> None:
         part = slice(int(offsets[index]), int(offsets[index + 1]))
-        picture = decode(dataset.frames[index].path, dataset.names[index], dataset.camera_of(index))
+        picture = decode(dataset.frames[index], dataset.camera_of(index))
         colour, opacity = _shrink(picture, *sizes[index], behind, keep_alpha=background != "none")
         pixels[part], alpha[part] = colour.reshape(-1, 3), opacity.reshape(-1)
 
@@ -127,49 +124,6 @@ def _with_background(images: ImageSet, background: Background, behind: tuple[flo
     return ImageSet(
         images.pixels, images.alpha, images.offsets, images.widths, images.heights, images.cameras, colour
     )
-
-
-def decode(path: Path, name: str, camera: Camera) -> NDArray[np.uint8]:
-    """The stored pixels, uint8 [h, w, 3] or [h, w, 4] (straight alpha); 16-bit and grey become 8-bit RGB.
-
-    Raises:
-        InputError: as `load_images`.
-    """
-    with open_image(path, name) as image:
-        if image.size != (camera.width, camera.height):
-            raise InputError(
-                "image_changed",
-                f"has {image.width} x {image.height} px now, not {camera.width} x {camera.height}.",
-                where=name,
-                mend="Leave the images alone while they are being read.",
-            )
-        try:
-            image.load()
-            return _eight_bit(image, name)
-        except DAMAGED:
-            raise InputError(
-                "image_truncated",
-                "is cut off or damaged.",
-                where=name,
-                mend="Copy it again, or remove its frame.",
-            ) from None
-
-
-def _eight_bit(image: Image.Image, name: str) -> NDArray[np.uint8]:
-    if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
-        # 65535 becomes 255: the full range, rounded.
-        grey = ((np.asarray(image).astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
-        return np.repeat(grey[..., None], 3, axis=2)
-    if image.mode in ("I", "F"):
-        raise InputError(
-            "image_format_unsupported",
-            "holds 32-bit numbers, which are no colours.",
-            where=name,
-            mend="Save it with 8 or 16 bits per channel.",
-        )
-    if image.mode in _ALPHA_MODES or "transparency" in image.info:
-        return np.asarray(image.convert("RGBA"))
-    return np.asarray(image.convert("RGB"))
 
 
 def _shrink(

@@ -137,7 +137,7 @@ def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int,
             "image_size_mismatch",
             f"{sizes}, the file says {w} x {h}: turned by 90 degrees.",
             where=where,
-            mend="Rotate the stored pixels (an EXIF tag is not enough), or exchange w and h, cx and cy.",
+            mend="Rotate the stored pixels (or tag them with EXIF's orientation), or exchange w and h, cx and cy.",
         )
     # Within one pixel of rounding, the image is a resized copy of the one the intrinsics were made for.
     if min(abs(h * header.width / w - header.height), abs(w * header.height / h - header.width)) > 1.0:

@@ -14,6 +14,7 @@ from biresnerf.data.dataset import Camera, Dataset, Dialect, Frame, SourceFormat
 from biresnerf.data.image_files import ImageHeader, find_image, is_image_name, read_header
 from biresnerf.data.intrinsics_json import Fields, camera_of_frame
 from biresnerf.data.json_document import read_json_object
+from biresnerf.data.orientation import meant_orientations, orientation_notes, page_notes, turned_header
 from biresnerf.data.poses import ROTATION_WARNED, rigid_matrix
 from biresnerf.errors import InputError
 
@@ -42,14 +43,24 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
         _refuse_outside(path, names, within)
     paths = _find_images(path, names)
     _refuse_missing_poses(rows, names, path.name)
-    headers = [read_header(image, name) for image, name in zip(paths, names, strict=True)]
+    stored = [read_header(image, name) for image, name in zip(paths, names, strict=True)]
+    sizes = [_named_size(row, document) for row in rows]
+    orientations = meant_orientations(stored, sizes)
+    headers = [turned_header(header, o) for header, o in zip(stored, orientations, strict=True)]
     cameras, camera_indices, notes = _cameras(rows, source, headers, names, path.name)
     poses, pose_notes = _poses(rows, names, source, path.name)
-    notes += pose_notes + orientation_notes(headers, names) + _ignored_notes(rows, document)
+    notes += (
+        pose_notes
+        + orientation_notes(stored, orientations, names)
+        + page_notes(stored, names)
+        + _ignored_notes(rows, document)
+    )
     notes += _unused_image_notes(paths)
     frames = tuple(
-        Frame(name, image, camera, pose, "given", row)
-        for name, image, camera, pose, row in zip(names, paths, camera_indices, poses, rows, strict=True)
+        Frame(name, image, camera, pose, "given", row, orientation=orientation)
+        for name, image, camera, pose, row, orientation in zip(
+            names, paths, camera_indices, poses, rows, orientations, strict=True
+        )
     )
     return Dataset(path.parent, cameras, frames, source, tuple(notes))
 
@@ -61,12 +72,15 @@ def few_names(names: Iterable[str], limit: int = 5) -> str:
     return ", ".join(listed[:limit]) + more
 
 
-def orientation_notes(headers: list[ImageHeader], names: Iterable[str]) -> list[str]:
-    """Notes on images whose EXIF tag asks viewers to turn them; stored pixels are used as they are."""
-    turned = [name for header, name in zip(headers, names, strict=True) if header.orientation != 1]
-    if not turned:
-        return []
-    return [f"an EXIF tag asks to turn {few_names(turned)}; poses and pixels are taken as stored, unturned"]
+def _named_size(row: dict[str, Any], document: dict[str, Any]) -> tuple[float | None, float | None]:
+    """w and h that go with a frame; None for what is no number, which is refused where it is used."""
+    top = {} if row.get("fl_x") is not None else document  # its own focal length goes with its own size
+    width, height = (_usable(row.get(key, top.get(key))) for key in ("w", "h"))
+    return width, height
+
+
+def _usable(value: Any) -> float | None:
+    return float(value) if isinstance(value, int | float) and 0 < value < 1e12 else None
 
 
 def _frame_objects(document: dict[str, Any], file: str) -> list[dict[str, Any]]:
