@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.geometry.camera_models import OpenCVParameters, full_parameters, smallest_model
+
+if TYPE_CHECKING:
+    from biresnerf.data.colmap_scene import ColmapModel
 
 PoseSource = Literal["given", "colmap"]
 IntrinsicsSource = Literal["given", "exif", "colmap", "guessed"]
@@ -84,6 +87,8 @@ class SourceFormat:
         applied_transform: float64 [4, 4] rigid motion of nerfstudio's key, identity where there is none.
         applied_scale: nerfstudio's key, 1 where there is none. A point of the world lies in the file at
             ``applied_scale * (applied_transform @ x)``.
+        colmap: the model that the input was, with its ids, rigs and points; ``Frame.name`` is then its name of the
+            image. None for other inputs.
     """
 
     dialect: Dialect
@@ -91,6 +96,7 @@ class SourceFormat:
     document: dict[str, Any]
     applied_transform: NDArray[np.float64]
     applied_scale: float = 1.0
+    colmap: ColmapModel | None = None
 
 
 @dataclass(frozen=True, eq=False)
