@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from biresnerf.field.occupancy import DECAY, DENSITY_CHUNK, LOOKED_AT, OccupancyGrid, interval_growth
+from biresnerf.field.occupancy import DECAY, DENSITY_CHUNK, OccupancyGrid, interval_growth
 from biresnerf.field.radiance_field import RadianceField
 
 
@@ -17,21 +17,21 @@ class DeviceOccupancyGrid(OccupancyGrid):
         step: float,
         generator: torch.Generator,
         *,
-        everywhere: bool,
+        looked_at: float,
         prune: bool,
         dilate: bool,
     ) -> None:
         count = self.side**3
         cells = torch.arange(count, device=self.device)
         total = torch.full((1,), count, device=self.device)
-        if not everywhere:
-            looked_at = torch.rand(count, generator=generator, device=self.device) < LOOKED_AT
-            looked_at |= self.occupied.reshape(-1).bool()
-            place = torch.cumsum(looked_at, 0)
+        if looked_at < 1:
+            chosen = torch.rand(count, generator=generator, device=self.device) < looked_at
+            chosen |= self.occupied.reshape(-1).bool()
+            place = torch.cumsum(chosen, 0)
             total = place[-1:]
             # The cells to look at come first; behind them lies a cell of no meaning, as often as needed.
             first = torch.full((count + 1,), count, device=self.device)
-            cells = first.scatter_(0, torch.where(looked_at, place - 1, count), cells)[:count]
+            cells = first.scatter_(0, torch.where(chosen, place - 1, count), cells)[:count]
             cells = torch.where(torch.arange(count, device=self.device) < total, cells, count)
         found = torch.zeros(count + 1, device=self.device)
         for begin in range(0, count, DENSITY_CHUNK):

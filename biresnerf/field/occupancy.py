@@ -12,7 +12,6 @@ from torch import Tensor
 from biresnerf.field.radiance_field import RadianceField
 
 DECAY = 0.95
-LOOKED_AT = 0.25  # of the cells that are not occupied, at a partial update
 THRESHOLD = 0.01
 GROWTH_UP_TO = 60.0  # inner boxes: how far unbounded rays reach
 DENSITY_CHUNK = 1 << 18  # cells whose density is asked for at once
@@ -55,14 +54,14 @@ class OccupancyGrid:
         step: float,
         generator: torch.Generator,
         *,
-        everywhere: bool,
+        looked_at: float,
         prune: bool,
         dilate: bool,
     ) -> None:
-        """Look again at all cells, or at a random quarter and the occupied ones, at a random point in each."""
+        """Look again at the occupied cells and a random share `looked_at` of the others, at a random point in each."""
         cells = torch.arange(self.side**3)
-        if not everywhere:
-            chosen = torch.rand(len(cells), generator=generator) < LOOKED_AT
+        if looked_at < 1:
+            chosen = torch.rand(len(cells), generator=generator) < looked_at
             cells = cells[chosen | self.occupied.reshape(-1).cpu().bool()]
         self.thickness *= DECAY
         for part in cells.split(DENSITY_CHUNK):

@@ -218,7 +218,7 @@ class JointOptimiser:
             self.field,
             self.schedule.fine_interval,
             self.draws,
-            everywhere=self.schedule.looks_everywhere(step, self.switch),
+            looked_at=self.schedule.empty_cells_looked_at(step, self.switch),
             prune=self.schedule.pruned(step),
             dilate=self.schedule.dilated(self.switch),
         )

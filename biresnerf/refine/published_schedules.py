@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from biresnerf.field.radiance_field import FieldRates, PositionGradient
 from biresnerf.geometry.perturb import RIG_DISTANCE
-from biresnerf.refine.schedule import NEAR_SHARES, POSE_DIP, Schedule, smooth_ramp
+from biresnerf.refine.schedule import EMPTY_LOOKED_AT, NEAR_SHARES, POSE_DIP, Schedule, smooth_ramp
 
 # Steps that look at all cells of the occupancy grid, as shares: 256 of BAA-NGP's 40 000, of NerfAcc-BARF's 200 000.
 FIRST_LOOKS, NERFACC_BARF_FIRST_LOOKS = 256 / 40_000, 256 / 200_000
@@ -29,8 +29,8 @@ class PlainSchedule(Schedule):
     def dilated(self, switch: int | None) -> bool:
         return False
 
-    def looks_everywhere(self, step: int, switch: int | None) -> bool:
-        return step < self.first_looks * self.steps
+    def empty_cells_looked_at(self, step: int, switch: int | None) -> float:
+        return 1.0 if step < self.first_looks * self.steps else EMPTY_LOOKED_AT[0]
 
     def pose_rate(self, step: int, switch: int | None) -> float:
         return self._decayed("pose", step / self.steps)

@@ -32,6 +32,8 @@ FREEZE_SHARE = 0.95  # of all steps: poses stand still from then on
 # From this share on, poses are averaged, and frozen at their mean: settled cameras stagger about the best pose by
 # steps of the learning rate's size, which the mean does not.
 AVERAGE_SHARE = 0.8
+# In stage 1 as NerfAcc; in stage 2 empty space hardly fills any more, and each look costs all levels.
+EMPTY_LOOKED_AT = (0.25, 1 / 16)
 FRESH_STEPS = (
     256,
     512,
@@ -109,10 +111,12 @@ class Schedule:
         """Whether neighbours of occupied cells are looked into."""
         return switch is None
 
-    def looks_everywhere(self, step: int, switch: int | None) -> bool:
-        """Whether occupancy is asked of all cells rather than of some."""
+    def empty_cells_looked_at(self, step: int, switch: int | None) -> float:
+        """Share of the empty cells that an update of the occupancy grid looks at."""
         start, fresh = FRESH_STEPS
-        return step < start or (switch is not None and step - switch < fresh)
+        if step < start or (switch is not None and step - switch < fresh):
+            return 1.0
+        return EMPTY_LOOKED_AT[0 if switch is None else 1]
 
     def blur(self, step: int, switch: int | None, long_side: float) -> float:
         """Standard deviation (px) that photos are blurred with, before its random factor."""

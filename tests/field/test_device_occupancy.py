@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from biresnerf.field.device_occupancy import DeviceOccupancyGrid
-from biresnerf.field.occupancy import LOOKED_AT, OccupancyGrid
+from biresnerf.field.occupancy import OccupancyGrid
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 SIDE = 16
@@ -31,7 +31,7 @@ class Ball:
 
 
 def update(grid, field, generator, **more) -> None:
-    grid.update(field, 0.01, generator, **{"everywhere": True, "prune": True, "dilate": False, **more})
+    grid.update(field, 0.01, generator, **{"looked_at": 1.0, "prune": True, "dilate": False, **more})
 
 
 @pytest.mark.parametrize("unbounded", [False, True])
@@ -51,8 +51,8 @@ def test_a_partial_update_looks_at_the_occupied_cells_and_a_share_of_the_rest():
     grid, generator = DeviceOccupancyGrid(SIDE, DEVICE), torch.Generator(DEVICE).manual_seed(1)
     update(grid, Ball(), generator)
     occupied, before, field = grid.share, grid.thickness.clone(), Ball()
-    update(grid, field, generator, everywhere=False)
-    expected = SIDE**3 * (occupied + LOOKED_AT * (1 - occupied))
+    update(grid, field, generator, looked_at=0.25)
+    expected = SIDE**3 * (occupied + 0.25 * (1 - occupied))
     assert sum(field.counts) == pytest.approx(expected, rel=0.05)
     assert torch.isfinite(grid.thickness).all()
     outside = before == 0
@@ -65,7 +65,7 @@ def test_new_matter_is_found_by_partial_updates():
     grid, generator = DeviceOccupancyGrid(SIDE, DEVICE), torch.Generator(DEVICE).manual_seed(1)
     grid.occupied.zero_()
     for _ in range(40):
-        update(grid, Ball(), generator, everywhere=False)
+        update(grid, Ball(), generator, looked_at=0.25)
     centre = (torch.arange(SIDE, device=DEVICE) + 0.5) / SIDE - 0.5
     z, y, x = torch.meshgrid(centre, centre, centre, indexing="ij")
     distance = (x * x + y * y + z * z).sqrt()

@@ -27,9 +27,9 @@ class Slab:
         return torch.where(inside, 50.0, self.elsewhere)
 
 
-def update(grid: OccupancyGrid, field: Slab, *, everywhere=True, prune=True, dilate=False, seed=0) -> None:
+def update(grid: OccupancyGrid, field: Slab, *, looked_at=1.0, prune=True, dilate=False, seed=0) -> None:
     generator = torch.Generator().manual_seed(seed)
-    grid.update(field, 0.01, generator, everywhere=everywhere, prune=prune, dilate=dilate)
+    grid.update(field, 0.01, generator, looked_at=looked_at, prune=prune, dilate=dilate)
 
 
 def columns(grid: OccupancyGrid) -> list[int]:
@@ -94,7 +94,7 @@ def test_a_partial_update_looks_at_the_occupied_and_a_quarter_of_the_rest():
     grid = OccupancyGrid(16, CPU)
     update(grid, Slab())
     field = Slab()
-    update(grid, field, everywhere=False)
+    update(grid, field, looked_at=0.25)
     expected = 16**3 * (1 / 8 + 7 / 8 / 4)
     assert field.asked == pytest.approx(expected, rel=0.1)
 
@@ -107,7 +107,7 @@ def test_new_matter_is_found_by_partial_updates():
     assert columns(grid) == [7]
     generator = torch.Generator().manual_seed(0)
     for _ in range(40):
-        grid.update(Slab(), 0.01, generator, everywhere=False, prune=True, dilate=False)
+        grid.update(Slab(), 0.01, generator, looked_at=0.25, prune=True, dilate=False)
     assert 3 in columns(grid)
 
 
