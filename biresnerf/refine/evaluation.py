@@ -66,15 +66,20 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
 
 @torch.no_grad()
 def render_view(
-    optimiser: JointOptimiser, unit_from_cam: Tensor, image: int, intrinsics: Intrinsics | None = None
+    optimiser: JointOptimiser,
+    unit_from_cam: Tensor,
+    image: int,
+    intrinsics: Intrinsics | None = None,
+    stride: int = 1,
 ) -> RenderedView:
     """Render what a camera at `unit_from_cam` [3, 4] with the intrinsics of `image` sees, whole.
 
-    `intrinsics` are the run's images' where not given.
+    `intrinsics` are the run's images' where not given; of rows and columns every `stride`-th is rendered.
     """
     lenses = intrinsics or optimiser.intrinsics
     width, height = int(lenses.width[image]), int(lenses.height[image])
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    rows, columns = torch.arange(0, height, stride) + 0.5, torch.arange(0, width, stride) + 0.5
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
     pixels = torch.stack([x, y], -1).reshape(-1, 2).to(optimiser.device)
     parts = []
     for xy in pixels.split(CHUNK):
@@ -86,7 +91,7 @@ def render_view(
             origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=False
         )
         parts.append(torch.cat([part.colour, part.depth[:, None], part.opacity[:, None]], 1).cpu())
-    whole = torch.cat(parts).reshape(height, width, 5).numpy()
+    whole = torch.cat(parts).reshape(len(rows), len(columns), 5).numpy()
     return RenderedView(whole[..., :3].clip(0, 1), whole[..., 3], whole[..., 4])
 
 

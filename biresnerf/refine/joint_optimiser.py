@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from biresnerf.config import RefineOptions
@@ -53,6 +55,7 @@ class JointOptimiser:
         options: resolved.
         held_out: images whose rays move their own pose but never the field.
         mobility: each camera's factor of the pose rate [2, n] in stage 1 and stage 2; 1 where left out.
+        sampler: of the same images and held-out views, where another optimiser has made it already.
     """
 
     def __init__(
@@ -65,6 +68,7 @@ class JointOptimiser:
         device: torch.device,
         threads: int,
         mobility: np.ndarray | None = None,
+        sampler: PhotoSampler | None = None,
     ) -> None:
         self.frame, self.options, self.device = frame, options, device
         self.method = METHODS[options.method]
@@ -72,8 +76,8 @@ class JointOptimiser:
         self.intrinsics = Intrinsics.from_cameras(images.cameras).to(device)
         self.poses = self._pose_parameters(torch.from_numpy(unit_from_cam))
         self.schedule = self.method.schedule(options, frame.pixel, frame.unbounded, frame.distance)
-        self.sampler = PhotoSampler(images, held_out, device)
-        self.photo_distances = photo_distances(images)
+        self._images = images
+        self.sampler = sampler or PhotoSampler(images, held_out, device)
         self.camera_errors = CameraErrors(images, held_out, device)
         self.directions, self.figures = directions_for(device), LateFigures(device)
         self.occupancy = make_occupancy(occupancy_side(self.method, options), device)
@@ -94,6 +98,11 @@ class JointOptimiser:
         )
         guess = self.schedule.samples(0, None) // (self.field.stratified or FIRST_SAMPLES)
         self.rays = max(self.method.rays_least, guess)
+
+    @cached_property
+    def photo_distances(self) -> NDArray[np.float32]:
+        """How unlike the photos are, see `photo_distances`; worked out when a lost camera first needs it."""
+        return photo_distances(self._images)
 
     def _pose_parameters(self, unit_from_cam: Tensor) -> PoseParameters:
         options, distance = self.options, self.frame.distance

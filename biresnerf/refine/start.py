@@ -1,7 +1,6 @@
 """Where the optimisation starts: at the given poses, or at those feature matches support, whichever the photos prefer.
 
-The trial is short and cannot favour one side: the same field is trained for the same steps on each set of poses, held
-still, and views it was not trained on are compared with their photos.
+The trial is short and cannot favour one side: see `biresnerf.refine.frozen_trials`.
 """
 
 from __future__ import annotations
@@ -16,22 +15,14 @@ import torch
 
 from biresnerf.config import RefineOptions
 from biresnerf.data.images import ImageSet
-from biresnerf.errors import Interrupted
-from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.pose_error import rotation_angle_deg
-from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.frozen_trials import FrozenTrials, trial_views
 from biresnerf.refine.methods import METHODS
-from biresnerf.refine.scene_frame import scene_frame
 from biresnerf.report import StartSource, TrialReport
 
 logger = logging.getLogger(__name__)
 
-# Until a field of an open scene has formed, good poses predict unseen views no better than bad ones (fountain-P11: no
-# difference after 200 steps, 4 dB after 400).
-TRIAL_STEPS, OPEN_TRIAL_STEPS = 200, 400
-TRIAL_SAMPLES = 1 << 14
-TRIAL_ONE_IN, TRIAL_VIEWS_MOST = 5, 16
-TRIAL_RAYS = 1 << 13
+TRIAL_STEPS = 200
 # Of the pose rate, in stage 1 and 2: what cameras placed by matches may move by. They are off by tenths of a degree,
 # and at the full rate the steps alone carry them further before the field can tell: fox, from 0.29 deg, ended 1,500
 # steps later at 1.03 with the full rate, 0.64 with a fifth of it, 0.28 with these.
@@ -106,10 +97,11 @@ def choose_start(
     Raises:
         Interrupted: ``should_stop`` said so.
     """
-    scores = [
-        _trial(candidate.world_from_cam, images, options, device, threads, should_stop)
-        for candidate in candidates
-    ]
+    rigs = [candidate.world_from_cam for candidate in candidates]
+    trials_of = FrozenTrials(
+        images, trial_views(len(images)), rigs, options, TRIAL_STEPS, device, threads, should_stop
+    )
+    scores = [float(trials_of.score(rig).psnr.mean()) for rig in rigs]
     best = int(np.argmax(scores))
     if scores[best] < scores[0] + MARGIN_DB:
         matched = int(np.argmax(scores[1:])) + 1
@@ -122,45 +114,6 @@ def choose_start(
     chosen = candidates[best]
     logger.info("start: %s of %s", chosen.source, ", ".join(f"{t.source} {t.psnr:.2f} dB" for t in trials))
     return replace(chosen, trials=trials)
-
-
-def _trial(
-    world_from_cam: np.ndarray,
-    images: ImageSet,
-    options: RefineOptions,
-    device: torch.device,
-    threads: int,
-    should_stop: Callable[[], bool],
-) -> float:
-    """Mean PSNR (dB) over views that a field trained on the others, all poses still, was not shown."""
-    count = len(world_from_cam)
-    unseen = list(range(TRIAL_ONE_IN // 2, count, max(TRIAL_ONE_IN, -(-count // TRIAL_VIEWS_MOST))))
-    frame = scene_frame(world_from_cam, images)
-    steps = OPEN_TRIAL_STEPS if frame.unbounded else TRIAL_STEPS
-    short = options.model_copy(
-        update={
-            "steps": 2 * steps,
-            "coarse_steps_min": steps,
-            "coarse_steps_max": steps,
-            "samples_per_step": TRIAL_SAMPLES,
-        }
-    )
-    poses = frame.unit_from_world.apply_to_poses(world_from_cam)
-    optimiser = JointOptimiser(images, frame, poses, short, unseen, device, threads)
-    optimiser.pose_scale = 0.0
-    for _ in range(steps):
-        if should_stop():
-            raise Interrupted("stopped while choosing the poses to start from")
-        optimiser.step()
-    batch = optimiser.sampler.draw(TRIAL_RAYS, 0.0, optimiser.generator, held_out_only=True)
-    with torch.no_grad():
-        origin, direction = optimiser.cast(optimiser.poses.matrices()[batch.image], batch.image, batch.xy)
-        rendering = optimiser.render(
-            origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=False
-        )
-    error = ((rendering.colour - batch.sharp) ** 2).mean(1)
-    per_view = [float(error[batch.image == view].mean()) for view in unseen]
-    return float(np.mean([-10 * np.log10(max(value, 1e-12)) for value in per_view]))
 
 
 def _turned_deg(given: np.ndarray, other: np.ndarray) -> float:

@@ -10,6 +10,7 @@ import pytest
 from biresnerf.config import RefineOptions
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.refine import frozen_trials
 from biresnerf.refine import start as start_module
 from biresnerf.refine.start import MATCHED_MOBILITY, Start, choose_start
 from tests.refine.scene import CPU, tiny_options, tiny_set
@@ -25,7 +26,7 @@ def scene(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
     monkeypatch.setattr(start_module, "TRIAL_STEPS", 60)
-    monkeypatch.setattr(start_module, "TRIAL_SAMPLES", 8192)
+    monkeypatch.setattr(frozen_trials, "SAMPLES", 8192)
 
 
 def candidates(dataset, first: np.ndarray, second: np.ndarray) -> list[Start]:
