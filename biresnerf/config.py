@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from biresnerf.errors import InputError
 
@@ -18,6 +18,7 @@ Background = Literal["auto", "white", "black", "none"]
 Wiring = Literal["concat", "replace", "residual"]
 DetectorName = Literal["trend", "counter", "variance"]
 PoseParametrisation = Literal["se3_world", "so3xr3", "so3xr3_camp"]
+PackName = Literal["colmap-text", "instant-ngp", "kitti", "bundler"]
 StartPoses = Literal["auto", "given"]
 
 
@@ -107,6 +108,17 @@ class RefineOptions(BaseModel):
     orbit_frames: int | None = Field(
         None, ge=0, le=600, description="Frames of the orbit video; 0 leaves it out."
     )
+    packs: tuple[PackName, ...] = Field(
+        (),
+        description="Forms to write the result in beside those that always are: colmap-text, instant-ngp, kitti, "
+        "bundler.",
+    )
+
+    @field_validator("packs", mode="before")
+    @classmethod
+    def _listed(cls, value: Any) -> Any:
+        """A list may be written with commas, as on a command line."""
+        return tuple(part.strip() for part in value.split(",")) if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _ordered(self) -> RefineOptions:

@@ -13,8 +13,10 @@ from biresnerf.data.area_resize import area_resize
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.images import ImageSet
+from biresnerf.data.packs.write_packs import write_packs
+from biresnerf.data.refined_set import refined_set
 from biresnerf.data.renders import picture_stems, write_orbit, write_view
-from biresnerf.data.write import write_colmap, write_transforms
+from biresnerf.data.write import write_transforms
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera import Intrinsics
 from biresnerf.geometry.pose_error import rotation_angle_deg
@@ -28,7 +30,7 @@ from biresnerf.refine.two_stages import TwoStages
 from biresnerf.report import HeldOut, ImageReport, Report, SimilarityReport
 
 REPORT, CONFIG, TRANSFORMS = "report.json", "config.json", "transforms.json"
-COLMAP, RENDERS, ORBIT = Path("colmap") / "sparse" / "0", "renders", "orbit.mp4"
+RENDERS, ORBIT = "renders", "orbit.mp4"
 PREVIEW = "preview"
 SOLID = 0.5  # opacity from which a depth means something
 _ANOTHER = "Choose another output folder, or remove this one."
@@ -131,21 +133,29 @@ class OutputFolder:
         threads: int,
         state: Literal["complete", "partial"],
     ) -> Report:
-        """Poses in the input's frame, as transforms.json and as a COLMAP model, the options and the report, last."""
+        """Poses in the input's frame, in the input's form and in others, the options, and the report, last."""
         optimiser = stages.optimiser
         self._write_text(CONFIG, optimiser.options.model_dump_json(indent=2))
         world_from_cam, similarity = poses_in_input_frame(dataset, optimiser)
         write_transforms(dataset, world_from_cam, self.path / TRANSFORMS)
-        write_colmap(dataset, world_from_cam, self.path / COLMAP)
         record = stages.record
         lost = [i for i, flag in enumerate(optimiser.camera_errors.lost.tolist()) if flag]
+        images_reported = _image_reports(
+            dataset, start, world_from_cam, held_out, scores, lost, stages.repair.repaired
+        )
+        refined = refined_set(
+            dataset,
+            world_from_cam,
+            similarity=similarity,
+            pose_sources=[image.pose_source for image in images_reported],
+            flags=[image.flags for image in images_reported],
+        )
+        notes = write_packs(refined, self.path, optimiser.options.packs)
         report = Report(
             version=_version(),
             state=state,
             options=optimiser.options,
-            images=_image_reports(
-                dataset, start, world_from_cam, held_out, scores, lost, stages.repair.repaired
-            ),
+            images=images_reported,
             heldout=HeldOut(
                 count=len(scores),
                 psnr=float(np.mean([s.psnr for s in scores])),
@@ -168,7 +178,7 @@ class OutputFolder:
                 rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
                 translation=tuple(float(v) for v in similarity.translation),
             ),
-            warnings=dataset.warnings + start.warnings + _lost_warnings(dataset, lost),
+            warnings=dataset.warnings + start.warnings + _lost_warnings(dataset, lost) + notes,
         )
         self._write_text(REPORT, report.model_dump_json(indent=2))
         return report

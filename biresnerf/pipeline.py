@@ -220,7 +220,7 @@ def _prepare(
     images = load_images(dataset, options.max_image_size, options.background)
     digest = hashlib.sha256(images.pixels.tobytes())
     # What changes neither result nor effort may differ between a run and its continuation.
-    asked = options.model_dump(exclude={"threads", "checkpoint_every_s", "orbit_frames"})
+    asked = options.model_dump(exclude={"threads", "checkpoint_every_s", "orbit_frames", "packs"})
     digest.update(json.dumps([asked, dataset.names], sort_keys=True).encode())
     digest.update(np.ascontiguousarray(dataset.world_from_cam).tobytes())
     return Prepared(

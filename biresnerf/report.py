@@ -36,6 +36,11 @@ class ImageReport(BaseModel):
     )
     ssim: float | None = Field(None, description="As psnr; Gaussian window of 11 px, standard deviation 1.5.")
 
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """The names of all that is true of the image."""
+        return tuple(name for name, value in self if value is True)
+
 
 class HeldOut(BaseModel):
     """Mean quality of held-out views, their poses fitted to the frozen field first (BARF's test-time protocol)."""

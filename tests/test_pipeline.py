@@ -195,7 +195,8 @@ def test_options_as_used_lie_beside_the_result(run):
 
 def test_a_finished_folder_holds_results_only(run):
     names = {path.name for path in run.output.iterdir()}
-    assert names == {"transforms.json", "colmap", "report.json", "config.json", "history.jsonl", "renders"}
+    packs = {"transforms.json", "colmap", "poses.json", "tum.txt", "scene.glb"}
+    assert names == packs | {"report.json", "config.json", "history.jsonl", "renders"}
 
 
 def test_progress_goes_through_the_stages_and_never_falls(run):

@@ -1,4 +1,4 @@
-"""Refined poses out: in the caller's own dialect, frame, names and order, and as a COLMAP model."""
+"""Refined poses out as transforms.json: in the caller's own dialect, frame, names and order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.atomic_file import whole_file
-from biresnerf.data.colmap_model import write_colmap_model
 from biresnerf.data.conventions import file_from_world_from_cam
 from biresnerf.data.dataset import Camera, Dataset
 
@@ -71,15 +70,3 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
     values |= {"fl_x": p.fx, "fl_y": p.fy, "cx": p.cx, "cy": p.cy}
     values |= {"k1": p.k1, "k2": p.k2, "p1": p.p1, "p2": p.p2}
     return values
-
-
-def write_colmap(dataset: Dataset, world_from_cam: NDArray[np.float64], folder: Path) -> None:
-    """Writes cameras.bin, images.bin and an empty points3D.bin into ``folder``.
-
-    Image names are paths relative to ``dataset.root``, with extension. The frame is the dataset's world: for
-    a nerfstudio file with ``applied_transform`` that is the frame from before it.
-    """
-    indices = [frame.camera for frame in dataset.frames]
-    write_colmap_model(
-        folder, dataset.cameras, dataset.file_names, indices, np.asarray(world_from_cam, np.float64)
-    )

@@ -10,7 +10,7 @@ import biresnerf.data
 
 
 def test_no_module_of_the_data_room_loads_torch_numba_or_pycolmap():
-    names = [f"biresnerf.data.{module.name}" for module in pkgutil.iter_modules(biresnerf.data.__path__)]
+    names = [m.name for m in pkgutil.walk_packages(biresnerf.data.__path__, "biresnerf.data.")]
     program = f"import sys, {', '.join(names)}; print([m for m in ('torch', 'numba', 'pycolmap') if m in sys.modules])"
     answer = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True

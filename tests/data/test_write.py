@@ -12,8 +12,10 @@ import pytest
 
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Camera
+from biresnerf.data.packs.colmap_binary import write_colmap_binary
 from biresnerf.data.read import read_dataset
-from biresnerf.data.write import write_colmap, write_transforms
+from biresnerf.data.refined_set import refined_set
+from biresnerf.data.write import write_transforms
 from biresnerf.geometry.perturb import perturb_poses
 from tests.data.scenes import blender_scene, nerfstudio_scene, opengl_poses, save, write_image
 
@@ -77,7 +79,7 @@ def test_colmap_reads_the_model_with_the_same_names_cameras_and_poses(tmp_path):
     dataset, _ = odd_scene(tmp_path)
     refined = perturb_poses(dataset.world_from_cam, 0.1, 3)
     folder = tmp_path / "colmap/sparse/0"
-    write_colmap(dataset, refined, folder)
+    write_colmap_binary(refined_set(dataset, refined).model, folder)
     assert sorted(p.name for p in folder.iterdir()) == ["cameras.bin", "images.bin", "points3D.bin"]
     answer = subprocess.run(
         [sys.executable, "-c", PYCOLMAP, str(folder)], capture_output=True, text=True, timeout=60, check=True
@@ -108,7 +110,7 @@ def test_colmap_reads_every_camera_model(tmp_path, model, extra):
     if importlib.util.find_spec("pycolmap") is None:
         pytest.skip("pycolmap is not installed")
     dataset = read_dataset(save(tmp_path, nerfstudio_scene(tmp_path, camera_model=model, **extra)))
-    write_colmap(dataset, dataset.world_from_cam, tmp_path / "0")
+    write_colmap_binary(refined_set(dataset, dataset.world_from_cam).model, tmp_path / "0")
     answer = subprocess.run(
         [sys.executable, "-c", PYCOLMAP, str(tmp_path / "0")],
         capture_output=True,
@@ -130,9 +132,8 @@ def test_poses_that_are_not_finite_or_too_few_are_never_written(tmp_path):
         with pytest.raises(ValueError, match="poses must be finite"):
             write_transforms(dataset, wrong, tmp_path / "out.json")
         with pytest.raises(ValueError, match="poses must be finite"):
-            write_colmap(dataset, wrong, tmp_path / "model")
+            refined_set(dataset, wrong)
     assert not (tmp_path / "out.json").exists()
-    assert not (tmp_path / "model").exists()
 
 
 def test_a_writer_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):

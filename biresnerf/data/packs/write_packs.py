@@ -1,0 +1,50 @@
+"""All packs by name: which files each writes, and why one cannot be written where it cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from biresnerf.config import PackName
+from biresnerf.data.packs.bundler import write_bundler
+from biresnerf.data.packs.colmap_binary import write_colmap_binary
+from biresnerf.data.packs.colmap_text import write_colmap_text
+from biresnerf.data.packs.instant_ngp import TRANSFORMS_NGP, write_transforms_ngp
+from biresnerf.data.packs.poses_json import POSES, write_poses_json
+from biresnerf.data.packs.scene_glb import SCENE, write_scene
+from biresnerf.data.packs.trajectories import write_kitti, write_tum
+from biresnerf.data.refined_set import RefinedSet
+from biresnerf.errors import InputError
+
+COLMAP, COLMAP_TEXT = Path("colmap") / "sparse" / "0", Path("colmap") / "sparse_txt" / "0"
+
+# Written with every result: small, and enough to make the others from.
+ALWAYS: dict[str, Callable[[RefinedSet, Path], None]] = {
+    "colmap": lambda refined, folder: write_colmap_binary(refined.model, folder / COLMAP),
+    "tum": lambda refined, folder: write_tum(refined, folder / "tum.txt"),
+    "scene": lambda refined, folder: write_scene(refined, folder / SCENE),
+    "poses": lambda refined, folder: write_poses_json(refined, folder / POSES),
+}
+ON_REQUEST: dict[PackName, Callable[[RefinedSet, Path], None]] = {
+    "colmap-text": lambda refined, folder: write_colmap_text(refined.model, folder / COLMAP_TEXT),
+    "instant-ngp": lambda refined, folder: write_transforms_ngp(refined, folder / TRANSFORMS_NGP),
+    "kitti": lambda refined, folder: write_kitti(refined, folder / "kitti.txt"),
+    "bundler": lambda refined, folder: write_bundler(refined, folder / "bundler"),
+}
+
+
+def write_packs(refined: RefinedSet, folder: Path, more: Iterable[PackName] = ()) -> tuple[str, ...]:
+    """Writes what belongs to every result and ``more`` into ``folder``.
+
+    Returns:
+        a sentence for each pack asked for that this set cannot be written as.
+    """
+    for write in ALWAYS.values():
+        write(refined, folder)
+    notes = []
+    for name in more:
+        try:
+            ON_REQUEST[name](refined, folder)
+        except InputError as error:
+            notes.append(f"{name} was not written: {error}")
+    return tuple(notes)
