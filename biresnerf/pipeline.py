@@ -219,6 +219,8 @@ def _prepare(
         )
     images = load_images(dataset, options.max_image_size, options.background)
     digest = hashlib.sha256(images.pixels.tobytes())
+    if images.counts is not None:
+        digest.update(images.counts.tobytes())
     # What changes neither result nor effort may differ between a run and its continuation.
     asked = options.model_dump(exclude={"threads", "checkpoint_every_s", "orbit_frames", "packs"})
     digest.update(json.dumps([asked, dataset.names], sort_keys=True).encode())

@@ -23,10 +23,11 @@ from biresnerf.refine.pose_parameters import PoseParameters
 
 @dataclass(frozen=True, eq=False)
 class PhotoAndRender:
-    """Both [h, w, 3] in 0..1, at working size."""
+    """Both [h, w, 3] in 0..1, at working size; `counts` [h, w] says where they may be compared, None: anywhere."""
 
     photo: Tensor
     render: Tensor
+    counts: Tensor | None = None
 
 
 def render_test_views(
@@ -44,15 +45,18 @@ def render_test_views(
     intrinsics = Intrinsics.from_cameras(images.cameras).to(optimiser.device)
     for index in range(len(images)):
         photo = torch.from_numpy(images.image(index).astype(np.float32) / 255)
-        matrix = _fitted(optimiser, unit_from_cam[index], photo, index, intrinsics)
+        mask = images.counts_image(index)
+        counts = None if mask is None else torch.from_numpy(mask)
+        matrix = _fitted(optimiser, unit_from_cam[index], photo, counts, index, intrinsics)
         colour = render_view(optimiser, matrix, index, intrinsics).colour
-        yield PhotoAndRender(photo, torch.from_numpy(colour))
+        yield PhotoAndRender(photo, torch.from_numpy(colour), counts)
 
 
 def _fitted(
     optimiser: JointOptimiser,
     unit_from_cam: NDArray[np.float64],
     photo: Tensor,
+    counts: Tensor | None,
     index: int,
     intrinsics: Intrinsics,
 ) -> Tensor:
@@ -60,12 +64,11 @@ def _fitted(
     device = optimiser.device
     length = optimiser.frame.distance / RIG_DISTANCE
     pose = PoseParameters(torch.from_numpy(unit_from_cam[None]), "se3_world", length, device)
-    height, width = photo.shape[:2]
+    pixels = torch.nonzero(torch.ones(photo.shape[:2]) if counts is None else counts)
     rays = fit_rays(optimiser)
     which = torch.full((rays,), index, device=device)
     for step in range(FIT_STEPS):
-        x = torch.randint(width, (rays,), generator=optimiser.generator)
-        y = torch.randint(height, (rays,), generator=optimiser.generator)
+        y, x = pixels[torch.randint(len(pixels), (rays,), generator=optimiser.generator)].T
         xy = torch.stack([x, y], 1).to(device) + 0.5
         matrices = pose.matrices().expand(rays, 3, 4)
         origin, direction = optimiser.cast(matrices, which, xy, intrinsics)

@@ -73,15 +73,15 @@ class TruthObserver:
         if self.test_views is None:
             return
         started = time.monotonic()
-        pairs = [
-            (pair.render, pair.photo) for pair in render_test_views(optimiser, self.test_views, self.truth)
-        ]
+        views = list(render_test_views(optimiser, self.test_views, self.truth))
+        pairs = [(view.render, view.photo) for view in views]
+        masked = [(view.render, view.photo, view.counts) for view in views]
         distances, absent = _perceptual(pairs)
         self.quality = ViewQuality(
             kind="test",
             count=len(pairs),
-            psnr=float(np.mean([psnr(*pair) for pair in pairs])),
-            ssim=float(np.mean([ssim(*pair) for pair in pairs])),
+            psnr=float(np.mean([psnr(*view) for view in masked])),
+            ssim=float(np.mean([ssim(*view) for view in masked])),
             lpips=distances,
             lpips_absent=absent,
         )

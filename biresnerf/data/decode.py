@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from biresnerf.data.dataset import Camera, Frame
-from biresnerf.data.image_files import DAMAGED, EXIF_ORIENTATION, open_image, stored_size
+from biresnerf.data.image_files import DAMAGED, header_of, open_image
 from biresnerf.data.orientation import INVERSE, turned, turned_size
 from biresnerf.errors import InputError
 
+T = TypeVar("T", bound=np.generic)
 _ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})
 
 
@@ -24,7 +27,8 @@ def decode(frame: Frame, camera: Camera) -> NDArray[np.uint8]:
             ``image_format_unsupported``.
     """
     with open_image(frame.path, frame.name) as image:
-        width, height = turned_size(*stored_size(image), frame.orientation)
+        header = header_of(image)
+        width, height = turned_size(header.width, header.height, frame.orientation)
         if (width, height) != (camera.width, camera.height):
             raise InputError(
                 "image_changed",
@@ -33,7 +37,9 @@ def decode(frame: Frame, camera: Camera) -> NDArray[np.uint8]:
                 mend="Leave the images alone while they are being read.",
             )
         try:
-            return turned(_stored_pixels(image, frame.name), frame.orientation)
+            image.load()
+            stored = as_stored(_eight_bit(image, frame.name), image, header.orientation)
+            return turned(stored, frame.orientation)
         except DAMAGED:
             raise InputError(
                 "image_truncated",
@@ -43,11 +49,9 @@ def decode(frame: Frame, camera: Camera) -> NDArray[np.uint8]:
             ) from None
 
 
-def _stored_pixels(image: Image.Image, name: str) -> NDArray[np.uint8]:
-    # Pillow turns a TIFF as its orientation says, and nothing else.
-    orientation = image.getexif().get(EXIF_ORIENTATION, 1) if image.format == "TIFF" else 1
-    image.load()
-    return turned(_eight_bit(image, name), INVERSE.get(orientation, 1))
+def as_stored(picture: NDArray[T], image: Image.Image, orientation: int) -> NDArray[T]:
+    """The decoded ``picture`` as its file has it: Pillow turns a TIFF as its tag says, and nothing else."""
+    return turned(picture, INVERSE[orientation]) if image.format == "TIFF" else picture
 
 
 def _eight_bit(image: Image.Image, name: str) -> NDArray[np.uint8]:

@@ -125,6 +125,9 @@ def open_image(path: Path, name: str) -> Image.Image:
             where=name,
             mend="Replace it by a PNG, JPEG, WebP, TIFF or BMP file, or remove its frame.",
         ) from None
+    if image.format == "TIFF":
+        # Without a file name it is not mapped into memory: Pillow maps a turned TIFF with its sides exchanged.
+        image.filename = ""
     if image.width * image.height > MAX_IMAGE_PIXELS:
         image.close()
         raise _too_large(name)
@@ -134,14 +137,19 @@ def open_image(path: Path, name: str) -> Image.Image:
 def read_header(path: Path, name: str) -> ImageHeader:
     """Size, EXIF orientation and focal length of an image file. Raises InputError as `open_image` does."""
     with quiet_pillow(), open_image(path, name) as image:
-        header = ImageHeader(*stored_size(image), several=_holds_several(image))
-        # Pillow would decode a whole PNG in search of EXIF behind its pixels.
-        if image.format == "PNG" and "exif" not in image.info:
-            return header
-        try:
-            return _with_exif(header, image.getexif())
-        except DAMAGED:  # broken metadata does not spoil the picture
-            return header
+        return header_of(image)
+
+
+def header_of(image: Image.Image) -> ImageHeader:
+    """Size, EXIF orientation and focal length of an opened image that is not decoded yet."""
+    header = ImageHeader(*stored_size(image), several=_holds_several(image))
+    # Pillow would decode a whole PNG in search of EXIF behind its pixels.
+    if image.format == "PNG" and "exif" not in image.info:
+        return header
+    try:
+        return _with_exif(header, image.getexif())
+    except DAMAGED:  # broken metadata does not spoil the picture
+        return header
 
 
 def stored_size(image: Image.Image) -> tuple[int, int]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,9 @@ from biresnerf.data.background import uniform_background
 from biresnerf.data.dataset import Camera, Dataset
 from biresnerf.data.decode import decode
 from biresnerf.data.image_files import quiet_pillow
+from biresnerf.data.masks import load_mask, shrink_mask
 
+T = TypeVar("T", bound=np.generic)
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 # More threads hold more full-size pictures at once than they save time.
 _DECODERS = 4
@@ -36,6 +39,7 @@ class ImageSet:
         widths, heights: int32 [n], px.
         cameras: of each image, at its working size.
         background: float32 [3], 0 to 1: the colour behind the scene; None where photos show surroundings.
+        counts: bool [total_px], which pixels may be learnt from and measured at (masks); None where all may.
     """
 
     pixels: NDArray[np.uint8]
@@ -45,6 +49,7 @@ class ImageSet:
     heights: NDArray[np.int32]
     cameras: tuple[Camera, ...]
     background: NDArray[np.float32] | None
+    counts: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -56,9 +61,14 @@ class ImageSet:
 
     def alpha_image(self, index: int) -> NDArray[np.uint8] | None:
         """uint8 [h, w], a view of the opacity of image ``index``, or None where all is opaque."""
-        if self.alpha is None:
-            return None
-        rows = self.alpha[self.offsets[index] : self.offsets[index + 1]]
+        return None if self.alpha is None else self._plane(self.alpha, index)
+
+    def counts_image(self, index: int) -> NDArray[np.bool_] | None:
+        """bool [h, w], a view of which pixels of image ``index`` count, or None where there are no masks."""
+        return None if self.counts is None else self._plane(self.counts, index)
+
+    def _plane(self, values: NDArray[T], index: int) -> NDArray[T]:
+        rows = values[self.offsets[index] : self.offsets[index + 1]]
         return rows.reshape(int(self.heights[index]), int(self.widths[index]))
 
 
@@ -79,8 +89,8 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
     it, else none.
 
     Raises:
-        InputError: ``not_an_image``, ``image_truncated``, ``image_too_large``, ``image_changed`` or
-            ``image_format_unsupported``, naming the image.
+        InputError: ``not_an_image``, ``image_truncated``, ``image_too_large``, ``image_changed``,
+            ``image_format_unsupported``, ``mask_size_mismatch`` or ``mask_hides_image``, naming the image.
     """
     sizes = [working_size(c.width, c.height, max_size) for c in map(dataset.camera_of, range(len(dataset)))]
     widths = np.array([w for w, _ in sizes], dtype=np.int32)
@@ -88,6 +98,8 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
     offsets = np.concatenate(([0], np.cumsum(widths.astype(np.int64) * heights)))
     pixels = np.empty((int(offsets[-1]), 3), dtype=np.uint8)
     alpha = np.empty(int(offsets[-1]), dtype=np.uint8)
+    masked = any(frame.mask is not None for frame in dataset.frames)
+    counts = np.ones(int(offsets[-1]) if masked else 0, dtype=np.bool_)
     behind = _BLACK if background == "black" else _WHITE
 
     def fill(index: int) -> None:
@@ -95,6 +107,9 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
         picture = decode(dataset.frames[index], dataset.camera_of(index))
         colour, opacity = _shrink(picture, *sizes[index], behind, keep_alpha=background != "none")
         pixels[part], alpha[part] = colour.reshape(-1, 3), opacity.reshape(-1)
+        mask = load_mask(dataset.frames[index], dataset.camera_of(index))
+        if mask is not None:
+            counts[part] = shrink_mask(mask, *sizes[index]).reshape(-1)
 
     largest = max(camera.width * camera.height for camera in dataset.cameras)
     fitting = _DECODING_BYTES // (largest * _DECODING_BYTES_PER_PX)
@@ -109,7 +124,9 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
             raise
     opaque = bool(alpha.min() == 255)
     cameras = tuple(dataset.camera_of(i).resized(*sizes[i]) for i in range(len(dataset)))
-    images = ImageSet(pixels, None if opaque else alpha, offsets, widths, heights, cameras, None)
+    images = ImageSet(
+        pixels, None if opaque else alpha, offsets, widths, heights, cameras, None, counts if masked else None
+    )
     return _with_background(images, background, behind)
 
 
@@ -118,12 +135,13 @@ def _with_background(images: ImageSet, background: Background, behind: tuple[flo
     if background == "none":
         colour = None
     elif background == "auto" and images.alpha is None:
-        colour = uniform_background([images.image(index) for index in range(len(images))])
+        indices = range(len(images))
+        colour = uniform_background(
+            [images.image(i) for i in indices], [images.counts_image(i) for i in indices]
+        )
     else:
         colour = np.array(behind, dtype=np.float32)
-    return ImageSet(
-        images.pixels, images.alpha, images.offsets, images.widths, images.heights, images.cameras, colour
-    )
+    return replace(images, background=colour)
 
 
 def _shrink(

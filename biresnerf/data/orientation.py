@@ -7,12 +7,14 @@ leaves the tag alone; other programs turn photos first. A pose file shows which 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.image_files import FocalPlane, ImageHeader
 
+T = TypeVar("T", bound=np.generic)
 # The orientation that undoes another.
 INVERSE = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
 NAMED = 5  # photos that a note names
@@ -23,7 +25,7 @@ def turned_size(width: int, height: int, orientation: int) -> tuple[int, int]:
     return (height, width) if orientation >= 5 else (width, height)
 
 
-def turned(picture: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
+def turned(picture: NDArray[T], orientation: int) -> NDArray[T]:
     """The stored ``picture`` [h, w, ...] as EXIF's ``orientation`` (1 to 8) shows it."""
     if orientation >= 5:
         picture = picture.swapaxes(0, 1)

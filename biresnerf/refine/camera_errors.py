@@ -25,18 +25,28 @@ LEAST_FOREGROUND = 0.02
 
 
 def foreground_shares(images: ImageSet) -> np.ndarray:
-    """The share [n] of each photo that shows the scene: opaque, or unlike the background; 1 without background."""
+    """The share [n] of each photo that shows the scene: opaque, or unlike the background; 1 without background.
+
+    Of the pixels that count, where there are masks.
+    """
     shares = np.ones(len(images))
     if images.background is None:
         return shares
     for i in range(len(images)):
         alpha = images.alpha_image(i)
         if alpha is not None:
-            shares[i] = alpha.mean() / 255
+            shows = alpha / np.float32(255)
         else:
             difference = np.abs(images.image(i) / np.float32(255) - images.background).max(-1)
-            shares[i] = (difference > BACKGROUND_TOLERANCE).mean()
+            shows = (difference > BACKGROUND_TOLERANCE).astype(np.float32)
+        shares[i] = _counted(shows, images, i).mean()
     return np.maximum(shares, LEAST_FOREGROUND)
+
+
+def _counted(values: np.ndarray, images: ImageSet, index: int) -> np.ndarray:
+    """Those of `values` [h, w, ...] whose pixels of image `index` count, one after another."""
+    counts = images.counts_image(index)
+    return values.reshape(-1, *values.shape[2:]) if counts is None else values[counts]
 
 
 def outliers(
@@ -88,7 +98,9 @@ class CameraErrors:
     def __init__(self, images: ImageSet, held_out: list[int], device: torch.device) -> None:
         count = len(images)
         self.shares = torch.from_numpy(foreground_shares(images)).float().to(device)
-        variances = [(images.image(i) / np.float32(255)).reshape(-1, 3).var(0).mean() for i in range(count)]
+        variances = [
+            _counted(images.image(i) / np.float32(255), images, i).var(0).mean() for i in range(count)
+        ]
         # Per ray that shows the scene, as the errors are.
         self._hard = UNEXPLAINED * torch.tensor(variances, device=device) / self.shares
         self.bounded = images.background is not None

@@ -96,13 +96,15 @@ def render_view(
 
 
 def score_views(optimiser: JointOptimiser, images: ImageSet, views: list[int]) -> Iterator[ViewScore]:
-    """Render each view at its present pose and score it against its photo."""
+    """Render each view at its present pose and score it against its photo, where its pixels count."""
     matrices = optimiser.poses.matrices().detach()
     for image in views:
         view = render_view(optimiser, matrices[image], image)
         photo = torch.from_numpy(images.image(image).astype(np.float32) / 255)
         colour = torch.from_numpy(view.colour)
-        yield ViewScore(image, view, psnr(colour, photo), ssim(colour, photo))
+        mask = images.counts_image(image)
+        counts = None if mask is None else torch.from_numpy(mask)
+        yield ViewScore(image, view, psnr(colour, photo, counts), ssim(colour, photo, counts))
 
 
 def orbit_poses(unit_from_cam: np.ndarray, frames: int) -> np.ndarray:

@@ -118,6 +118,8 @@ class FrozenTrials:
             )
             sampled = images.image(view)[:: self._stride, :: self._stride]
             photo = torch.from_numpy(sampled.astype(np.float32) / 255)
-            scores.append((psnr(rendered, photo), ssim(rendered, photo)))
+            mask = images.counts_image(view)
+            counts = None if mask is None else torch.from_numpy(mask[:: self._stride, :: self._stride].copy())
+            scores.append((psnr(rendered, photo, counts), ssim(rendered, photo, counts)))
         table = np.array(scores, dtype=np.float64).reshape(-1, 2)
         return TrialScores(table[:, 0], table[:, 1])

@@ -11,15 +11,22 @@ SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 
-def psnr(image: Tensor, reference: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB; identical images give 120."""
-    error = float(((image.double() - reference.double()) ** 2).mean())
+def psnr(image: Tensor, reference: Tensor, counts: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB over the pixels that `counts` [h, w] names, all if left out.
+
+    Identical images give 120.
+    """
+    squared = (image.double() - reference.double()) ** 2
+    error = float((squared if counts is None else squared[counts]).mean())
     return -10 * math.log10(max(error, 1e-12))
 
 
-def ssim(image: Tensor, reference: Tensor) -> float:
+def ssim(image: Tensor, reference: Tensor, counts: Tensor | None = None) -> float:
     """Structural similarity (Wang et al. 2004) of [h, w, 3] images: Gaussian window of 11 px, sigma 1.5, mean over
     channels and over the pixels whose window lies inside; small images take the largest odd window that fits.
+
+    Pixels that `counts` [h, w] leaves out have no part in it: windows weigh what is left of them, and the mean is over
+    pixels that count (over all, where none has its window inside).
     """
     a, b = (x.double().permute(2, 0, 1)[:, None] for x in (image, reference))
     size = min(SSIM_WINDOW, *a.shape[2:])
@@ -27,10 +34,16 @@ def ssim(image: Tensor, reference: Tensor) -> float:
     offset = torch.arange(size, dtype=torch.float64) - size // 2
     window = torch.exp(-(offset**2) / (2 * SSIM_SIGMA**2))
     window = window / window.sum()
+    weight = torch.ones_like(a[:1]) if counts is None else counts.double()[None, None]
 
-    def blurred(x: Tensor) -> Tensor:
+    def summed(x: Tensor) -> Tensor:
         x = torch.nn.functional.conv2d(x, window.reshape(1, 1, 1, -1))
         return torch.nn.functional.conv2d(x, window.reshape(1, 1, -1, 1))
+
+    weights = summed(weight)
+
+    def blurred(x: Tensor) -> Tensor:
+        return summed(x * weight) / weights.clamp(min=1e-12)
 
     mean_a, mean_b = blurred(a), blurred(b)
     variance_a = blurred(a * a) - mean_a**2
@@ -38,4 +51,8 @@ def ssim(image: Tensor, reference: Tensor) -> float:
     covariance = blurred(a * b) - mean_a * mean_b
     luminance = (2 * mean_a * mean_b + SSIM_C1) / (mean_a**2 + mean_b**2 + SSIM_C1)
     structure = (2 * covariance + SSIM_C2) / (variance_a + variance_b + SSIM_C2)
-    return float((luminance * structure).mean())
+    half = size // 2
+    inner = weight[..., half : weight.shape[2] - half, half : weight.shape[3] - half].expand_as(luminance)
+    if not bool(inner.any()):
+        inner = torch.ones_like(inner)
+    return float((luminance * structure * inner).sum() / inner.sum())

@@ -85,7 +85,8 @@ class JointOptimiser:
         # What a step draws, it draws on the device: the host's draws would have to be waited for.
         on_device = None if device.type == "cpu" else torch.Generator(device).manual_seed(options.seed)
         self.draws = on_device or self.generator
-        behind = frame.background if frame.background is not None else images.pixels.mean(0) / 255
+        seen = images.pixels if images.counts is None else images.pixels[images.counts]
+        behind = frame.background if frame.background is not None else seen.mean(0) / 255
         self.background = torch.as_tensor(behind, dtype=torch.float32, device=device)
         self.step_index = 0
         # The step that stage 2 began at. What has one stage is in its last from the first step on.

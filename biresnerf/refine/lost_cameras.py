@@ -182,7 +182,13 @@ class LostCameraRepair:
             rendering = self._render(matrices[owner[part]], rays[part], xy[part], PositionGradient())
             self._spent += FORWARD_COST * rendering.samples
             errors.append(((rendering.colour - target[part]) ** 2).mean(1))
-        mean = torch.cat(errors).reshape(len(image), -1).mean(1)
+        squared = torch.cat(errors).reshape(len(image), -1)
+        counting = optimiser.sampler.counting(rays, xy)
+        if counting is None:
+            mean = squared.mean(1)
+        else:
+            counting = counting.reshape(squared.shape)
+            mean = (squared * counting).sum(1) / counting.sum(1).clamp(min=1)
         return mean / optimiser.camera_errors.shares[image]
 
     def _optimised(self, matrices: Tensor, camera: int, rays: int, steps: int) -> Tensor:
@@ -195,11 +201,9 @@ class LostCameraRepair:
         count = len(matrices) * rays
         owner = torch.arange(len(matrices), device=optimiser.device).repeat_interleave(rays)
         image = torch.full((count,), camera, device=optimiser.device)
-        size = optimiser.sampler.sizes[0][image]
         first, last = RATES
         for step in range(steps):
-            drawn = torch.rand(count, 2, generator=optimiser.generator).to(optimiser.device)
-            xy = (drawn * size).floor() + 0.5
+            xy = optimiser.sampler.random_pixels(image, optimiser.generator)
             target = optimiser.sampler.colours(image, xy, self._blur())
             rendering = self._render(
                 poses.matrices()[owner], image, xy, PositionGradient(1.0, 1.0, 1.0), jitter=True

@@ -1,4 +1,8 @@
-"""Random pixels of the photos, with their colour at a chosen sharpness. Photos stay bytes in memory."""
+"""Random pixels of the photos, with their colour at a chosen sharpness. Photos stay bytes in memory.
+
+Masked pixels are never drawn, and no blurred colour holds any of theirs: levels of the pyramid know how much of each
+of their pixels counts, and are averaged by it.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from biresnerf.data.area_resize import area_resize
@@ -31,7 +36,11 @@ class PixelBatch:
 
 
 class PhotoSampler:
-    """Draws the same number of pixels from every image; keeps an image pyramid for coarse-to-fine targets."""
+    """Draws the same number of pixels from every image; keeps an image pyramid for coarse-to-fine targets.
+
+    Attributes:
+        shares: how much of each of the pyramid's pixels counts, uint8 of 255; None where there are no masks.
+    """
 
     def __init__(self, images: ImageSet, held_out: list[int], device: torch.device) -> None:
         count = len(images)
@@ -40,9 +49,12 @@ class PhotoSampler:
         self.training, self.device = len(training), device
         levels, offsets, sizes, base = [], [], [], 0
         current = [images.image(i) for i in range(count)]
+        masks, shares = _masks(images), []
         for level in range(PYRAMID_LEVELS):
             if level:
-                current = [_half(image) for image in current]
+                halves = [_half(image, mask) for image, mask in zip(current, masks, strict=True)]
+                current, masks = [image for image, _ in halves], [mask for _, mask in halves]
+            shares += [mask.reshape(-1) for mask in masks if mask is not None]
             offsets.append(
                 [base + n for n in np.cumsum([0, *(im.shape[0] * im.shape[1] for im in current)])[:-1]]
             )
@@ -50,11 +62,20 @@ class PhotoSampler:
             levels.append(np.concatenate([im.reshape(-1, 3) for im in current]))
             base += len(levels[-1])
         self.pixels = torch.from_numpy(np.concatenate(levels)).to(device)
+        self.shares = torch.from_numpy(np.concatenate(shares)).to(device) if shares else None
+        self._counted = self._counted_pixels(images) if shares else None
         self.offsets = torch.tensor(offsets, device=device)
         self.sizes = torch.tensor(sizes, device=device)
         self.long_side = float(self.sizes[0].max())
         self._corners = torch.tensor([[[0, 0], [0, 1]], [[1, 0], [1, 1]]], device=device)
         self._host: torch.Generator | None = None
+
+    def _counted_pixels(self, images: ImageSet) -> tuple[Tensor, Tensor]:
+        """Which pixels count, int32 image after image, and where each image's begin [n + 1]."""
+        masks = (images.counts_image(i) for i in range(len(images)))
+        parts = [np.flatnonzero(mask).astype(np.int32) for mask in masks if mask is not None]
+        begin = torch.from_numpy(np.cumsum([0, *map(len, parts)]))
+        return torch.from_numpy(np.concatenate(parts)).to(self.device), begin.to(self.device)
 
     def draw(
         self, rays: int, blur_px: float, generator: torch.Generator, *, held_out_only: bool = False
@@ -63,14 +84,32 @@ class PhotoSampler:
         position, trained = self._positions(rays, generator, held_out_only)
         image = self.order[position]
         size = self.sizes[0][image]
-        share = torch.rand(rays, 2, generator=generator, device=generator.device).to(self.device)
-        xy = (share * size).floor()
-        index = self.offsets[0][image] + (xy[:, 1] * size[:, 0] + xy[:, 0]).long()
+        xy = self.random_pixels(image, generator)
+        index = self.offsets[0][image] + (xy[:, 1].floor() * size[:, 0] + xy[:, 0].floor()).long()
         sharp = self.pixels[index].float() / 255
-        xy = xy + 0.5
         sigma = blur_px * self._share(generator)
         target = sharp if sigma <= LEVEL_SIGMA else self._blurred(image, xy, sigma)
         return PixelBatch(image, xy, target, sharp, trained)
+
+    def random_pixels(self, image: Tensor, generator: torch.Generator) -> Tensor:
+        """The centre [rays, 2] (px) of a random pixel that counts, of each of the images `image` [rays]."""
+        size = self.sizes[0][image]
+        if self._counted is None:
+            share = torch.rand(len(image), 2, generator=generator, device=generator.device).to(self.device)
+            return (share * size).floor() + 0.5
+        pixels, begin = self._counted
+        first, count = begin[image], begin[image + 1] - begin[image]
+        drawn = torch.rand(len(image), generator=generator, device=generator.device, dtype=torch.float64)
+        pixel = pixels[first + (drawn.to(self.device) * count).long()].long()
+        return torch.stack([pixel % size[:, 0], pixel // size[:, 0]], 1) + 0.5
+
+    def counting(self, image: Tensor, xy: Tensor) -> Tensor | None:
+        """Whether pixels with centres `xy` [rays, 2] count, 0 or 1 [rays]; None where there are no masks."""
+        if self.shares is None:
+            return None
+        pixel = xy.floor().long()
+        index = self.offsets[0][image] + pixel[:, 1] * self.sizes[0][image][:, 0] + pixel[:, 0]
+        return (self.shares[index] > 0).float()
 
     def _positions(self, rays: int, generator: torch.Generator, held_out_only: bool) -> tuple[Tensor, int]:
         """Places in `order`, evenly spread and in turn, and how many are of training views."""
@@ -122,6 +161,7 @@ class PhotoSampler:
         low = at.floor()
         fraction = at - low
         total = torch.zeros(len(image), 3, device=self.device)
+        weight = torch.zeros(len(image), 1, device=self.device)
         for dx in (0, 1):
             for dy in (0, 1):
                 corner = (low + self._corners[dx, dy]).long()
@@ -129,10 +169,32 @@ class PhotoSampler:
                 index = self.offsets[level][image] + corner[:, 1] * size[:, 0] + corner[:, 0]
                 wx = fraction[:, 0] if dx else 1 - fraction[:, 0]
                 wy = fraction[:, 1] if dy else 1 - fraction[:, 1]
-                total += (wx * wy)[:, None] * self.pixels[index].float()
+                share = (wx * wy)[:, None]
+                if self.shares is not None:
+                    share = share * self.shares[index, None]
+                    weight += share
+                total += share * self.pixels[index].float()
+        if self.shares is not None:
+            total = total / weight.clamp(min=1e-6)
         return total / 255
 
 
-def _half(image: np.ndarray) -> np.ndarray:
+def _masks(images: ImageSet) -> list[NDArray[np.uint8] | None]:
+    counts = [images.counts_image(i) for i in range(len(images))]
+    return [None if c is None else c.astype(np.uint8) * 255 for c in counts]
+
+
+def _half(
+    image: NDArray[np.uint8], share: NDArray[np.uint8] | None
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """Image and mask at half the size; colours averaged over what counts, the share of it never rounded to nothing."""
     height, width = max(1, image.shape[0] // 2), max(1, image.shape[1] // 2)
-    return np.clip(np.rint(area_resize(image, width, height)), 0, 255).astype(np.uint8)
+    if share is None:
+        return _bytes(area_resize(image, width, height)), None
+    weighed = np.concatenate([image * (share[..., None] / np.float32(255)), share[..., None]], 2)
+    small = area_resize(weighed, width, height)
+    return _bytes(small[..., :3] * 255 / np.maximum(small[..., 3:], 1e-6)), _bytes(np.ceil(small[..., 3]))
+
+
+def _bytes(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)

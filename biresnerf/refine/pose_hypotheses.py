@@ -20,13 +20,27 @@ THUMBNAIL = 16  # px
 
 
 def photo_distances(images: ImageSet) -> NDArray[np.float32]:
-    """Root mean squared difference [n, n] of the photos, each shrunk to at most 16 x 16 px."""
+    """Root mean squared difference [n, n] of the photos where both count, each shrunk to at most 16 x 16 px."""
     width = min(THUMBNAIL, int(images.widths.min()))
     height = min(THUMBNAIL, int(images.heights.min()))
-    small = np.stack([area_resize(images.image(i), width, height).ravel() / 255 for i in range(len(images))])
-    square = (small**2).mean(1)
-    squared = square[:, None] + square - 2 * (small @ small.T) / small.shape[1]
-    return np.sqrt(np.maximum(squared, 0))
+    small, weight = (
+        np.stack(part)
+        for part in zip(*(_thumbnail(images, i, width, height) for i in range(len(images))), strict=True)
+    )
+    weighed = small * weight
+    squared = (weighed * small) @ weight.T + weight @ (weighed * small).T - 2 * weighed @ weighed.T
+    return np.sqrt(np.maximum(squared / np.maximum(weight @ weight.T, 1e-6), 0))
+
+
+def _thumbnail(images: ImageSet, index: int, width: int, height: int) -> tuple[NDArray, NDArray]:
+    """Colours of an image, shrunk, 0 to 1 [width * height * 3], and how much of each counts."""
+    photo, counts = images.image(index) / np.float32(255), images.counts_image(index)
+    if counts is None:
+        small = area_resize(photo, width, height).ravel()
+        return small, np.ones_like(small)
+    share = area_resize(counts[..., None].astype(np.float32), width, height)
+    colour = area_resize(photo * counts[..., None], width, height) / np.maximum(share, 1e-6)
+    return colour.ravel(), share.repeat(3, axis=2).ravel()
 
 
 def pose_hypotheses(given: Array, now: Array, camera: int, trusted: NDArray[np.bool_], far: Array) -> Array:

@@ -56,7 +56,9 @@ def _silhouette_tangent(images: ImageSet) -> float | None:
         alpha = images.alpha_image(i)
         if alpha is None:
             return None
-        rows, columns = np.nonzero(alpha > 127)
+        seen = alpha > 127
+        counts = images.counts_image(i)
+        rows, columns = np.nonzero(seen if counts is None else seen & counts)
         if len(rows):
             full = camera.full()
             x, y = (columns + 0.5 - full.cx) / full.fx, (rows + 0.5 - full.cy) / full.fy

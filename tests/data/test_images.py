@@ -227,15 +227,26 @@ def _framed(colour: int, rng: np.random.Generator) -> np.ndarray:
     return image
 
 
+def _background(images: list[np.ndarray], counts: list[np.ndarray | None] | None = None):
+    found = uniform_background(images, counts or [None] * len(images))
+    return None if found is None else found.tolist()
+
+
 def test_plain_borders_show_the_background_and_others_do_not():
     rng = np.random.default_rng(0)
-    black = uniform_background([_framed(6, rng) for _ in range(10)])
-    white = uniform_background([_framed(255, rng) for _ in range(10)])
-    assert black is not None
-    assert black.tolist() == [0, 0, 0]
-    assert white is not None
-    assert white.tolist() == [1, 1, 1]
-    assert uniform_background([_framed(128, rng) for _ in range(10)]) is None
-    assert (
-        uniform_background([_framed(6, rng) for _ in range(5)] + [_framed(90, rng) for _ in range(5)]) is None
-    )
+    assert _background([_framed(6, rng) for _ in range(10)]) == [0, 0, 0]
+    assert _background([_framed(255, rng) for _ in range(10)]) == [1, 1, 1]
+    assert _background([_framed(128, rng) for _ in range(10)]) is None
+    assert _background([_framed(6, rng) for _ in range(5)] + [_framed(90, rng) for _ in range(5)]) is None
+
+
+def test_masked_borders_have_no_say_about_the_background():
+    rng = np.random.default_rng(0)
+    images = [_framed(6, rng) for _ in range(10)]
+    for image in images:
+        image[:, :20] = 128  # someone stands there
+    assert _background(images) is None
+    counts = np.ones((40, 50), dtype=bool)
+    counts[:, :20] = False
+    assert _background(images, [counts] * 10) == [0, 0, 0]
+    assert _background(images, [np.zeros((40, 50), dtype=bool)] * 10) is None

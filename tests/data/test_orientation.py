@@ -61,6 +61,26 @@ def test_poses_for_the_turned_picture_get_the_turned_picture(tmp_path, suffix, o
     assert any(f"x{suffix}" in note and "turned as EXIF says" in note for note in dataset.warnings)
 
 
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA", "CMYK", "I;16"])
+@pytest.mark.parametrize("compression", [None, "tiff_lzw"])
+def test_a_tiff_is_taken_as_stored_whatever_its_kind(tmp_path, mode, compression):
+    """Pillow turns TIFFs by itself, and gets those that it maps into memory wrong."""
+    stored = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    picture = Image.fromarray(stored).convert("L" if mode == "I;16" else mode)
+    if mode == "I;16":
+        picture = Image.fromarray(np.asarray(picture).astype(np.uint16) * 257)
+    pixels = []
+    for orientation in (1, 6):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        document = nerfstudio_scene(tmp_path)
+        picture.save(tmp_path / "images/x.tif", exif=exif, compression=compression)
+        document["frames"][0]["file_path"] = "images/x.tif"
+        pixels.append(load_images(read_dataset(save(tmp_path, document))).image(0))
+    assert np.array_equal(pixels[0], pixels[1])
+    assert pixels[0].std() > 30
+
+
 def test_images_alone_keep_their_stored_pixels(tmp_path):
     stored, _ = _tagged(tmp_path, 6)
     for path in (tmp_path / "transforms.json", *(tmp_path / "images").glob("*.jpg")):
