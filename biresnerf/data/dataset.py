@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.geometry.camera_models import OpenCVParameters, full_parameters, smallest_model
+from biresnerf.geometry.camera_models import FullParameters, full_parameters, smallest_model
 
 if TYPE_CHECKING:
     from biresnerf.data.colmap_scene import ColmapModel
@@ -32,8 +32,8 @@ class Camera:
     height: int
     params: tuple[float, ...]
 
-    def full(self) -> OpenCVParameters:
-        """These intrinsics as the full OPENCV model (fx, fy, cx, cy, k1, k2, p1, p2)."""
+    def full(self) -> FullParameters:
+        """These intrinsics with all coefficients written out, and whether they are a fisheye's."""
         return full_parameters(self.model, self.params)
 
     def resized(self, width: int, height: int) -> Camera:

@@ -8,12 +8,18 @@ from typing import Any, NamedTuple
 from biresnerf.data.dataset import Camera
 from biresnerf.data.image_files import ImageHeader
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera_models import MODEL_IDS, OpenCVParameters, smallest_model
+from biresnerf.geometry.camera_models import (
+    COEFFICIENTS,
+    FISHEYE_MODELS,
+    MODEL_IDS,
+    FullParameters,
+    smallest_model,
+)
 from biresnerf.geometry.lens import lens_problem
 
 _UNSUPPORTED = "camera_model_unsupported"
-# Keys of instant-ngp that mean another lens than the pinhole with radial and tangential distortion.
-_OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
+# Keys of instant-ngp that mean a lens of neither family.
+_OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
 _MODEL_MEND = (
     f"Supported are {', '.join(MODEL_IDS)}; undistort the images to one of them "
     "(for example with COLMAP's image_undistorter)."
@@ -64,13 +70,11 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
         InputError: ``camera_model_unsupported``, ``intrinsics_missing``, ``intrinsics_invalid`` or
             ``image_size_mismatch``.
     """
-    preferred = _declared_model(fields)
+    preferred, fisheye = _declared_lens(fields)
     width, height, notes = _declared_size(fields, header, name)
-    full, more = _parameters(fields, width, height)
-    if preferred is None:
-        preferred = "PINHOLE" if full.k1 == full.k2 == full.p1 == full.p2 == 0.0 else "OPENCV"
+    full, more = _parameters(fields, preferred, fisheye, width, height)
     # nerfstudio writes OPENCV with zeros for a pinhole; PINHOLE is the same camera and more programs read it.
-    elif preferred == "OPENCV" and full.k1 == full.k2 == full.p1 == full.p2 == 0.0:
+    if preferred == "OPENCV" and not full.distorted:
         preferred = "PINHOLE"
     problem = lens_problem(full, width, height)
     if problem is not None:
@@ -78,7 +82,7 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
             "intrinsics_invalid",
             problem,
             where=fields.where("k1"),
-            mend="Check k1, k2, p1 and p2, or undistort the images.",
+            mend="Check the coefficients k1, k2, ... and p1, p2, or undistort the images.",
         )
     model, params = smallest_model(full, preferred)
     camera = Camera(model, width, height, params).resized(header.width, header.height)
@@ -91,27 +95,25 @@ def _short(value: Any) -> str:
     return text if len(text) <= 40 else text[:37] + "..."
 
 
-def _declared_model(fields: Fields) -> str | None:
+def _declared_lens(fields: Fields) -> tuple[str | None, bool]:
+    """The model that the file names, and whether the lens is a fisheye's."""
     for key in _OTHER_LENSES:
-        for source in (fields.frame, fields.top):
-            if source.get(key):
-                raise InputError(
-                    _UNSUPPORTED,
-                    f"{key}: fisheye and panorama lenses are not supported.",
-                    where=fields.where(key),
-                    mend=_MODEL_MEND,
-                )
+        if fields.frame.get(key) or fields.top.get(key):
+            raise _unsupported(fields, key, f"{key}: panoramas and f-theta lenses are not supported.")
     declared = fields.frame.get("camera_model") or fields.top.get("camera_model")
-    if declared is None:
-        return None
-    if not isinstance(declared, str) or declared.upper() not in MODEL_IDS:
-        raise InputError(
-            _UNSUPPORTED,
-            f"the camera model {_short(declared)} is not supported.",
-            where=fields.where("camera_model"),
-            mend=_MODEL_MEND,
-        )
-    return declared.upper()
+    if declared is not None and (not isinstance(declared, str) or declared.upper() not in MODEL_IDS):
+        raise _unsupported(fields, "camera_model", f"the camera model {_short(declared)} is not supported.")
+    model = None if declared is None else declared.upper()
+    flag = fields.frame.get("is_fisheye", fields.top.get("is_fisheye"))
+    if flag not in (None, False, True):
+        raise _unsupported(fields, "is_fisheye", f"{_short(flag)} is neither true nor false.")
+    if flag and model is not None and model not in FISHEYE_MODELS:
+        raise _unsupported(fields, "is_fisheye", f"is_fisheye is true, but camera_model is {model}.")
+    return model, bool(flag) or model in FISHEYE_MODELS
+
+
+def _unsupported(fields: Fields, key: str, what: str, also: str = "") -> InputError:
+    return InputError(_UNSUPPORTED, what, where=fields.where(key), mend=_MODEL_MEND + also)
 
 
 def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int, int, list[str]]:
@@ -151,15 +153,29 @@ def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int,
     return w, h, [f"{scaled}: the intrinsics were scaled to the images"]
 
 
-def _parameters(fields: Fields, width: int, height: int) -> tuple[OpenCVParameters, list[str]]:
-    for key in ("k3", "k4"):
-        if fields.get(key):
-            raise InputError(
-                _UNSUPPORTED,
-                f"{key} is not zero.",
-                where=fields.where(key),
-                mend=_MODEL_MEND + " Or set it to 0.",
-            )
+def _coefficients(fields: Fields, model: str | None, fisheye: bool) -> dict[str, float]:
+    """Distortion by the names of `FullParameters`. Raises InputError for a term that the lens's model lacks."""
+    values = {key: fields.get(key) or 0.0 for key in COEFFICIENTS}
+    if model == "FULL_OPENCV":
+        return values
+    if fisheye:
+        # instant-ngp keeps p1 and p2 in the places of k3 and k4, the last one named wins; nobody means that.
+        for key in ("p1", "p2", "k5", "k6"):
+            if values[key]:
+                raise _unsupported(fields, key, f"{key} is not zero, but a fisheye has k1 to k4 only.")
+        return values
+    for key in ("k4", "k5", "k6"):
+        if values[key]:
+            meaning = " In nerfstudio's files it is a fourth radial term, which no model of COLMAP's has."
+            also = " If it is the rational model's, say camera_model FULL_OPENCV. If it is not needed, set it to 0."
+            raise _unsupported(fields, key, f"{key} is not zero.{meaning if key == 'k4' else ''}", also)
+    return values
+
+
+def _parameters(
+    fields: Fields, model: str | None, fisheye: bool, width: int, height: int
+) -> tuple[FullParameters, list[str]]:
+    coefficients = _coefficients(fields, model, fisheye)
     fx, key_x = _focal(fields, ("fl_x", "camera_angle_x", "x_fov"), width)
     fy, key_y = _focal(fields, ("fl_y", "camera_angle_y", "y_fov"), height)
     if key_x != "fl_x" and key_y != "fl_y":
@@ -186,8 +202,7 @@ def _parameters(fields: Fields, width: int, height: int) -> tuple[OpenCVParamete
             where=fields.where("cx"),
             mend="Give cx and cy in pixels from the top left corner.",
         )
-    k1, k2, p1, p2 = (fields.get(key) or 0.0 for key in ("k1", "k2", "p1", "p2"))
-    return OpenCVParameters(fx, fy, cx, cy, k1, k2, p1, p2), notes
+    return FullParameters(fx, fy, cx, cy, **coefficients, fisheye=fisheye), notes
 
 
 def _focal(fields: Fields, keys: tuple[str, str, str], size: int) -> tuple[float | None, str | None]:

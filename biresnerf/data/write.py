@@ -55,18 +55,35 @@ def _frame_object(dataset: Dataset, index: int, matrix: list[list[float]]) -> di
 def _with_intrinsics(document: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
     """Intrinsics shared by all frames, or in each frame where there are several cameras."""
     frames = document.pop("frames")
+    models = {_model(camera) for camera in dataset.cameras}
+    if len(models) == 1:
+        document["camera_model"] = models.pop()
     if len(dataset.cameras) == 1:
         return {**document, **_intrinsics(dataset.cameras[0]), "frames": frames}
     described = [
         {"file_path": row.pop("file_path"), **_intrinsics(dataset.camera_of(index)), **row}
         for index, row in enumerate(frames)
     ]
+    if models:
+        document.pop("camera_model", None)
+        for index, row in enumerate(described):
+            row["camera_model"] = _model(dataset.camera_of(index))
     return {**document, "frames": described}
 
 
-def _intrinsics(camera: Camera) -> dict[str, float]:
+def _model(camera: Camera) -> str:
+    """nerfstudio's name of the lens's family; FULL_OPENCV, which it does not know, where nothing less will do."""
+    if camera.full().fisheye:
+        return "OPENCV_FISHEYE"
+    return "FULL_OPENCV" if camera.model == "FULL_OPENCV" else "OPENCV"
+
+
+def _intrinsics(camera: Camera) -> dict[str, Any]:
     p = camera.full()
-    values: dict[str, float] = {"w": camera.width, "h": camera.height}
+    values: dict[str, Any] = {"w": camera.width, "h": camera.height}
     values |= {"fl_x": p.fx, "fl_y": p.fy, "cx": p.cx, "cy": p.cy}
-    values |= {"k1": p.k1, "k2": p.k2, "p1": p.p1, "p2": p.p2}
-    return values
+    # instant-ngp would take p1 and p2 of a fisheye for its k3 and k4.
+    names = ["k1", "k2", "k3", "k4"] if p.fisheye else ["k1", "k2", "p1", "p2"]
+    if camera.model == "FULL_OPENCV":
+        names += ["k3", "k4", "k5", "k6"]
+    return values | {name: getattr(p, name) for name in names}

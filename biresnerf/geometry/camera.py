@@ -1,4 +1,4 @@
-"""Pixels to viewing directions and back, for pinhole cameras with radial and tangential distortion.
+"""Pixels to viewing directions and back, for perspective and fisheye cameras with distortion.
 
 Camera axes are OpenCV's (x right, y down, z forward). Pixel coordinates are (x, y); the first pixel's centre
 lies at (0.5, 0.5).
@@ -7,18 +7,27 @@ lies at (0.5, 0.5).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, fields, replace
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from biresnerf.geometry.camera_models import full_parameters
+from biresnerf.geometry.distortion import (
+    Coefficients,
+    coefficients_of,
+    distort,
+    distort_jacobian,
+    solve,
+    undistort,
+)
+from biresnerf.geometry.lens import lens_reach
 
-# Newton doubles the digits at each step; lenses that do not fold inside the image need five or six.
-NEWTON_STEPS = 20
-# In units of the focal length: under 1e-9 px for any real camera.
-_NEWTON_DONE = 1e-13
+# Columns of `Intrinsics.distortion`: numerator, denominator, tangential.
+ABOVE, BELOW, TANGENTIAL = slice(0, 4), slice(4, 7), slice(7, 9)
+# Radians from the axis: nearer to it, series stand for quotients whose gradient would be 0 / 0.
+_NEAR_AXIS = 1e-8
 
 
 class CameraDescription(Protocol):
@@ -40,9 +49,13 @@ class Intrinsics:
 
     Attributes:
         fx, fy, cx, cy: float64 [images], px.
-        distortion: float64 [images, 4]: k1, k2, p1, p2 of COLMAP's OPENCV model.
+        distortion: float64 [images, 9]: coefficients of the radial factor's numerator (4) and denominator (3), and
+            p1, p2, as in `biresnerf.geometry.distortion`.
+        fisheye: bool [images].
+        reach: float64 [images]: radius, on the plane of directions, about all that the image shows.
         width, height: int64 [images], px.
-        distorted: whether any coefficient differs from zero; if not, undistortion is skipped.
+        terms: how many coefficients of each of the three groups any image has; no more are computed with.
+        some_fisheye: whether any image is a fisheye's.
     """
 
     fx: Tensor
@@ -50,9 +63,12 @@ class Intrinsics:
     cx: Tensor
     cy: Tensor
     distortion: Tensor
+    fisheye: Tensor
+    reach: Tensor
     width: Tensor
     height: Tensor
-    distorted: bool
+    terms: tuple[int, int, int]
+    some_fisheye: bool
 
     @staticmethod
     def from_cameras(cameras: Sequence[CameraDescription]) -> Intrinsics:
@@ -61,35 +77,48 @@ class Intrinsics:
         Raises:
             ValueError: a model is not supported or has the wrong number of parameters.
         """
-        rows = [full_parameters(camera.model, camera.params) for camera in cameras]
-        table = torch.tensor(rows, dtype=torch.float64).reshape(len(rows), 8)
-        sizes = torch.tensor([(c.width, c.height) for c in cameras], dtype=torch.int64).reshape(len(rows), 2)
-        fx, fy, cx, cy = (column.contiguous() for column in table[:, :4].unbind(1))
-        distortion = table[:, 4:].contiguous()
+        full = [full_parameters(camera.model, camera.params) for camera in cameras]
+        coefficients = [coefficients_of(f) for f in full]
+        count = len(full)
+        table = torch.tensor([f[:4] for f in full], dtype=torch.float64).reshape(count, 4)
+        rows = [(*c.above, *c.below, *c.tangential) for c in coefficients]
+        distortion = torch.tensor(rows, dtype=torch.float64).reshape(count, 9)
+        reach = [lens_reach(f, c.width, c.height) for f, c in zip(full, cameras, strict=True)]
+        sizes = torch.tensor([(c.width, c.height) for c in cameras], dtype=torch.int64).reshape(count, 2)
+        fx, fy, cx, cy = (column.contiguous() for column in table.unbind(1))
         width, height = (column.contiguous() for column in sizes.unbind(1))
-        return Intrinsics(fx, fy, cx, cy, distortion, width, height, bool((distortion != 0).any()))
+        fisheye = torch.tensor([f.fisheye for f in full], dtype=torch.bool)
+        reaches = torch.tensor(reach, dtype=torch.float64)
+        terms = _terms(distortion)
+        return Intrinsics(
+            fx, fy, cx, cy, distortion, fisheye, reaches, width, height, terms, bool(fisheye.any())
+        )
 
     def __len__(self) -> int:
         return len(self.fx)
 
+    @property
+    def distorted(self) -> bool:
+        """Whether any coefficient differs from zero; if not, undistortion is skipped."""
+        return any(self.terms)
+
     def to(self, device: torch.device | str) -> Intrinsics:
         """The same on another device; stays in float64."""
-        return Intrinsics(
-            fx=self.fx.to(device),
-            fy=self.fy.to(device),
-            cx=self.cx.to(device),
-            cy=self.cy.to(device),
-            distortion=self.distortion.to(device),
-            width=self.width.to(device),
-            height=self.height.to(device),
-            distorted=self.distorted,
-        )
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        moved: dict[str, Any] = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
+        return replace(self, **moved)
+
+    def coefficients(self, image_index: Tensor) -> Coefficients:
+        """Those of each of the images [rays], without columns that are zero for all of the set."""
+        rows = self.distortion[image_index]
+        groups = (rows[:, part].unbind(1) for part in (ABOVE, BELOW, TANGENTIAL))
+        return Coefficients(*(group[:count] for group, count in zip(groups, self.terms, strict=True)))
 
 
 def directions_in_cam(intrinsics: Intrinsics, image_index: Tensor, pixel_xy: Tensor) -> Tensor:
     """Unit viewing directions [rays, 3] of pixel positions, in the type of ``pixel_xy``.
 
-    Distortion is undone by Newton's method in float64, to rounding.
+    Distortion is undone by Newton's method in float64, to rounding. A fisheye's rays may point backward.
 
     Args:
         intrinsics: of all images.
@@ -100,17 +129,38 @@ def directions_in_cam(intrinsics: Intrinsics, image_index: Tensor, pixel_xy: Ten
         ValueError: the shapes do not fit.
     """
     _require(image_index, pixel_xy, 2)
-    xy = pixel_xy.to(torch.float64)
-    x = (xy[:, 0] - intrinsics.cx[image_index]) / intrinsics.fx[image_index]
-    y = (xy[:, 1] - intrinsics.cy[image_index]) / intrinsics.fy[image_index]
+    x, y = _in_focal_lengths(intrinsics, image_index, pixel_xy)
     if intrinsics.distorted:
-        x, y = _undistort(x, y, intrinsics.distortion[image_index])
-    directions = torch.stack([x, y, torch.ones_like(x)], dim=-1)
-    return (directions / directions.norm(dim=-1, keepdim=True)).to(pixel_xy.dtype)
+        x, y = undistort(x, y, intrinsics.coefficients(image_index))
+    return _from_plane(intrinsics, image_index, x, y).to(pixel_xy.dtype)
+
+
+def directions_with_gradient(
+    intrinsics: Intrinsics, image_index: Tensor, pixel_xy: Tensor, directions: Tensor
+) -> Tensor:
+    """`directions_in_cam` as a function of the intrinsics' tensors, which may require gradients.
+
+    By the implicit function theorem, one step of Newton's method from the solution has the solution's derivatives:
+    nothing need be kept of the steps that led there.
+
+    Args:
+        directions: what `directions_in_cam` gave, of any precision.
+    """
+    _require(image_index, pixel_xy, 2)
+    c = intrinsics.coefficients(image_index)
+    with torch.no_grad():
+        x, y = _to_plane(intrinsics, image_index, directions.to(torch.float64))
+        jacobian = distort_jacobian(x, y, c)
+    now_x, now_y = distort(x, y, c)
+    to_x, to_y = _in_focal_lengths(intrinsics, image_index, pixel_xy)
+    step_x, step_y = solve(jacobian, now_x - to_x, now_y - to_y)
+    return _from_plane(intrinsics, image_index, x - step_x, y - step_y).to(pixel_xy.dtype)
 
 
 def project(intrinsics: Intrinsics, image_index: Tensor, points_in_cam: Tensor) -> Tensor:
-    """Pixel positions [points, 2] of points in camera coordinates, in their type; NaN unless z > 0.
+    """Pixel positions [points, 2] of points in camera coordinates, in their type.
+
+    NaN where there is none: behind a perspective camera (unless z > 0), straight behind a fisheye.
 
     Args:
         intrinsics: of all images.
@@ -121,53 +171,75 @@ def project(intrinsics: Intrinsics, image_index: Tensor, points_in_cam: Tensor) 
         ValueError: the shapes do not fit.
     """
     _require(image_index, points_in_cam, 3)
-    points = points_in_cam.to(torch.float64)
-    in_front = points[:, 2] > 0
-    depth = torch.where(in_front, points[:, 2], torch.ones_like(points[:, 2]))
-    x, y = points[:, 0] / depth, points[:, 1] / depth
-    if intrinsics.distorted:
-        x, y = _distort(x, y, intrinsics.distortion[image_index])
-    pixel_xy = torch.stack(
-        [
-            x * intrinsics.fx[image_index] + intrinsics.cx[image_index],
-            y * intrinsics.fy[image_index] + intrinsics.cy[image_index],
-        ],
-        dim=-1,
-    )
-    nowhere = torch.full_like(pixel_xy, float("nan"))
-    return torch.where(in_front[:, None], pixel_xy, nowhere).to(points_in_cam.dtype)
+    x, y = _to_plane(intrinsics, image_index, points_in_cam.to(torch.float64))
+    return _on_image(intrinsics, image_index, x, y).to(points_in_cam.dtype)
 
 
-def _distort(x: Tensor, y: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
-    """COLMAP's OPENCV model on coordinates in units of the focal length."""
-    k1, k2, p1, p2 = distortion.unbind(-1)
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * k2)
+def in_view(intrinsics: Intrinsics, image_index: Tensor, points_in_cam: Tensor) -> Tensor:
+    """Which points [points, 3] of camera coordinates the images show, bool [points].
+
+    What lies farther out than all that the image shows is not in view, wherever the lens formula may fold it.
+    """
+    _require(image_index, points_in_cam, 3)
+    x, y = _to_plane(intrinsics, image_index, points_in_cam.to(torch.float64))
+    pixel_xy = _on_image(intrinsics, image_index, x, y)
+    size = torch.stack([intrinsics.width[image_index], intrinsics.height[image_index]], 1)
+    inside = ((pixel_xy > 0) & (pixel_xy < size)).all(1)
+    return inside & (x * x + y * y <= intrinsics.reach[image_index] ** 2)
+
+
+def _in_focal_lengths(i: Intrinsics, image_index: Tensor, pixel_xy: Tensor) -> tuple[Tensor, Tensor]:
+    xy = pixel_xy.to(torch.float64)
     return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+        (xy[:, 0] - i.cx[image_index]) / i.fx[image_index],
+        (xy[:, 1] - i.cy[image_index]) / i.fy[image_index],
     )
 
 
-def _undistort(x_distorted: Tensor, y_distorted: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverse of `_distort`: Newton's method in two unknowns, started at the distorted position."""
-    k1, k2, p1, p2 = distortion.unbind(-1)
-    x, y = x_distorted, y_distorted
-    for _ in range(NEWTON_STEPS):
-        x_now, y_now = _distort(x, y, distortion)
-        error_x, error_y = x_now - x_distorted, y_now - y_distorted
-        r2 = x * x + y * y
-        radial, slope = 1 + r2 * (k1 + r2 * k2), 2 * k1 + 4 * k2 * r2
-        xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-        yy = radial + slope * y * y + 2 * p2 * x + 6 * p1 * y
-        xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
-        determinant = xx * yy - xy * xy
-        step_x = (yy * error_x - xy * error_y) / determinant
-        step_y = (xx * error_y - xy * error_x) / determinant
-        x, y = x - step_x, y - step_y
-        if x.numel() == 0 or float(torch.maximum(step_x.abs(), step_y.abs()).max()) < _NEWTON_DONE:
-            break
-    return x, y
+def _on_image(i: Intrinsics, image_index: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Pixel positions [points, 2] of positions on the plane of directions."""
+    if i.distorted:
+        x, y = distort(x, y, i.coefficients(image_index))
+    x, y = x * i.fx[image_index] + i.cx[image_index], y * i.fy[image_index] + i.cy[image_index]
+    return torch.stack([x, y], dim=-1)
+
+
+def _from_plane(i: Intrinsics, image_index: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Unit directions [rays, 3] of positions on the plane of directions."""
+    slopes = torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    perspective = slopes / slopes.norm(dim=-1, keepdim=True)
+    if not i.some_fisheye:
+        return perspective
+    s = x * x + y * y
+    off_axis = s > _NEAR_AXIS**2
+    angle = torch.where(off_axis, s, torch.ones_like(s)).sqrt()
+    across = torch.where(off_axis, angle.sin() / angle, 1 - s / 6)
+    along = torch.where(off_axis, angle.cos(), 1 - s / 2)
+    fisheye = torch.stack([x * across, y * across, along], dim=-1)
+    return torch.where(i.fisheye[image_index][:, None], fisheye, perspective)
+
+
+def _to_plane(i: Intrinsics, image_index: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """The inverse of `_from_plane` for points at any distance; NaN where there is no position."""
+    x, y, z = points.unbind(1)
+    one, nowhere = torch.ones_like(z), torch.full_like(z, float("nan"))
+    scale = torch.where(z > 0, 1 / torch.where(z > 0, z, one), nowhere)
+    if i.some_fisheye:
+        s = x * x + y * y
+        off_axis = s > (_NEAR_AXIS * z) ** 2
+        r = torch.where(off_axis, s, one).sqrt()
+        angle = torch.where(off_axis, torch.atan2(r, z) / r, scale)
+        scale = torch.where(i.fisheye[image_index], angle, scale)
+    return x * scale, y * scale
+
+
+def _terms(distortion: Tensor) -> tuple[int, int, int]:
+    """How many leading columns of each group hold anything but zeros; p1 and p2 go together."""
+    used = (distortion != 0).any(0)
+    above, below = (
+        int((used[part].nonzero().max() + 1) if used[part].any() else 0) for part in (ABOVE, BELOW)
+    )
+    return above, below, 2 if bool(used[TANGENTIAL].any()) else 0
 
 
 def _require(image_index: Tensor, values: Tensor, columns: int) -> None:

@@ -1,7 +1,9 @@
 """COLMAP's camera models that this project supports, as plain numbers (needs no torch).
 
-All of them are special cases of OPENCV: two focal lengths, a principal point, two radial coefficients (k1,
-k2) and two tangential ones (p1, p2). Lengths are in pixels; the centre of the first pixel lies at (0.5, 0.5).
+Two families. The perspective one is a special case of FULL_OPENCV: two focal lengths, a principal point, radial
+coefficients of a rational function (k1 to k3 above, k4 to k6 below) and two tangential ones (p1, p2). The fisheye
+one is a special case of OPENCV_FISHEYE: k1 to k4 are the coefficients of a polynomial in the angle from the axis.
+Lengths are in pixels; the centre of the first pixel lies at (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -16,6 +18,10 @@ MODEL_IDS: dict[str, int] = {
     "SIMPLE_RADIAL": 2,
     "RADIAL": 3,
     "OPENCV": 4,
+    "OPENCV_FISHEYE": 5,
+    "FULL_OPENCV": 6,
+    "SIMPLE_RADIAL_FISHEYE": 8,
+    "RADIAL_FISHEYE": 9,
 }
 MODEL_PARAMETERS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -23,11 +29,24 @@ MODEL_PARAMETERS: dict[str, tuple[str, ...]] = {
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
 }
+FISHEYE_MODELS = frozenset({"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"})
+# Where the model asked for cannot hold a camera, the first of these that can.
+_FALLBACKS = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 
 
-class OpenCVParameters(NamedTuple):
-    """Any supported model, written out in full. Pixels, and coefficients without unit."""
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
+class FullParameters(NamedTuple):
+    """Any supported model, written out in full. Pixels, and coefficients without unit.
+
+    k3 and k4 mean one thing in a perspective lens (FULL_OPENCV) and another in a fisheye (OPENCV_FISHEYE).
+    """
 
     fx: float
     fy: float
@@ -37,10 +56,20 @@ class OpenCVParameters(NamedTuple):
     k2: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+    fisheye: bool = False
+
+    @property
+    def distorted(self) -> bool:
+        """Whether any coefficient differs from zero. A fisheye without coefficients is the equidistant lens."""
+        return any(getattr(self, name) for name in COEFFICIENTS)
 
 
-def full_parameters(model: str, params: Sequence[float]) -> OpenCVParameters:
-    """The parameters of ``model`` (COLMAP name and order) as the full OPENCV model.
+def full_parameters(model: str, params: Sequence[float]) -> FullParameters:
+    """The parameters of ``model`` (COLMAP name and order) written out in full.
 
     Raises:
         ValueError: the model is not supported, or the number of parameters is not the model's.
@@ -54,20 +83,26 @@ def full_parameters(model: str, params: Sequence[float]) -> OpenCVParameters:
     if "f" in given:
         focal = given.pop("f")
         given |= {"fx": focal, "fy": focal}
-    return OpenCVParameters(**given)
+    return FullParameters(**given, fisheye=model in FISHEYE_MODELS)
 
 
-def smallest_model(full: OpenCVParameters, preferred: str) -> tuple[str, tuple[float, ...]]:
-    """``preferred`` where it holds ``full`` without loss, else PINHOLE or OPENCV; with its parameters."""
-    one_focal = full.fx == full.fy
-    pinhole = full.k1 == full.k2 == full.p1 == full.p2 == 0.0
-    fits = {
-        "SIMPLE_PINHOLE": one_focal and pinhole,
-        "PINHOLE": pinhole,
-        "SIMPLE_RADIAL": one_focal and full.k2 == full.p1 == full.p2 == 0.0,
-        "RADIAL": one_focal and full.p1 == full.p2 == 0.0,
-        "OPENCV": True,
-    }
-    model = preferred if fits[preferred] else ("PINHOLE" if pinhole else "OPENCV")
+def smallest_model(full: FullParameters, preferred: str | None) -> tuple[str, tuple[float, ...]]:
+    """``preferred`` where it holds ``full`` without loss, else one that does; with its parameters.
+
+    Raises:
+        ValueError: no model does: a fisheye with p1, p2, k5 or k6.
+    """
+    order = _FALLBACKS if preferred is None else (preferred, *_FALLBACKS)
+    model = next((name for name in order if _holds(name, full)), None)
+    if model is None:
+        raise ValueError("no camera model holds a fisheye lens with p1, p2, k5 or k6")
     values = full._asdict() | {"f": full.fx}
     return model, tuple(values[name] for name in MODEL_PARAMETERS[model])
+
+
+def _holds(model: str, full: FullParameters) -> bool:
+    """Whether ``model`` is of the lens's family and has a place for all that is not zero in it."""
+    names = MODEL_PARAMETERS[model]
+    if (model in FISHEYE_MODELS) != full.fisheye or ("f" in names and full.fx != full.fy):
+        return False
+    return all(name in names for name in COEFFICIENTS if getattr(full, name) != 0.0)

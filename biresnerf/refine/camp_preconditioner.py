@@ -10,36 +10,37 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from biresnerf.geometry.camera import Intrinsics
+from biresnerf.geometry.camera import Intrinsics, directions_in_cam, project
 
 POINTS = 5000
 NEAR, FAR = 0.125, 2.0  # depths of the points, of the cameras' distance: 0.5 to 8 of rigs 4 away
 DAMPING, DAMPING_LEAST = 0.1, 1e-8  # of Sigma's diagonal
 
 
-def projection_jacobian(
-    points: Tensor, focal: Tensor, size: float, rotation: Tensor, length: float
-) -> Tensor:
-    """d(pixel / size) / d(rotation, translation) [n, 2, 6] at zero, of points [n, 3] in the camera's frame.
+def pixels_by_points(intrinsics: Intrinsics, image: Tensor, points: Tensor) -> Tensor:
+    """d(pixel) / d(point) [n, 2, 3] of points [n, 3] in the frames of the cameras of images [n]."""
+    points = points.detach().requires_grad_()
+    pixels = project(intrinsics, image, points)
+    rows = [torch.autograd.grad(pixels[:, axis].sum(), points, retain_graph=axis == 0)[0] for axis in (0, 1)]
+    return torch.stack(rows, 1)
+
+
+def projection_jacobian(points: Tensor, by_point: Tensor, rotation: Tensor, length: float) -> Tensor:
+    """d(pixel) / d(rotation, translation) [n, 2, 6] at zero, of points [n, 3] in the camera's frame.
 
     Args:
-        focal: fx and fy [2], px; lens distortion is left out.
-        size: the longer side of the image, px.
+        by_point: d(pixel) / d(point) [n, 2, 3], in any unit.
         rotation: unit_from_cam [3, 3].
         length: unit lengths per unit of translation.
     """
     x, y, z = points.unbind(1)
     zero = torch.zeros_like(x)
-    projection = torch.stack(
-        [torch.stack([1 / z, zero, -x / z**2], 1), torch.stack([zero, 1 / z, -y / z**2], 1)], 1
-    )
-    projection = projection * (focal / size)[:, None]
     # A point at p of the camera's frame goes to p - (R^T omega) x p - R^T u.
     cross = torch.stack(
         [torch.stack([zero, -z, y], 1), torch.stack([z, zero, -x], 1), torch.stack([-y, x, zero], 1)], 1
     )
-    by_rotation = projection @ cross @ rotation.T
-    by_translation = -length * projection @ rotation.T
+    by_rotation = by_point @ cross @ rotation.T
+    by_translation = -length * by_point @ rotation.T
     return torch.cat([by_rotation, by_translation], 2)
 
 
@@ -56,13 +57,16 @@ def camp_preconditioner(
     across = torch.rand(POINTS, 2, generator=generator, dtype=torch.float64)
     depth = torch.rand(POINTS, 1, generator=generator, dtype=torch.float64)
     depth = distance * (NEAR + (FAR - NEAR) * depth)
+    intrinsics = intrinsics.to("cpu")
     result = []
     for i, pose in enumerate(unit_from_cam.double().cpu()):
-        size = torch.stack([intrinsics.width[i], intrinsics.height[i]]).double().cpu()
-        focal = torch.stack([intrinsics.fx[i], intrinsics.fy[i]]).double().cpu()
-        centre = torch.stack([intrinsics.cx[i], intrinsics.cy[i]]).double().cpu()
-        points = torch.cat([(across * size - centre) / focal * depth, depth], 1)
-        jacobian = projection_jacobian(points, focal, float(size.max()), pose[:3, :3], length)
+        size = torch.stack([intrinsics.width[i], intrinsics.height[i]]).double()
+        image = torch.full((POINTS,), i)
+        direction = directions_in_cam(intrinsics, image, across * size)
+        # A fisheye has no depth along its axis to speak of: rays to its sides have none.
+        points = direction * depth if intrinsics.fisheye[i] else direction / direction[:, 2:] * depth
+        by_point = pixels_by_points(intrinsics, image, points) / size.max()
+        jacobian = projection_jacobian(points, by_point, pose[:3, :3], length)
         sigma = (jacobian.transpose(1, 2) @ jacobian).mean(0)
         damped = sigma + torch.diag((DAMPING * sigma.diagonal()).clamp(min=DAMPING_LEAST))
         values, vectors = torch.linalg.eigh(damped)

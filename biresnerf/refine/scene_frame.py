@@ -11,8 +11,11 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
+from biresnerf.data.dataset import Camera
 from biresnerf.data.images import ImageSet
+from biresnerf.geometry.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.similarity import Similarity
 
@@ -22,6 +25,9 @@ logger = logging.getLogger(__name__)
 CONVERGING = 0.01
 FORWARD_FACING_DEPTH = 6.0  # in spreads of the camera centres, where nothing better is known
 ALPHA_MARGIN = 1.15  # poses are noisy: the silhouettes' box is widened by this
+WIDEST_SLOPE = (
+    1.5  # half an angle of view counts as no more than this tangent (56 deg): fisheyes see to their sides
+)
 FAR_BOXES = 60.0  # unbounded rays end this many inner boxes away (contracted to 1.98 of 2)
 
 
@@ -43,16 +49,32 @@ class SceneFrame:
     background: np.ndarray | None
 
 
+def _slopes(images: ImageSet, image: int, pixel_xy: np.ndarray) -> np.ndarray:
+    """x/z and y/z [n, 2] of the directions that pixels [n, 2] of an image look in, within `WIDEST_SLOPE`."""
+    intrinsics = Intrinsics.from_cameras([images.cameras[image]])
+    index = torch.zeros(len(pixel_xy), dtype=torch.int64)
+    ray = directions_in_cam(intrinsics, index, torch.from_numpy(pixel_xy.astype(np.float64))).numpy()
+    across, ahead = ray[:, :2], ray[:, 2:]
+    beyond = np.abs(across) >= WIDEST_SLOPE * ahead
+    return np.where(beyond, WIDEST_SLOPE * np.sign(across), across / np.where(beyond, 1.0, ahead))
+
+
 def _half_angle_tangent(images: ImageSet) -> float:
-    full = [camera.full() for camera in images.cameras]
-    sides = [max(c.width / f.fx, c.height / f.fy) / 2 for c, f in zip(images.cameras, full, strict=True)]
-    return float(np.median(sides))
+    """Tangent of half the angle of view along the longer side, of most cameras."""
+    tangents: dict[Camera, float] = {}
+    for i, camera in enumerate(images.cameras):
+        if camera not in tangents:
+            full, w, h = camera.full(), camera.width, camera.height
+            x, y = min(max(full.cx, 0.0), float(w)), min(max(full.cy, 0.0), float(h))
+            slopes = _slopes(images, i, np.array([[0, y], [w, y], [x, 0], [x, h]]))
+            tangents[camera] = float(max(slopes[1, 0] - slopes[0, 0], slopes[3, 1] - slopes[2, 1])) / 2
+    return float(np.median([tangents[camera] for camera in images.cameras]))
 
 
 def _silhouette_tangent(images: ImageSet) -> float | None:
     """How far from the optical axis silhouettes reach, as a tangent; None without alpha."""
     reach = []
-    for i, camera in enumerate(images.cameras):
+    for i in range(len(images.cameras)):
         alpha = images.alpha_image(i)
         if alpha is None:
             return None
@@ -60,10 +82,16 @@ def _silhouette_tangent(images: ImageSet) -> float | None:
         counts = images.counts_image(i)
         rows, columns = np.nonzero(seen if counts is None else seen & counts)
         if len(rows):
-            full = camera.full()
-            x, y = (columns + 0.5 - full.cx) / full.fx, (rows + 0.5 - full.cy) / full.fy
-            reach.append(max(np.abs(x).max(), np.abs(y).max()))
+            x, y = np.meshgrid([columns.min(), columns.max()], [rows.min(), rows.max()])
+            corners = np.stack([x, y], -1).reshape(-1, 2) + 0.5
+            reach.append(np.abs(_slopes(images, i, corners)).max())
     return float(np.quantile(reach, 0.9)) if reach else None
+
+
+def _pixel_slope(images: ImageSet) -> float:
+    """What one pixel spans at the image's centre, at a distance of one."""
+    spans = [max(c.width / c.full().fx, c.height / c.full().fy) for c in images.cameras]
+    return float(np.median(spans) / np.median([max(c.width, c.height) for c in images.cameras]))
 
 
 def scene_frame(poses: np.ndarray, images: ImageSet) -> SceneFrame:
@@ -84,13 +112,12 @@ def scene_frame(poses: np.ndarray, images: ImageSet) -> SceneFrame:
     if silhouette is not None:
         tangent = min(tangent, ALPHA_MARGIN * silhouette)
     half = distance * tangent
-    widest = float(np.median([max(c.width, c.height) for c in images.cameras]))
     unit_from_world = Similarity(1 / half, np.eye(3), -centre / half)
     return SceneFrame(
         unit_from_world=unit_from_world,
         unbounded=images.background is None,
         distance=distance / half,
-        pixel=2 * _half_angle_tangent(images) / widest * distance / half,
+        pixel=_pixel_slope(images) * distance / half,
         far=FAR_BOXES if images.background is None else 4 * distance / half + 4,
         background=images.background,
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from biresnerf.geometry.camera import Intrinsics
+from biresnerf.geometry.camera import Intrinsics, in_view
 
 WITNESSES = 2  # other cameras that must have a point in view
 
@@ -20,17 +20,15 @@ def shared_shares(points: Tensor, seer: Tensor, unit_from_cam: Tensor, intrinsic
     Args:
         seer: index [k] of the camera that sees the points, or would from another pose.
         unit_from_cam: [n, 3, 4], in the frame of the points.
-        intrinsics: of the n cameras; views are taken as pinholes, whatever the lens.
+        intrinsics: of the n cameras.
     """
     rotation, centre = unit_from_cam[:, :, :3], unit_from_cam[:, :, 3]
-    focal = torch.stack([intrinsics.fx, intrinsics.fy], 1).to(points)
-    middle = torch.stack([intrinsics.cx, intrinsics.cy], 1).to(points)
-    size = torch.stack([intrinsics.width, intrinsics.height], 1).to(points)
+    everyone = torch.arange(len(unit_from_cam), device=points.device)
     shares = []
     for own, camera in zip(points, seer.tolist(), strict=True):
         in_cam = torch.einsum("cji,ckj->cki", rotation, own[None] - centre[:, None])
-        pixel = in_cam[..., :2] / in_cam[..., 2:].clamp(min=1e-9) * focal[:, None] + middle[:, None]
-        inside = (in_cam[..., 2] > 0) & ((pixel > 0) & (pixel < size[:, None])).all(-1)
-        inside[camera] = False
-        shares.append((inside.sum(0) >= WITNESSES).float().mean())
+        cameras = everyone.repeat_interleave(len(own))
+        seen = in_view(intrinsics, cameras, in_cam.reshape(-1, 3)).reshape(len(everyone), len(own))
+        seen[camera] = False
+        shares.append((seen.sum(0) >= WITNESSES).float().mean())
     return torch.stack(shares)

@@ -118,15 +118,27 @@ BAD = {
     "frames is text": ("pose_file_invalid", "frames", lambda d: d.update(frames="images")),
     "frame is a list": ("pose_file_invalid", "frames[1]", lambda d: d["frames"].__setitem__(1, [])),
     "frames missing": ("pose_file_invalid", "frames", _without("frames")),
-    "fisheye": (
+    "another fisheye": (
         "camera_model_unsupported",
         "camera_model",
-        lambda d: d.update(camera_model="OPENCV_FISHEYE"),
+        lambda d: d.update(camera_model="THIN_PRISM_FISHEYE"),
     ),
     "own fisheye": ("camera_model_unsupported", "frames[2].camera_model", _frame(2, camera_model="FISHEYE")),
     "odd model": ("camera_model_unsupported", "camera_model", lambda d: d.update(camera_model=["OPENCV"])),
-    "ngp fisheye": ("camera_model_unsupported", "is_fisheye", lambda d: d.update(is_fisheye=True)),
-    "k3": ("camera_model_unsupported", "k3", lambda d: d.update(k3=0.01)),
+    "two lenses": ("camera_model_unsupported", "is_fisheye", lambda d: d.update(is_fisheye=True)),
+    "fisheye perhaps": ("camera_model_unsupported", "is_fisheye", lambda d: d.update(is_fisheye="no")),
+    "panorama": ("camera_model_unsupported", "equirectangular", lambda d: d.update(equirectangular=True)),
+    "tangential fisheye": (
+        "camera_model_unsupported",
+        "p2",
+        lambda d: d.update(camera_model="OPENCV_FISHEYE", p2=0.001),
+    ),
+    "k5 of OPENCV": ("camera_model_unsupported", "k5", lambda d: d.update(k5=0.01)),
+    "fisheye all around": (
+        "intrinsics_invalid",
+        "k1",
+        lambda d: d.update(camera_model="OPENCV_FISHEYE", fl_x=4.0, fl_y=4.0),
+    ),
     "own k4": ("camera_model_unsupported", "frames[1].k4", _frame(1, k4=0.01)),
     "negative focal": ("intrinsics_invalid", "fl_x", lambda d: d.update(fl_x=-18.0)),
     "zero focal": ("intrinsics_invalid", "frames[2].fl_y", _frame(2, fl_y=0)),
@@ -231,13 +243,29 @@ anything = st.recursive(
     | st.booleans()
     | st.integers()
     | st.floats()
-    | st.sampled_from(["", "OPENCV", "images/000.jpg", "..", "\0", "x" * 300, 1e308, -1, 0, 1e-300]),
+    | st.sampled_from(
+        [
+            "",
+            "OPENCV",
+            "OPENCV_FISHEYE",
+            "FULL_OPENCV",
+            "images/000.jpg",
+            "..",
+            "\0",
+            "x" * 300,
+            1e308,
+            -1,
+            0,
+            1e-300,
+        ]
+    ),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
     max_leaves=6,
 )
 KNOWN_KEYS = (
     *("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "x_fov", "camera_angle_x"),
     *("camera_angle_y", "camera_model", "applied_transform", "applied_scale", "is_fisheye", "mask_path"),
+    *("k5", "k6", "equirectangular"),
     *("rolling_shutter", "frames", "file_path", "transform_matrix", "aabb_scale", "ftheta_p0"),
 )
 

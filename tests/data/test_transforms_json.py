@@ -120,6 +120,14 @@ def test_one_focal_length_serves_both_axes(tmp_path):
         ("SIMPLE_RADIAL", {"fl_y": 18.0, "k1": 0.01}, "SIMPLE_RADIAL"),
         ("RADIAL", {"fl_y": 18.0, "k1": 0.01, "k2": 0.01}, "RADIAL"),
         ("RADIAL", {"k1": 0.01, "p1": 0.001}, "OPENCV"),
+        ("OPENCV", {"k1": 0.01, "k3": 0.001}, "FULL_OPENCV"),
+        ("FULL_OPENCV", {"k1": 0.01, "k4": 0.02, "k6": 0.001}, "FULL_OPENCV"),
+        ("OPENCV_FISHEYE", {}, "OPENCV_FISHEYE"),
+        ("OPENCV_FISHEYE", {"k1": 0.01, "k3": -0.003, "k4": 0.001, "p1": 0.0}, "OPENCV_FISHEYE"),
+        ("RADIAL_FISHEYE", {"fl_y": 18.0, "k1": 0.01}, "RADIAL_FISHEYE"),
+        ("RADIAL_FISHEYE", {"k1": 0.01}, "OPENCV_FISHEYE"),
+        (None, {"is_fisheye": True, "k1": 0.01, "k4": 0.001}, "OPENCV_FISHEYE"),
+        (None, {"is_fisheye": False, "k1": 0.01}, "OPENCV"),
         (None, {}, "PINHOLE"),
         (None, {"p1": 0.001}, "OPENCV"),
     ],
@@ -128,10 +136,12 @@ def test_the_camera_model_is_the_declared_one_where_it_holds_the_numbers(tmp_pat
     document = nerfstudio_scene(tmp_path, camera_model=declared, **extra)
     camera = read_dataset(save(tmp_path, document)).cameras[0]
     assert camera.model == model
-    expected = {"k1": 0.0, "k2": 0.0, "p1": 0.0, "fl_y": 18.5} | extra
+    expected = {"fl_y": 18.5} | extra
     full = camera.full()
     assert (full.fx, full.fy) == (18.0, expected["fl_y"])
-    assert (full.k1, full.k2, full.p1) == (expected["k1"], expected["k2"], expected["p1"])
+    assert full.fisheye == ("FISHEYE" in model)
+    for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"):
+        assert getattr(full, key) == expected.get(key, 0.0)
 
 
 def test_applied_transform_and_scale_are_undone(tmp_path):

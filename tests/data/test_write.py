@@ -6,6 +6,7 @@ import importlib.util
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -161,3 +162,28 @@ def test_whole_files_take_the_umask_like_any_other(tmp_path):
 def test_opengl_poses_of_the_test_scenes_are_rigid():
     for pose in np.array(opengl_poses(5)):
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+LENSES = [
+    Camera("SIMPLE_RADIAL", 20, 16, (18.0, 10.0, 8.0, 0.01)),
+    Camera("FULL_OPENCV", 20, 16, (18.0, 19.0, 10.0, 8.0, 0.01, 0.02, 1e-3, -1e-3, 0.03, 0.04, 0.05, 0.06)),
+    Camera("OPENCV_FISHEYE", 20, 16, (12.0, 12.5, 10.0, 8.0, 0.01, 0.002, -0.003, 0.0004)),
+    Camera("RADIAL_FISHEYE", 20, 16, (12.0, 10.0, 8.0, 0.01, 0.002)),
+]
+
+
+@pytest.mark.parametrize("cameras", [*((lens,) for lens in LENSES), tuple(LENSES)])
+def test_any_lens_of_a_folder_of_images_is_written_so_that_it_reads_back(tmp_path, cameras):
+    dataset, _ = odd_scene(tmp_path)
+    source = replace(dataset.source, dialect="images", document={}, applied_transform=np.eye(4))
+    frames = tuple(replace(frame, camera=i % len(cameras), raw={}) for i, frame in enumerate(dataset.frames))
+    dataset = replace(dataset, cameras=cameras, frames=frames, source=source)
+    write_transforms(dataset, dataset.world_from_cam, tmp_path / "out.json")
+    again = read_dataset(tmp_path / "out.json")
+    for i, frame in enumerate(again.frames):
+        given, read = dataset.camera_of(i), again.cameras[frame.camera]
+        assert (read.width, read.height, read.full()) == (given.width, given.height, given.full())
+    written = json.loads((tmp_path / "out.json").read_text("utf-8"))
+    for row in (written, *written["frames"]):
+        if "FISHEYE" in row.get("camera_model", ""):
+            assert not row.keys() & {"p1", "p2"}  # instant-ngp would take them for k3 and k4

@@ -14,16 +14,22 @@ from biresnerf.geometry import camera
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
+PINHOLE = Camera("PINHOLE", 320, 240, (300.0, 310.0, 160.0, 118.0))
+OPENCV = Camera("OPENCV", 320, 240, (300.0, 310.0, 160.0, 118.0, -0.12, 0.03, 0.002, -0.003))
+FULL = (252.0, 252.0, 160.0, 120.0, 0.52, -2.69, 0.0006, -0.0002, 1.5, 0.4, -2.5, 1.43)
+FISHEYE = Camera("OPENCV_FISHEYE", 320, 240, (110.0, 108.0, 160.0, 118.0, 0.02, -0.004, 0.001, -0.0002))
+
+
 @pytest.mark.parametrize(
-    "parameters",
+    "cameras",
     [
-        (300.0, 310.0, 160.0, 118.0, 0.0, 0.0, 0.0, 0.0),
-        (300.0, 310.0, 160.0, 118.0, -0.12, 0.03, 0.002, -0.003),
+        (PINHOLE, PINHOLE),
+        (OPENCV, PINHOLE),
+        (OPENCV, Camera("FULL_OPENCV", 320, 240, FULL)),
+        (FISHEYE, OPENCV),
     ],
 )
-def test_directions_equal_those_of_the_geometry(parameters):
-    other = (280.0, 280.0, 150.0, 120.0, *(0.5 * p for p in parameters[4:]))
-    cameras = [Camera("OPENCV", 320, 240, p) for p in (parameters, other)]
+def test_directions_equal_those_of_the_geometry(cameras):
     intrinsics = camera.Intrinsics.from_cameras(cameras).to(DEVICE)
     generator = torch.Generator().manual_seed(1)
     xy = (torch.rand(300, 2, generator=generator) * torch.tensor([320, 240])).to(DEVICE)

@@ -10,7 +10,7 @@ from biresnerf.data.dataset import Camera
 from biresnerf.data.synthetic import synthetic_cameras
 from biresnerf.geometry.camera import Intrinsics
 from biresnerf.geometry.lie import so3_exp
-from biresnerf.refine.camp_preconditioner import camp_preconditioner, projection_jacobian
+from biresnerf.refine.camp_preconditioner import camp_preconditioner, pixels_by_points, projection_jacobian
 from biresnerf.refine.pose_parameters import PoseParameters
 from tests.refine.scene import tiny_optimiser, tiny_options, tiny_set
 
@@ -45,8 +45,8 @@ def in_view(count: int, seed: int = 0) -> torch.Tensor:
 
 def test_the_jacobian_is_that_of_the_projection_by_autograd():
     pose, points = poses()[1], in_view(20)
-    focal = torch.tensor([FX, FY], dtype=torch.float64)
-    formula = projection_jacobian(points, focal, max(WIDTH, HEIGHT), pose[:3, :3], LENGTH)
+    by_point = pixels_by_points(intrinsics(1), torch.zeros(20, dtype=torch.int64), points)
+    formula = projection_jacobian(points, by_point / max(WIDTH, HEIGHT), pose[:3, :3], LENGTH)
     world = points @ pose[:3, :3].T + pose[:3, 3]
     automatic = torch.autograd.functional.jacobian(
         lambda theta: pixels(world, pose, theta), torch.zeros(6, dtype=torch.float64)
@@ -74,6 +74,13 @@ def test_the_preconditioner_is_symmetric_positive_and_the_same_for_the_same_seed
     torch.testing.assert_close(p, p.transpose(1, 2))
     assert float(torch.linalg.eigvalsh(p).min()) > 0
     assert torch.equal(p, camp_preconditioner(poses(4), intrinsics(4), DISTANCE, LENGTH, seed=2))
+
+
+def test_a_fisheye_that_sees_behind_itself_has_a_preconditioner_too():
+    lens = Camera("OPENCV_FISHEYE", WIDTH, HEIGHT, (18.0, 18.0, 30.0, 20.0, 0.01, 0.0, 0.0, 0.0))
+    p = camp_preconditioner(poses(2), Intrinsics.from_cameras([lens] * 2), DISTANCE, LENGTH, seed=0)
+    assert p.isfinite().all()
+    assert float(torch.linalg.eigvalsh(p).min()) > 0
 
 
 def parameters(p: torch.Tensor | None, form: str) -> PoseParameters:

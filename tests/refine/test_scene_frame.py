@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from biresnerf.data.dataset import Camera
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.scene_frame import scene_frame
 from tests.refine.scene import tiny_set
@@ -67,6 +68,27 @@ def test_a_pixel_is_as_wide_as_two_neighbouring_rays_are_apart_at_the_centre(sce
     frame = scene_frame(dataset.world_from_cam, images)
     fx = images.cameras[0].full().fx
     assert frame.pixel == pytest.approx(frame.distance / fx, rel=1e-6)
+
+
+def test_the_lens_decides_how_far_the_box_reaches(scene):
+    """Seen through a lens that squeezes the picture, the same pixels lie farther out."""
+    dataset, images = scene
+    images = replace(images, alpha=None)
+
+    def half(camera: Camera) -> float:
+        bent = replace(images, cameras=(camera,) * len(dataset))
+        return 1 / scene_frame(dataset.world_from_cam, bent).unit_from_world.scale
+
+    w = images.cameras[0].width
+    tangents = {
+        Camera("SIMPLE_PINHOLE", w, w, (2.0 * w, w / 2, w / 2)): 0.25,
+        Camera("SIMPLE_RADIAL_FISHEYE", w, w, (0.5 * w / 0.9, w / 2, w / 2, 0.0)): np.tan(0.9),
+        Camera("SIMPLE_RADIAL_FISHEYE", w, w, (0.3 * w, w / 2, w / 2, 0.0)): 1.5,  # 95 degrees to each side
+        # Slopes of 0.3 are seen at 0.3 (1 - 0.5 * 0.09) = 0.2865.
+        Camera("SIMPLE_RADIAL", w, w, (w / 2 / 0.2865, w / 2, w / 2, -0.5)): 0.3,
+    }
+    halves = [half(camera) / tangent for camera, tangent in tangents.items()]
+    np.testing.assert_allclose(halves, halves[0], rtol=1e-9)
 
 
 def test_photos_that_show_surroundings_make_an_unbounded_frame(scene):

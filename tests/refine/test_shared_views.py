@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from biresnerf.data.dataset import Camera
@@ -13,8 +14,8 @@ from biresnerf.refine.shared_views import shared_shares
 LENS = Camera("SIMPLE_PINHOLE", 20, 20, (20.0, 10.0, 10.0))  # half a unit to each side at a distance of one
 
 
-def shares(poses: np.ndarray, points: torch.Tensor, seer: list[int]) -> list[float]:
-    intrinsics = Intrinsics.from_cameras([LENS] * len(poses))
+def shares(poses: np.ndarray, points: torch.Tensor, seer: list[int], lens: Camera = LENS) -> list[float]:
+    intrinsics = Intrinsics.from_cameras([lens] * len(poses))
     unit_from_cam = torch.from_numpy(poses[:, :3]).float()
     return shared_shares(points, torch.tensor(seer), unit_from_cam, intrinsics).tolist()
 
@@ -46,3 +47,9 @@ def test_a_camera_turned_away_shares_nothing_and_those_about_a_scene_all():
     poses[4] = poses[4] @ np.diag([-1.0, 1, -1, 1])
     ahead = torch.from_numpy(poses[:, :3, 3] + 4 * poses[:, :3, 2]).float()[:, None]
     assert shares(poses, ahead, list(range(12))) == [0.0 if i == 4 else 1.0 for i in range(12)]
+
+
+def test_fisheyes_share_what_lies_beside_and_behind_them():
+    lens = Camera("SIMPLE_RADIAL_FISHEYE", 20, 20, (5.0, 10.0, 10.0, 0.0))  # 115 degrees to each side
+    beside = torch.tensor([[[50.0, 0.0, 0.0], [50.0, 0.0, -10.0], [50.0, 0.0, -100.0]]])
+    assert shares(side_by_side(3), beside, [0], lens) == [pytest.approx(2 / 3)]

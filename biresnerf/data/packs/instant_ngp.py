@@ -17,6 +17,7 @@ from biresnerf.data.conventions import file_from_world_from_cam
 from biresnerf.data.dataset import Camera
 from biresnerf.data.refined_set import RefinedSet
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera_models import COEFFICIENTS
 from biresnerf.geometry.focus import focus_point
 
 TRANSFORMS_NGP = "transforms_ngp.json"
@@ -59,15 +60,13 @@ def write_transforms_ngp(refined: RefinedSet, path: Path) -> None:
 
 def _lens(camera: Camera) -> dict[str, Any]:
     full = camera.full()
-    fisheye = camera.model.endswith("FISHEYE")
-    names = _FISHEYE if fisheye else _PERSPECTIVE
-    beyond = full._replace(**dict.fromkeys(("fx", "fy", "cx", "cy", *names), 0.0))
-    if any(value for value in beyond if not isinstance(value, bool)):
+    names = _FISHEYE if full.fisheye else _PERSPECTIVE
+    if any(getattr(full, name) for name in COEFFICIENTS if name not in names):
         raise _impossible(f"it has no lens with all coefficients of {camera.model}")
     values: dict[str, Any] = {"w": camera.width, "h": camera.height}
     values |= {"fl_x": full.fx, "fl_y": full.fy, "cx": full.cx, "cy": full.cy}
     values |= {name: getattr(full, name) for name in names}
-    return {**values, "is_fisheye": True} if fisheye else values
+    return {**values, "is_fisheye": True} if full.fisheye else values
 
 
 def _placement(refined: RefinedSet) -> tuple[float, list[float], int]:

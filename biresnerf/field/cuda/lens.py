@@ -11,16 +11,22 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from biresnerf.geometry.camera import NEWTON_STEPS, Intrinsics
+from biresnerf.geometry.camera import Intrinsics
+from biresnerf.geometry.distortion import NEWTON_STEPS
 
 BLOCK = 128
+NEAR_AXIS = tl.constexpr(1e-16)  # squared radians, as in the geometry
 
 
 @triton.jit
 def directions(
-    fx, fy, cx, cy, distortion, image, xy, out, n, STEPS: tl.constexpr, BLOCK: tl.constexpr
+    fx, fy, cx, cy, distortion, fisheye, image, xy, out, n, STEPS: tl.constexpr, FISHEYE: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Unit directions out [n, 3] of pixels xy [n, 2] of images [n]; all float64 inside. STEPS = 0: no distortion."""
+    """Unit directions out [n, 3] of pixels xy [n, 2] of images [n]; all float64 inside.
+
+    STEPS = 0: no distortion. FISHEYE: some images are a fisheye's.
+    """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < n
     m = tl.load(image + i, mask=here, other=0)
@@ -30,26 +36,41 @@ def directions(
     y0 = y0 / tl.load(fy + m, mask=here, other=1.0)
     x, y = x0, y0
     if STEPS > 0:
-        k1 = tl.load(distortion + 4 * m, mask=here, other=0.0)
-        k2 = tl.load(distortion + 4 * m + 1, mask=here, other=0.0)
-        p1 = tl.load(distortion + 4 * m + 2, mask=here, other=0.0)
-        p2 = tl.load(distortion + 4 * m + 3, mask=here, other=0.0)
+        a1 = tl.load(distortion + 9 * m, mask=here, other=0.0)
+        a2 = tl.load(distortion + 9 * m + 1, mask=here, other=0.0)
+        a3 = tl.load(distortion + 9 * m + 2, mask=here, other=0.0)
+        a4 = tl.load(distortion + 9 * m + 3, mask=here, other=0.0)
+        b1 = tl.load(distortion + 9 * m + 4, mask=here, other=0.0)
+        b2 = tl.load(distortion + 9 * m + 5, mask=here, other=0.0)
+        b3 = tl.load(distortion + 9 * m + 6, mask=here, other=0.0)
+        p1 = tl.load(distortion + 9 * m + 7, mask=here, other=0.0)
+        p2 = tl.load(distortion + 9 * m + 8, mask=here, other=0.0)
         for _ in range(STEPS):
-            r2 = x * x + y * y
-            radial = r2 * (k2 * r2 + k1) + 1.0
-            slope = k2 * r2 * 4.0 + k1 * 2.0
-            error_x = x * radial + p1 * x * y * 2.0 + p2 * (r2 + x * x * 2.0) - x0
-            error_y = y * radial + p2 * x * y * 2.0 + p1 * (r2 + y * y * 2.0) - y0
+            s = x * x + y * y
+            below = ((b3 * s + b2) * s + b1) * s + 1.0
+            radial = ((((a4 * s + a3) * s + a2) * s + a1) * s + 1.0) / below
+            slope = ((a4 * s * 4.0 + a3 * 3.0) * s + a2 * 2.0) * s + a1
+            slope = (slope - radial * ((b3 * s * 3.0 + b2 * 2.0) * s + b1)) * 2.0 / below
+            error_x = x * radial + p1 * x * y * 2.0 + p2 * (s + x * x * 2.0) - x0
+            error_y = y * radial + p2 * x * y * 2.0 + p1 * (s + y * y * 2.0) - y0
             xx = radial + slope * x * x + p1 * y * 2.0 + p2 * x * 6.0
             yy = radial + slope * y * y + p2 * x * 2.0 + p1 * y * 6.0
             across = slope * x * y + p1 * x * 2.0 + p2 * y * 2.0
             determinant = xx * yy - across * across
             x -= (yy * error_x - across * error_y) / determinant
             y -= (xx * error_y - across * error_x) / determinant
-    norm = tl.sqrt(x * x + y * y + 1.0)
-    tl.store(out + 3 * i, (x / norm).to(tl.float32), mask=here)
-    tl.store(out + 3 * i + 1, (y / norm).to(tl.float32), mask=here)
-    tl.store(out + 3 * i + 2, (1.0 / norm).to(tl.float32), mask=here)
+    s = x * x + y * y
+    z = 1.0 / tl.sqrt(s + 1.0)
+    scale = z
+    if FISHEYE:
+        curved = tl.load(fisheye + m, mask=here, other=0) != 0
+        off_axis = s > NEAR_AXIS
+        angle = tl.sqrt(tl.where(off_axis, s, 1.0))
+        scale = tl.where(curved, tl.where(off_axis, tl.sin(angle) / angle, 1.0 - s / 6.0), scale)
+        z = tl.where(curved, tl.where(off_axis, tl.cos(angle), 1.0 - s / 2.0), z)
+    tl.store(out + 3 * i, (x * scale).to(tl.float32), mask=here)
+    tl.store(out + 3 * i + 1, (y * scale).to(tl.float32), mask=here)
+    tl.store(out + 3 * i + 2, z.to(tl.float32), mask=here)
 
 
 def directions_in_cam(intrinsics: Intrinsics, image_index: Tensor, pixel_xy: Tensor) -> Tensor:
@@ -59,7 +80,8 @@ def directions_in_cam(intrinsics: Intrinsics, image_index: Tensor, pixel_xy: Ten
     i = intrinsics
     if n:
         directions[(triton.cdiv(n, BLOCK),)](
-            i.fx, i.fy, i.cx, i.cy, i.distortion, image_index.contiguous(), pixel_xy.float().contiguous(), out, n,
-            STEPS=NEWTON_STEPS if i.distorted else 0, BLOCK=BLOCK,
+            i.fx, i.fy, i.cx, i.cy, i.distortion, i.fisheye.view(torch.uint8), image_index.contiguous(),
+            pixel_xy.float().contiguous(), out, n,
+            STEPS=NEWTON_STEPS if i.distorted else 0, FISHEYE=i.some_fisheye, BLOCK=BLOCK,
         )  # fmt: skip
     return out
