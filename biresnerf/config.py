@@ -58,6 +58,12 @@ class RefineOptions(BaseModel):
         "ones are started from; given: no matches are looked for.",
     )
 
+    fixed: tuple[str, ...] = Field(
+        (),
+        max_length=10_000,
+        description="Names of images whose poses stay as given, to the bit; the result's frame is tied to them.",
+    )
+
     steps: int | None = Field(None, ge=20, le=1_000_000, description="Steps of both stages together.")
     coarse_steps_min: int | None = Field(None, ge=10, description="Stage 1 takes at least this many steps.")
     coarse_steps_max: int | None = Field(None, ge=10, description="Stage 1 ends here, stable or not.")
@@ -114,7 +120,7 @@ class RefineOptions(BaseModel):
         "bundler.",
     )
 
-    @field_validator("packs", mode="before")
+    @field_validator("fixed", "packs", mode="before")
     @classmethod
     def _listed(cls, value: Any) -> Any:
         """A list may be written with commas, as on a command line."""

@@ -141,7 +141,14 @@ class OutputFolder:
         record = stages.record
         lost = [i for i, flag in enumerate(optimiser.camera_errors.lost.tolist()) if flag]
         images_reported = _image_reports(
-            dataset, start, world_from_cam, held_out, scores, lost, stages.repair.repaired
+            dataset,
+            start,
+            world_from_cam,
+            held_out,
+            scores,
+            lost,
+            stages.repair.repaired,
+            optimiser.bodies.fixed,
         )
         refined = refined_set(
             dataset,
@@ -192,16 +199,19 @@ def poses_in_input_frame(dataset: Dataset, optimiser: JointOptimiser) -> tuple[n
     """Refined world_from_cam [n, 4, 4] carried into the input's frame, and the similarity that does it.
 
     The optimisation leaves frame and scale free; what ties them down is the best similarity, robust to lost
-    cameras unless the method has it otherwise, from the optimised poses to the given ones.
+    cameras unless the method has it otherwise, from the optimised poses to the given ones. Fixed cameras and rigs
+    leave less open.
     """
     world_from_unit = optimiser.frame.unit_from_world.inverse()
     optimised = world_from_unit.apply_to_poses(optimiser.poses.poses().numpy())
     given = dataset.world_from_cam
-    if optimiser.method.robust_frame:
+    input_from_optimised = optimiser.bodies.input_from_optimised(optimised, given)
+    if input_from_optimised is None and optimiser.method.robust_frame:
         input_from_optimised = align_robust(optimised, given, with_rotations=True)
-    else:
+    elif input_from_optimised is None:
         input_from_optimised = align_umeyama(optimised, given)
-    return input_from_optimised.apply_to_poses(optimised), input_from_optimised
+    carried = input_from_optimised.apply_to_poses(optimised)
+    return optimiser.bodies.restored(carried, given), input_from_optimised
 
 
 def _lost_warnings(dataset: Dataset, lost: list[int]) -> tuple[str, ...]:
@@ -219,6 +229,7 @@ def _image_reports(
     scores: list[ViewScore],
     lost: list[int],
     repaired: list[int],
+    fixed: np.ndarray,
 ) -> tuple[ImageReport, ...]:
     given = dataset.world_from_cam
     turn = rotation_angle_deg(np.swapaxes(given[:, :3, :3], 1, 2) @ world_from_cam[:, :3, :3])
@@ -229,6 +240,7 @@ def _image_reports(
             name=frame.name,
             pose_source=start.source if start.placed[i] else frame.pose_source,
             held_out=i in held_out,
+            fixed=bool(fixed[i]),
             moved_deg=float(turn[i]),
             moved_units=float(shift[i]),
             lost=i in lost,

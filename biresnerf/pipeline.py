@@ -34,6 +34,7 @@ from biresnerf.refine.evaluation import (
 )
 from biresnerf.refine.history import Observer
 from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.rigid_bodies import rigid_bodies
 from biresnerf.refine.scene_frame import scene_frame
 from biresnerf.refine.start import Start, choose_start
 from biresnerf.refine.two_stages import LAST_FRACTION, TwoStages
@@ -136,10 +137,12 @@ def _optimiser(
     prepared: Prepared, start: Start, options: RefineOptions, device: torch.device, threads: int
 ) -> JointOptimiser:
     """The optimisation at its first step, in the unit frame of the poses it starts from."""
-    frame = scene_frame(start.world_from_cam, prepared.images)
-    poses = frame.unit_from_world.apply_to_poses(start.world_from_cam)
+    bodies = rigid_bodies(prepared.dataset, options)
+    world_from_cam = bodies.held(start.world_from_cam, prepared.dataset.world_from_cam)
+    frame = scene_frame(world_from_cam, prepared.images)
+    poses = frame.unit_from_world.apply_to_poses(world_from_cam)
     return JointOptimiser(
-        prepared.images, frame, poses, options, prepared.held_out, device, threads, start.mobility
+        prepared.images, frame, poses, options, prepared.held_out, device, threads, start.mobility, bodies
     )
 
 
@@ -206,6 +209,7 @@ def _prepare(
     stop: Callable[[], bool],
 ) -> Prepared:
     dataset = given if isinstance(given, Dataset) else read_dataset(Path(given))
+    rigid_bodies(dataset, options)  # names that are not there are told before anything takes time
     unposed = not dataset.posed.all()
     if unposed:
         dataset = seed_poses(

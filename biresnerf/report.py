@@ -22,6 +22,7 @@ class ImageReport(BaseModel):
     name: str
     pose_source: StartSource = Field(description="Who found the pose that the optimisation started from.")
     held_out: bool = Field(description="Never used to train the field.")
+    fixed: bool = Field(False, description="Kept where it was, on request.")
     moved_deg: float = Field(description="Rotation between the given pose and the refined one, degrees.")
     moved_units: float = Field(description="Distance between the given camera centre and the refined one.")
     lost: bool = Field(

@@ -34,7 +34,10 @@ def write_transforms(dataset: Dataset, world_from_cam: NDArray[np.float64], path
         dict(source.document) if source.document else {"camera_model": "OPENCV", "frames": None}
     )
     document["frames"] = [
-        _frame_object(dataset, index, matrix.tolist()) for index, matrix in enumerate(matrices)
+        _frame_object(
+            dataset, index, matrix.tolist(), unmoved=_unmoved(dataset, index, world_from_cam[index])
+        )
+        for index, matrix in enumerate(matrices)
     ]
     if source.dialect == "images":
         document = _with_intrinsics(document, dataset)
@@ -44,10 +47,19 @@ def write_transforms(dataset: Dataset, world_from_cam: NDArray[np.float64], path
         )
 
 
-def _frame_object(dataset: Dataset, index: int, matrix: list[list[float]]) -> dict[str, Any]:
+def _unmoved(dataset: Dataset, index: int, world_from_cam: NDArray[np.float64]) -> bool:
+    given = dataset.frames[index].world_from_cam
+    return given is not None and np.array_equal(given, world_from_cam)
+
+
+def _frame_object(
+    dataset: Dataset, index: int, matrix: list[list[float]], *, unmoved: bool
+) -> dict[str, Any]:
     frame = dataset.frames[index]
     row = dict(frame.raw) or {"file_path": dataset.file_names[index]}
     rows_given = row.get("transform_matrix")
+    if isinstance(rows_given, list) and unmoved:
+        return row  # its own digits, not those of the way to our convention and back
     row["transform_matrix"] = matrix[:3] if isinstance(rows_given, list) and len(rows_given) == 3 else matrix
     return row
 

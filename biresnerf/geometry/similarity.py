@@ -114,11 +114,13 @@ def align_row_flip(a_from_cam: Array, b_from_cam: Array) -> Similarity:
     return Similarity(best.scale, rotation, middle_b - best.scale * rotation @ a[:, :3, 3].mean(0))
 
 
-def align_robust(a_from_cam: Array, b_from_cam: Array, *, with_rotations: bool = False) -> Similarity:
+def align_robust(
+    a_from_cam: Array, b_from_cam: Array, *, with_rotations: bool = False, with_scale: bool = True
+) -> Similarity:
     """As `align_umeyama`, with cameras that do not follow the others weighed down.
 
     ``with_rotations`` lets the cameras' rotations have their say in the turn beside the centres: not BARF's
-    metric, but the better estimate of a frame from noisy poses.
+    metric, but the better estimate of a frame from noisy poses. Without ``with_scale`` the scale is 1.
 
     Iteratively reweighted least squares with Cauchy weights; the scale is twice the median residual of each
     round, for centres and for rotations apart.
@@ -128,7 +130,8 @@ def align_robust(a_from_cam: Array, b_from_cam: Array, *, with_rotations: bool =
     """
     a, b = _rig_pair(a_from_cam, b_from_cam)
     weights_centre = weights_rotation = np.ones(len(a))
-    b_from_a = _align_weighted(a, b, weights_centre, weights_rotation, with_rotations=with_rotations)
+    free = {"with_rotations": with_rotations, "with_scale": with_scale}
+    b_from_a = _align_weighted(a, b, weights_centre, weights_rotation, **free)
     spread = float(np.sqrt(((b[:, :3, 3] - b[:, :3, 3].mean(0)) ** 2).sum(1).mean()))
     for _ in range(_ROBUST_ROUNDS):
         moved = b_from_a.apply_to_poses(a)
@@ -138,14 +141,20 @@ def align_robust(a_from_cam: Array, b_from_cam: Array, *, with_rotations: bool =
         weights_centre = _cauchy(centre_residual, floor=1e-12 * max(spread, 1e-300))
         weights_rotation = _cauchy(rotation_residual, floor=1e-12)
         last = b_from_a
-        b_from_a = _align_weighted(a, b, weights_centre, weights_rotation, with_rotations=with_rotations)
+        b_from_a = _align_weighted(a, b, weights_centre, weights_rotation, **free)
         if _same(last, b_from_a, spread):
             break
     return b_from_a
 
 
 def _align_weighted(
-    a: Array, b: Array, weights_centre: Array, weights_rotation: Array, *, with_rotations: bool = False
+    a: Array,
+    b: Array,
+    weights_centre: Array,
+    weights_rotation: Array,
+    *,
+    with_rotations: bool = False,
+    with_scale: bool = True,
 ) -> Similarity:
     share = weights_centre / weights_centre.sum()
     centres_a, centres_b = a[:, :3, 3], b[:, :3, 3]
@@ -158,7 +167,7 @@ def _align_weighted(
     if _is_point(spread_a, centres_a) or _is_point(spread_b, centres_b):
         scale, rotation = 1.0, _nearest_rotation(turn)
     else:
-        scale = spread_b / spread_a
+        scale = spread_b / spread_a if with_scale else 1.0
         correlation = (from_middle_b.T * share) @ from_middle_a / (spread_a * spread_b)
         # Both matrices are without unit: a trace of 1 for centres that agree, of 3 for rotations that do.
         rotation = (

@@ -50,6 +50,7 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
         return
     mobility = torch.zeros(len(optimiser.poses), device=optimiser.device)
     mobility[held_out] = 1.0
+    mobility[torch.from_numpy(optimiser.bodies.fixed).to(optimiser.device)] = 0.0
     schedule = optimiser.schedule
     gradient = PositionGradient()
     poses = optimiser.poses

@@ -24,6 +24,7 @@ from biresnerf.refine.methods import METHODS, build_field, occupancy_side
 from biresnerf.refine.photo_sampler import PhotoSampler, PixelBatch
 from biresnerf.refine.pose_hypotheses import photo_distances
 from biresnerf.refine.pose_parameters import PoseParameters
+from biresnerf.refine.rigid_bodies import RigidBodies
 from biresnerf.refine.scene_frame import SceneFrame
 
 MOST_SAMPLES = 768  # per ray
@@ -55,6 +56,7 @@ class JointOptimiser:
         options: resolved.
         held_out: images whose rays move their own pose but never the field.
         mobility: each camera's factor of the pose rate [2, n] in stage 1 and stage 2; 1 where left out.
+        bodies: which cameras move together, and which not at all; all by themselves where left out.
         sampler: of the same images and held-out views, where another optimiser has made it already.
     """
 
@@ -68,9 +70,11 @@ class JointOptimiser:
         device: torch.device,
         threads: int,
         mobility: np.ndarray | None = None,
+        bodies: RigidBodies | None = None,
         sampler: PhotoSampler | None = None,
     ) -> None:
         self.frame, self.options, self.device = frame, options, device
+        self.bodies = bodies or RigidBodies.free(len(images))
         self.method = METHODS[options.method]
         self.field = build_field(self.method, options, frame, device, threads)
         self.intrinsics = Intrinsics.from_cameras(images.cameras).to(device)
@@ -95,8 +99,9 @@ class JointOptimiser:
         self.mobility = (
             torch.ones(2, len(self.poses), device=device)
             if mobility is None or not self.method.additions
-            else torch.as_tensor(mobility, dtype=torch.float32, device=device)
+            else torch.tensor(mobility, dtype=torch.float32, device=device)
         )
+        self.mobility[:, torch.from_numpy(self.bodies.fixed).to(device)] = 0.0
         guess = self.schedule.samples(0, None) // (self.field.stratified or FIRST_SAMPLES)
         self.rays = max(self.method.rays_least, guess)
 
@@ -121,13 +126,14 @@ class JointOptimiser:
             betas=self.method.pose_betas,
             double_step=bool(options.double_pose_step),
             preconditioner=preconditioner,
+            body=torch.from_numpy(self.bodies.of),
         )
 
     def replace_pose(self, camera: int, unit_from_cam: Tensor) -> None:
         """Start one camera over from another pose [3, 4]: as free as any, with nothing known of it yet."""
         self.poses.replace(camera, unit_from_cam)
         self.camera_errors.forget(camera)
-        self.mobility[:, camera] = 1.0
+        self.mobility[:, self.poses.members(camera)] = 1.0
         if self.poses.preconditioner is not None:
             fresh = self._pose_parameters(self.poses.poses()).preconditioner
             assert fresh is not None

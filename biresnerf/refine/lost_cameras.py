@@ -246,7 +246,8 @@ class LostCameraRepair:
 
     def load_notes(self, notes: dict[str, Any]) -> None:
         self.repaired, self._times, self._spent = notes["repaired"], notes["times"], notes["spent"]
-        self.optimiser.mobility[:, self.repaired] = 1.0
+        for camera in self.repaired:
+            self.optimiser.mobility[:, self.optimiser.poses.members(camera)] = 1.0
 
 
 def _distinct(matrices: Tensor, scores: Tensor, keep: int) -> Tensor:
