@@ -44,8 +44,8 @@ def _straight_through(fraction, smoothing):
     return ONE + smoothing * HALF_PI * cosine
 
 
-def _make_level(hashing: bool):
-    """Kernels of one level; `hashing` is fixed at compile time so that the index arithmetic stays branch-free."""
+def _make_corners(hashing: bool):
+    """How corners are numbered; `hashing` is fixed at compile time so that the index arithmetic stays branch-free."""
 
     @njit(inline="always")
     def index_of(x, y, z, mask):
@@ -58,6 +58,13 @@ def _make_level(hashing: bool):
         if hashing:
             return PRIME_Y, PRIME_Z
         return stride, u4(stride * stride)
+
+    return index_of, strides
+
+
+def _make_forward(hashing: bool):
+    """The kernel that encodes samples at one level."""
+    index_of, strides = _make_corners(hashing)
 
     @njit(**KERNEL)
     def forward(x, table, scale, stride, mask, smoothing, out0, out1, j0, j1, j2, j3, j4, j5, begin, end):
@@ -102,6 +109,13 @@ def _make_level(hashing: bool):
             y0, y1 = a + fy * w0, c + fy * w1
             store(j5, i, sz * (y1 - y0))
             store(out1, i, y0 + fz * (y1 - y0))
+
+    return forward
+
+
+def _make_scatter(hashing: bool):
+    """The kernel that adds samples' gradients to the table of one level."""
+    index_of, strides = _make_corners(hashing)
 
     @njit(**KERNEL)
     def scatter(x, gradient, scale, stride, mask, g0, g1, corner, value, first, last):
@@ -158,11 +172,11 @@ def _make_level(hashing: bool):
                     store(gradient, entry, a0)
                     store(gradient, entry + 1, a1)
 
-    return forward, scatter
+    return scatter
 
 
-_forward_hashed, _scatter_hashed = _make_level(True)
-_forward_dense, _scatter_dense = _make_level(False)
+_forward_hashed, _forward_dense = _make_forward(True), _make_forward(False)
+_scatter_hashed, _scatter_dense = _make_scatter(True), _make_scatter(False)
 
 
 @njit(**PARALLEL_KERNEL)
