@@ -170,8 +170,8 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
     "fast": {
         "max_image_size": 128,
         "steps": 3000,
-        "coarse_steps_min": 1000,
-        "coarse_steps_max": 2000,
+        "coarse_steps_min": 600,
+        "coarse_steps_max": 1200,
         "check_every": 50,
         "samples_per_step": 2**15,
         "pose_rate": 5e-3,
@@ -187,8 +187,8 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
     "balanced": {
         "max_image_size": 200,
         "steps": 8000,
-        "coarse_steps_min": 2000,
-        "coarse_steps_max": 4500,
+        "coarse_steps_min": 1600,
+        "coarse_steps_max": 3200,
         "check_every": 100,
         "samples_per_step": 2**16,
         "pose_rate": 5e-3,
