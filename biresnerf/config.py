@@ -19,7 +19,7 @@ Wiring = Literal["concat", "replace", "residual"]
 DetectorName = Literal["trend", "counter", "variance"]
 PoseParametrisation = Literal["se3_world", "so3xr3", "so3xr3_camp"]
 PackName = Literal["colmap-text", "instant-ngp", "kitti", "bundler"]
-StartPoses = Literal["auto", "given"]
+StartPoses = Literal["auto", "given", "colmap", "none"]
 
 
 class RefineOptions(BaseModel):
@@ -54,8 +54,9 @@ class RefineOptions(BaseModel):
 
     start: StartPoses | None = Field(
         None,
-        description="auto: poses that feature matches support are tried against the given ones, and the better "
-        "ones are started from; given: no matches are looked for.",
+        description="auto: feature matches find missing poses, and poses they support are tried against the given "
+        "ones; given: the given poses, of all images; colmap: COLMAP's poses, whatever is given; none: no feature "
+        "matches, missing poses are guessed from other images.",
     )
 
     fixed: tuple[str, ...] = Field(

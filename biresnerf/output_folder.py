@@ -185,7 +185,7 @@ class OutputFolder:
                 rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
                 translation=tuple(float(v) for v in similarity.translation),
             ),
-            warnings=dataset.warnings + start.warnings + _lost_warnings(dataset, lost) + notes,
+            warnings=dataset.warnings + _lost_warnings(dataset, lost) + notes,
         )
         self._write_text(REPORT, report.model_dump_json(indent=2))
         return report
@@ -204,12 +204,12 @@ def poses_in_input_frame(dataset: Dataset, optimiser: JointOptimiser) -> tuple[n
     """
     world_from_unit = optimiser.frame.unit_from_world.inverse()
     optimised = world_from_unit.apply_to_poses(optimiser.poses.poses().numpy())
-    given = dataset.world_from_cam
+    given, tied = dataset.world_from_cam, dataset.anchors
     input_from_optimised = optimiser.bodies.input_from_optimised(optimised, given)
     if input_from_optimised is None and optimiser.method.robust_frame:
-        input_from_optimised = align_robust(optimised, given, with_rotations=True)
+        input_from_optimised = align_robust(optimised[tied], given[tied], with_rotations=True)
     elif input_from_optimised is None:
-        input_from_optimised = align_umeyama(optimised, given)
+        input_from_optimised = align_umeyama(optimised[tied], given[tied])
     carried = input_from_optimised.apply_to_poses(optimised)
     return optimiser.bodies.restored(carried, given), input_from_optimised
 
@@ -238,7 +238,7 @@ def _image_reports(
     return tuple(
         ImageReport(
             name=frame.name,
-            pose_source=start.source if start.placed[i] else frame.pose_source,
+            pose_source=start.sources[i],
             held_out=i in held_out,
             fixed=bool(fixed[i]),
             moved_deg=float(turn[i]),

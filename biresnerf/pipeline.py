@@ -7,20 +7,18 @@ import json
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 
 from biresnerf.config import RefineOptions
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.images import ImageSet, load_images
-from biresnerf.data.match_poses import can_match, poses_from_matches
 from biresnerf.data.read import read_dataset
-from biresnerf.data.seed_colmap import seed_poses
-from biresnerf.errors import InputError, Interrupted, RefinementError
+from biresnerf.data.seed_poses import PoseCandidate, seed_poses
+from biresnerf.errors import Interrupted
 from biresnerf.field.backends import choose_device, use_threads
 from biresnerf.field.compile_kernels import compile_kernels
 from biresnerf.output_folder import OutputFolder
@@ -38,7 +36,7 @@ from biresnerf.refine.rigid_bodies import rigid_bodies
 from biresnerf.refine.scene_frame import scene_frame
 from biresnerf.refine.start import Start, choose_start
 from biresnerf.refine.two_stages import LAST_FRACTION, TwoStages
-from biresnerf.report import Report, StartSource
+from biresnerf.report import Report
 
 logger = logging.getLogger(__name__)
 
@@ -54,7 +52,8 @@ class Prepared:
     images: ImageSet
     held_out: list[int]
     fingerprint: str
-    seeding: str | None  # COLMAP's answer, where the poses are COLMAP's
+    candidates: tuple[PoseCandidate, ...]
+    seeding: str | None  # what COLMAP answered, where it was asked
 
 
 def refine_poses(
@@ -100,9 +99,9 @@ def refine_poses(
         start = Start.from_json(notes["start"])
     else:
         start = _find_start(prepared, options, device, threads, report, stop)
-    sought = prepared.seeding is not None or options.start == "auto"
     message = f"{len(prepared.dataset)} images read"
-    report(Progress(stage="seeding" if sought else "preparing", fraction=0.02, message=message))
+    stage: Literal["seeding", "preparing"] = "seeding" if prepared.seeding is not None else "preparing"
+    report(Progress(stage=stage, fraction=0.02, message=message))
 
     options = start.stage_lengths(asked, options)
     optimiser = _optimiser(prepared, start, options, device, threads)
@@ -166,29 +165,10 @@ def _find_start(
     report: OnProgress,
     stop: Callable[[], bool],
 ) -> Start:
-    """The given poses, or better ones by feature matches where `options.start` lets them be looked for."""
-    dataset = prepared.dataset
-    by_colmap = prepared.seeding is not None
-    placed = np.full(len(dataset), by_colmap)
-    given = Start(dataset.world_from_cam, "colmap" if by_colmap else "given", placed)
-    if options.start == "given" or by_colmap:
-        return given
-    report(Progress(stage="seeding", fraction=0.012, message="comparing the poses with feature matches"))
-    if not can_match():
-        return replace(
-            given,
-            warnings=("COLMAP is not installed: the given poses were not compared with feature matches.",),
-        )
-    try:
-        matched = poses_from_matches(dataset, should_stop=stop, seed=options.seed)
-    except (InputError, RefinementError) as error:
-        return replace(
-            given, warnings=(f"The given poses could not be compared with feature matches: {error}",)
-        )
-    if not matched:
-        return given
-    sources: dict[str, StartSource] = {"incremental": "matches-incremental", "global": "matches-global"}
-    candidates = [given, *(Start(m.world_from_cam, sources[m.mapper], m.placed) for m in matched)]
+    """The poses that predict unseen photos best, where there is a choice."""
+    candidates = [Start.of(candidate) for candidate in prepared.candidates]
+    if len(candidates) == 1:
+        return candidates[0]
     report(Progress(stage="seeding", fraction=0.016, message=f"trying {len(candidates)} sets of poses"))
     return choose_start(candidates, prepared.images, options, device, threads, stop)
 
@@ -210,31 +190,32 @@ def _prepare(
 ) -> Prepared:
     dataset = given if isinstance(given, Dataset) else read_dataset(Path(given))
     rigid_bodies(dataset, options)  # names that are not there are told before anything takes time
-    unposed = not dataset.posed.all()
-    if unposed:
-        dataset = seed_poses(
-            dataset,
-            should_stop=stop,
-            seed=options.seed,
-            remember=seeding,
-            on_start=lambda: report(
-                Progress(stage="seeding", fraction=0.01, message="COLMAP looks for poses")
-            ),
-        )
+    missing = not dataset.posed.all()
+    message = "COLMAP looks for poses" if missing else "comparing the poses with feature matches"
+    given_poses = [None if f.world_from_cam is None else f.world_from_cam.tolist() for f in dataset.frames]
+    found = seed_poses(
+        dataset,
+        options.start or "auto",
+        should_stop=stop,
+        seed=options.seed,
+        remember=seeding,
+        on_start=lambda: report(Progress(stage="seeding", fraction=0.01, message=message)),
+    )
+    dataset = found.dataset
     images = load_images(dataset, options.max_image_size, options.background)
     digest = hashlib.sha256(images.pixels.tobytes())
     if images.counts is not None:
         digest.update(images.counts.tobytes())
     # What changes neither result nor effort may differ between a run and its continuation.
     asked = options.model_dump(exclude={"threads", "checkpoint_every_s", "orbit_frames", "packs"})
-    digest.update(json.dumps([asked, dataset.names], sort_keys=True).encode())
-    digest.update(np.ascontiguousarray(dataset.world_from_cam).tobytes())
+    digest.update(json.dumps([asked, dataset.names, given_poses], sort_keys=True).encode())
     return Prepared(
         dataset,
         images,
         held_out_views(len(dataset), options.holdout),
         digest.hexdigest(),
-        seeding.read_text("utf-8") if unposed else None,
+        found.candidates,
+        seeding.read_text("utf-8") if seeding.is_file() else None,
     )
 
 

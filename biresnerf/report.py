@@ -11,7 +11,15 @@ from biresnerf.config import RefineOptions
 _FROZEN = ConfigDict(frozen=True, extra="forbid")
 
 SwitchReason = Literal["stable", "cap"]
-StartSource = Literal["given", "colmap", "matches-incremental", "matches-global"]
+PoseSource = Literal[
+    "given",
+    "colmap",
+    "matches-incremental",
+    "matches-global",
+    "neighbours",
+    "nearest-view",
+    "forward-facing",
+]
 
 
 class ImageReport(BaseModel):
@@ -20,7 +28,10 @@ class ImageReport(BaseModel):
     model_config = _FROZEN
 
     name: str
-    pose_source: StartSource = Field(description="Who found the pose that the optimisation started from.")
+    pose_source: PoseSource = Field(
+        description="Who found the pose that the optimisation started from: the user, COLMAP from the images alone or "
+        "beside the given poses, or a guess from other images."
+    )
     held_out: bool = Field(description="Never used to train the field.")
     fixed: bool = Field(False, description="Kept where it was, on request.")
     moved_deg: float = Field(description="Rotation between the given pose and the refined one, degrees.")
@@ -58,7 +69,7 @@ class TrialReport(BaseModel):
 
     model_config = _FROZEN
 
-    source: StartSource
+    source: PoseSource
     placed: int = Field(
         description="Images whose pose comes from feature matches; the others keep the given one."
     )

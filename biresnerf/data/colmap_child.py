@@ -14,107 +14,76 @@ import zlib  # noqa: F401
 from pathlib import Path
 from typing import Any
 
-MAX_IMAGE_SIZE = 1600  # long side (px) at which features are found; more costs time and adds little
-SEQUENTIAL_OVERLAP = 12  # neighbours that each image is matched with, where all pairs would be too many
+SAYS = "seeding: "  # before lines meant for the job's log; all others are COLMAP's own
 # Small photos have few features: faint ones count as well, and fewer matches than COLMAP asks for must do.
 FAINTEST_PEAK, LEAST_MATCHES, LEAST_SEEN = 0.003, 12, 10
-ENOUGH_PLACED = 0.8  # of the images: no other way of mapping is tried then
+ENOUGH_PLACED = 0.8  # of the images: where all poses are given, no other way of mapping is tried then
+INTRINSICS_FROM = 0.5  # of the images: a model of fewer does not say what the lens is
 PAIR_OUTLIER = 3.0  # median disagreements beyond which a pair's matches are taken for repeated structure
 PAIR_OUTLIER_DEG = 30.0  # but not below this
 
 
 def main(request_path: Path) -> None:
-    """Does the request's task and writes its ``answer``."""
+    """Does what the request asks and writes its ``answer``."""
     request: dict[str, Any] = json.loads(request_path.read_text("utf-8"))
-    task = {"from_scratch": map_from_scratch, "from_given": map_from_given}[request["task"]]
-    Path(request["answer"]).write_text(json.dumps(task(request)), "utf-8")
+    Path(request["answer"]).write_text(json.dumps(map_images(request)), "utf-8")
 
 
-def map_from_scratch(request: dict[str, Any]) -> dict[str, Any]:
-    """Features, matches, incremental mapping; the largest model found."""
-    import pycolmap
-
-    work = Path(request["work"])
-    database, images = work / "database.db", Path(request["root"])
-    pycolmap.set_random_seed(request["seed"])
-
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "SIMPLE_RADIAL"
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.max_image_size = MAX_IMAGE_SIZE
-    mode = pycolmap.CameraMode.PER_IMAGE if request["camera_per_image"] else pycolmap.CameraMode.SINGLE
-    pycolmap.extract_features(
-        database, images, image_names=request["names"], camera_mode=mode, reader_options=reader,
-        extraction_options=extraction,
-    )  # fmt: skip
-    if request["sequential"]:
-        pairing = pycolmap.SequentialPairingOptions()
-        pairing.overlap = SEQUENTIAL_OVERLAP
-        pycolmap.match_sequential(database, pairing_options=pairing)
-    else:
-        pycolmap.match_exhaustive(database)
-
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = 3
-    options.random_seed = request["seed"]
-    (work / "sparse").mkdir()
-    models = pycolmap.incremental_mapping(database, images, work / "sparse", options)
-    return describe_largest(models)
+def say(text: str) -> None:
+    """A line for the job's log."""
+    sys.stdout.write(f"{SAYS}{text}\n")
+    sys.stdout.flush()
 
 
-def map_from_given(request: dict[str, Any]) -> dict[str, Any]:
-    """Features and matches with known intrinsics; the largest model of image by image mapping, guided by given poses.
+def map_images(request: dict[str, Any]) -> dict[str, Any]:
+    """Features and matches; the largest model of image by image mapping, guided by the poses there are.
 
-    Where that one leaves out many images, global mapping's model as well: it places more and makes more mistakes.
-
-    One thread in every step: with more, the answer differs from run to run.
+    And global mapping's, which places more and makes more mistakes: always where poses are missing, else where the
+    first leaves out many images.
     """
     import pycolmap
 
     work = Path(request["work"])
     database, images = work / "database.db", Path(request["root"])
+    count = sum(len(camera["names"]) for camera in request["cameras"])
     pycolmap.set_random_seed(request["seed"])
-    extract_with_cameras(request, database, images)
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = 1
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.compute_relative_pose = True
-    verification.min_num_inliers = LEAST_MATCHES
-    verification.ransac.random_seed = request["seed"]
-    verification.ransac.max_error *= request["error_scale"]
-    if request["pairs"] is None:
-        pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification)
-    else:
-        listed = work / "pairs.txt"
-        listed.write_text("".join(f"{a} {b}\n" for a, b in request["pairs"]), "utf-8")
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = str(listed)
-        pycolmap.match_image_pairs(
-            database, matching_options=matching, pairing_options=pairing, verification_options=verification
-        )
-    drop_contradicting_pairs(database, request["cam_from_world"])
-    write_position_priors(database, request["cam_from_world"], request["position_deviation"])
+    numbers = extract_features(request, database, images)
+    say(f"features of {count} images found")
+    match_features(request, database, work)
+    if request["cam_from_world"]:
+        drop_contradicting_pairs(database, request["cam_from_world"])
+        write_position_priors(database, request["cam_from_world"], request["position_deviation"])
+    matches = matched_pairs(database)
+    say(f"{len(matches)} pairs of images match")
 
-    answer = []
+    answer: list[dict[str, Any]] = []
     for mapper, run in (("incremental", map_incrementally), ("global", map_globally)):
         (work / mapper).mkdir()
-        models = run(database, images, work / mapper, request)
-        if models:
-            best = max(models.values(), key=lambda model: model.num_reg_images())
-            images_of = describe(best)["images"]
-            answer.append({"mapper": mapper, "images": images_of, "points": best.num_points3D()})
-            if len(images_of) >= ENOUGH_PLACED * len(request["cam_from_world"]):
-                break
-    return {"models": answer}
+        models = run(database, images, work / mapper, request, numbers)
+        if not models:
+            say(f"{mapper} mapping: no model")
+            continue
+        best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
+        answer.append({"mapper": mapper, **describe(best, numbers)})
+        placed = best.num_reg_images()
+        say(
+            f"{mapper} mapping: {placed} of {count} images, {best.num_points3D()} points, "
+            f"error {answer[-1]['reprojection_px']:.2f} px, {len(models)} models"
+        )
+        if len(request["cam_from_world"]) == count and placed >= ENOUGH_PLACED * count:
+            break
+        if mapper == "incremental" and placed >= INTRINSICS_FROM * count:
+            keep_intrinsics(database, best, request, numbers)
+    return {"models": answer, "matches": matches}
 
 
-def extract_with_cameras(request: dict[str, Any], database: Path, images: Path) -> None:
-    """Features of all images, each with its given intrinsics."""
+def extract_features(request: dict[str, Any], database: Path, images: Path) -> list[int]:
+    """Features of all images; returns the database's number of each camera asked for."""
     import pycolmap
 
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = request["widest_image"]
-    extraction.num_threads = 1
+    extraction.num_threads = request["threads"]
     extraction.sift.max_num_features = request["most_features"]
     extraction.sift.peak_threshold = FAINTEST_PEAK
     extraction.sift.domain_size_pooling = extraction.sift.estimate_affine_shape = request["thorough"]
@@ -123,11 +92,57 @@ def extract_with_cameras(request: dict[str, Any], database: Path, images: Path) 
             continue
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = camera["model"]
-        reader.camera_params = ",".join(repr(float(value)) for value in camera["params"])
+        if request["masks"] is not None:
+            reader.mask_path = request["masks"]
+        if camera["params"] is not None:
+            reader.camera_params = ",".join(repr(float(value)) for value in camera["params"])
         pycolmap.extract_features(
             database, images, image_names=camera["names"], camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader, extraction_options=extraction,
         )  # fmt: skip
+    opened = pycolmap.Database.open(database)
+    camera_of = {image.name: image.camera_id for image in opened.read_all_images()}
+    opened.close()
+    firsts = [camera["names"][0] if camera["names"] else "" for camera in request["cameras"]]
+    return [camera_of.get(name, -1) for name in firsts]
+
+
+def match_features(request: dict[str, Any], database: Path, work: Path) -> None:
+    """Matches of all pairs, or of those listed, and the relative poses they support."""
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = request["threads"]
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.compute_relative_pose = True
+    verification.min_num_inliers = LEAST_MATCHES
+    verification.ransac.random_seed = request["seed"]
+    verification.ransac.max_error *= request["error_scale"]
+    if request["pairs"] is None:
+        pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification)
+        return
+    listed = work / "pairs.txt"
+    listed.write_text("".join(f"{a} {b}\n" for a, b in request["pairs"]), "utf-8")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = str(listed)
+    pycolmap.match_image_pairs(
+        database, matching_options=matching, pairing_options=pairing, verification_options=verification
+    )
+
+
+def matched_pairs(database_path: Path) -> list[tuple[str, str, int]]:
+    """Names of the images of each pair that matches, and how many matches."""
+    import pycolmap
+
+    database = pycolmap.Database.open(database_path)
+    names = {image.image_id: image.name for image in database.read_all_images()}
+    found = []
+    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
+        if len(geometry.inlier_matches) >= LEAST_MATCHES:
+            a, b = pycolmap.pair_id_to_image_pair(pair)
+            found.append((names[a], names[b], len(geometry.inlier_matches)))
+    database.close()
+    return found
 
 
 def drop_contradicting_pairs(database_path: Path, cam_from_world: dict[str, Any]) -> None:
@@ -140,9 +155,9 @@ def drop_contradicting_pairs(database_path: Path, cam_from_world: dict[str, Any]
     rotation = {name: np.array(pose)[:3, :3] for name, pose in cam_from_world.items()}
     angles = {}
     for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
-        if geometry.cam2_from_cam1 is None:
-            continue
         a, b = pycolmap.pair_id_to_image_pair(pair)
+        if geometry.cam2_from_cam1 is None or names[a] not in rotation or names[b] not in rotation:
+            continue
         matched = geometry.cam2_from_cam1.rotation.matrix()
         given = rotation[names[b]] @ rotation[names[a]].T
         cosine = (np.trace(matched.T @ given) - 1) / 2
@@ -162,6 +177,8 @@ def write_position_priors(database_path: Path, cam_from_world: dict[str, Any], d
 
     database = pycolmap.Database.open(database_path)
     for image in database.read_all_images():
+        if image.name not in cam_from_world:
+            continue
         pose = np.array(cam_from_world[image.name])
         prior = pycolmap.PosePrior()
         prior.position = -pose[:3, :3].T @ pose[:3, 3]
@@ -172,15 +189,20 @@ def write_position_priors(database_path: Path, cam_from_world: dict[str, Any], d
     database.close()
 
 
-def map_incrementally(database: Path, images: Path, work: Path, request: dict[str, Any]) -> dict[int, Any]:
+def map_incrementally(
+    database: Path, images: Path, work: Path, request: dict[str, Any], numbers: list[int]
+) -> dict[int, Any]:
     """Models by adding image to image, with position priors; few matches suffice, as images may be small."""
     import pycolmap
 
+    known = [number for number, c in zip(numbers, request["cameras"], strict=True) if c["known"]]
     options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed, options.num_threads = request["seed"], 1
+    options.random_seed, options.num_threads = request["seed"], request["threads"]
     options.min_model_size, options.min_num_matches = 3, 10
-    options.ba_refine_focal_length = options.ba_refine_extra_params = False
-    options.use_prior_position = options.use_robust_loss_on_prior_position = True
+    options.ba_refine_focal_length = options.ba_refine_extra_params = len(known) < len(numbers)
+    options.constant_cameras = set(known)
+    guided = len(request["cam_from_world"]) >= 3
+    options.use_prior_position = options.use_robust_loss_on_prior_position = guided
     mapper, scale = options.mapper, request["error_scale"]
     mapper.init_min_num_inliers, mapper.abs_pose_min_num_inliers = 3 * LEAST_SEEN, LEAST_SEEN
     mapper.init_min_tri_angle, mapper.max_reg_trials = 8.0, 6
@@ -190,50 +212,61 @@ def map_incrementally(database: Path, images: Path, work: Path, request: dict[st
     return pycolmap.incremental_mapping(database, images, work, options)
 
 
-def map_globally(database: Path, images: Path, work: Path, request: dict[str, Any]) -> dict[int, Any]:
+def map_globally(
+    database: Path, images: Path, work: Path, request: dict[str, Any], numbers: list[int]
+) -> dict[int, Any]:
     """Models by averaging all pairs' rotations, then placing all cameras at once."""
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
-    options.random_seed, options.num_threads = request["seed"], 1
-    options.mapper.random_seed, options.mapper.num_threads = request["seed"], 1
+    options.random_seed, options.num_threads = request["seed"], request["threads"]
+    options.mapper.random_seed, options.mapper.num_threads = request["seed"], request["threads"]
+    fixed = all(camera["known"] for camera in request["cameras"])
     adjustment = options.mapper.bundle_adjustment
-    adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = (
-        False
-    )
+    adjustment.refine_focal_length = adjustment.refine_extra_params = not fixed
+    adjustment.refine_principal_point = False
     return pycolmap.global_mapping(database, images, work, options)
 
 
-def describe_largest(models: dict[int, Any]) -> dict[str, Any]:
-    """Cameras and poses of the model with most images, and the sizes of all models."""
-    ordered = sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
-    if not ordered:
-        return {"cameras": {}, "images": [], "sizes": []}
-    return {**describe(ordered[0]), "sizes": [model.num_reg_images() for model in ordered]}
+def keep_intrinsics(database_path: Path, model: Any, request: dict[str, Any], numbers: list[int]) -> None:
+    """What image by image mapping found of a lens holds for what follows, so that models can be compared."""
+    import pycolmap
+
+    database = pycolmap.Database.open(database_path)
+    for camera, number in zip(request["cameras"], numbers, strict=True):
+        if not camera["known"] and number in model.cameras:
+            found = model.cameras[number]
+            found.has_prior_focal_length = True
+            database.update_camera(found)
+            camera["known"] = True
+    database.close()
 
 
-def describe(best: Any) -> dict[str, Any]:
-    """Cameras and poses of one model."""
+def describe(model: Any, numbers: list[int]) -> dict[str, Any]:
+    """Cameras, by their place in the request, and poses of one model, and how well it explains its matches."""
+    seen = {image.camera_id for image in model.images.values() if image.has_pose}
     cameras = {
-        str(number): {
-            "model": camera.model.name,
-            "width": camera.width,
-            "height": camera.height,
-            "params": [float(value) for value in camera.params],
+        str(index): {
+            "model": model.cameras[number].model.name,
+            "width": model.cameras[number].width,
+            "height": model.cameras[number].height,
+            "params": [float(value) for value in model.cameras[number].params],
         }
-        for number, camera in best.cameras.items()
+        for index, number in enumerate(numbers)
+        if number in seen
     }
-    images = []
-    for image in best.images.values():
-        if image.has_pose:
-            images.append(
-                {
-                    "name": image.name,
-                    "camera": str(image.camera_id),
-                    "cam_from_world": image.cam_from_world().matrix().tolist(),
-                }
-            )
-    return {"cameras": cameras, "images": images}
+    images = [
+        {"name": image.name, "cam_from_world": image.cam_from_world().matrix().tolist()}
+        for image in model.images.values()
+        if image.has_pose
+    ]
+    return {
+        "cameras": cameras,
+        "images": images,
+        "points": model.num_points3D(),
+        "observations": model.compute_num_observations(),
+        "reprojection_px": float(model.compute_mean_reprojection_error()),
+    }
 
 
 if __name__ == "__main__":

@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.geometry.camera_models import FullParameters, full_parameters, smallest_model
+from biresnerf.report import PoseSource
 
 if TYPE_CHECKING:
     from biresnerf.data.colmap_scene import ColmapModel
 
-PoseSource = Literal["given", "colmap"]
+# Guesses from other images: worth trying, not worth believing.
+GUESSES: frozenset[PoseSource] = frozenset({"neighbours", "nearest-view"})
 IntrinsicsSource = Literal["given", "exif", "colmap", "guessed"]
 Dialect = Literal["nerfstudio", "instant-ngp", "blender", "images"]
 
@@ -144,6 +146,15 @@ class Dataset:
         if len(poses) != len(self.frames):
             raise ValueError(f"{len(self.frames) - len(poses)} of {len(self.frames)} frames have no pose yet")
         return np.stack(poses)
+
+    @property
+    def anchors(self) -> NDArray[np.bool_]:
+        """Whose poses say what the frame is, bool [n]: those given; where there are none, all but guesses."""
+        given = np.array([frame.pose_source == "given" for frame in self.frames], dtype=np.bool_)
+        if given.any():
+            return given
+        found = np.array([frame.pose_source not in GUESSES for frame in self.frames], dtype=np.bool_)
+        return found if found.any() else ~found
 
     def camera_of(self, index: int) -> Camera:
         """The camera of frame ``index``, at full size."""

@@ -14,13 +14,17 @@ import numpy as np
 import torch
 
 from biresnerf.config import RefineOptions
+from biresnerf.data.dataset import GUESSES
 from biresnerf.data.images import ImageSet
+from biresnerf.data.seed_poses import PoseCandidate
 from biresnerf.geometry.pose_error import rotation_angle_deg
 from biresnerf.refine.frozen_trials import FrozenTrials, trial_views
 from biresnerf.refine.methods import METHODS
-from biresnerf.report import StartSource, TrialReport
+from biresnerf.report import PoseSource, TrialReport
 
 logger = logging.getLogger(__name__)
+
+MATCHED_SOURCES: frozenset[PoseSource] = frozenset({"colmap", "matches-incremental", "matches-global"})
 
 TRIAL_STEPS = 200
 # Of the pose rate, in stage 1 and 2: what cameras placed by matches may move by. They are off by tenths of a degree,
@@ -40,17 +44,29 @@ class Start:
 
     Attributes:
         world_from_cam: float64 [n, 4, 4], in the frame of the given poses.
-        source: whose they are.
-        placed: bool [n], whether feature matches gave the pose.
+        source: whose they are, as a whole.
+        sources: who found each of them.
         trials: how every candidate did; empty if there was nothing to choose between.
-        warnings: what a user should know about how they came about.
     """
 
     world_from_cam: np.ndarray
-    source: StartSource
-    placed: np.ndarray
+    source: PoseSource
+    sources: tuple[PoseSource, ...]
     trials: tuple[TrialReport, ...] = ()
-    warnings: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, candidate: PoseCandidate) -> Start:
+        return cls(candidate.world_from_cam, candidate.name, candidate.sources)
+
+    @property
+    def placed(self) -> np.ndarray:
+        """Bool [n], whether feature matches gave the pose."""
+        return np.array([source in MATCHED_SOURCES for source in self.sources])
+
+    @property
+    def guessed(self) -> np.ndarray:
+        """Bool [n], whether the pose is a guess from other images."""
+        return np.array([source in GUESSES for source in self.sources])
 
     @property
     def mobility(self) -> np.ndarray:
@@ -70,16 +86,14 @@ class Start:
         return {
             "world_from_cam": self.world_from_cam.tolist(),
             "source": self.source,
-            "placed": self.placed.tolist(),
+            "sources": list(self.sources),
             "trials": [trial.model_dump() for trial in self.trials],
-            "warnings": list(self.warnings),
         }
 
     @classmethod
     def from_json(cls, kept: dict[str, Any]) -> Start:
         trials = tuple(TrialReport.model_validate(trial) for trial in kept["trials"])
-        placed = np.array(kept["placed"], dtype=bool)
-        return cls(np.array(kept["world_from_cam"]), kept["source"], placed, trials, tuple(kept["warnings"]))
+        return cls(np.array(kept["world_from_cam"]), kept["source"], tuple(kept["sources"]), trials)
 
 
 def choose_start(

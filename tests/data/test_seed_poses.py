@@ -5,19 +5,22 @@ from __future__ import annotations
 import importlib.util
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from biresnerf.data import colmap_process
+from biresnerf.data import colmap_process, map_images
+from biresnerf.data.dataset import Camera, Dataset
 from biresnerf.data.read import read_dataset
-from biresnerf.data.seed_colmap import seed_poses
+from biresnerf.data.seed_poses import seed_poses
 from biresnerf.data.synthetic import synthetic_focal
 from biresnerf.data.write import write_transforms
 from biresnerf.errors import InputError, Interrupted, RefinementError
-from biresnerf.geometry.pose_error import pose_error
+from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.geometry.pose_error import pose_error, rotation_angle_deg
 from tests.data.scenes import arc_poses, assert_complete, textured_arc, write_image
 
 needs_colmap = pytest.mark.skipif(
@@ -26,9 +29,41 @@ needs_colmap = pytest.mark.skipif(
 VIEWS, SIZE = 10, 320
 
 
+def turned_deg(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return rotation_angle_deg(np.swapaxes(one[:, :3, :3], 1, 2) @ other[:, :3, :3])
+
+
+def with_poses(folder: Path, poses: np.ndarray) -> Dataset:
+    """The photos with these poses and their true intrinsics, both given."""
+    bare = read_dataset(folder)
+    camera = Camera("SIMPLE_PINHOLE", SIZE, SIZE, (synthetic_focal(SIZE), SIZE / 2, SIZE / 2))
+    frames = tuple(
+        replace(f, world_from_cam=p, pose_source="given") for f, p in zip(bare.frames, poses, strict=True)
+    )
+    return replace(bare, cameras=(camera,), frames=frames, intrinsics_sources=())
+
+
+def without(dataset: Dataset, *missing: int) -> Dataset:
+    """The set with the poses of some frames taken away."""
+    frames = (
+        replace(f, world_from_cam=None, pose_source=None) if i in missing else f
+        for i, f in enumerate(dataset.frames)
+    )
+    return replace(dataset, frames=tuple(frames))
+
+
 def seeded(folder, **how):
     """What a folder of images becomes once COLMAP has placed them."""
-    return seed_poses(read_dataset(folder), **how)
+    return seed_poses(read_dataset(folder), **how).dataset
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    """Plain features do for these scenes, at a seventh of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(map_images, "THOROUGH_UP_TO", 0)
+        patch.setattr(map_images, "THOROUGH_ALONE_UP_TO", 0)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -46,16 +81,17 @@ def folder(photos, tmp_path):
 
 
 @needs_colmap
-def test_poses_and_focal_length_are_found_and_a_stranger_is_left_out_by_name(folder):
+def test_poses_and_focal_length_are_found_and_a_stranger_is_guessed_by_name(folder):
     write_image(folder / "images/stranger 1.png", seed=9, size=(SIZE, SIZE))
     dataset = seeded(folder)
-    assert dataset.names == tuple(f"images/{i:02}.png" for i in range(VIEWS))
-    assert {frame.pose_source for frame in dataset.frames} == {"colmap"}
+    assert dataset.names == (*(f"images/{i:02}.png" for i in range(VIEWS)), "images/stranger 1.png")
+    assert [frame.pose_source for frame in dataset.frames] == ["colmap"] * VIEWS + ["neighbours"]
     assert dataset.source.dialect == "images"
     assert len(dataset.cameras) == 1
+    assert dataset.intrinsics_sources == ("colmap",)
     assert dataset.cameras[0].full().fx == pytest.approx(synthetic_focal(SIZE), rel=0.1)
     assert any("images/stranger 1.png" in text and "1 of 11" in text for text in dataset.warnings)
-    error = pose_error(dataset.world_from_cam, arc_poses(VIEWS))
+    error = pose_error(dataset.world_from_cam[:VIEWS], arc_poses(VIEWS))
     # A short arc of smooth textures leaves the focal length loose, and the rotations with it.
     assert error.aligned.rotation_deg.max < 3.0
     assert error.aligned.centre_percent.max < 2.0
@@ -145,6 +181,7 @@ def test_two_images_are_too_few_and_broken_ones_are_named_before_colmap_runs(tmp
 def test_a_continued_run_is_given_the_same_poses_until_an_image_changes(folder, tmp_path, monkeypatch):
     kept = tmp_path / "kept" / "seeding.json"
     first = seeded(folder, remember=kept)
+    assert "Feature extraction" in (kept.parent / "colmap.log").read_text("utf-8")
     monkeypatch.setattr(colmap_process, "CHILD", tmp_path / "no_such_program.py")
     again = seeded(folder, remember=kept)
     assert np.array_equal(again.world_from_cam, first.world_from_cam)
@@ -152,3 +189,49 @@ def test_a_continued_run_is_given_the_same_poses_until_an_image_changes(folder, 
     write_image(folder / "images/00.png", size=(SIZE, SIZE))
     with pytest.raises(RefinementError):  # COLMAP is asked anew
         seeded(folder, remember=kept)
+
+
+@needs_colmap
+def test_known_intrinsics_are_kept_and_given_poses_only_say_what_the_frame_is(folder):
+    truth = with_poses(folder, arc_poses(VIEWS))
+    wrong = perturb_poses(arc_poses(VIEWS), 0.02, seed=4)
+    noisy = replace(
+        truth, frames=tuple(replace(f, world_from_cam=p) for f, p in zip(truth.frames, wrong, strict=True))
+    )
+    found = seed_poses(noisy, "colmap")
+    assert found.dataset.cameras == truth.cameras
+    np.testing.assert_array_equal(found.dataset.world_from_cam, wrong)  # what the result is measured against
+    poses = found.candidates[0].world_from_cam
+    assert set(found.candidates[0].sources) == {"colmap"}
+    assert turned_deg(poses, arc_poses(VIEWS)).max() < 3  # in the given frame, to within its noise
+    assert pose_error(poses, arc_poses(VIEWS)).aligned.rotation_deg.max < 2.0
+
+
+def test_given_poses_are_taken_as_they_are_and_missing_ones_refused_by_name(folder):
+    truth = with_poses(folder, arc_poses(VIEWS))
+    (candidate,) = seed_poses(truth, "given").candidates
+    np.testing.assert_array_equal(candidate.world_from_cam, arc_poses(VIEWS))
+    assert set(candidate.sources) == {"given"}
+    with pytest.raises(InputError) as caught:
+        seed_poses(without(truth, 3), "given")
+    assert_complete(caught.value, "pose_missing", folder.name)
+    assert "03.png" in caught.value.what
+    assert "start=auto" in caught.value.mend
+
+
+def test_without_features_missing_poses_come_from_neighbours_and_all_missing_ones_face_forward(folder):
+    truth = with_poses(folder, arc_poses(VIEWS))
+    found = seed_poses(without(truth, 3, 7), "none")
+    assert [f.pose_source for f in found.dataset.frames].count("neighbours") == 2
+    assert turned_deg(found.dataset.world_from_cam, arc_poses(VIEWS)).max() < 0.5
+    (candidate,) = seed_poses(without(truth, *range(VIEWS)), "none").candidates
+    assert set(candidate.sources) == {"forward-facing"}
+    np.testing.assert_array_equal(candidate.world_from_cam, np.tile(np.eye(4), (VIEWS, 1, 1)))
+
+
+def test_without_colmap_given_poses_are_completed_and_the_user_is_told(folder, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    dataset = seed_poses(without(with_poses(folder, arc_poses(VIEWS)), 5)).dataset
+    assert dataset.frames[5].pose_source == "neighbours"
+    assert any("not installed" in text for text in dataset.warnings)
+    assert any("05.png (neighbours)" in text for text in dataset.warnings)
