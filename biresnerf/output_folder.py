@@ -14,6 +14,7 @@ from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.images import ImageSet
 from biresnerf.data.packs.write_packs import write_packs
+from biresnerf.data.refined_points import with_given_points
 from biresnerf.data.refined_set import refined_set
 from biresnerf.data.renders import picture_stems, write_orbit, write_view
 from biresnerf.data.write import write_transforms
@@ -157,6 +158,8 @@ class OutputFolder:
             pose_sources=[image.pose_source for image in images_reported],
             flags=[image.flags for image in images_reported],
         )
+        if dataset.source.colmap is not None:
+            refined = with_given_points(refined, dataset.source.colmap)
         notes = write_packs(refined, self.path, optimiser.options.packs)
         report = Report(
             version=_version(),

@@ -16,9 +16,9 @@ from biresnerf.data.dataset import Camera, Dataset
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity
 
-# ``features``: matched anew at the refined poses; ``tracks``: the input's own tracks triangulated again; ``moved``:
-# the input's points carried along with the cameras nearest to them.
-PointsSource = Literal["none", "features", "tracks", "moved"]
+# ``given``: the input's, as nothing moved; ``tracks``: its tracks triangulated again; ``features``: matches of features
+# triangulated; ``moved``: the input's points carried along with the cameras nearest to them.
+PointsSource = Literal["none", "given", "features", "tracks", "moved"]
 
 
 @dataclass(frozen=True, eq=False)

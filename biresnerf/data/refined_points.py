@@ -1,0 +1,143 @@
+"""The sparse points of a result: triangulated anew at the refined poses, never those of the poses before.
+
+Trainers start from these points, and points that lie beside the refined cameras' rays undo the refinement
+(nerfstudio's users, issue 3443).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.colmap_result import matrix_of_pose, with_points
+from biresnerf.data.colmap_scene import ColmapModel, ColmapPoints
+from biresnerf.data.refined_set import RefinedSet
+from biresnerf.geometry.pixel_rays import pixels_of_points, rays_of_pixels
+from biresnerf.geometry.rigid import rigid_inverse
+from biresnerf.geometry.triangulation import parallax_deg, triangulate
+
+# COLMAP's own bounds for a point worth keeping.
+MOST_ERROR_PX, LEAST_PARALLAX_DEG = 4.0, 1.5
+LEAST_AGREEING = 0.5  # of a track's observations: two of eight wrong ones agree on something by chance
+NEAREST = 4  # cameras that carry a point along that no image is known to see
+
+
+def with_given_points(refined: RefinedSet, given: ColmapModel) -> RefinedSet:
+    """The result with the points of the model that the input was.
+
+    Where nothing moved, they are taken as they are. Points with tracks are triangulated from the refined cameras, and
+    left out where those do not agree on them. Points without tracks are carried along by the cameras nearest to them.
+    """
+    if len(given.points) == 0:
+        return refined
+    if _unmoved(refined, given):
+        return replace(refined, model=with_points(refined.model, given.points), points_source="given")
+    if len(given.points.track_image_ids):
+        points = triangulated(refined.model, given.points)
+        return replace(refined, model=with_points(refined.model, points), points_source="tracks")
+    points = replace(given.points, xyz=_carried(refined, given.points.xyz))
+    return replace(refined, model=with_points(refined.model, points), points_source="moved")
+
+
+def _unmoved(refined: RefinedSet, given: ColmapModel) -> bool:
+    model = refined.model
+    return all(
+        number in model.images
+        and np.array_equal(model.images[number].cam_from_world.quat_wxyz, image.cam_from_world.quat_wxyz)
+        and np.array_equal(model.images[number].cam_from_world.translation, image.cam_from_world.translation)
+        and model.cameras[image.camera_id] == given.cameras[image.camera_id]
+        for number, image in given.images.items()
+    )
+
+
+def triangulated(model: ColmapModel, tracks: ColmapPoints) -> ColmapPoints:
+    """The points of ``tracks`` as the model's cameras see them; ids and colours stay.
+
+    Observations that are off by more than `MOST_ERROR_PX` are left out, and points that most of their observations do
+    not agree on, that fewer than two images see, or those only by rays within `LEAST_PARALLAX_DEG` of each other.
+    """
+    lengths = np.diff(tracks.track_starts)
+    owner = np.repeat(np.arange(len(tracks)), lengths)
+    kept = np.isin(tracks.track_image_ids, list(model.images))
+    errors = np.full(len(tracks), -1.0)
+    xyz = np.zeros((len(tracks), 3))
+    good = np.zeros(len(tracks), dtype=np.bool_)
+    # First with all observations, robustly; then with those that agree.
+    for last in (False, True):
+        seen = np.bincount(owner[kept], minlength=len(tracks)) >= 2
+        kept &= seen[owner]
+        rows, point = np.unique(owner[kept], return_inverse=True)
+        views = _Views(model, tracks.track_image_ids[kept], tracks.track_point2d_indices[kept])
+        found = triangulate(views.origins, views.directions, views.focal_px, point, len(rows))
+        off_px = views.errors_px(found[point])
+        agree = off_px <= MOST_ERROR_PX  # NaN, from behind, is no agreement
+        if not last:
+            kept[np.flatnonzero(kept)[~agree]] = False
+            agreeing = np.bincount(owner[kept], minlength=len(tracks)) / np.maximum(lengths, 1)
+            kept &= (agreeing >= LEAST_AGREEING)[owner]
+            continue
+        xyz[rows] = found
+        errors[rows] = np.bincount(point, np.nan_to_num(off_px, nan=np.inf)) / np.maximum(
+            np.bincount(point), 1
+        )
+        good[rows] = errors[rows] <= MOST_ERROR_PX
+        good[rows] &= parallax_deg(views.origins, found, point) >= LEAST_PARALLAX_DEG
+    kept &= good[owner]
+    lengths = np.bincount(owner[kept], minlength=len(tracks))[good]
+    return ColmapPoints(
+        tracks.ids[good],
+        xyz[good],
+        tracks.rgb[good],
+        errors[good],
+        np.concatenate(([0], np.cumsum(lengths))).astype(np.int64),
+        tracks.track_image_ids[kept],
+        tracks.track_point2d_indices[kept],
+    )
+
+
+class _Views:
+    """The rays of observations: from which camera, in which direction."""
+
+    def __init__(self, model: ColmapModel, image_ids: NDArray[np.int64], features: NDArray[np.int64]) -> None:
+        self.model, self.image_ids = model, image_ids
+        count = len(image_ids)
+        self.pixel_xy, self.focal_px = np.zeros((count, 2)), np.zeros(count)
+        self.origins, self.directions = np.zeros((count, 3)), np.zeros((count, 3))
+        for number in np.unique(image_ids).tolist():
+            rows, image = image_ids == number, model.images[number]
+            lens = model.cameras[image.camera_id].full()
+            world_from_cam = rigid_inverse(matrix_of_pose(image.cam_from_world))
+            self.pixel_xy[rows] = image.points2d_px[features[rows]]
+            self.focal_px[rows] = (lens.fx * lens.fy) ** 0.5
+            self.origins[rows] = world_from_cam[:3, 3]
+            self.directions[rows] = rays_of_pixels(lens, self.pixel_xy[rows]) @ world_from_cam[:3, :3].T
+
+    def errors_px(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far from its feature each observation's point [observations, 3] appears; NaN from behind."""
+        off = np.zeros(len(xyz))
+        for number in np.unique(self.image_ids).tolist():
+            rows, image = self.image_ids == number, self.model.images[number]
+            pose = matrix_of_pose(image.cam_from_world)
+            in_cam = xyz[rows] @ pose[:3, :3].T + pose[:3, 3]
+            there = pixels_of_points(self.model.cameras[image.camera_id].full(), in_cam)
+            off[rows] = np.linalg.norm(there - self.pixel_xy[rows], axis=1)
+        return off
+
+
+def _carried(refined: RefinedSet, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points [m, 3] moved as the cameras nearest to them moved, the nearer the more."""
+    pairs = [(image.world_from_cam, image.given) for image in refined.images if image.given is not None]
+    after_from_before = np.stack([after @ rigid_inverse(before) for after, before in pairs])
+    centres = np.stack([before[:3, 3] for _, before in pairs])
+    carried = np.empty_like(xyz)
+    for part in np.array_split(np.arange(len(xyz)), -(-len(xyz) // 4096)):
+        away = np.linalg.norm(xyz[part, None] - centres[None], axis=2)
+        nearest = np.argsort(away, axis=1)[:, :NEAREST]
+        weights = 1.0 / np.maximum(np.take_along_axis(away, nearest, 1), 1e-12) ** 2
+        weights /= weights.sum(1, keepdims=True)
+        moved = np.einsum("mkij,mj->mki", after_from_before[nearest][..., :3, :3], xyz[part])
+        moved += after_from_before[nearest][..., :3, 3]
+        carried[part] = (weights[..., None] * moved).sum(1)
+    return carried
