@@ -10,10 +10,17 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from biresnerf.errors import InputError
+from biresnerf.presets import (
+    COMMON_VALUES,
+    CUDA_SCALE,
+    METHOD_PAPER_VALUES,
+    METHOD_VALUES,
+    PRESETS,
+    MethodName,
+    PresetName,
+)
 
-PresetName = Literal["fast", "balanced", "quality", "paper"]
 Device = Literal["auto", "cpu", "cuda"]
-MethodName = Literal["biresnerf", "biresnerf-paper", "baa-ngp", "nerfacc-barf", "barf"]
 Background = Literal["auto", "white", "black", "none"]
 Wiring = Literal["concat", "replace", "residual"]
 DetectorName = Literal["trend", "counter", "variance"]
@@ -111,6 +118,19 @@ class RefineOptions(BaseModel):
     reconstruction_resolution_max: int | None = Field(None, ge=4, le=16384)
     table_size_log2: int | None = Field(None, ge=10, le=22, description="Entries of a hashed level, log2.")
 
+    verdict: bool = Field(
+        True,
+        description="At the end, compare the refined poses with the input's, and return the input's unless the refined "
+        "ones are better; without it the refined ones are returned.",
+    )
+    trial_steps: int | None = Field(
+        None,
+        ge=0,
+        le=100_000,
+        description="Steps of each of the verdict's two short trainings (scenes with surroundings take twice as many); "
+        "0 leaves them out.",
+    )
+
     checkpoint_every_s: float = Field(20.0, gt=0, description="Seconds between two checkpoints.")
     orbit_frames: int | None = Field(
         None, ge=0, le=600, description="Frames of the orbit video; 0 leaves it out."
@@ -161,129 +181,9 @@ class RefineOptions(BaseModel):
             for key in ("coarse_steps_min", "coarse_steps_max", "check_every", "warmup_steps"):
                 if given[key] is None:
                     filled[key] = max(10, round(preset[key] * ratio))
+            if self.trial_steps is None:
+                filled["trial_steps"] = max(10, round(preset["trial_steps"] * min(1.0, ratio)))
         return parse_options({**given, **filled})
-
-
-# A GPU affords larger batches and images at the same number of steps; `paper` is made for one and stays as it is.
-CUDA_SCALE = {"samples_per_step": 4, "max_image_size": 2}
-
-PRESETS: dict[PresetName, dict[str, Any]] = {
-    "fast": {
-        "max_image_size": 128,
-        "steps": 3000,
-        "coarse_steps_min": 600,
-        "coarse_steps_max": 1200,
-        "check_every": 50,
-        "samples_per_step": 2**15,
-        "pose_rate": 5e-3,
-        "pose_rate_final": 1e-4,
-        "field_rate": 1e-2,
-        "field_rate_final": 1e-3,
-        "warmup_steps": 200,
-        "reconstruction_levels": 8,
-        "reconstruction_resolution_max": 1024,
-        "table_size_log2": 16,
-        "orbit_frames": 24,
-    },
-    "balanced": {
-        "max_image_size": 200,
-        "steps": 8000,
-        "coarse_steps_min": 1600,
-        "coarse_steps_max": 3200,
-        "check_every": 100,
-        "samples_per_step": 2**16,
-        "pose_rate": 5e-3,
-        "pose_rate_final": 5e-5,
-        "field_rate": 1e-2,
-        "field_rate_final": 5e-4,
-        "warmup_steps": 400,
-        "reconstruction_levels": 12,
-        "reconstruction_resolution_max": 2048,
-        "table_size_log2": 17,
-        "orbit_frames": 48,
-    },
-    "quality": {
-        "max_image_size": 400,
-        "steps": 20_000,
-        "coarse_steps_min": 3000,
-        "coarse_steps_max": 8000,
-        "check_every": 200,
-        "samples_per_step": 2**17,
-        "pose_rate": 5e-3,
-        "pose_rate_final": 2e-5,
-        "field_rate": 1e-2,
-        "field_rate_final": 2e-4,
-        "warmup_steps": 800,
-        "reconstruction_levels": 16,
-        "reconstruction_resolution_max": 4096,
-        "table_size_log2": 19,
-        "orbit_frames": 96,
-    },
-    # Guo et al., Appl. Sci. 2023, 13(24), 13333: Table 1 for the encodings; steps, period and floor inferred
-    # from its timing tables; rates and loss inherited from BAA-NGP, which it builds on.
-    "paper": {
-        "max_image_size": 400,
-        "steps": 40_000,
-        "coarse_steps_min": 5000,
-        "coarse_steps_max": 16_000,
-        "check_every": 200,
-        "samples_per_step": 2**18,
-        "pose_rate": 5e-3,
-        "pose_rate_final": 1e-5,
-        "field_rate": 1e-2,
-        "field_rate_final": 1e-4,
-        "warmup_steps": 1000,
-        "reconstruction_levels": 16,
-        "reconstruction_resolution_max": 4096,
-        "table_size_log2": 19,
-        "orbit_frames": 96,
-    },
-}
-
-COMMON_VALUES: dict[str, Any] = {
-    "start": "auto",
-    "reconstruction_resolution_min": 128,
-    "double_pose_step": False,
-}
-
-_BAA_NGP = {
-    "start": "given",
-    "double_pose_step": True,
-    "pose_rate": 1e-3,
-    "pose_rate_final": 1e-5,
-    "field_rate": 1e-2,
-    "field_rate_final": 1e-4,
-}
-_BARF = {
-    "start": "given",
-    "pose_rate": 1e-3,
-    "pose_rate_final": 1e-5,
-    "field_rate": 5e-4,
-    "field_rate_final": 1e-4,
-}
-
-# What a method takes instead of the preset's values, whatever the preset: its published rates and grid.
-METHOD_VALUES: dict[MethodName, dict[str, Any]] = {
-    "biresnerf": {},
-    "biresnerf-paper": _BAA_NGP,
-    "baa-ngp": {
-        **_BAA_NGP,
-        "reconstruction_levels": 16,
-        "reconstruction_resolution_min": 14,
-        "reconstruction_resolution_max": 4096,
-    },
-    "nerfacc-barf": _BARF,
-    "barf": _BARF,
-}
-
-# And in the preset `paper`: its published length and batch (1024 rays of 128 samples; pruned, of about 32).
-METHOD_PAPER_VALUES: dict[MethodName, dict[str, Any]] = {
-    "biresnerf": {},
-    "biresnerf-paper": {},
-    "baa-ngp": {},
-    "nerfacc-barf": {"steps": 200_000, "samples_per_step": 2**15},
-    "barf": {"steps": 200_000, "samples_per_step": 2**17},
-}
 
 
 def parse_options(values: dict[str, Any]) -> RefineOptions:

@@ -20,19 +20,21 @@ from biresnerf.data.renders import picture_stems, write_orbit, write_view
 from biresnerf.data.write import write_transforms
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera import Intrinsics
-from biresnerf.geometry.pose_error import rotation_angle_deg
-from biresnerf.geometry.similarity import Similarity, align_robust, align_umeyama
-from biresnerf.refine.checkpoint import CHECKPOINT, SEEDING
+from biresnerf.geometry.similarity import Similarity
+from biresnerf.refine.checkpoint import CHECKPOINT, MATCHES, SEEDING
 from biresnerf.refine.evaluation import ViewScore, render_view
 from biresnerf.refine.history import HISTORY
+from biresnerf.refine.input_frame import poses_in_input_frame
 from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.judgement import Judgement
+from biresnerf.refine.run_report import run_report
 from biresnerf.refine.start import Start
 from biresnerf.refine.two_stages import TwoStages
-from biresnerf.report import HeldOut, ImageReport, Report, SimilarityReport
+from biresnerf.report import Report
 
 REPORT, CONFIG, TRANSFORMS = "report.json", "config.json", "transforms.json"
 RENDERS, ORBIT = "renders", "orbit.mp4"
-PREVIEW = "preview"
+PREVIEW, REFINED = "preview", "refined"
 SOLID = 0.5  # opacity from which a depth means something
 _ANOTHER = "Choose another output folder, or remove this one."
 
@@ -67,6 +69,11 @@ class OutputFolder:
     def seeding(self) -> Path:
         """The file that keeps what COLMAP answered until the run is complete."""
         return self.path / SEEDING
+
+    @property
+    def matches(self) -> Path:
+        """The file that keeps the feature matches COLMAP found, until the run is complete."""
+        return self.path / MATCHES
 
     def restore_seeding(self, seeding: str | None) -> None:
         """Put back the answer that a checkpoint carried: it may have come here without its folder."""
@@ -130,132 +137,50 @@ class OutputFolder:
         stages: TwoStages,
         held_out: list[int],
         scores: list[ViewScore],
+        judgement: Judgement | None,
         *,
         threads: int,
         state: Literal["complete", "partial"],
     ) -> Report:
-        """Poses in the input's frame, in the input's form and in others, the options, and the report, last."""
+        """Poses in the input's frame, in the input's form and in others, the options, and the report, last.
+
+        Where the verdict keeps the input's poses, those are written, and the refined ones beside them in refined/.
+        """
         optimiser = stages.optimiser
         self._write_text(CONFIG, optimiser.options.model_dump_json(indent=2))
-        world_from_cam, similarity = poses_in_input_frame(dataset, optimiser)
-        write_transforms(dataset, world_from_cam, self.path / TRANSFORMS)
-        record = stages.record
-        lost = [i for i, flag in enumerate(optimiser.camera_errors.lost.tolist()) if flag]
-        images_reported = _image_reports(
-            dataset,
-            start,
-            world_from_cam,
-            held_out,
-            scores,
-            lost,
-            stages.repair.repaired,
-            optimiser.bodies.fixed,
-        )
+        refined, similarity = poses_in_input_frame(dataset, optimiser)
+        report = run_report(
+            dataset, start, images, stages, held_out, scores, judgement, refined, similarity,
+            threads=threads, state=state,
+        )  # fmt: skip
+        returned = refined
+        if judgement is not None and judgement.verdict.returned == "input":
+            returned = dataset.world_from_cam
+            if np.isfinite(refined).all():
+                self._write_poses(self.path / REFINED, dataset, refined, report)
+        notes = self._write_poses(self.path, dataset, returned, report)
+        report = report.model_copy(update={"warnings": report.warnings + notes})
+        self._write_text(REPORT, report.model_dump_json(indent=2))
+        return report
+
+    @staticmethod
+    def _write_poses(
+        folder: Path, dataset: Dataset, world_from_cam: np.ndarray, report: Report
+    ) -> tuple[str, ...]:
+        """Poses [n, 4, 4] in all forms; returns a sentence for each that could not be written."""
+        write_transforms(dataset, world_from_cam, folder / TRANSFORMS)
+        tie = report.input_from_optimised
         refined = refined_set(
             dataset,
             world_from_cam,
-            similarity=similarity,
-            pose_sources=[image.pose_source for image in images_reported],
-            flags=[image.flags for image in images_reported],
+            similarity=Similarity(tie.scale, np.array(tie.rotation), np.array(tie.translation)),
+            pose_sources=[image.pose_source for image in report.images],
+            flags=[image.flags for image in report.images],
         )
         if dataset.source.colmap is not None:
             refined = with_given_points(refined, dataset.source.colmap)
-        notes = write_packs(refined, self.path, optimiser.options.packs)
-        report = Report(
-            version=_version(),
-            state=state,
-            options=optimiser.options,
-            images=images_reported,
-            heldout=HeldOut(
-                count=len(scores),
-                psnr=float(np.mean([s.psnr for s in scores])),
-                ssim=float(np.mean([s.ssim for s in scores])),
-            )
-            if scores
-            else None,
-            start_trials=start.trials,
-            steps_done=optimiser.step_index,
-            switch_step=optimiser.switch if optimiser.method.two_stages else None,
-            switch_reason=record.switch_reason,
-            resumed=record.resumed,
-            seconds={stage: round(seconds, 3) for stage, seconds in record.seconds.items()},
-            backend=optimiser.field.backend,
-            device=str(optimiser.device),
-            threads=threads,
-            working_size=(int(images.widths.max()), int(images.heights.max())),
-            input_from_optimised=SimilarityReport(
-                scale=similarity.scale,
-                rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
-                translation=tuple(float(v) for v in similarity.translation),
-            ),
-            warnings=dataset.warnings + _lost_warnings(dataset, lost) + notes,
-        )
-        self._write_text(REPORT, report.model_dump_json(indent=2))
-        return report
+        return write_packs(refined, folder, report.options.packs)
 
     def _write_text(self, name: str, text: str) -> None:
         with whole_file(self.path / name) as temporary:
             temporary.write_text(text + "\n", "utf-8")
-
-
-def poses_in_input_frame(dataset: Dataset, optimiser: JointOptimiser) -> tuple[np.ndarray, Similarity]:
-    """Refined world_from_cam [n, 4, 4] carried into the input's frame, and the similarity that does it.
-
-    The optimisation leaves frame and scale free; what ties them down is the best similarity, robust to lost
-    cameras unless the method has it otherwise, from the optimised poses to the given ones. Fixed cameras and rigs
-    leave less open.
-    """
-    world_from_unit = optimiser.frame.unit_from_world.inverse()
-    optimised = world_from_unit.apply_to_poses(optimiser.poses.poses().numpy())
-    given, tied = dataset.world_from_cam, dataset.anchors
-    input_from_optimised = optimiser.bodies.input_from_optimised(optimised, given)
-    if input_from_optimised is None and optimiser.method.robust_frame:
-        input_from_optimised = align_robust(optimised[tied], given[tied], with_rotations=True)
-    elif input_from_optimised is None:
-        input_from_optimised = align_umeyama(optimised[tied], given[tied])
-    carried = input_from_optimised.apply_to_poses(optimised)
-    return optimiser.bodies.restored(carried, given), input_from_optimised
-
-
-def _lost_warnings(dataset: Dataset, lost: list[int]) -> tuple[str, ...]:
-    if not lost:
-        return ()
-    names = ", ".join(dataset.names[i] for i in lost)
-    return (f"{len(lost)} of {len(dataset)} images agree with no pose that was found: {names}.",)
-
-
-def _image_reports(
-    dataset: Dataset,
-    start: Start,
-    world_from_cam: np.ndarray,
-    held_out: list[int],
-    scores: list[ViewScore],
-    lost: list[int],
-    repaired: list[int],
-    fixed: np.ndarray,
-) -> tuple[ImageReport, ...]:
-    given = dataset.world_from_cam
-    turn = rotation_angle_deg(np.swapaxes(given[:, :3, :3], 1, 2) @ world_from_cam[:, :3, :3])
-    shift = np.linalg.norm(world_from_cam[:, :3, 3] - given[:, :3, 3], axis=1)
-    scored = {score.image: score for score in scores}
-    return tuple(
-        ImageReport(
-            name=frame.name,
-            pose_source=start.sources[i],
-            held_out=i in held_out,
-            fixed=bool(fixed[i]),
-            moved_deg=float(turn[i]),
-            moved_units=float(shift[i]),
-            lost=i in lost,
-            repaired=i in repaired,
-            psnr=scored[i].psnr if i in scored else None,
-            ssim=scored[i].ssim if i in scored else None,
-        )
-        for i, frame in enumerate(dataset.frames)
-    )
-
-
-def _version() -> str:
-    from biresnerf import __version__
-
-    return __version__

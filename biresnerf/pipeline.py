@@ -1,4 +1,4 @@
-"""The whole method on one screen: read -> prepare -> stage 1 -> stage 2 -> evaluate -> write."""
+"""The whole method on one screen: read -> prepare -> stage 1 -> stage 2 -> evaluate -> judge -> write."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
+from biresnerf.conclude import Run
 from biresnerf.config import RefineOptions
 from biresnerf.data.dataset import Dataset
+from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.data.images import ImageSet, load_images
 from biresnerf.data.read import read_dataset
 from biresnerf.data.seed_poses import PoseCandidate, seed_poses
@@ -24,24 +27,18 @@ from biresnerf.field.compile_kernels import compile_kernels
 from biresnerf.output_folder import OutputFolder
 from biresnerf.progress import OnProgress, Progress
 from biresnerf.refine.checkpoint import load_checkpoint
-from biresnerf.refine.evaluation import (
-    ViewScore,
-    fit_held_out_poses,
-    render_orbit,
-    score_views,
-)
 from biresnerf.refine.history import Observer
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.rigid_bodies import rigid_bodies
 from biresnerf.refine.scene_frame import scene_frame
 from biresnerf.refine.start import Start, choose_start
-from biresnerf.refine.two_stages import LAST_FRACTION, TwoStages
+from biresnerf.refine.two_stages import TwoStages
 from biresnerf.report import Report
 
 logger = logging.getLogger(__name__)
 
+MATCHED_IMAGES, MATCHED_XY = "matches.images", "matches.xy"  # in a checkpoint
 HOLD_OUT_ONE_IN, HOLD_OUT_MOST, HOLD_OUT_FROM = 10, 10, 6
-SHOWN_WITHOUT_HELD_OUT = 2  # training views rendered when none is held out
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,14 +79,36 @@ def refine_poses(
             yet where poses to start from were still being looked for.
     """
     report = on_progress or (lambda _progress: None)
-    stop = should_stop or (lambda: False)
+    run = _begin(input, OutputFolder(output), options, report, should_stop or (lambda: False), observer)
+    stages = run.stages
+    if not stages.run():
+        run.write("partial")
+        raise Interrupted(f"stopped at step {stages.optimiser.step_index}; run again to go on")
+    run.evaluate()
+    if observer is not None:
+        observer.at_end(stages.optimiser)
+    try:
+        run.judge()
+    except Interrupted:
+        run.write("partial")
+        raise
+    return run.write("complete")
+
+
+def _begin(
+    input: Path | Dataset,
+    folder: OutputFolder,
+    asked: RefineOptions,
+    report: OnProgress,
+    stop: Callable[[], bool],
+    observer: Observer | None,
+) -> Run:
+    """Read, prepare, choose where to start or take up a checkpoint: all up to the first step."""
     started = time.monotonic()
-    folder = OutputFolder(output)
     folder.refuse_finished()
     checkpoint = load_checkpoint(folder.path)
     report(Progress(stage="preparing"))
-    asked = options
-    options, device, threads = _choose_backend(options, report)
+    options, device, threads = _choose_backend(asked, report)
     unstarted: dict[str, Any] = {"fingerprint": None, "seeding": None}
     notes = checkpoint[1] if checkpoint is not None else unstarted
     folder.restore_seeding(notes["seeding"])
@@ -103,33 +122,50 @@ def refine_poses(
     stage: Literal["seeding", "preparing"] = "seeding" if prepared.seeding is not None else "preparing"
     report(Progress(stage=stage, fraction=0.02, message=message))
 
+    matches = _matches(folder, prepared.dataset, checkpoint)
     options = start.stage_lengths(asked, options)
     optimiser = _optimiser(prepared, start, options, device, threads)
     stages = TwoStages(
         optimiser, folder.path, prepared.fingerprint, report, stop, prepared.seeding, start.as_json(), observer,
         lambda: folder.write_preview(prepared.dataset, prepared.images, optimiser, (prepared.held_out or [0])[0]),
+        _carried(matches),
     )  # fmt: skip
     if checkpoint is not None:
         stages.resume(*checkpoint)
         logger.info("going on from step %d", optimiser.step_index)
     stages.record.seconds["preparing"] = time.monotonic() - started
+    return Run(
+        prepared.dataset,
+        prepared.images,
+        prepared.held_out,
+        start,
+        matches,
+        stages,
+        folder,
+        threads,
+        report,
+        stop,
+    )
 
-    def write(scores: list[ViewScore], state: Literal["complete", "partial"]) -> Report:
-        return folder.write_result(
-            prepared.dataset, start, prepared.images, stages, prepared.held_out, scores, threads=threads, state=state,
-        )  # fmt: skip
 
-    if not stages.run():
-        write([], state="partial")
-        raise Interrupted(f"stopped at step {optimiser.step_index}; run again to go on")
-    scores = _evaluate(prepared, optimiser, stages, folder, report)
-    if observer is not None:
-        observer.at_end(optimiser)
-    report(Progress(stage="exporting", fraction=0.99))
-    result = write(scores, state="complete")
-    folder.drop_traces()
-    report(Progress(stage="exporting", fraction=1.0, eta_s=0.0))
-    return result
+def _matches(
+    folder: OutputFolder, dataset: Dataset, checkpoint: tuple[dict[str, Tensor], dict[str, Any]] | None
+) -> FeatureMatches | None:
+    """The feature matches that the search for a start came by, from the checkpoint where there is one."""
+    if checkpoint is None:
+        return FeatureMatches.load(folder.matches, dataset.names)
+    tensors = checkpoint[0]
+    if MATCHED_IMAGES not in tensors:
+        return None
+    return FeatureMatches.of(tensors[MATCHED_IMAGES].numpy(), tensors[MATCHED_XY].numpy())
+
+
+def _carried(matches: FeatureMatches | None) -> dict[str, Tensor]:
+    """The same for checkpoints."""
+    if matches is None:
+        return {}
+    images, xy = matches.kept()
+    return {MATCHED_IMAGES: torch.from_numpy(images), MATCHED_XY: torch.from_numpy(xy)}
 
 
 def _optimiser(
@@ -217,40 +253,3 @@ def _prepare(
         found.candidates,
         seeding.read_text("utf-8") if seeding.is_file() else None,
     )
-
-
-def _evaluate(
-    prepared: Prepared, optimiser: JointOptimiser, stages: TwoStages, folder: OutputFolder, report: OnProgress
-) -> list[ViewScore]:
-    """Held-out poses fitted, views scored and rendered, orbit filmed."""
-    started = time.monotonic()
-    report(Progress(stage="evaluating", fraction=LAST_FRACTION))
-    fit_held_out_poses(optimiser, prepared.held_out)
-    views = prepared.held_out or list(range(min(SHOWN_WITHOUT_HELD_OUT, len(prepared.dataset))))
-    frames = int(optimiser.options.orbit_frames or 0)
-    work = len(views) + frames
-    scores = []
-
-    rendering_from = time.monotonic()
-
-    def tell(done: int) -> None:
-        share = done / max(1, work)
-        spent = time.monotonic() - rendering_from
-        report(
-            Progress(
-                stage="evaluating",
-                step=done,
-                steps_total=work,
-                fraction=LAST_FRACTION + (0.98 - LAST_FRACTION) * share,
-                eta_s=spent * (1 - share) / share if share else None,
-            )
-        )
-
-    for score in score_views(optimiser, prepared.images, views):
-        folder.write_view(prepared.dataset.names, prepared.images, score)
-        scores.append(score)
-        tell(len(scores))
-    if frames:
-        folder.write_orbit(render_orbit(optimiser, frames, lambda i: tell(len(views) + i + 1)))
-    stages.record.seconds["evaluating"] = time.monotonic() - started
-    return scores if prepared.held_out else []

@@ -22,6 +22,84 @@ PoseSource = Literal[
 ]
 
 
+VerdictName = Literal["improved", "unchanged", "kept_input", "inconclusive", "failed_check"]
+Finding = Literal["better", "worse", "same", "open"]
+
+
+class PairedDifference(BaseModel):
+    """One figure for the input's poses and for the refined ones, taken of the same views or images.
+
+    `difference` is the mean over them of how much better the refined poses are: positive is better, whatever the
+    figure. The interval is Student's, at 95 %.
+    """
+
+    model_config = _FROZEN
+
+    count: int = Field(description="Views or images that the figure was taken of.")
+    before: float = Field(description="With the input's poses: the mean.")
+    after: float = Field(description="With the refined poses: the mean.")
+    difference: float
+    low: float | None = Field(None, description="Lower end of the interval; None of fewer than two.")
+    high: float | None = None
+    finding: Finding = Field(
+        description="better, worse, same (the interval holds nothing that would matter), or open (it holds too much)."
+    )
+
+
+class HeldOutEvidence(BaseModel):
+    """Two equal short trainings on poses held still, the input's and the refined ones, scored on unseen views."""
+
+    model_config = _FROZEN
+
+    protocol: Literal["frozen_retraining"] = "frozen_retraining"
+    steps: int = Field(description="Of each of the two trainings.")
+    strictly: int = Field(
+        description="Of the views: those that the refinement never trained its field on, either."
+    )
+    psnr: PairedDifference = Field(description="dB.")
+    ssim: PairedDifference
+
+
+class EpipolarEvidence(BaseModel):
+    """How well matched features fit the poses: each image's median symmetric epipolar error.
+
+    The difference is the mean of log2(before / after) over images: 1 is half the error.
+    """
+
+    model_config = _FROZEN
+
+    matches: int
+    independent: bool = Field(
+        description="Whether the start had nothing to do with these matches. If it had, they may speak against the "
+        "refined poses, not for them."
+    )
+    error_px: PairedDifference = Field(
+        description="Pixels of the full-size photos; before and after are medians."
+    )
+    share_of_image: float = Field(description="The error after, as a share of the photos' long side.")
+
+
+class Verdict(BaseModel):
+    """Whether the refined poses are better than the input's, and why that is said."""
+
+    model_config = _FROZEN
+
+    verdict: VerdictName
+    returned: Literal["refined", "input"] = Field(
+        description="Whose poses the result holds. Where it is the input's, refined/ holds the refined ones."
+    )
+    compared_with: Literal["given", "seeded", "mixed"] = Field(
+        description="The input's poses: all the user's own, all found by us, or some of each."
+    )
+    why: tuple[str, ...] = Field(description="The grounds in sentences, the weightiest first.")
+    moved_px: float = Field(
+        description="How far the scene's middle moves in the image from the input's to the refined poses: median over "
+        "cameras, px at working size."
+    )
+    heldout: HeldOutEvidence | None = None
+    epipolar: EpipolarEvidence | None = None
+
+
 class ImageReport(BaseModel):
     """What became of one image. Lengths are in the input's own units."""
 
@@ -43,6 +121,21 @@ class ImageReport(BaseModel):
     repaired: bool = Field(
         False, description="It was lost and took up its way again from a pose found by trying many."
     )
+    moved_far: bool = Field(False, description="Its pose moved by far more than the other images' did.")
+    blurred: bool = Field(False, description="Far less sharp than photos taken from about the same place.")
+    exposure_off: bool = Field(False, description="Brighter or darker than the other photos make the scene.")
+    sharpness: float | None = Field(
+        None, description="Variance of the Laplacian over that of its neighbours' photos; at working size."
+    )
+    gain: float | None = Field(None, description="Brightness of the photo over that of its render.")
+    trial_psnr_before: float | None = Field(
+        None, description="In the verdict's training on the input's poses, dB; its unseen views only."
+    )
+    trial_psnr_after: float | None = Field(None, description="The same on the refined poses.")
+    epipolar_px_before: float | None = Field(
+        None, description="Median symmetric epipolar error of its feature matches with the input's poses, px."
+    )
+    epipolar_px_after: float | None = Field(None, description="The same with the refined poses.")
     psnr: float | None = Field(
         None, description="Render against photo at working size, dB; held-out views only."
     )
@@ -94,6 +187,10 @@ class Report(BaseModel):
     version: str
     state: Literal["complete", "partial"] = Field(description="partial: stopped before the end, on request.")
     options: RefineOptions
+    verdict: Verdict | None = Field(
+        None,
+        description="None of a partial result, and where none was asked for; the poses are the refined ones then.",
+    )
     images: tuple[ImageReport, ...]
     heldout: HeldOut | None = Field(None, description="None where there were too few views to hold any out.")
     start_trials: tuple[TrialReport, ...] = Field(

@@ -42,10 +42,15 @@ class Plan:
 
     def options(self, variant: Variant, scene: Scene, start: Perturbation) -> RefineOptions:
         """The variant's options. Where they say nothing, the run's own seed is that of the noise, it starts from
-        the wrong poses themselves without asking feature matches, films no orbit, and holds out no views of a
-        scene that has test views of its own. Raises `InputError`.
+        the wrong poses themselves without asking feature matches, films no orbit, gives back the refined poses without
+        a verdict, and holds out no views of a scene that has test views of its own. Raises `InputError`.
         """
-        defaults: dict[str, Any] = {"seed": start.seed, "start": "given", "orbit_frames": 0}
+        defaults: dict[str, Any] = {
+            "seed": start.seed,
+            "start": "given",
+            "orbit_frames": 0,
+            "verdict": False,
+        }
         if scene.test_file is not None:
             defaults["holdout"] = 0
         options = parse_options({**defaults, **self.settings, **variant.settings})

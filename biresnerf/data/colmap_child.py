@@ -21,6 +21,8 @@ ENOUGH_PLACED = 0.8  # of the images: where all poses are given, no other way of
 INTRINSICS_FROM = 0.5  # of the images: a model of fewer does not say what the lens is
 PAIR_OUTLIER = 3.0  # median disagreements beyond which a pair's matches are taken for repeated structure
 PAIR_OUTLIER_DEG = 30.0  # but not below this
+# Matches handed on to measure poses by: so many do, and checkpoints carry them.
+MATCHES_PER_PAIR, MATCHES_IN_ALL, LEAST_KEPT = 50, 100_000, 8
 
 
 def main(request_path: Path) -> None:
@@ -50,6 +52,7 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     numbers = extract_features(request, database, images)
     say(f"features of {count} images found")
     match_features(request, database, work)
+    write_matches(database, work)
     if request["cam_from_world"]:
         drop_contradicting_pairs(database, request["cam_from_world"])
         write_position_priors(database, request["cam_from_world"], request["position_deviation"])
@@ -128,6 +131,28 @@ def match_features(request: dict[str, Any], database: Path, work: Path) -> None:
     pycolmap.match_image_pairs(
         database, matching_options=matching, pairing_options=pairing, verification_options=verification
     )
+
+
+def write_matches(database_path: Path, work: Path) -> None:
+    """All verified matches, thinned evenly, to matches.npz: images by their number, the order of names; px."""
+    import numpy as np
+    import pycolmap
+
+    database = pycolmap.Database.open(database_path)
+    names = {image.image_id: image.name for image in database.read_all_images()}
+    number = {image: i for i, (_, image) in enumerate(sorted((name, image) for image, name in names.items()))}
+    points = {image: np.asarray(database.read_keypoints(image))[:, :2] for image in names}
+    pairs = list(zip(*database.read_two_view_geometries(), strict=True))
+    database.close()
+    most = max(LEAST_KEPT, min(MATCHES_PER_PAIR, MATCHES_IN_ALL // max(1, len(pairs))))
+    images, xy = [np.zeros((0, 2), np.int32)], [np.zeros((0, 4), np.float32)]
+    for pair, geometry in pairs:
+        found = np.asarray(geometry.inlier_matches).reshape(-1, 2)
+        found = found[np.linspace(0, len(found) - 1, min(most, len(found))).astype(int)]
+        a, b = pycolmap.pair_id_to_image_pair(pair)
+        images.append(np.tile(np.array([[number[a], number[b]]], np.int32), (len(found), 1)))
+        xy.append(np.hstack([points[a][found[:, 0]], points[b][found[:, 1]]]).astype(np.float32))
+    np.savez(work / "matches.npz", images=np.concatenate(images), xy=np.concatenate(xy))
 
 
 def matched_pairs(database_path: Path) -> list[tuple[str, str, int]]:

@@ -15,6 +15,7 @@ from PIL import Image
 from biresnerf.data.colmap_process import run_colmap
 from biresnerf.data.dataset import Camera, Dataset
 from biresnerf.data.decode import decode
+from biresnerf.data.feature_matches import KEPT, keep_matches
 from biresnerf.data.image_likeness import likeness
 from biresnerf.data.image_order import natural_order, pose_distances
 from biresnerf.data.masks import write_masks
@@ -88,7 +89,8 @@ def ask_colmap(
 ) -> dict[str, Any]:
     """What COLMAP finds, as plain data for `read_mapping`. Poses that the set has guide it.
 
-    One thread where all poses are given: more would make the answer differ from run to run.
+    Beside the log in ``log_folder`` the matches are left, for `FeatureMatches.load`. One thread where all poses are
+    given: more would make the answer differ from run to run.
 
     Raises:
         InputError: ``seed_timeout``, or a code of `open_image`.
@@ -110,7 +112,10 @@ def ask_colmap(
             **_request_images(dataset, names),
             **_thoroughness(dataset),
         }
-        return run_colmap(request, Path(work), should_stop, limit_s, log_folder)
+        answer = run_colmap(request, Path(work), should_stop, limit_s, log_folder)
+        if log_folder is not None:
+            keep_matches(Path(work), dataset.names, log_folder / KEPT)
+        return answer
 
 
 def _numbered(dataset: Dataset) -> list[str]:

@@ -12,10 +12,12 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from biresnerf.data.atomic_file import whole_file
+from biresnerf.data.feature_matches import KEPT
 from biresnerf.errors import InputError
 
 CHECKPOINT = Path("checkpoint") / "latest.safetensors"
 SEEDING = CHECKPOINT.with_name("seeding.json")  # what COLMAP answered; every checkpoint carries a copy
+MATCHES = CHECKPOINT.with_name(KEPT)  # feature matches; every checkpoint carries them, too
 FORMAT = "2"
 
 

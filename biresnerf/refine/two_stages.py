@@ -55,6 +55,7 @@ class TwoStages:
         start: the poses started from; goes into every checkpoint.
         observer: looks in at every check.
         after_checkpoint: called after each checkpoint on the way.
+        carried: tensors that go into every checkpoint as they are.
     """
 
     def __init__(
@@ -68,11 +69,12 @@ class TwoStages:
         start: dict[str, Any] | None = None,
         observer: Observer | None = None,
         after_checkpoint: Callable[[], None] = lambda: None,
+        carried: dict[str, Tensor] | None = None,
     ) -> None:
         self.optimiser, self.folder = optimiser, folder
         self.history, self.observer = History(folder), observer or Observer()
         self.on_progress, self.should_stop = on_progress, should_stop
-        self.after_checkpoint = after_checkpoint
+        self.after_checkpoint, self.carried = after_checkpoint, carried or {}
         self.record = RunRecord(fingerprint, seeding=seeding, start=start or {})
         self.repair = LostCameraRepair(optimiser)
         options = optimiser.options
@@ -255,7 +257,7 @@ class TwoStages:
             "repair": self.repair.notes(),
             "optimiser": self.optimiser.notes(),
         }
-        tensors = {**self.optimiser.state(), "poses_at_check": self._poses_at_check}
+        tensors = {**self.carried, **self.optimiser.state(), "poses_at_check": self._poses_at_check}
         if self._snapshot is not None:
             notes["snapshot_error"] = self._snapshot[0]
             tensors.update({SNAPSHOT + name: tensor for name, tensor in self._snapshot[1].items()})

@@ -1,0 +1,42 @@
+"""How far matched viewing rays of two cameras are from meeting."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Sines: a baseline or a ray along it so short leaves the epipolar plane to rounding.
+_DEGENERATE = 1e-9
+
+
+def epipolar_angles(
+    world_from_cam: Array, a: NDArray[np.int64], b: NDArray[np.int64], ray_a: Array, ray_b: Array
+) -> Array:
+    """Symmetric epipolar error [m] of matches, radians: 0 where both rays and the baseline lie in one plane.
+
+    It is the mean of two angles: from the ray of b to the plane that the baseline spans with the ray of a, and the
+    other way round. For a pinhole near its axis that is the distance to the epipolar line in focal lengths; unlike
+    that, it holds for any lens. Moving, turning or scaling the whole rig changes nothing. NaN where two cameras stand
+    at one point, or a ray runs along the baseline.
+
+    Args:
+        world_from_cam: poses [n, 4, 4].
+        a, b: indices [m] of the two cameras of each match.
+        ray_a, ray_b: unit viewing directions [m, 3], each in the axes of its camera.
+    """
+    direction_a = np.einsum("mij,mj->mi", world_from_cam[a, :3, :3], ray_a)
+    direction_b = np.einsum("mij,mj->mi", world_from_cam[b, :3, :3], ray_b)
+    baseline = world_from_cam[b, :3, 3] - world_from_cam[a, :3, 3]
+    reach = np.linalg.norm(world_from_cam[:, :3, 3] - world_from_cam[:, :3, 3].mean(0), axis=1).max()
+    baseline = _unit(baseline, _DEGENERATE * max(float(reach), 1e-300))
+    sine_b = np.abs((_unit(np.cross(baseline, direction_a), _DEGENERATE) * direction_b).sum(1))
+    sine_a = np.abs((_unit(np.cross(baseline, direction_b), _DEGENERATE) * direction_a).sum(1))
+    return (np.arcsin(np.minimum(sine_a, 1.0)) + np.arcsin(np.minimum(sine_b, 1.0))) / 2
+
+
+def _unit(vectors: Array, shortest: float) -> Array:
+    """Vectors [m, 3] at length 1, NaN where they are no longer than `shortest`."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > shortest, length, np.nan)

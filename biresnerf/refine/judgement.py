@@ -1,0 +1,153 @@
+"""The verdict on a finished optimisation: evidence gathered, decision taken, photos looked over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.dataset import GUESSES, Dataset
+from biresnerf.data.feature_matches import FeatureMatches
+from biresnerf.data.images import ImageSet
+from biresnerf.geometry.focus import focus_point
+from biresnerf.geometry.pose_error import rotation_angle_deg
+from biresnerf.refine import image_flags
+from biresnerf.refine.input_frame import poses_in_input_frame
+from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.pose_evidence import (
+    EpipolarComparison,
+    HeldOutComparison,
+    Rig,
+    compare_on_matches,
+    compare_on_unseen_views,
+    moved_px,
+)
+from biresnerf.refine.start import Start
+from biresnerf.refine.verdict import Findings, decide, failed_checks
+from biresnerf.report import Verdict
+
+Array = NDArray[np.float64]
+
+GUESSED = GUESSES | {"forward-facing"}
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """The verdict, and what it has to say of each image [n].
+
+    Attributes:
+        trial_psnr: of the unseen views, before and after [2, n]; NaN for the others.
+        epipolar_px: before and after [2, n]; NaN where there are too few matches.
+        sharpness, gain: see `image_flags`.
+        moved_far, blurred, exposure_off: bool.
+    """
+
+    verdict: Verdict
+    trial_psnr: Array
+    epipolar_px: Array
+    sharpness: Array
+    gain: Array
+    moved_far: NDArray[np.bool_]
+    blurred: NDArray[np.bool_]
+    exposure_off: NDArray[np.bool_]
+
+
+def judge(
+    dataset: Dataset,
+    images: ImageSet,
+    optimiser: JointOptimiser,
+    start: Start,
+    held_out: list[int],
+    matches: FeatureMatches | None,
+    threads: int,
+    should_stop: Callable[[], bool],
+    tell: Callable[[float], None] = lambda _share: None,
+) -> Judgement:
+    """Compare the optimised poses with the dataset's own.
+
+    Args:
+        held_out: views that the optimisation never trained its field on.
+        matches: feature matches of the dataset's images.
+        tell: called with the share of the work that is done.
+
+    Raises:
+        Interrupted: ``should_stop`` said so.
+    """
+    cameras = tuple(dataset.camera_of(i) for i in range(len(dataset)))
+    before, after = (
+        Rig(poses, cameras) for poses in (dataset.world_from_cam, poses_in_input_frame(dataset, optimiser)[0])
+    )
+    turned, shifted = motion(before.world_from_cam, after.world_from_cam)
+    centres = before.world_from_cam[:, :3, 3]
+    spread = float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
+    grounded = sum(frame.pose_source not in GUESSED for frame in dataset.frames) > len(dataset) / 2
+    lost = int(optimiser.camera_errors.lost.sum())
+    failed = failed_checks(after.world_from_cam, lost, turned, shifted, spread, grounded)
+    heldout: HeldOutComparison | None = None
+    epipolar: EpipolarComparison | None = None
+    moved = 0.0
+    if np.isfinite(after.world_from_cam).all():
+        moved = moved_px(before, after, images)
+        if matches is not None:
+            epipolar = compare_on_matches(before, after, matches, independent=not start.placed.any())
+        heldout = compare_on_unseen_views(
+            before, after, images, held_out, optimiser.options, optimiser.device, threads, should_stop,
+            lambda done: tell(0.45 * done),
+        )  # fmt: skip
+    verdict = decide(
+        Findings(
+            failed=failed,
+            moved_px=moved,
+            heldout=heldout.evidence if heldout else None,
+            epipolar=epipolar.evidence if epipolar else None,
+            compared_with=_whose(dataset),
+            grounded=grounded,
+        )
+    )
+    return _with_images(verdict, images, optimiser, before, heldout, epipolar, turned, shifted)
+
+
+def motion(before: Array, after: Array) -> tuple[Array, Array]:
+    """Rotation (deg) and distance of the centres [n] between poses [n, 4, 4] of the same cameras."""
+    turned = rotation_angle_deg(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+    return turned, np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+
+
+def _whose(dataset: Dataset) -> Literal["given", "seeded", "mixed"]:
+    given = sum(frame.pose_source == "given" for frame in dataset.frames)
+    if given == len(dataset):
+        return "given"
+    return "mixed" if given else "seeded"
+
+
+def _with_images(
+    verdict: Verdict,
+    images: ImageSet,
+    optimiser: JointOptimiser,
+    before: Rig,
+    heldout: HeldOutComparison | None,
+    epipolar: EpipolarComparison | None,
+    turned: Array,
+    shifted: Array,
+) -> Judgement:
+    trial_psnr, epipolar_px = np.full((2, len(images)), np.nan), np.full((2, len(images)), np.nan)
+    if heldout is not None:
+        trial_psnr[:, heldout.views] = heldout.before.psnr, heldout.after.psnr
+    if epipolar is not None:
+        epipolar_px[:] = epipolar.before, epipolar.after
+    sharpness = image_flags.sharpness(images, before.world_from_cam)
+    gain = image_flags.gains(optimiser)
+    distance = focus_point(before.world_from_cam).mean_distance
+    return Judgement(
+        verdict=verdict,
+        trial_psnr=trial_psnr,
+        epipolar_px=epipolar_px,
+        sharpness=sharpness,
+        gain=gain,
+        moved_far=image_flags.moved_far(turned, shifted, distance),
+        blurred=image_flags.blurred(sharpness),
+        exposure_off=image_flags.exposure_off(gain),
+    )

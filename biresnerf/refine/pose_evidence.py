@@ -1,0 +1,181 @@
+"""The evidence for or against refined poses: unseen views after equal trainings, feature matches, motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.config import RefineOptions
+from biresnerf.data.dataset import Camera
+from biresnerf.data.feature_matches import FeatureMatches
+from biresnerf.data.images import ImageSet
+from biresnerf.geometry.camera import Intrinsics, directions_in_cam, project
+from biresnerf.geometry.epipolar import epipolar_angles
+from biresnerf.geometry.focus import focus_point
+from biresnerf.refine.frozen_trials import FrozenTrials, TrialScores
+from biresnerf.refine.verdict import EPIPOLAR_MATTERS, PSNR_MATTERS, SSIM_MATTERS, paired
+from biresnerf.report import EpipolarEvidence, HeldOutEvidence
+
+Array = NDArray[np.float64]
+
+LEAST_VIEWS = 5  # unseen, where the set is large enough to spare them
+SPARED_OF = 3  # and one in so many at most
+MATCHES_OF_IMAGE = 8  # an image with fewer says nothing
+LEAST_MATCHED = 4  # images
+LEAST_PX = 0.05  # errors below it are equal: matches are not that exact
+MOTION_GRID = 5  # points across and down
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Poses [n, 4, 4] in the input's frame and the lens of each image at full size."""
+
+    world_from_cam: Array
+    cameras: tuple[Camera, ...]
+
+    def lenses(self, images: ImageSet) -> tuple[Camera, ...]:
+        """The lenses at the photos' working size."""
+        return tuple(
+            camera.resized(small.width, small.height)
+            for camera, small in zip(self.cameras, images.cameras, strict=True)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutComparison:
+    """What two trainings made of the unseen `views`."""
+
+    views: list[int]
+    before: TrialScores
+    after: TrialScores
+    evidence: HeldOutEvidence
+
+
+@dataclass(frozen=True, eq=False)
+class EpipolarComparison:
+    """Median error of each image's matches [n] (px, full size) with either rig; NaN where it has too few."""
+
+    before: Array
+    after: Array
+    evidence: EpipolarEvidence
+
+
+def unseen_views(count: int, held_out: Sequence[int], most: int) -> list[int]:
+    """The views that the verdict is passed on: those held out by the refinement, and others, evenly spread.
+
+    `most` in all, unless more are held out; at least `LEAST_VIEWS` where no more than a third of all are needed.
+    """
+    wanted = max(len(held_out), min(most, max(count // SPARED_OF // 2, min(LEAST_VIEWS, count // SPARED_OF))))
+    others = [i for i in range(count) if i not in set(held_out)]
+    more = wanted - len(held_out)
+    spread = [others[int((i + 0.5) * len(others) / more)] for i in range(more)]
+    return sorted({*held_out, *spread})
+
+
+def compare_on_unseen_views(
+    before: Rig,
+    after: Rig,
+    images: ImageSet,
+    held_out: Sequence[int],
+    options: RefineOptions,
+    device: torch.device,
+    threads: int,
+    should_stop: Callable[[], bool],
+    after_trial: Callable[[int], None] = lambda _done: None,
+) -> HeldOutComparison | None:
+    """Train a field on either rig, held still, and score both on the same unseen views; None of too few images.
+
+    Raises:
+        Interrupted: ``should_stop`` said so.
+    """
+    steps = int(options.trial_steps or 0)
+    views = unseen_views(len(images), held_out, most=16)
+    if steps == 0 or not views:
+        return None
+    rigs = [before.world_from_cam, after.world_from_cam]
+    trials = FrozenTrials(images, views, rigs, options, steps, device, threads, should_stop)
+    scores = []
+    for done, rig in enumerate((before, after)):
+        scores.append(trials.score(rig.world_from_cam, rig.lenses(images)))
+        after_trial(done + 1)
+    old, new = scores
+    evidence = HeldOutEvidence(
+        steps=trials.steps,
+        strictly=len(set(views) & set(held_out)),
+        psnr=paired(old.psnr, new.psnr, PSNR_MATTERS),
+        ssim=paired(old.ssim, new.ssim, SSIM_MATTERS),
+    )
+    return HeldOutComparison(views, old, new, evidence)
+
+
+def compare_on_matches(
+    before: Rig, after: Rig, matches: FeatureMatches, *, independent: bool
+) -> EpipolarComparison | None:
+    """Each image's median epipolar error with either rig; None where too few images have matches.
+
+    Args:
+        independent: whether the rig `after` has not been made from these matches.
+    """
+    old, new = (_image_errors(rig, matches) for rig in (before, after))
+    known = np.isfinite(old) & np.isfinite(new)
+    if known.sum() < LEAST_MATCHED:
+        return None
+    gains = np.log2(np.maximum(old[known], LEAST_PX) / np.maximum(new[known], LEAST_PX))
+    comparison = paired(old[known], new[known], EPIPOLAR_MATTERS, gains)
+    medians = {"before": float(np.median(old[known])), "after": float(np.median(new[known]))}
+    sides = [max(camera.width, camera.height) for camera in after.cameras]
+    evidence = EpipolarEvidence(
+        matches=len(matches),
+        independent=independent,
+        error_px=comparison.model_copy(update=medians),
+        share_of_image=medians["after"] / float(np.median(sides)),
+    )
+    return EpipolarComparison(old, new, evidence)
+
+
+def _image_errors(rig: Rig, matches: FeatureMatches) -> Array:
+    intrinsics = Intrinsics.from_cameras(rig.cameras)
+    a, b = matches.images.T
+    ray_a, ray_b = (
+        directions_in_cam(intrinsics, torch.from_numpy(side.copy()), torch.from_numpy(xy.copy())).numpy()
+        for side, xy in ((a, matches.xy[:, 0]), (b, matches.xy[:, 1]))
+    )
+    focal = ((intrinsics.fx + intrinsics.fy) / 2).numpy()
+    errors = epipolar_angles(rig.world_from_cam, a, b, ray_a, ray_b) * (focal[a] + focal[b]) / 2
+    medians = np.full(len(rig.cameras), np.nan)
+    for image in range(len(medians)):
+        own = errors[((a == image) | (b == image)) & np.isfinite(errors)]
+        if len(own) >= MATCHES_OF_IMAGE:
+            medians[image] = np.median(own)
+    return medians
+
+
+def moved_px(before: Rig, after: Rig, images: ImageSet) -> float:
+    """How far the scene moves in the image (px, working size) between two rigs in one frame: median over cameras.
+
+    Looked at are points of a grid over each image, as far as the point that the rig `before` looks at; each camera
+    counts with their mean, and no point with more than the image's long side.
+    """
+    n = len(images)
+    old, new = (Intrinsics.from_cameras(rig.lenses(images)) for rig in (before, after))
+    focus = focus_point(before.world_from_cam)
+    towards = (focus.point - before.world_from_cam[:, :3, 3]) * before.world_from_cam[:, :3, 2]
+    depth = np.where(towards.sum(1) > 0, towards.sum(1), focus.mean_distance)
+    steps = (torch.arange(MOTION_GRID, dtype=torch.float64) + 0.5) / MOTION_GRID
+    share = torch.cartesian_prod(steps, steps).repeat(n, 1)
+    index = torch.arange(n).repeat_interleave(MOTION_GRID**2)
+    xy = share * torch.stack([old.width, old.height], 1)[index]
+    rays = directions_in_cam(old, index, xy).numpy()
+    i = index.numpy()
+    in_cam = rays * depth[i][:, None]
+    world = (
+        np.einsum("mij,mj->mi", before.world_from_cam[i, :3, :3], in_cam) + before.world_from_cam[i, :3, 3]
+    )
+    seen = np.einsum("mji,mj->mi", after.world_from_cam[i, :3, :3], world - after.world_from_cam[i, :3, 3])
+    moved = (project(new, index, torch.from_numpy(seen)) - xy).norm(dim=1).numpy().reshape(n, -1)
+    most = np.maximum(images.widths, images.heights)[:, None].astype(np.float64)
+    return float(np.median(np.fmin(moved, most).mean(1)))

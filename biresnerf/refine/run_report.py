@@ -1,0 +1,136 @@
+"""The account of a run: everything that report.json says."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from biresnerf.data.dataset import Dataset
+from biresnerf.data.images import ImageSet
+from biresnerf.geometry.similarity import Similarity
+from biresnerf.refine.evaluation import ViewScore
+from biresnerf.refine.judgement import Judgement, motion
+from biresnerf.refine.start import Start
+from biresnerf.refine.two_stages import TwoStages
+from biresnerf.report import HeldOut, ImageReport, Report, SimilarityReport
+
+
+def run_report(
+    dataset: Dataset,
+    start: Start,
+    images: ImageSet,
+    stages: TwoStages,
+    held_out: list[int],
+    scores: list[ViewScore],
+    judgement: Judgement | None,
+    refined: np.ndarray,
+    similarity: Similarity,
+    *,
+    threads: int,
+    state: Literal["complete", "partial"],
+) -> Report:
+    """The report of a run whose refined poses, in the input's frame, are `refined` [n, 4, 4].
+
+    Args:
+        similarity: carries optimised poses to the input's frame.
+        judgement: None where no verdict has been passed.
+    """
+    from biresnerf import __version__
+
+    optimiser, record = stages.optimiser, stages.record
+    lost = [i for i, flag in enumerate(optimiser.camera_errors.lost.tolist()) if flag]
+    return Report(
+        version=__version__,
+        state=state,
+        options=optimiser.options,
+        verdict=judgement.verdict if judgement is not None else None,
+        images=_image_reports(
+            dataset,
+            start,
+            refined,
+            held_out,
+            scores,
+            lost,
+            stages.repair.repaired,
+            optimiser.bodies.fixed,
+            judgement,
+        ),
+        heldout=HeldOut(
+            count=len(scores),
+            psnr=float(np.mean([s.psnr for s in scores])),
+            ssim=float(np.mean([s.ssim for s in scores])),
+        )
+        if scores
+        else None,
+        start_trials=start.trials,
+        steps_done=optimiser.step_index,
+        switch_step=optimiser.switch if optimiser.method.two_stages else None,
+        switch_reason=record.switch_reason,
+        resumed=record.resumed,
+        seconds={stage: round(seconds, 3) for stage, seconds in record.seconds.items()},
+        backend=optimiser.field.backend,
+        device=str(optimiser.device),
+        threads=threads,
+        working_size=(int(images.widths.max()), int(images.heights.max())),
+        input_from_optimised=SimilarityReport(
+            scale=similarity.scale,
+            rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
+            translation=tuple(float(v) for v in similarity.translation),
+        ),
+        warnings=dataset.warnings + _lost_warnings(dataset, lost),
+    )
+
+
+def _lost_warnings(dataset: Dataset, lost: list[int]) -> tuple[str, ...]:
+    if not lost:
+        return ()
+    names = ", ".join(dataset.names[i] for i in lost)
+    return (f"{len(lost)} of {len(dataset)} images agree with no pose that was found: {names}.",)
+
+
+def _image_reports(
+    dataset: Dataset,
+    start: Start,
+    refined: np.ndarray,
+    held_out: list[int],
+    scores: list[ViewScore],
+    lost: list[int],
+    repaired: list[int],
+    fixed: np.ndarray,
+    judgement: Judgement | None,
+) -> tuple[ImageReport, ...]:
+    turn, shift = motion(dataset.world_from_cam, refined)
+    scored = {score.image: score for score in scores}
+    return tuple(
+        ImageReport(
+            name=frame.name,
+            pose_source=start.sources[i],
+            held_out=i in held_out,
+            fixed=bool(fixed[i]),
+            moved_deg=float(turn[i]),
+            moved_units=float(shift[i]),
+            lost=i in lost,
+            repaired=i in repaired,
+            psnr=scored[i].psnr if i in scored else None,
+            ssim=scored[i].ssim if i in scored else None,
+            **_judged(judgement, i),
+        )
+        for i, frame in enumerate(dataset.frames)
+    )
+
+
+def _judged(judgement: Judgement | None, image: int) -> dict[str, float | bool | None]:
+    """What a judgement says of one image, by the names of `ImageReport`."""
+    if judgement is None:
+        return {}
+    figures = {
+        "sharpness": judgement.sharpness[image],
+        "gain": judgement.gain[image],
+        "trial_psnr_before": judgement.trial_psnr[0, image],
+        "trial_psnr_after": judgement.trial_psnr[1, image],
+        "epipolar_px_before": judgement.epipolar_px[0, image],
+        "epipolar_px_after": judgement.epipolar_px[1, image],
+    }
+    flags = {name: bool(getattr(judgement, name)[image]) for name in ("moved_far", "blurred", "exposure_off")}
+    return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | flags

@@ -1,0 +1,207 @@
+"""The decision: are the refined poses better than the input's? By fixed rules, by which the input has the doubt.
+
+docs/verdict.md explains them. Every comparison is paired and signed, positive where the refined poses are better, so
+that swapping the two sets of poses turns every finding round.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.report import (
+    EpipolarEvidence,
+    Finding,
+    HeldOutEvidence,
+    PairedDifference,
+    Verdict,
+    VerdictName,
+)
+
+Array = NDArray[np.float64]
+
+# Student's t, two-sided at 95 %, for 1 to 30 degrees of freedom; from there on 1.96 + 2.5 / degrees is near enough.
+STUDENT = (
+    12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131,
+    2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
+)  # fmt: skip
+# What matters, and what chance cannot make: trainings on the same poses differ by less (docs/verdict.md).
+PSNR_MATTERS, SSIM_MATTERS = 0.3, 0.01  # dB, and 1
+EPIPOLAR_MATTERS = 0.1  # log2: 7 % of the error
+SAME_WITHIN = 2.0  # times that: an interval inside it says that there is nothing to gain or lose
+MEASURABLE_PX = 0.1  # at working size: motion that no photo of that size tells
+# Feature matches that miss by more than this share of the image fit no scene: neither set of poses is to be trusted.
+FITS_BELOW = 0.02
+MOSTLY = 0.5  # share of cameras from which on a failing is that of the whole
+FAR_DEG, FAR_SHARE = 60.0, 0.5  # residuals (median) with which the result no longer lies in the input's frame
+
+
+@dataclass(frozen=True)
+class Findings:
+    """All that the decision rests on.
+
+    Attributes:
+        failed: sentences on what is inconsistent; empty where all is well.
+        compared_with: whose the input's poses are.
+        grounded: whether the input's poses are given ones or come from matches, and are not mere guesses.
+    """
+
+    failed: tuple[str, ...]
+    moved_px: float
+    heldout: HeldOutEvidence | None
+    epipolar: EpipolarEvidence | None
+    compared_with: Literal["given", "seeded", "mixed"]
+    grounded: bool
+
+
+def paired(before: Array, after: Array, matters: float, gains: Array | None = None) -> PairedDifference:
+    """The comparison of a figure [n] of which more is better, or else by its `gains` [n], positive where better."""
+    gains = after - before if gains is None else gains
+    mean, count = float(gains.mean()), len(gains)
+    low = high = None
+    if count > 1:
+        half = student_quantile(count - 1) * float(gains.std(ddof=1)) / count**0.5
+        low, high = mean - half, mean + half
+    return PairedDifference(
+        count=count, before=float(before.mean()), after=float(after.mean()), difference=mean, low=low, high=high,
+        finding=finding(mean, low, high, matters),
+    )  # fmt: skip
+
+
+def student_quantile(freedom: int) -> float:
+    """Half the width of a 95 % interval, in standard errors, with so many degrees of freedom."""
+    return STUDENT[freedom - 1] if freedom <= len(STUDENT) else 1.96 + 2.5 / freedom
+
+
+def finding(mean: float, low: float | None, high: float | None, matters: float) -> Finding:
+    """What a difference and its interval say, given the least difference that matters."""
+    if low is None or high is None:
+        return "open"
+    if low > 0 and mean >= matters:
+        return "better"
+    if high < 0 and mean <= -matters:
+        return "worse"
+    return "same" if max(-low, high) <= SAME_WITHIN * matters else "open"
+
+
+def failed_checks(
+    refined: Array, lost: int, turned_deg: Array, shifted: Array, spread: float, grounded: bool
+) -> tuple[str, ...]:
+    """Sentences on what is inconsistent about refined poses [n, 4, 4].
+
+    Args:
+        lost: cameras that agree with no pose that was found.
+        turned_deg, shifted: how far each camera ends from its input pose, in the input's frame.
+        spread: root-mean-square distance of the input's centres from their mean.
+        grounded: see `Findings`; from a guess poses may go any way.
+    """
+    if not np.isfinite(refined).all():
+        return ("Refined poses are not finite.",)
+    failed = []
+    if lost > MOSTLY * len(refined):
+        failed.append(f"{lost} of {len(refined)} cameras are lost: they agree with no pose that was found.")
+    turn, shift = float(np.median(turned_deg)), float(np.median(shifted))
+    if grounded and (turn > FAR_DEG or shift > FAR_SHARE * spread > 0):
+        failed.append(
+            f"The refined cameras do not fit the input's frame any more: half of them are off by {turn:.3g} deg and "
+            f"{shift:.3g} units (the cameras' spread is {spread:.3g}) or more."
+        )
+    return tuple(failed)
+
+
+def decide(findings: Findings) -> Verdict:
+    """The verdict by the rules of docs/verdict.md."""
+    name, ground = _judge(findings)
+    # Where nothing speaks for either, poses that somebody found stay, and mere guesses do not.
+    keep = name != "improved" and not (name == "inconclusive" and not findings.grounded)
+    return Verdict(
+        verdict=name,
+        returned="input" if keep else "refined",
+        compared_with=findings.compared_with,
+        why=(ground, *_sentences(findings)),
+        moved_px=findings.moved_px,
+        heldout=findings.heldout,
+        epipolar=findings.epipolar,
+    )
+
+
+def _judge(f: Findings) -> tuple[VerdictName, str]:
+    if f.failed:
+        return "failed_check", " ".join(f.failed)
+    if f.moved_px < MEASURABLE_PX:
+        return "unchanged", f"The poses moved by less than can be measured (below {MEASURABLE_PX:g} px)."
+    speaks_for, speaks_against = _for(f), _against(f)
+    if speaks_for and speaks_against:
+        return (
+            "inconclusive",
+            f"The evidence disagrees: {speaks_for} for the refined poses, {speaks_against} against.",
+        )
+    if speaks_against:
+        return "kept_input", f"The refined poses are worse by {speaks_against}."
+    if f.epipolar is not None and f.epipolar.share_of_image > FITS_BELOW:
+        return (
+            "inconclusive",
+            "Neither the input's poses nor the refined ones agree with the feature matches.",
+        )
+    if speaks_for:
+        return "improved", f"The refined poses are better by {speaks_for}."
+    said = [item.finding for item in _counted(f)]
+    if said and all(item == "same" for item in said):
+        return "kept_input", "The refined poses are no better than the input's by any measure."
+    return "inconclusive", "The evidence is too weak to tell the refined poses from the input's."
+
+
+def _counted(f: Findings) -> list[PairedDifference]:
+    """The comparisons that may speak for the refined poses."""
+    counted = [f.heldout.psnr] if f.heldout is not None else []
+    if f.epipolar is not None and f.epipolar.independent:
+        counted.append(f.epipolar.error_px)
+    return counted
+
+
+def _for(f: Findings) -> str:
+    """What speaks for the refined poses, empty if nothing does."""
+    names = []
+    if f.heldout is not None and f.heldout.psnr.finding == "better":
+        names.append("unseen views")
+    if f.epipolar is not None and f.epipolar.independent and f.epipolar.error_px.finding == "better":
+        names.append("feature matches")
+    return " and ".join(names)
+
+
+def _against(f: Findings) -> str:
+    """What speaks against them; matches that the start came from may do so as well."""
+    names = []
+    if f.heldout is not None and "worse" in (f.heldout.psnr.finding, f.heldout.ssim.finding):
+        names.append("unseen views")
+    if f.epipolar is not None and f.epipolar.error_px.finding == "worse":
+        names.append("feature matches")
+    return " and ".join(names)
+
+
+def _sentences(f: Findings) -> list[str]:
+    """The figures, in words."""
+    said = []
+    if f.heldout is not None:
+        p = f.heldout.psnr
+        said.append(
+            f"{p.count} unseen views: {p.before:.2f} dB with the input's poses, {p.after:.2f} dB with the refined ones"
+            f"{_interval(p, 'dB')}."
+        )
+    if f.epipolar is not None:
+        e = f.epipolar.error_px
+        source = "" if f.epipolar.independent else ", which the start came from"
+        said.append(
+            f"{f.epipolar.matches} feature matches{source}: epipolar error {e.before:.2f} px with the input's poses, "
+            f"{e.after:.2f} px with the refined ones{_interval(e, 'octaves')}."
+        )
+    return said
+
+
+def _interval(item: PairedDifference, unit: str) -> str:
+    if item.low is None or item.high is None:
+        return f" ({item.difference:+.2f} {unit})"
+    return f" ({item.difference:+.2f} {unit}, 95 % interval {item.low:+.2f} to {item.high:+.2f})"
