@@ -25,7 +25,7 @@ Background = Literal["auto", "white", "black", "none"]
 Wiring = Literal["concat", "replace", "residual"]
 DetectorName = Literal["trend", "counter", "variance"]
 PoseParametrisation = Literal["se3_world", "so3xr3", "so3xr3_camp"]
-PackName = Literal["colmap-text", "instant-ngp", "kitti", "bundler"]
+PackName = Literal["colmap-text", "instant-ngp", "kitti", "bundler", "pinhole"]
 StartPoses = Literal["auto", "given", "colmap", "none"]
 
 
@@ -138,7 +138,7 @@ class RefineOptions(BaseModel):
     packs: tuple[PackName, ...] = Field(
         (),
         description="Forms to write the result in beside those that always are: colmap-text, instant-ngp, kitti, "
-        "bundler.",
+        "bundler, pinhole (undistorted photos with a PINHOLE model).",
     )
 
     @field_validator("fixed", "packs", mode="before")

@@ -33,6 +33,8 @@ class RefinedImage:
         given: its pose before, float64 [4, 4]; None where there was none.
         pose_source: who found the pose that the optimisation started from.
         flags: what is to be known of it: ``fixed``, ``held_out``, ``lost``, ``repaired``, ...
+        path: the file; None where it is not known.
+        orientation: as `biresnerf.data.dataset.Frame` has it.
     """
 
     name: str
@@ -42,6 +44,8 @@ class RefinedImage:
     given: NDArray[np.float64] | None
     pose_source: str
     flags: tuple[str, ...] = ()
+    path: Path | None = None
+    orientation: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +59,6 @@ class RefinedSet:
         image_ids: of the images in the model.
         points_source: where the model's points come from.
         similarity: ``input_from_optimised``, which tied the poses to the caller's frame.
-        root: the folder that file names are relative to; None where it is not known.
         timestamps_s: of the images, where the input was a trajectory with times.
     """
 
@@ -65,7 +68,6 @@ class RefinedSet:
     image_ids: tuple[int, ...]
     points_source: PointsSource
     similarity: Similarity
-    root: Path | None = None
     timestamps_s: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -120,7 +122,17 @@ def refined_set(
     sources = pose_sources or [frame.pose_source or "none" for frame in dataset.frames]
     marks = flags or [()] * count
     images = tuple(
-        RefinedImage(frame.name, file_name, frame.camera, pose, before[i], sources[i], marks[i])
+        RefinedImage(
+            frame.name,
+            file_name,
+            frame.camera,
+            pose,
+            before[i],
+            sources[i],
+            marks[i],
+            frame.path,
+            frame.orientation,
+        )
         for i, (frame, file_name, pose) in enumerate(
             zip(dataset.frames, dataset.file_names, np.asarray(world_from_cam, np.float64), strict=True)
         )
@@ -148,6 +160,5 @@ def refined_set(
         image_ids,
         "none",
         similarity or Similarity.identity(),
-        dataset.root,
         timestamps_s,
     )

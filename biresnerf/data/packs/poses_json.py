@@ -48,6 +48,10 @@ class PoseImage(BaseModel):
     name: str = Field(description="As the input writes it.")
     file_name: str = Field(description="Path relative to the input's folder, with extension.")
     camera: int = Field(description="Index into cameras.")
+    orientation: int = Field(
+        1,
+        description="EXIF orientation that stored pixels are turned by first; camera and poses are for the result.",
+    )
     cam_from_world: Matrix
     world_from_cam: Matrix = Field(description="The inverse: its last column is the camera's centre.")
     world_from_cam_before: Matrix | None = Field(description="As given; null where no pose was.")
@@ -88,6 +92,7 @@ def write_poses_json(refined: RefinedSet, path: Path) -> None:
             name=image.name,
             file_name=image.file_name,
             camera=image.camera,
+            orientation=image.orientation,
             cam_from_world=_rows(cam_from_world),
             world_from_cam=_rows(image.world_from_cam),
             world_from_cam_before=None if image.given is None else _rows(image.given),

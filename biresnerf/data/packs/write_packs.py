@@ -10,6 +10,7 @@ from biresnerf.data.packs.bundler import write_bundler
 from biresnerf.data.packs.colmap_binary import write_colmap_binary
 from biresnerf.data.packs.colmap_text import write_colmap_text
 from biresnerf.data.packs.instant_ngp import TRANSFORMS_NGP, write_transforms_ngp
+from biresnerf.data.packs.pinhole import PINHOLE, write_pinhole
 from biresnerf.data.packs.poses_json import POSES, write_poses_json
 from biresnerf.data.packs.scene_glb import SCENE, write_scene
 from biresnerf.data.packs.trajectories import write_kitti, write_tum
@@ -30,6 +31,7 @@ ON_REQUEST: dict[PackName, Callable[[RefinedSet, Path], None]] = {
     "instant-ngp": lambda refined, folder: write_transforms_ngp(refined, folder / TRANSFORMS_NGP),
     "kitti": lambda refined, folder: write_kitti(refined, folder / "kitti.txt"),
     "bundler": lambda refined, folder: write_bundler(refined, folder / "bundler"),
+    "pinhole": lambda refined, folder: write_pinhole(refined, folder / PINHOLE),
 }
 
 
