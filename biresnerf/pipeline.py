@@ -176,9 +176,11 @@ def _optimiser(
     world_from_cam = bodies.held(start.world_from_cam, prepared.dataset.world_from_cam)
     frame = scene_frame(world_from_cam, prepared.images)
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
-    return JointOptimiser(
+    optimiser = JointOptimiser(
         prepared.images, frame, poses, options, prepared.held_out, device, threads, start.mobility, bodies
     )
+    optimiser.camera_errors.doubt(start.doubted)
+    return optimiser
 
 
 def _choose_backend(options: RefineOptions, report: OnProgress) -> tuple[RefineOptions, torch.device, int]:

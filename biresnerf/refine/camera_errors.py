@@ -19,6 +19,7 @@ MAD_TO_DEVIATION = 1.4826
 OWN_YARDSTICK_FROM = 4  # held-out views
 IN_A_ROW = 2  # blocks
 COVERAGE = 0.1  # of the photo's share that is no background: rendering less has lost the scene from sight
+DOUBTED_WEIGHT = 0.1  # of a camera whose pose is a guess, until it agrees with the field
 SMOOTHING = 0.5  # share of the newest block in the moving average
 BACKGROUND_TOLERANCE = 0.05  # colours nearer to the background than this count as background
 LEAST_FOREGROUND = 0.02
@@ -91,7 +92,8 @@ class CameraErrors:
     Attributes:
         shares: see `foreground_shares`.
         errors: moving average [n] over blocks; infinite where there is none yet.
-        lost: mask [n] of cameras that stood out for `IN_A_ROW` blocks.
+        doubted: mask [n] of cameras that began at a guess and have not been seen to agree with the others' field.
+        lost: mask [n] of cameras that stood out for `IN_A_ROW` blocks, and of those in doubt.
         weights: of each camera's rays in the loss [n], None where all weigh the same.
     """
 
@@ -108,12 +110,13 @@ class CameraErrors:
         self.held_out[held_out] = True
         self.errors = torch.full((count,), torch.inf, device=device)
         self.weights: Tensor | None = None
+        self.doubted = torch.zeros(count, dtype=torch.bool, device=device)
         self._stood_out = torch.zeros(count, dtype=torch.int64, device=device)
         self._sums = torch.zeros(3, count, device=device)  # rays, squared errors, opacities
 
     @property
     def lost(self) -> Tensor:
-        return self._stood_out >= IN_A_ROW
+        return (self._stood_out >= IN_A_ROW) | self.doubted
 
     @property
     def suspects(self) -> Tensor:
@@ -130,8 +133,20 @@ class CameraErrors:
         """A lost camera must not fog the field where it believes it stands."""
         self.weights = None
         if bool(self.lost.any()):
-            weights = 1 / self.relative.clamp(min=1)
+            known = self.errors.isfinite()
+            weights = torch.where(known, 1 / self.relative.clamp(min=1), torch.ones_like(self.errors))
+            weights = torch.where(self.doubted, weights.clamp(max=DOUBTED_WEIGHT), weights)
             self.weights = torch.where(self.lost, weights, torch.ones_like(weights))
+
+    def doubt(self, cameras: np.ndarray) -> None:
+        """Begin with little weight, and as suspects, for cameras [n] whose pose is a guess."""
+        self.doubted.copy_(torch.from_numpy(cameras))
+        self._weigh()
+
+    def believe(self, camera: int) -> None:
+        """The camera has been seen to agree with the others' field."""
+        self.doubted[camera] = False
+        self._weigh()
 
     def add(self, image: Tensor, colour: Tensor, target: Tensor, opacity: Tensor) -> None:
         """One batch: image [rays], colours [rays, 3] rendered and wanted, opacity [rays]."""
@@ -163,14 +178,21 @@ class CameraErrors:
         """Start over with one camera: its pose is another one now."""
         self.errors[camera] = torch.inf
         self._stood_out[camera] = 0
+        self.doubted[camera] = False
         self._sums[:, camera] = 0
         self._weigh()
 
     def state(self) -> dict[str, Tensor]:
-        return {"errors": self.errors, "stood_out": self._stood_out, "sums": self._sums}
+        return {
+            "errors": self.errors,
+            "stood_out": self._stood_out,
+            "sums": self._sums,
+            "doubted": self.doubted,
+        }
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         self.errors.copy_(state["errors"])
         self._stood_out.copy_(state["stood_out"])
         self._sums.copy_(state["sums"])
+        self.doubted.copy_(state["doubted"])
         self._weigh()

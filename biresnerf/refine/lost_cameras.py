@@ -40,6 +40,7 @@ FIRST_SHARE = 0.5  # of the least length of stage 1: the field has formed (open 
 LAST_SHARE = 0.6  # of all steps: the repair within stage 2
 SETTLED_SHARE = 1 / 3  # of stage 2, at the least before that
 RUN_SHARE, EVENT_SHARE = 0.1, 0.04  # of the run's samples: what all repairs may cost, and those of one time
+GUESSED_TIMES = 2  # that much where poses are guesses: more cameras need it
 FORWARD_COST = 0.4  # of a sample without its backward pass
 
 
@@ -78,6 +79,7 @@ class LostCameraRepair:
             return
         self._times = 3 if switching else self._times + 1 if optimiser.switch is None else 4
         total = float(optimiser.schedule.samples(optimiser.schedule.steps, 0)) * optimiser.schedule.steps
+        total *= GUESSED_TIMES if bool(optimiser.camera_errors.doubted.any()) else 1
         allowance = min(self._spent + EVENT_SHARE * total, RUN_SHARE * total)
         self._marching = self._coarse_marching()
         alone = self._alone()
@@ -145,7 +147,9 @@ class LostCameraRepair:
         image = torch.full((len(tried),), camera, device=optimiser.device)
         scores = self._scores(tried, image)
         old = float(scores[0])
-        bound = min(BETTER * old, max(NEAR_MEDIAN * median, FAR_BETTER * old))
+        # A guess has no claim to stay.
+        better = 1.0 if bool(optimiser.camera_errors.doubted[camera]) else BETTER
+        bound = min(better * old, max(NEAR_MEDIAN * median, FAR_BETTER * old))
         if alone:  # its own error says nothing, nor does that of another pose with a view of its own
             bound = NEAR_MEDIAN * median
             shared = self._shared(tried, image) >= ALONE
@@ -168,6 +172,8 @@ class LostCameraRepair:
         if taken:
             optimiser.replace_pose(camera, tried[best])
             self.repaired = sorted({*self.repaired, camera})
+        elif old < NEAR_MEDIAN * median and not alone:
+            optimiser.camera_errors.believe(camera)  # nothing better was found than where it stands
 
     @torch.no_grad()
     def _scores(self, matrices: Tensor, image: Tensor) -> Tensor:

@@ -33,6 +33,7 @@ TRIAL_STEPS = 200
 MATCHED_MOBILITY = (0.0, 0.3)
 # Where most cameras are placed, stage 1 has only to form the field: its lengths shrink to this share.
 MOSTLY_PLACED, MATCHED_COARSE_SHARE = 0.8, 0.4
+DOUBTED_MOST = 0.5  # of the cameras: with more guesses there is no field of others to agree with
 MARGIN_DB = 0.3  # less is a tie
 # On a tie, matches are believed if the given poses differ from them by more than this (median).
 DISAGREE_DEG = 2.0
@@ -64,9 +65,10 @@ class Start:
         return np.array([source in MATCHED_SOURCES for source in self.sources])
 
     @property
-    def guessed(self) -> np.ndarray:
-        """Bool [n], whether the pose is a guess from other images."""
-        return np.array([source in GUESSES for source in self.sources])
+    def doubted(self) -> np.ndarray:
+        """Bool [n], whose pose is a guess from other images; nobody where most are, as all are alike then."""
+        guessed = np.array([source in GUESSES for source in self.sources])
+        return guessed if guessed.mean() <= DOUBTED_MOST else np.zeros_like(guessed)
 
     @property
     def mobility(self) -> np.ndarray:
@@ -106,7 +108,7 @@ def choose_start(
 ) -> Start:
     """The candidate whose poses let a field predict unseen views best.
 
-    On a tie the first one, the given poses, is kept if the matches agree with it, and otherwise left.
+    On a tie the first one is kept, unless it is the given poses and the matches do not agree with them.
 
     Raises:
         Interrupted: ``should_stop`` said so.
@@ -120,7 +122,8 @@ def choose_start(
     if scores[best] < scores[0] + MARGIN_DB:
         matched = int(np.argmax(scores[1:])) + 1
         disagree = _turned_deg(candidates[0].world_from_cam, candidates[matched].world_from_cam)
-        best = matched if disagree > DISAGREE_DEG and scores[matched] > scores[0] - MARGIN_DB else 0
+        believed = candidates[0].source == "given" and disagree > DISAGREE_DEG
+        best = matched if believed and scores[matched] > scores[0] - MARGIN_DB else 0
     trials = tuple(
         TrialReport(source=c.source, placed=int(c.placed.sum()), psnr=s)
         for c, s in zip(candidates, scores, strict=True)

@@ -157,3 +157,22 @@ def test_the_share_that_shows_the_scene_is_the_opaque_one_or_what_differs_from_t
     assert foreground_shares(plain) == pytest.approx([1])  # nothing is known to be background
     object.__setattr__(plain, "background", np.ones(3, np.float32))
     assert foreground_shares(plain) == pytest.approx([0.25])
+
+
+def test_a_guessed_camera_weighs_little_until_it_is_believed(tmp_path):
+    images = tiny_set(tmp_path, views=5, size=16)[1]
+    errors = CameraErrors(images, [], CPU)
+    errors.doubt(np.array([False, True, False, False, True]))
+    assert errors.lost.tolist() == errors.suspects.tolist() == [False, True, False, False, True]
+    assert errors.weights is not None
+    np.testing.assert_allclose(errors.weights, [1, 0.1, 1, 1, 0.1])
+    errors.close_block()
+    np.testing.assert_allclose(errors.weights, [1, 0.1, 1, 1, 0.1])
+    kept = {name: tensor.clone() for name, tensor in errors.state().items()}
+    errors.believe(1)
+    errors.forget(4)  # it has another pose now
+    assert not errors.lost.any()
+    assert errors.weights is None
+    again = CameraErrors(images, [], CPU)
+    again.load_state(kept)
+    np.testing.assert_allclose(again.weights, [1, 0.1, 1, 1, 0.1])

@@ -103,6 +103,21 @@ def test_a_camera_half_turned_and_one_carried_far_round_come_home(scene, repaire
     assert not repaired.optimiser.camera_errors.lost.any()
 
 
+def test_cameras_that_begin_at_a_guess_are_in_doubt_until_they_stand_right(scene, tmp_path):
+    truth = true_poses(scene)
+    given, guessed = truth.copy(), np.zeros(len(truth), dtype=bool)
+    for camera in (TURNED, ORBITED):
+        apart = np.linalg.norm(truth[:, :3, 3] - truth[camera, :3, 3], axis=1)
+        given[camera] = truth[np.argsort(apart)[2]]  # where another photo was taken
+        guessed[camera] = True
+    stages = start(scene, tmp_path, given)
+    stages.optimiser.camera_errors.doubt(guessed)
+    assert errors_deg(stages, truth)[guessed].min() > 20
+    assert stages.run()
+    assert errors_deg(stages, truth)[guessed].max() < 15
+    assert not stages.optimiser.camera_errors.lost.any()
+
+
 def test_a_run_stopped_between_repairs_ends_as_an_uninterrupted_one(scene, tmp_path, repaired):
     stopped = start(scene, tmp_path, spoiled(true_poses(scene)), stop_at=70)
     assert not stopped.run()
@@ -165,9 +180,9 @@ def test_the_report_names_those_that_stay_lost(scene, tmp_path):
     stages.optimiser.camera_errors._stood_out[TURNED] = 2
     stages.repair.repaired = [ORBITED]
     dataset, images = scene
-    given = Start(dataset.world_from_cam, "given", np.zeros(len(dataset), bool))
+    given = Start(dataset.world_from_cam, "given", ("given",) * len(dataset))
     report = OutputFolder(tmp_path).write_result(
-        dataset, given, images, stages, HELD_OUT, [], threads=1, state="partial"
+        dataset, given, images, stages, HELD_OUT, [], None, threads=1, state="partial"
     )
     assert [image.name for image in report.images if image.lost] == [dataset.names[TURNED]]
     assert [image.name for image in report.images if image.repaired] == [dataset.names[ORBITED]]
