@@ -18,7 +18,7 @@ from biresnerf.errors import InputError
 CHECKPOINT = Path("checkpoint") / "latest.safetensors"
 SEEDING = CHECKPOINT.with_name("seeding.json")  # what COLMAP answered; every checkpoint carries a copy
 MATCHES = CHECKPOINT.with_name(KEPT)  # feature matches; every checkpoint carries them, too
-FORMAT = "2"
+FORMAT = "3"
 
 
 def save_checkpoint(folder: Path, tensors: dict[str, Tensor], notes: dict[str, Any]) -> Path:

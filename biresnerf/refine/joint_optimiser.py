@@ -199,10 +199,7 @@ class JointOptimiser:
         if rate > 0:
             mobility = self.mobility[0 if self.switch is None else 1]
             self.poses.step(rate, mobility, field_rate=rates.networks)
-            if schedule.averages(t):
-                self.poses.gather()
         else:
-            self.poses.settle()
             self.poses.forget_gradients()
         self.step_index += 1
         self._adapt_rays(rendering.samples, schedule.samples(t, self.switch))

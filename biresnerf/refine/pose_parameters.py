@@ -55,10 +55,6 @@ class PoseParameters:
         self.rotation = torch.zeros(count, 3, device=device, requires_grad=True)
         self.translation = torch.zeros(count, 3, device=device, requires_grad=True)
         self.preconditioner = None if preconditioner is None else preconditioner.float().to(device)
-        self.mean = torch.zeros(
-            2, count, 3, device=device
-        )  # of rotation and translation, since `gather` began
-        self.gathered = 0
         self.betas, self.double_step = betas, double_step
         self.restart_adam()
 
@@ -129,21 +125,6 @@ class PoseParameters:
                     parameter.copy_(torch.lerp(kept, parameter, mobility[:, None]))
         self.forget_gradients()
 
-    @torch.no_grad()
-    def gather(self) -> None:
-        """Add the present increments to their running mean."""
-        self.gathered += 1
-        self.mean += (torch.stack([self.rotation, self.translation]) - self.mean) / self.gathered
-
-    @torch.no_grad()
-    def settle(self) -> None:
-        """Take the mean of what was gathered, if anything was, and begin anew."""
-        if self.gathered:
-            self.rotation.copy_(self.mean[0])
-            self.translation.copy_(self.mean[1])
-            self.mean.zero_()
-            self.gathered = 0
-
     def restart_adam(self) -> None:
         """Forget the moments: what follows is another optimisation."""
         parameters = [self.rotation, self.translation]
@@ -166,7 +147,6 @@ class PoseParameters:
             )
         self.start[row] = unit_from_cam
         row = row if self.body is None else int(self.body[row])
-        self.mean[:, row] = 0
         for parameter in (self.rotation, self.translation):
             parameter[row] = 0
             for adam in (self._adam, self._second):
@@ -182,8 +162,6 @@ class PoseParameters:
             "start": self.start,
             "rotation": self.rotation.detach(),
             "translation": self.translation.detach(),
-            "mean": self.mean,
-            "gathered": torch.tensor(self.gathered),
         }
         if self.preconditioner is not None:
             state["preconditioner"] = self.preconditioner
@@ -197,8 +175,6 @@ class PoseParameters:
             self.start.copy_(state["start"])
             self.rotation.copy_(state["rotation"])
             self.translation.copy_(state["translation"])
-            self.mean.copy_(state["mean"])
-            self.gathered = int(state["gathered"])
             if self.preconditioner is not None:
                 self.preconditioner.copy_(state["preconditioner"])
         load_adam_state("adam", self._adam, state)

@@ -35,9 +35,6 @@ class PlainSchedule(Schedule):
     def pose_rate(self, step: int, switch: int | None) -> float:
         return self._decayed("pose", step / self.steps)
 
-    def averages(self, step: int) -> bool:
-        return False
-
     def field_rates(self, step: int, switch: int | None) -> FieldRates:
         rate = self._decayed("field", step / self.steps)
         return FieldRates(rate, rate, (), 0.0)

@@ -29,9 +29,6 @@ POSE_DIP = 0.05  # pose rate right after the switch, as a share
 POSE_STAGE2_CAP = 1e-3
 FIELD_DIP = 0.3
 FREEZE_SHARE = 0.95  # of all steps: poses stand still from then on
-# From this share on, poses are averaged, and frozen at their mean: settled cameras stagger about the best pose by
-# steps of the learning rate's size, which the mean does not.
-AVERAGE_SHARE = 0.8
 # In stage 1 as NerfAcc; in stage 2 empty space hardly fills any more, and each look costs all levels.
 EMPTY_LOOKED_AT = (0.25, 1 / 16)
 FRESH_STEPS = (
@@ -139,10 +136,6 @@ class Schedule:
             share = POSE_DIP + (1 - POSE_DIP) * smooth_ramp((step - switch) / warmup)
             rate = min(rate, POSE_STAGE2_CAP) * share
         return rate
-
-    def averages(self, step: int) -> bool:
-        """Whether the poses of this step count towards those they are frozen at."""
-        return step >= AVERAGE_SHARE * self.steps
 
     def field_rates(self, step: int, switch: int | None) -> FieldRates:
         """Learning rates of the field: smooth warm-up of the reconstruction module after the switch."""

@@ -138,20 +138,3 @@ def test_restarted_moments_forget_where_they_were_going():
     pull(poses, [1])
     poses.step(0.01)
     assert moved(poses, start) == [1]
-
-
-def test_settling_takes_the_mean_of_what_was_gathered():
-    poses = PoseParameters(given(), "se3_world", 1.0, CPU)
-    turns = torch.randn(6, len(poses), 3) * 0.01
-    shifts = torch.randn(6, len(poses), 3) * 0.01
-    for turn, shift in zip(turns, shifts, strict=True):
-        with torch.no_grad():
-            poses.rotation.copy_(turn)
-            poses.translation.copy_(shift)
-        poses.gather()
-    poses.settle()
-    torch.testing.assert_close(poses.rotation.detach(), turns.mean(0))
-    torch.testing.assert_close(poses.translation.detach(), shifts.mean(0))
-    before = poses.matrices().detach().clone()
-    poses.settle()  # nothing gathered since: nothing changes
-    assert torch.equal(poses.matrices(), before)

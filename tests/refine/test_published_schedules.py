@@ -40,7 +40,6 @@ def test_nothing_of_ours_is_added(method):
     assert s.blur(0, None, 400.0) == 0.0
     assert s.pruned(0)
     assert not s.dilated(None)
-    assert not s.averages(s.steps - 1)
     assert s.pose_rate(s.steps - 1, 100) > 0  # poses move to the end
     gradient = s.position_gradient(0, None)
     assert (gradient.pose_smoothing, gradient.reconstruction_smoothing) == (0.0, 0.0)
