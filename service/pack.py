@@ -27,29 +27,35 @@ class Scene:
 
 
 def look_at(path: Path) -> Scene:
-    """The files that make up the input at ``path``: a transforms file with its images, or images alone.
+    """The files that make up the input at ``path``: its poses, the images and masks that they name; or images alone.
 
     Raises:
         InputError: the input cannot be used, or an image lies outside of its folder.
     """
-    from biresnerf.data.folder import look_into
-    from biresnerf.data.transforms_json import read_transforms
+    from biresnerf.data.read import read_dataset
 
-    if not path.exists():
-        raise InputError(
-            "input_missing", "does not exist.", where=str(path), mend="Give a folder or a transforms.json."
-        )
-    transforms = path
-    if path.is_dir():
-        contents = look_into(path)
-        if contents.transforms is None:
-            return _scene([(_name_below(contents.root, image), image) for image in contents.images])
-        transforms = contents.transforms
-    dataset = read_transforms(transforms)
+    dataset = read_dataset(path)
+    root = dataset.root
     images = list({frame.path.resolve(): frame.path for frame in dataset.frames}.values())
-    # The service looks for the pose file by its usual name.
-    name = transforms.name if transforms.name.startswith("transforms") else TRANSFORMS
-    return _scene([(name, transforms), *((_name_below(dataset.root, image), image) for image in images)])
+    masks = list(
+        {frame.mask.resolve(): frame.mask for frame in dataset.frames if frame.mask is not None}.values()
+    )
+    poses = [(_name_below(root, file), file) for file in dataset.source.files]
+    if dataset.source.file is not None:
+        # The service looks for the pose file by its usual name.
+        name = dataset.source.file.name
+        poses = [(name if name.startswith("transforms") else TRANSFORMS, dataset.source.file)]
+    elif dataset.source.files and not path.is_dir():
+        poses = _found_by_name(root, path, poses)
+    return _scene([*poses, *((_name_below(root, file), file) for file in images + masks)])
+
+
+def _found_by_name(root: Path, path: Path, poses: list[tuple[str, Path]]) -> list[tuple[str, Path]]:
+    """The files, under names by which the service will read the same of them."""
+    from biresnerf.data.folder import usual_name
+
+    usual = usual_name(path)
+    return [(usual if usual and file == path else name, file) for name, file in poses]
 
 
 def _name_below(root: Path, path: Path) -> str:

@@ -23,7 +23,6 @@ MEMORY_BYTES = 6 * 2**30
 CPU_S = 3600
 # Decoded in full, then kept as thumbnails: the check needs no pixels afterwards.
 THUMBNAIL_PX = 16
-IMAGES_MIN = 3
 
 
 def main(folder: Path) -> int:
@@ -48,58 +47,26 @@ def check(folder: Path) -> dict[str, Any]:
     Raises:
         InputError: what is wrong, with which file, and the mend.
     """
-    from biresnerf.data.folder import look_into
     from biresnerf.data.images import load_images
-    from biresnerf.data.transforms_json import read_transforms
+    from biresnerf.data.read import read_dataset
 
-    contents = look_into(folder)
-    if contents.transforms is None:
-        return _check_images_alone(contents.root, contents.images)
-    dataset = read_transforms(contents.transforms)
-    for frame in dataset.frames:
-        _require_inside(folder, frame.path, frame.name)
+    dataset = read_dataset(folder, within=folder)
     images = load_images(dataset, THUMBNAIL_PX)
+    posed = int(dataset.posed.sum())
+    guessed = "guessed" in dataset.intrinsics_sources
     return {
         "images": len(dataset),
+        "with_pose": posed,
+        "without_pose": len(dataset) - posed,
+        "poses": "missing" if posed == 0 else "given" if posed == len(dataset) else "partial",
         "cameras": len(dataset.cameras),
-        "poses": "given",
+        "camera_models": sorted({camera.model for camera in dataset.cameras}),
+        "intrinsics": "guessed" if guessed else "given",
         "format": dataset.source.dialect,
+        "masks": sum(frame.mask is not None for frame in dataset.frames),
         "transparency": images.alpha is not None,
-        "warnings": [*contents.notes, *dataset.warnings],
+        "warnings": list(dataset.warnings),
     }
-
-
-def _check_images_alone(root: Path, images: tuple[Path, ...]) -> dict[str, Any]:
-    from biresnerf.data.image_files import DAMAGED, open_image
-
-    if len(images) < IMAGES_MIN:
-        raise InputError(
-            "too_few_images",
-            f"{len(images)} images are too few; {IMAGES_MIN} is the least.",
-            where="the dataset",
-            mend="Send more images of the scene.",
-        )
-    for path in images:
-        name = path.relative_to(root).as_posix()
-        with open_image(path, name) as image:
-            try:
-                image.load()
-            except DAMAGED as error:
-                raise InputError(
-                    "not_an_image", f"is damaged: {error}.", where=name, mend="Replace the file."
-                ) from None
-    return {"images": len(images), "cameras": None, "poses": "missing", "format": "images", "warnings": []}
-
-
-def _require_inside(folder: Path, path: Path, name: str) -> None:
-    """A frame must not name a file of somebody else on this machine."""
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise InputError(
-            "unsafe_path",
-            "names a file outside of the dataset.",
-            where=name,
-            mend="Name images by their path relative to transforms.json, inside what you send.",
-        )
 
 
 def confine() -> None:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from biresnerf.compare.cell import Perturbation, Scene
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.folder import look_into
-from biresnerf.data.transforms_json import read_transforms, refuse_too_few
+from biresnerf.data.named_images import refuse_too_few
+from biresnerf.data.transforms_json import read_transforms
 from biresnerf.errors import InputError
 
 TRAIN_NAME, TEST_NAME = "transforms_train.json", "transforms_test.json"
@@ -32,7 +33,7 @@ def find_scene(path: Path, every: int, test_views: int) -> Scene:
     Views of a transforms_test.json beside a transforms_train.json are test views.
 
     Raises:
-        InputError: what `read_transforms` says, or ``poses_missing`` for a folder of images alone.
+        InputError: what `read_transforms` says, or ``poses_missing`` where images have none.
     """
     file = path
     if path.is_dir():
@@ -61,7 +62,15 @@ def find_scene(path: Path, every: int, test_views: int) -> Scene:
         every=every,
         test_views=test_views if test_file is not None else 0,
     )
-    refuse_too_few(len(read_scene(scene)), f"{file} (every {every})")
+    views = read_scene(scene)
+    refuse_too_few(len(views), f"{file} (every {every})")
+    if not views.posed.all():
+        raise InputError(
+            "poses_missing",
+            f"{int((~views.posed).sum())} of {len(views)} frames have no true pose to compare with.",
+            where=str(file),
+            mend="Remove these frames.",
+        )
     read_test_views(scene)
     return scene
 

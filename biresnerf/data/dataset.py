@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 # Guesses from other images: worth trying, not worth believing.
 GUESSES: frozenset[PoseSource] = frozenset({"neighbours", "nearest-view"})
 IntrinsicsSource = Literal["given", "exif", "colmap", "guessed"]
-Dialect = Literal["nerfstudio", "instant-ngp", "blender", "images"]
+Dialect = Literal[
+    "nerfstudio", "instant-ngp", "blender", "images", "colmap", "llff", "tum", "kitti", "bundler", "metashape"
+]
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,8 @@ class Frame:
         mask: a file that says which pixels count: where it is black they do not.
         orientation: EXIF orientation (1 to 8) by which stored pixels are turned first; camera, pose and mask are
             for the turned picture. 1 where they are for pixels as stored.
+        mask_inverted: the mask means the opposite: pixels count where it is black (instant-ngp's dynamic_mask_*).
+        timestamp_s: when it was taken, where a trajectory said so.
     """
 
     name: str
@@ -75,6 +79,8 @@ class Frame:
     raw: dict[str, Any] = field(default_factory=dict)
     mask: Path | None = None
     orientation: int = 1
+    mask_inverted: bool = False
+    timestamp_s: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +89,7 @@ class SourceFormat:
 
     Attributes:
         dialect: which convention the input follows; ``images`` for a folder without poses.
-        file: the transforms file, or None for a folder of images.
+        file: the transforms file, or None for other inputs.
         document: its top-level values other than ``frames``, in their order; and the place of ``frames`` kept
             as a None.
         applied_transform: float64 [4, 4] rigid motion of nerfstudio's key, identity where there is none.
@@ -91,6 +97,7 @@ class SourceFormat:
             ``applied_scale * (applied_transform @ x)``.
         colmap: the model that the input was, with its ids, rigs and points; ``Frame.name`` is then its name of the
             image. None for other inputs.
+        files: all files but images and masks that were read.
     """
 
     dialect: Dialect
@@ -99,6 +106,7 @@ class SourceFormat:
     applied_transform: NDArray[np.float64]
     applied_scale: float = 1.0
     colmap: ColmapModel | None = None
+    files: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

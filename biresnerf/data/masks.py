@@ -36,7 +36,7 @@ def load_mask(frame: Frame, camera: Camera) -> NDArray[np.bool_] | None:
     """Which pixels count, bool [h, w] at the mask's own size, turned as the photo; None where there is no mask.
 
     Any kind of picture will do. A pixel counts unless it is black; in formats with losses, unless it is darker than
-    the middle; a transparent one does not.
+    the middle; a transparent one does not. An inverted mask (``Frame.mask_inverted``) means the opposite.
 
     Raises:
         InputError: ``mask_size_mismatch`` where the mask is no copy of the photo's shape, ``mask_hides_image`` where
@@ -49,7 +49,7 @@ def load_mask(frame: Frame, camera: Camera) -> NDArray[np.bool_] | None:
         turn = _turn_to_fit(frame, camera, header.width, header.height, header.orientation)
         try:
             image.load()
-            counts = as_stored(_not_black(image), image, header.orientation)
+            counts = as_stored(_not_black(image) ^ frame.mask_inverted, image, header.orientation)
         except DAMAGED:
             raise InputError(
                 "image_truncated", "is cut off or damaged.", where=_where(frame), mend="Copy the mask again."
@@ -57,7 +57,7 @@ def load_mask(frame: Frame, camera: Camera) -> NDArray[np.bool_] | None:
     if counts.mean() < LEAST_SHARE:
         raise InputError(
             "mask_hides_image",
-            f"leaves {100 * counts.mean():.2g} % of the photo: black pixels do not count, all others do.",
+            f"leaves {100 * counts.mean():.2g} % of the photo: {_meaning(frame)}.",
             where=_where(frame),
             mend="Invert the mask if it means the opposite; else remove the frame, or its mask.",
         )
@@ -92,6 +92,12 @@ def write_masks(dataset: Dataset, names: Sequence[str], folder: Path) -> bool:
         full = shrink_mask(counts, camera.width, camera.height)
         Image.fromarray(full.astype(np.uint8) * 255).save(path)
     return found
+
+
+def _meaning(frame: Frame) -> str:
+    if frame.mask_inverted:
+        return "black pixels count, all others do not"
+    return "black pixels do not count, all others do"
 
 
 def _where(frame: Frame) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -96,3 +97,17 @@ def _nearest_rotation(block: NDArray[np.float64], where: str) -> tuple[NDArray[n
             "pose_not_rotation", "the rotation mirrors (determinant -1).", where=where, mend=_REFLECTION_MEND
         )
     return u @ vt, deviation
+
+
+def refuse_coinciding(poses: Sequence[NDArray[np.float64]], where: str) -> None:
+    """Raises InputError ``poses_coincide`` where ``poses`` [n, 4, 4], two or more, all stand at one point."""
+    if len(poses) < 2:
+        return
+    centres = np.stack(poses)[:, :3, 3]
+    if np.ptp(centres, axis=0).max() <= 1e-9 * max(1.0, float(np.abs(centres).max())):
+        raise InputError(
+            "poses_coincide",
+            "all cameras stand at one point, so there is no parallax to work from.",
+            where=where,
+            mend="Give poses with different positions, or the images alone to have them found by COLMAP.",
+        )

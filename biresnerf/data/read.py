@@ -2,49 +2,62 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from biresnerf.data.bundler import read_bundler
+from biresnerf.data.colmap_dataset import read_colmap_dataset
 from biresnerf.data.dataset import Dataset
-from biresnerf.data.folder import look_into
+from biresnerf.data.folder import FolderContents, PoseForm, look_at, look_into
 from biresnerf.data.image_folder import read_image_folder
+from biresnerf.data.llff import read_llff
+from biresnerf.data.masks import refuse_unfit_mask
+from biresnerf.data.metashape import read_metashape
+from biresnerf.data.trajectory import read_trajectory
 from biresnerf.data.transforms_json import read_transforms
 from biresnerf.errors import InputError
 
+# (root, the file or the model's folder, within) -> Dataset
+_READERS: dict[PoseForm, Callable[[Path, Path, Path | None], Dataset]] = {
+    "transforms": lambda _root, file, within: read_transforms(file, within),
+    "colmap": read_colmap_dataset,
+    "llff": read_llff,
+    "bundler": read_bundler,
+    "metashape": read_metashape,
+    "trajectory": read_trajectory,
+}
+
 
 def read_dataset(path: Path, within: Path | None = None) -> Dataset:
-    """Reads a transforms file, a folder with one, or a folder of images, whose frames then have no pose.
+    """Reads poses in any form that docs/formats.md names, with their images, or a folder of images alone.
 
-    Everything is validated but the pixels, which `biresnerf.data.images.load_images` decodes.
-    `biresnerf.data.seed_colmap.seed_poses` finds poses that are missing.
+    Everything is validated but the pixels, which `biresnerf.data.images.load_images` decodes. Frames may lack poses:
+    `biresnerf.data.seed_poses.seed_poses` finds them.
 
     Args:
-        path: a transforms.json (nerfstudio, instant-ngp or Blender dialect) or a folder.
-        within: refuse images outside of this folder; for files of strangers.
+        path: a folder, or the file in it that has the poses.
+        within: refuse files outside of this folder; for files of strangers.
 
     Raises:
         InputError: the input cannot be used; says the file, the field and the mend.
     """
-    path = Path(path)
+    contents = find_input(Path(path))
+    if contents.form is None or contents.poses is None:
+        dataset = read_image_folder(contents.root, contents.images, within)
+    else:
+        dataset = _READERS[contents.form](contents.root, contents.poses, within)
+    for index, frame in enumerate(dataset.frames):
+        refuse_unfit_mask(frame, dataset.camera_of(index))
+    return replace(dataset, warnings=contents.notes + dataset.warnings)
+
+
+def find_input(path: Path) -> FolderContents:
+    """What of ``path`` is read. Raises InputError where nothing is there that can be."""
     if path.is_file():
-        _refuse_other_files(path)
-        return read_transforms(path, within)
-    if not path.is_dir():
-        raise InputError(
-            "input_missing", "does not exist.", where=str(path), mend="Give a folder or a transforms.json."
-        )
-    contents = look_into(path)
-    if contents.transforms is not None:
-        dataset = read_transforms(contents.transforms, within)
-        return replace(dataset, warnings=contents.notes + dataset.warnings)
-    return read_image_folder(contents.root, contents.images)
-
-
-def _refuse_other_files(path: Path) -> None:
-    if path.suffix.lower() != ".json":
-        raise InputError(
-            "input_unsupported",
-            "is neither a folder nor a .json file.",
-            where=path.name,
-            mend="Give a transforms.json, or a folder that holds one or the images.",
-        )
+        return look_at(path)
+    if path.is_dir():
+        return look_into(path)
+    raise InputError(
+        "input_missing", "does not exist.", where=str(path), mend="Give a folder or a transforms.json."
+    )

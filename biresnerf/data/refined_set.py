@@ -111,6 +111,7 @@ def refined_set(
 
     Args:
         given: the poses before; those of the dataset where left out.
+        timestamps_s: of the images; those of the dataset where left out.
 
     Raises:
         ValueError: poses are not finite or not of all images.
@@ -160,5 +161,11 @@ def refined_set(
         image_ids,
         "none",
         similarity or Similarity.identity(),
-        timestamps_s,
+        _times(dataset) if timestamps_s is None else timestamps_s,
     )
+
+
+def _times(dataset: Dataset) -> tuple[float, ...] | None:
+    """When the images were taken, where the input says it of all of them."""
+    times = tuple(frame.timestamp_s for frame in dataset.frames if frame.timestamp_s is not None)
+    return times if len(times) == len(dataset) else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +11,22 @@ from numpy.typing import NDArray
 
 from biresnerf.data.conventions import world_from_cam_of_file
 from biresnerf.data.dataset import Camera, Dataset, Dialect, Frame, SourceFormat
-from biresnerf.data.image_files import ImageHeader, find_image, is_image_name, read_header
+from biresnerf.data.image_files import ImageHeader, read_header
 from biresnerf.data.intrinsics_json import Fields, camera_of_frame
 from biresnerf.data.json_document import read_json_object
+from biresnerf.data.mask_files import dynamic_mask, named_mask
+from biresnerf.data.named_images import (
+    few_names,
+    find_images,
+    refuse_names_outside,
+    refuse_too_few,
+    unused_image_notes,
+)
+from biresnerf.data.older_nerfstudio import applied_transform_left_out
 from biresnerf.data.orientation import meant_orientations, orientation_notes, page_notes, turned_header
-from biresnerf.data.poses import ROTATION_WARNED, rigid_matrix
+from biresnerf.data.poses import ROTATION_WARNED, refuse_coinciding, rigid_matrix
 from biresnerf.errors import InputError
 
-MIN_IMAGES = 3  # two views leave scale and much else open
 _NGP_KEYS = frozenset(
     {"aabb_scale", "scale", "offset", "is_fisheye", "sharpness", "x_fov", "enable_depth_loading"}
 )
@@ -37,39 +45,29 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
     """
     document = read_json_object(path)
     rows = _frame_objects(document, path.name)
-    source = _source_format(document, path)
     names = _names(rows, path.name)
     if within is not None:
-        _refuse_outside(path, names, within)
-    paths = _find_images(path, names)
-    _refuse_missing_poses(rows, names, path.name)
+        refuse_names_outside(path, names, within, "file_path")
+    paths = find_images(path, names)
+    source, notes = _source_format(document, path)
     stored = [read_header(image, name) for image, name in zip(paths, names, strict=True)]
     sizes = [_named_size(row, document) for row in rows]
     orientations = meant_orientations(stored, sizes)
     headers = [turned_header(header, o) for header, o in zip(stored, orientations, strict=True)]
-    cameras, camera_indices, notes = _cameras(rows, source, headers, names, path.name)
+    cameras, camera_indices, more = _cameras(rows, source, headers, names, path.name)
     poses, pose_notes = _poses(rows, names, source, path.name)
-    notes += (
-        pose_notes
-        + orientation_notes(stored, orientations, names)
-        + page_notes(stored, names)
-        + _ignored_notes(rows, document)
-    )
-    notes += _unused_image_notes(paths)
+    masks = _masks(path, rows, paths, within)
+    notes += more + pose_notes + orientation_notes(stored, orientations, names) + page_notes(stored, names)
+    notes += _other_notes(rows, document, masks)
+    notes += unused_image_notes(paths, [mask for mask, _ in masks if mask is not None])
     frames = tuple(
-        Frame(name, image, camera, pose, "given", row, orientation=orientation)
-        for name, image, camera, pose, row, orientation in zip(
-            names, paths, camera_indices, poses, rows, orientations, strict=True
+        Frame(
+            name, paths[i], camera_indices[i], poses[i], "given" if poses[i] is not None else None, rows[i],
+            mask=masks[i][0], mask_inverted=masks[i][1], orientation=orientations[i],
         )
-    )
+        for i, name in enumerate(names)
+    )  # fmt: skip
     return Dataset(path.parent, cameras, frames, source, tuple(notes))
-
-
-def few_names(names: Iterable[str], limit: int = 5) -> str:
-    """A short list for a message: the first ``limit`` names and how many more."""
-    listed = list(names)
-    more = f" and {len(listed) - limit} more" if len(listed) > limit else ""
-    return ", ".join(listed[:limit]) + more
 
 
 def _named_size(row: dict[str, Any], document: dict[str, Any]) -> tuple[float | None, float | None]:
@@ -104,18 +102,7 @@ def _frame_objects(document: dict[str, Any], file: str) -> list[dict[str, Any]]:
     return rows
 
 
-def refuse_too_few(count: int, where: str) -> None:
-    """Raises InputError ``too_few_images`` where ``count`` images are too few to optimise anything."""
-    if count < MIN_IMAGES:
-        raise InputError(
-            "too_few_images",
-            f"{count} image{'' if count == 1 else 's'}; at least {MIN_IMAGES} are needed.",
-            where=where,
-            mend="Add views that overlap; 20 to 100 are good.",
-        )
-
-
-def _source_format(document: dict[str, Any], path: Path) -> SourceFormat:
+def _source_format(document: dict[str, Any], path: Path) -> tuple[SourceFormat, list[str]]:
     applied = document.get("applied_transform")
     matrix, scale = np.eye(4), document.get("applied_scale", 1.0)
     if applied is not None:
@@ -127,8 +114,17 @@ def _source_format(document: dict[str, Any], path: Path) -> SourceFormat:
             where=f"{path.name} applied_scale",
             mend="Remove the key, or give the factor that was applied to the positions.",
         )
+    dialect, notes = _dialect(document), []
+    if applied is None and dialect == "nerfstudio":
+        older = applied_transform_left_out(path, document["frames"])
+        if older is not None:
+            matrix = older
+            notes.append(
+                "applied_transform is not given; colmap/sparse/0 shows that it was older nerfstudio's, so that model's "
+                "world is taken for the result's COLMAP model"
+            )
     kept = {key: None if key == "frames" else value for key, value in document.items()}
-    return SourceFormat(_dialect(document), path, kept, matrix, float(scale))
+    return SourceFormat(dialect, path, kept, matrix, float(scale), files=(path,)), notes
 
 
 def _dialect(document: dict[str, Any]) -> Dialect:
@@ -159,62 +155,6 @@ def _names(rows: list[dict[str, Any]], file: str) -> list[str]:
     return names
 
 
-def _refuse_outside(path: Path, names: list[str], within: Path) -> None:
-    """Names that lead out of ``within`` are refused before anything is looked for there, links included."""
-    limit = within.resolve()
-    for index, name in enumerate(names):
-        for spelling in (name, name.replace("\\", "/")):
-            if not _lies_in(path.parent / spelling, limit):
-                raise InputError(
-                    "unsafe_path",
-                    f"{name[:100]!r} leads out of the image set's folder.",
-                    where=f"{path.name} frames[{index}].file_path",
-                    mend="Name images by their path relative to this file, inside the folder.",
-                )
-
-
-def _lies_in(path: Path, limit: Path) -> bool:
-    try:
-        return path.resolve().is_relative_to(limit)
-    except (OSError, ValueError):  # too long, or a NUL in it: no such file anyway
-        return False
-
-
-def _find_images(path: Path, names: list[str]) -> list[Path]:
-    found = [find_image(path.parent, name) for name in names]
-    missing = [index for index, image in enumerate(found) if image is None]
-    if missing:
-        raise InputError(
-            "image_missing",
-            f"{len(missing)} of {len(names)} images not found: {few_names(names[i] for i in missing)}.",
-            where=f"{path.name} frames[{missing[0]}].file_path",
-            mend="Put the images there (paths are relative to the file), or remove their frames.",
-        )
-    images = [image for image in found if image is not None]
-    places: dict[str, int] = {}
-    for index, image in enumerate(images):
-        first = places.setdefault(str(image.resolve()), index)
-        if first != index:
-            raise InputError(
-                "duplicate_image",
-                f"{names[index]!r} is the same file as {names[first]!r} in frames[{first}].",
-                where=f"{path.name} frames[{index}].file_path",
-                mend="Remove one of the two frames.",
-            )
-    return images
-
-
-def _refuse_missing_poses(rows: list[dict[str, Any]], names: list[str], file: str) -> None:
-    without = [index for index, row in enumerate(rows) if row.get("transform_matrix") is None]
-    if without:
-        raise InputError(
-            "pose_missing",
-            f"{len(without)} of {len(rows)} frames have no pose: {few_names(names[i] for i in without)}.",
-            where=f"{file} frames[{without[0]}].transform_matrix",
-            mend="Remove these frames, or give a folder of images alone to have all poses found by COLMAP.",
-        )
-
-
 def _cameras(
     rows: list[dict[str, Any]], source: SourceFormat, headers: list[ImageHeader], names: list[str], file: str
 ) -> tuple[tuple[Camera, ...], list[int], list[str]]:
@@ -242,52 +182,50 @@ def _cameras(
 
 def _poses(
     rows: list[dict[str, Any]], names: list[str], source: SourceFormat, file: str
-) -> tuple[NDArray[np.float64], list[str]]:
-    matrices, worst, worst_name = [], 0.0, ""
+) -> tuple[list[NDArray[np.float64] | None], list[str]]:
+    """Each frame's pose, or None where the file has none for it, and notes."""
+    poses: list[NDArray[np.float64] | None] = []
+    worst, worst_name = 0.0, ""
     for index, (row, name) in enumerate(zip(rows, names, strict=True)):
+        if row.get("transform_matrix") is None:
+            poses.append(None)
+            continue
         matrix, deviation = rigid_matrix(row["transform_matrix"], f"{file} frames[{index}].transform_matrix")
-        matrices.append(matrix)
+        poses.append(world_from_cam_of_file(matrix, source.applied_transform, source.applied_scale))
         if deviation > worst:
             worst, worst_name = deviation, name
     notes = []
     if worst > ROTATION_WARNED:
         notes.append(f"rotations were made orthonormal; the worst was off by {worst:.1e} ({worst_name})")
-    poses = world_from_cam_of_file(np.stack(matrices), source.applied_transform, source.applied_scale)
-    centres = poses[:, :3, 3]
-    if np.ptp(centres, axis=0).max() <= 1e-9 * max(1.0, float(np.abs(centres).max())):
-        raise InputError(
-            "poses_coincide",
-            "all cameras stand at one point, so there is no parallax to work from.",
-            where=f"{file} frames",
-            mend="Give poses with different positions, or the images alone to have them found by COLMAP.",
-        )
+    without = [name for name, pose in zip(names, poses, strict=True) if pose is None]
+    if without:
+        notes.append(f"{len(without)} of {len(rows)} frames have no pose yet: {few_names(without)}")
+    refuse_coinciding([pose for pose in poses if pose is not None], f"{file} frames")
     return poses, notes
 
 
-def _ignored_notes(rows: list[dict[str, Any]], document: dict[str, Any]) -> list[str]:
+def _masks(
+    path: Path, rows: list[dict[str, Any]], images: Sequence[Path], within: Path | None
+) -> list[tuple[Path | None, bool]]:
+    """Each frame's mask, its own or instant-ngp's beside the image, and whether it is black where pixels count."""
+    masks = []
+    for index, (row, image) in enumerate(zip(rows, images, strict=True)):
+        name = row.get("mask_path")
+        where = f"{path.name} frames[{index}].mask_path"
+        if name is None:
+            masks.append(dynamic_mask(image, within))
+        else:
+            masks.append((named_mask(path, name, where, within), False))
+    return masks
+
+
+def _other_notes(
+    rows: list[dict[str, Any]], document: dict[str, Any], masks: list[tuple[Path | None, bool]]
+) -> list[str]:
     notes = []
-    if any("mask_path" in row or "mask" in row for row in rows):
-        notes.append("masks are not used yet: masked pixels count like all others")
+    masked = sum(mask is not None for mask, _ in masks)
+    if masked:
+        notes.append(f"masks were found for {masked} of {len(rows)} images")
     if any(row.get("rolling_shutter") or document.get("rolling_shutter") for row in rows):
         notes.append("rolling_shutter is not modelled")
     return notes
-
-
-def _unused_image_notes(paths: list[Path]) -> list[str]:
-    used = {path.resolve() for path in paths}
-    suffixes = {path.suffix.lower() for path in paths}
-    unused = []
-    for folder in sorted({path.parent.resolve() for path in paths}):
-        for path in sorted(folder.iterdir()):
-            if (
-                path.suffix.lower() in suffixes
-                and is_image_name(path)
-                and path not in used
-                and path.is_file()
-            ):
-                unused.append(path.name)
-    if not unused:
-        return []
-    return [
-        f"{len(unused)} images beside the used ones have no frame and are left out: {few_names(unused, 3)}"
-    ]

@@ -39,7 +39,7 @@ def write_transforms(dataset: Dataset, world_from_cam: NDArray[np.float64], path
         )
         for index, matrix in enumerate(matrices)
     ]
-    if source.dialect == "images":
+    if not source.document:
         document = _with_intrinsics(document, dataset)
     with whole_file(path) as temporary:
         temporary.write_text(

@@ -95,12 +95,8 @@ BAD = {
     "scaled": ("pose_not_rotation", "frames[1].transform_matrix", _scaled_rotation),
     "mirrored": ("pose_not_rotation", "frames[1].transform_matrix", _mirrored),
     "one place": ("poses_coincide", "frames", _same_place),
-    "no pose": (
-        "pose_missing",
-        "frames[2].transform_matrix",
-        lambda d: d["frames"][2].pop("transform_matrix"),
-    ),
-    "null pose": ("pose_missing", "frames[2].transform_matrix", _frame(2, transform_matrix=None)),
+    "no such mask": ("mask_missing", "frames[2].mask_path", _frame(2, mask_path="masks/2.png")),
+    "number for a mask": ("mask_missing", "frames[2].mask_path", _frame(2, mask_path=7)),
     "no image name": (
         "frame_without_image",
         "frames[1].file_path",
@@ -223,6 +219,10 @@ def test_names_that_lead_out_of_a_strangers_folder_are_refused_whether_or_not_th
     with pytest.raises(InputError) as caught:
         read_transforms(save(folder, document), within=folder)
     assert_complete(caught.value, "unsafe_path", "transforms.json", "frames[1].file_path")
+    document["frames"][1] |= {"file_path": "images/001.jpg", "mask_path": name}
+    with pytest.raises(InputError) as caught:
+        read_transforms(save(folder, document), within=folder)
+    assert_complete(caught.value, "unsafe_path", "transforms.json", "frames[1].mask_path")
 
 
 def test_a_file_that_is_no_json_is_refused_by_its_name(tmp_path):

@@ -52,20 +52,43 @@ def test_a_folder_without_images_is_refused(tmp_path):
     assert_complete(caught.value, "no_images", tmp_path.name)
 
 
-@pytest.mark.parametrize("name", ["sparse/0/cameras.bin", "poses_bounds.npy", "sparse_txt/cameras.txt"])
-def test_poses_in_other_forms_are_not_thrown_away(tmp_path, name):
-    for index in range(3):
-        write_image(tmp_path / f"images/{index}.png")
-    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+FORMS = {
+    "transforms.json": "transforms",
+    "sparse/0": "colmap",
+    "colmap/sparse/0": "colmap",
+    "poses_bounds.npy": "llff",
+    "bundle.out": "bundler",
+    "cameras.xml": "metashape",
+    "trajectory.txt": "trajectory",
+}
+
+
+def test_the_first_form_in_the_order_is_read_and_the_others_are_said(tmp_path):
+    present = list(FORMS)
+    for name in present:
+        path = tmp_path / name
+        if FORMS[name] == "colmap":
+            path.mkdir(parents=True)
+            (path / "cameras.bin").touch()
+            (path / "images.bin").touch()
+        else:
+            path.write_text("<document><chunk>" if path.suffix == ".xml" else "")
+    write_image(tmp_path / "images/0.png")
+    while present:
+        contents = look_into(tmp_path)
+        assert contents.form == FORMS[present[0]]
+        assert contents.root == tmp_path
+        if len(present) > 1:
+            were = "were not" if len(present) > 2 else "was not"
+            assert contents.notes == (f"{present[0]} was read and {', '.join(present[1:])} {were}",)
+        path = tmp_path / present.pop(0)
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    assert look_into(tmp_path).form is None
+
+
+@pytest.mark.parametrize("name", ["poses.bin", "video.mp4", "scene.ply"])
+def test_a_file_in_no_form_that_is_read_is_refused(tmp_path, name):
     (tmp_path / name).touch()
     with pytest.raises(InputError) as caught:
-        read_dataset(tmp_path)
-    assert_complete(caught.value, "pose_format_unsupported", name)
-
-
-def test_a_transforms_file_goes_before_other_forms(tmp_path):
-    save(tmp_path, nerfstudio_scene(tmp_path))
-    (tmp_path / "sparse/0").mkdir(parents=True)
-    (tmp_path / "sparse/0/cameras.bin").touch()
-    assert len(read_dataset(tmp_path)) == 4
-    shutil.rmtree(tmp_path / "sparse")
+        read_dataset(tmp_path / name)
+    assert_complete(caught.value, "input_unsupported", name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from pathlib import Path
@@ -11,7 +12,10 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.dataset import Camera
+from biresnerf.data.packs.colmap_binary import write_colmap_binary
 from biresnerf.data.read import read_dataset
+from biresnerf.data.refined_set import refined_set
+from biresnerf.data.write import write_transforms
 from tests.data.scenes import (
     HEIGHT,
     WIDTH,
@@ -219,10 +223,60 @@ def test_an_exif_orientation_is_said_and_left_alone(tmp_path):
     assert "images/002.jpg" in dataset.warnings[0]
 
 
-def test_unused_masks_and_images_without_frame_are_said(tmp_path):
+def test_images_without_frame_are_left_out_and_said(tmp_path):
     document = nerfstudio_scene(tmp_path, count=5)
     del document["frames"][4]
+    dataset = read_dataset(save(tmp_path, document))
+    assert len(dataset) == 4
+    assert any("004.jpg" in text for text in dataset.warnings)
+
+
+@pytest.mark.parametrize("without", [[2], [0, 3], [0, 1, 2, 3]])
+def test_frames_without_a_matrix_have_no_pose_yet_and_keep_their_camera(tmp_path, without):
+    document = nerfstudio_scene(tmp_path)
+    for index in without:
+        document["frames"][index]["transform_matrix"] = None
+    del document["frames"][without[0]]["transform_matrix"]
+    dataset = read_dataset(save(tmp_path, document))
+    assert dataset.posed.tolist() == [index not in without for index in range(4)]
+    assert [frame.pose_source for frame in dataset.frames] == [
+        None if index in without else "given" for index in range(4)
+    ]
+    assert len(dataset.cameras) == 1
+    assert any(f"{len(without)} of 4 frames have no pose yet" in text for text in dataset.warnings)
+
+
+def test_masks_are_found_by_their_path_or_as_instant_ngp_names_them_which_means_the_opposite(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    for name in ("masks/000.png", "images/dynamic_mask_001.png", "images/dynamic_mask_000.png"):
+        write_image(tmp_path / name, mode="L")
     document["frames"][0]["mask_path"] = "masks/000.png"
-    warnings = read_dataset(save(tmp_path, document)).warnings
-    assert any("masks" in text for text in warnings)
-    assert any("004.jpg" in text for text in warnings)
+    dataset = read_dataset(save(tmp_path, document))
+    assert [(f.mask, f.mask_inverted) for f in dataset.frames] == [
+        (tmp_path / "masks/000.png", False),
+        (tmp_path / "images/dynamic_mask_001.png", True),
+        (None, False),
+        (None, False),
+    ]
+    assert dataset.warnings == ("masks were found for 2 of 4 images",)
+
+
+def test_the_turn_that_older_nerfstudio_left_out_is_taken_from_the_model_that_shows_it(tmp_path):
+    turn = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+    document = nerfstudio_scene(tmp_path)
+    originals = read_dataset(save(tmp_path, document)).world_from_cam
+    write_colmap_binary(refined_set(read_dataset(tmp_path), originals).model, tmp_path / "colmap/sparse/0")
+    dataset = read_dataset(tmp_path)  # the model agrees with the file as it stands: nothing was left out
+    np.testing.assert_array_equal(dataset.source.applied_transform, np.eye(4))
+    for row in document["frames"]:
+        row["transform_matrix"] = (turn @ np.array(row["transform_matrix"])).tolist()
+    dataset = read_dataset(save(tmp_path, document))
+    np.testing.assert_array_equal(dataset.source.applied_transform, turn)
+    np.testing.assert_allclose(dataset.world_from_cam, originals, atol=1e-12)
+    assert any("colmap/sparse/0 shows" in text for text in dataset.warnings)
+    write_transforms(dataset, dataset.world_from_cam, tmp_path / "out.json")
+    assert "applied_transform" not in json.loads((tmp_path / "out.json").read_text())
+    for row, other in zip(
+        document["frames"], json.loads((tmp_path / "out.json").read_text())["frames"], strict=True
+    ):
+        np.testing.assert_allclose(row["transform_matrix"], other["transform_matrix"], atol=1e-12)

@@ -149,7 +149,6 @@ BAD: dict[str, tuple[Callable[[Files], object], str | None, str]] = {
     "two images only": (edited(lambda d: d.update(frames=d["frames"][:2])), None, "transforms.json"),
     "same name twice": (with_frame(file_path="./train/r_1"), None, "r_1"),
     "frame without name": (edited(lambda d: d["frames"][2].pop("file_path")), None, "transforms.json"),
-    "frame without pose": (edited(lambda d: d["frames"][2].pop("transform_matrix")), None, ""),
     "NaN in a pose": (with_entry(float("nan")), None, ""),
     "no rotation": (with_entry(3.0), None, ""),
     "unknown camera model": (edited(lambda d: d.update(camera_model="PANINI")), None, "camera_model"),

@@ -8,8 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from biresnerf.data.read import read_dataset
 from biresnerf.errors import InputError
 from service.pack import look_at, zipped
+from tests.data import trajectories
+from tests.data.scenes import write_image
 from tests.service.conftest import scene_files
 
 
@@ -76,3 +79,32 @@ def test_an_image_outside_of_the_folder_is_refused_with_a_mend(scene: Path, tmp_
 def test_what_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         look_at(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize(
+    ("given", "sent"),
+    [
+        ("", ["sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"]),
+        ("sparse/0", ["sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"]),
+        ("poses_bounds.npy", ["poses_bounds.npy"]),
+        ("walk.txt", ["trajectory.txt", "camera.json"]),
+    ],
+)
+def test_poses_in_other_forms_are_sent_with_their_images_and_masks(
+    tmp_path: Path, given: str, sent: list[str]
+) -> None:
+    trajectories.colmap_set(tmp_path)
+    trajectories.llff_set(tmp_path)
+    trajectories.tum_set(tmp_path, ["0", "1", "2", "3"]).rename(tmp_path / "walk.txt")
+    write_image(tmp_path / "masks/a.png.png", mode="L")
+    (tmp_path / "notes.txt").write_text("private")
+    packed = look_at(tmp_path / given)
+    images = [f"images/{name}" for name in trajectories.NAMES]
+    assert [name for name, _ in packed.files] == [*sent, *images, "masks/a.png.png"]
+    unpacked = tmp_path / "there"
+    for name, content in unzipped(b"".join(zipped(packed))).items():
+        (unpacked / name).parent.mkdir(parents=True, exist_ok=True)
+        (unpacked / name).write_bytes(content)
+    here, there = read_dataset(tmp_path / given), read_dataset(unpacked)
+    assert there.source.dialect == here.source.dialect
+    assert (there.world_from_cam == here.world_from_cam).all()

@@ -1,0 +1,26 @@
+"""Text from anybody: bounded, UTF-8."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from biresnerf.errors import InputError
+
+MAX_TEXT_BYTES = 64 * 2**20
+
+
+def read_text(path: Path, most_bytes: int = MAX_TEXT_BYTES) -> str:
+    """The text of ``path``. Raises InputError ``pose_file_invalid`` where it is none, or longer than ``most_bytes``."""
+
+    def invalid(what: str) -> InputError:
+        return InputError("pose_file_invalid", what, where=path.name, mend="Export or copy the file again.")
+
+    try:
+        size = path.stat().st_size
+        if size > most_bytes:
+            raise invalid(f"{size / 2**20:.0f} MiB is more than is read ({most_bytes // 2**20} MiB).")
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise invalid(f"cannot be read: {error.strerror}.") from None
+    except UnicodeDecodeError:
+        raise invalid("is not UTF-8 text.") from None
