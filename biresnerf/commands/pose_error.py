@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,10 +36,11 @@ _TITLES = {
 def pose_error_command(result: Path, truth: Path, as_json: bool, paper_compat: bool) -> None:
     """Compare the poses of RESULT with those of TRUTH.
 
-    Both are transforms.json files or folders that hold one. Images are matched by name, with or without
-    extension; they need not be there. "aligned" is after the best similarity of the camera centres, as
-    published tables have it; "robust" after one that single lost cameras do not drag along; "own frame"
-    without any alignment. --paper-compat adds the alignment of the published code with its flaw on flat rigs.
+    Both are files with poses, or folders that hold one, in any form that `refine` reads. Images are matched by name,
+    with or without extension, else by file name alone where just one has it; they need not be there. "aligned" is after
+    the best similarity of the camera centres, as published tables have it; "robust" after one that single lost cameras
+    do not drag along; "own frame" without any alignment. --paper-compat adds the alignment of the published code with
+    its flaw on flat rigs.
     """
     import numpy as np
 
@@ -60,35 +62,51 @@ def pose_error_command(result: Path, truth: Path, as_json: bool, paper_compat: b
     if paper_compat:
         frames["paper_compat"] = paper_compat_error(*both)
     left_out = {"result": len(estimated) - len(pairs), "truth": len(true) - len(pairs)}
+    by_file_name = sum(_bare(name) != _bare(other) for name, other in pairs)
+    names = [name for name, _ in pairs]
     if as_json:
-        click.echo(json.dumps(_as_json(error, frames, [name for name, _ in pairs], left_out)))
+        click.echo(
+            json.dumps({**_as_json(error, frames, names, left_out), "matched_by_file_name": by_file_name})
+        )
     else:
-        click.echo(_as_table(error, frames, [name for name, _ in pairs], left_out))
+        click.echo(_as_table(error, frames, names, left_out))
+        if by_file_name:
+            click.echo(
+                f"\n{by_file_name} images were matched by file name alone, from folders of other names"
+            )
 
 
 def matched_names(estimated: list[str], true: list[str]) -> list[tuple[str, str]]:
     """Pairs (name in the estimate, name in the truth) of the same image, in the order of the estimate.
 
-    Equal names match; else names that differ in the image's extension only, where one file alone has each.
+    Equal names match; else names that differ in the image's extension only, where one file alone has each; else names
+    of which just the last part is the same, by the same rule.
     """
     exact = set(true)
-    by_bare = _names_by_bare(true)
-    estimated_by_bare = _names_by_bare(estimated)
-    pairs = []
-    for name in estimated:
-        candidates = by_bare.get(_bare(name), [])
-        if name in exact:
-            pairs.append((name, name))
-        elif len(candidates) == len(estimated_by_bare[_bare(name)]) == 1:
-            pairs.append((name, candidates[0]))
-    return pairs
+    partner = {name: name for name in estimated if name in exact}
+    for key in (_bare, _bare_file_name):
+        theirs, ours = _grouped(true, key), _grouped(estimated, key)
+        taken = set(partner.values())
+        for name in estimated:
+            candidates = theirs.get(key(name), [])
+            if (
+                name not in partner
+                and len(candidates) == len(ours[key(name)]) == 1
+                and candidates[0] not in taken
+            ):
+                partner[name] = candidates[0]
+    return [(name, partner[name]) for name in estimated if name in partner]
 
 
-def _names_by_bare(names: list[str]) -> dict[str, list[str]]:
+def _grouped(names: list[str], key: Callable[[str], str]) -> dict[str, list[str]]:
     grouped: dict[str, list[str]] = {}
     for name in names:
-        grouped.setdefault(_bare(name), []).append(name)
+        grouped.setdefault(key(name), []).append(name)
     return grouped
+
+
+def _bare_file_name(name: str) -> str:
+    return Path(_bare(name)).name
 
 
 def _bare(name: str) -> str:

@@ -37,7 +37,7 @@ def read_bundler(root: Path, file: Path, within: Path | None = None) -> Dataset:
     """
     entries = read_cameras(file)
     files = image_files(root)
-    names, list_file, notes = _names(root, file, sorted(files), len(entries))
+    names, list_file, notes = names_of_cameras(root, file, sorted(files), len(entries))
     found, more = match_files(names, list(files), lambda i: f"{file.name} camera {i}")
     given = []
     for index, (name, place, (lens, pose)) in enumerate(zip(names, found, entries, strict=True)):
@@ -105,10 +105,17 @@ def _numbers(lines: Sequence[Sequence[str]], rows: int, columns: int, where: str
     return values
 
 
-def _names(
+def names_of_cameras(
     root: Path, file: Path, in_order: list[str], count: int
 ) -> tuple[list[str], Path | None, list[str]]:
-    """The images' names in the order of the cameras, the list they come from, and notes."""
+    """The images' names in the order of the cameras, the list they come from, and notes.
+
+    Args:
+        in_order: what they are called where there is no list.
+
+    Raises:
+        InputError: ``pose_count_mismatch``, or the list is bad.
+    """
     places = [file.parent / "list.txt", *(root / name for name in LIST_NAMES)]
     table = next((path for path in places if path.is_file()), None)
     if table is None:

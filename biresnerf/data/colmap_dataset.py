@@ -60,17 +60,23 @@ def image_files(root: Path) -> dict[str, Path]:
     Raises:
         InputError: ``no_images``.
     """
-    folder = root / IMAGE_FOLDER
-    paths = images_below(folder)
-    if not paths:
-        folder, paths = root, images_in(root)
-    if not paths:
+    files = images_beside(root)
+    if not files:
         raise InputError(
             "no_images",
             "there are poses, but no images.",
             where=str(root),
             mend="Put the images into images/ beside the poses.",
         )
+    return files
+
+
+def images_beside(root: Path) -> dict[str, Path]:
+    """As `image_files`; empty where there are none."""
+    folder = root / IMAGE_FOLDER
+    paths = images_below(folder)
+    if not paths:
+        folder, paths = root, images_in(root)
     return {path.relative_to(folder).as_posix(): path for path in paths}
 
 

@@ -57,6 +57,16 @@ def read_llff(root: Path, file: Path, within: Path | None = None) -> Dataset:
     return dataset_of(root, given, source, [note], within)
 
 
+def read_llff_poses(file: Path) -> list[NDArray[np.float64]]:
+    """``world_from_cam`` [4, 4] of each row. Raises InputError as `read_llff` does."""
+    return [_world_from_cam(row, f"{file.name} row {index}") for index, row in enumerate(_rows(file))]
+
+
+def _world_from_cam(row: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+    down, right, back, centre, _ = row[:15].reshape(3, 5).T
+    return rigid_matrix(np.stack([right, down, -back, centre], axis=1).tolist(), where)[0]
+
+
 def _camera(height: float, width: float, focal: float, where: str) -> Camera:
     whole = 0 < width < 1e6 and 0 < height < 1e6 and width == round(width) and height == round(height)
     if not whole or not 1e-3 * max(width, height) < focal < 1e5 * max(width, height):

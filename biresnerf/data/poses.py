@@ -85,7 +85,7 @@ def _nearest_rotation(block: NDArray[np.float64], where: str) -> tuple[NDArray[n
     u, stretch, vt = np.linalg.svd(block)
     deviation = float(np.abs(stretch - 1.0).max())
     if deviation > ROTATION_REFUSED:
-        if stretch[2] > 1e-12 and stretch[0] / stretch[2] - 1.0 < ROTATION_REFUSED:
+        if stretch[2] > 1e-12 and stretch[0] < (1.0 + ROTATION_REFUSED) * stretch[2]:
             what = f"the rotation is scaled by {stretch.mean():.6g}."
             mend = "Divide the 3 x 3 block by that factor; put a change of scale into the positions alone."
         else:

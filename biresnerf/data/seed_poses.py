@@ -16,8 +16,8 @@ from biresnerf.data.image_likeness import likeness
 from biresnerf.data.map_images import MappedModel, Mapping, known_intrinsics
 from biresnerf.data.match_poses import MatchedPoses, can_match, carry_model
 from biresnerf.data.missing_poses import guess_missing
-from biresnerf.data.remembered_mapping import remembered_mapping
 from biresnerf.data.named_images import MIN_IMAGES, few_names
+from biresnerf.data.remembered_mapping import remembered_mapping
 from biresnerf.errors import InputError, RefinementError
 from biresnerf.geometry.lens import lens_problem
 from biresnerf.geometry.pose_error import rotation_angle_deg

@@ -92,7 +92,7 @@ def read_trajectory(root: Path, file: Path, within: Path | None = None) -> Datas
     trajectory = Trajectory(file)
     files = image_files(root)
     names = sorted(files)
-    pose_of, how = _matched(trajectory, names, root, file)
+    pose_of, how = matched(trajectory, names, root)
     camera, camera_files = read_camera_file(root)
     given = []
     for name in names:
@@ -105,10 +105,16 @@ def read_trajectory(root: Path, file: Path, within: Path | None = None) -> Datas
     return dataset_of(root, given, source, [f"{file.name}: images and poses were matched {how}"], within)
 
 
-def _matched(
-    trajectory: Trajectory, names: Sequence[str], root: Path, file: Path
-) -> tuple[dict[str, int], str]:
-    """Which pose (by index) each image has, and how that was found out."""
+def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[dict[str, int], str]:
+    """Which pose (by index) each image has, and how that was found out: the rules of `read_trajectory`.
+
+    Args:
+        names: of the images, sorted.
+        root: the folder that may hold rgb.txt.
+
+    Raises:
+        InputError: ``pose_count_mismatch``.
+    """
     count, times = len(trajectory.poses), trajectory.times_s
     if trajectory.name_of_time:
         by_base = {PurePosixPath(name).name: name for name in names}
@@ -132,7 +138,7 @@ def _matched(
     raise InputError(
         "pose_count_mismatch",
         f"has {count} poses for {len(names)} images, and nothing says which is whose.",
-        where=file.name,
+        where=trajectory.file.name,
         mend="Name images by their time, add rgb.txt (time and name a line), or give one pose an image.",
     )
 

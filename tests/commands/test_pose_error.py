@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from biresnerf.commands.pose_error import matched_names, pose_error_command
 from biresnerf.errors import InputError
+from tests.data import trajectories
 from tests.geometry.rigs import dome, jitter, similar
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -92,7 +94,47 @@ def test_names_match_by_extension_only_where_nothing_else_tells_them_apart():
     assert matched_names(["a.png", "b"], ["b.JPG", "a"]) == [("a.png", "a"), ("b", "b.JPG")]
     assert matched_names(["a.png", "a.jpg"], ["a.png"]) == [("a.png", "a.png")]
     assert matched_names(["a.png", "a.jpg"], ["a"]) == []
-    assert matched_names(["v1.2", "x/a"], ["v1", "a"]) == []
+    assert matched_names(["v1.2", "x/a"], ["v1", "y/b"]) == []
+
+
+def test_names_match_by_file_name_alone_only_where_one_file_alone_has_it():
+    assert matched_names(["images/a.png", "images/b.png"], ["b.jpg", "a.png"]) == [
+        ("images/a.png", "a.png"),
+        ("images/b.png", "b.jpg"),
+    ]
+    assert matched_names(["left/a.png", "right/a.png"], ["a.png"]) == []
+    assert matched_names(["left/a.png"], ["l/a.png", "r/a.png"]) == []
+    assert matched_names(["a.png", "x/a.png"], ["a.png"]) == [("a.png", "a.png")]
+
+
+@pytest.mark.parametrize("form", ["colmap", "llff", "tum", "kitti", "bundler", "metashape"])
+@pytest.mark.parametrize("with_images", [True, False])
+def test_poses_in_every_form_compare_with_a_transforms_file(tmp_path, form, with_images):
+    scene = tmp_path / "scene"
+    {
+        "colmap": trajectories.colmap_set,
+        "llff": trajectories.llff_set,
+        "tum": lambda folder: trajectories.tum_set(folder, ["0", "1", "2", "3"]),
+        "kitti": trajectories.kitti_set,
+        "bundler": trajectories.bundler_set,
+        "metashape": trajectories.write_images,
+    }[form](scene)
+    if form == "metashape":
+        (scene / "cameras.xml").write_text(trajectories.metashape_xml())
+    named = with_images or form in ("colmap", "bundler", "metashape")
+    if not with_images:
+        shutil.rmtree(scene / "images")
+    truth = write(tmp_path / "truth.json", trajectories.truth())
+    document = json.loads(truth.read_text())
+    for index, row in enumerate(document["frames"]):
+        row["file_path"] = f"images/{trajectories.NAMES[index]}" if named else str(index)
+    truth.write_text(json.dumps(document))
+    error = json.loads(run(scene, truth, "--json"))
+    assert error["cameras"] == 4
+    assert error["own_frame"]["rotation_deg"]["max"] == pytest.approx(0, abs=1e-6)
+    assert error["own_frame"]["centre_percent"]["max"] == pytest.approx(0, abs=1e-9)
+    by_path = form == "bundler" or not named
+    assert error["matched_by_file_name"] == (0 if by_path else 4)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +147,7 @@ def test_names_match_by_extension_only_where_nothing_else_tells_them_apart():
         ('{"frames": [{"file_path": "a"}, {"file_path": "./a"}]}', "duplicate_image", "truth.json frames[1]"),
         ('{"frames": [], "applied_scale": 0}', "pose_file_invalid", "truth.json applied_scale"),
         ('{"frames": []}', "no_common_images", "out.json"),
-        (None, "pose_file_invalid", "truth.json"),
+        (None, "input_missing", "truth.json"),
     ],
 )
 def test_a_file_that_cannot_be_compared_is_named(tmp_path, broken, code, where):

@@ -7,6 +7,7 @@ import pytest
 
 from biresnerf.data.colmap_reader import ColmapModel, model_forms, read_colmap_model, world_from_cam_of
 from biresnerf.data.colmap_scene import RigidPose
+from biresnerf.geometry.camera_models import MODEL_IDS
 from tests.data.colmap_files import TINY_TEXT, by_pycolmap, image_record, tiny_tables, write_tables
 from tests.data.test_real_sets import ROOT
 
@@ -16,6 +17,10 @@ PARAMETERS = {
     "SIMPLE_RADIAL": [700.0, 320.5, 240.25, 0.01],
     "RADIAL": [700.0, 320.5, 240.25, 0.01, -0.002],
     "OPENCV": [700.0, 710.0, 320.5, 240.25, 0.01, -0.002, 0.0005, -0.0003],
+    "FULL_OPENCV": [700.0, 710.0, 320.5, 240.25, 0.01, -0.002, 5e-4, -3e-4, 1e-3, 2e-3, -1e-3, 1e-4],
+    "SIMPLE_RADIAL_FISHEYE": [400.0, 320.5, 240.25, 0.01],
+    "RADIAL_FISHEYE": [400.0, 320.5, 240.25, 0.01, -0.002],
+    "OPENCV_FISHEYE": [400.0, 410.0, 320.5, 240.25, 0.01, -0.002, 1e-3, -1e-4],
 }
 
 
@@ -69,6 +74,10 @@ def assert_reads_as_pycolmap(model: ColmapModel, said):
         assert frame.rig_id == rig_id
         assert_same_pose(frame.rig_from_world, pose)
         assert sorted([*sensor, data] for sensor, data in frame.data_ids) == data_ids
+
+
+def test_every_supported_camera_model_is_among_those_tested():
+    assert PARAMETERS.keys() == MODEL_IDS.keys()
 
 
 def test_random_models_of_every_camera_model_and_with_rigs_read_as_pycolmap_reads_them(tmp_path):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from biresnerf.data.dataset import Camera
+from biresnerf.data.masks import load_mask
 from biresnerf.data.packs.colmap_binary import write_colmap_binary
 from biresnerf.data.read import read_dataset
 from biresnerf.data.refined_set import refined_set
 from biresnerf.data.write import write_transforms
+from biresnerf.errors import InputError
 from tests.data import trajectories
 from tests.data.scenes import HEIGHT, WIDTH, write_image
 from tests.data.test_real_sets import ROOT
@@ -138,8 +141,6 @@ def test_colmaps_masks_and_instant_ngps_are_found(tmp_path, names):
 
 
 def test_a_stored_photo_that_its_camera_means_turned_is_turned(tmp_path):
-    from PIL import Image
-
     trajectories.colmap_set(tmp_path)
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -307,6 +308,34 @@ def test_a_metashape_export_is_read_by_its_labels(tmp_path):
     assert dataset.names == NAMES
     # Metashape's p1 is COLMAP's p2.
     assert dataset.cameras == (Camera("OPENCV", 20, 16, (18.0, 18.5, 10.25, 7.75, 0.01, 0.0, 0.0, 0.001)),)
+
+
+def test_metashapes_third_radial_term_makes_the_camera_full_opencv(tmp_path):
+    trajectories.write_images(tmp_path)
+    (tmp_path / "cameras.xml").write_text(trajectories.metashape_xml("<k1>0.01</k1><k3>0.001</k3>"))
+    camera = read_dataset(tmp_path).cameras[0]
+    assert (camera.model, camera.params[4:]) == ("FULL_OPENCV", (0.01, 0, 0, 0, 0.001, 0, 0, 0))
+
+
+def test_a_mask_of_another_shape_is_refused_when_the_set_is_read(tmp_path):
+    trajectories.colmap_set(tmp_path)
+    write_image(tmp_path / "masks/b.png.png", size=(WIDTH, 2 * HEIGHT), mode="L")
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path)
+    assert caught.value.code == "mask_size_mismatch"
+
+
+def test_instant_ngps_mask_means_the_opposite_of_colmaps(tmp_path):
+    trajectories.colmap_set(tmp_path)
+    picture = np.zeros((HEIGHT, WIDTH), np.uint8)
+    picture[:4] = 255
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(picture).save(tmp_path / "masks/a.png.png")
+    Image.fromarray(picture).save(tmp_path / "images/dynamic_mask_b.png")
+    dataset = read_dataset(tmp_path)
+    white_counts, black_counts = (load_mask(dataset.frames[i], dataset.camera_of(i)) for i in range(2))
+    np.testing.assert_array_equal(white_counts, picture > 0)
+    np.testing.assert_array_equal(black_counts, picture == 0)
 
 
 def test_metashapes_tangential_terms_move_a_point_as_its_manual_says(tmp_path):
