@@ -113,6 +113,7 @@ class Run:
             self.report(Progress(stage="exporting", fraction=EXPORTING_FRACTION))
         result = self.folder.write_result(
             self.dataset, self.start, self.images, self.stages, self.held_out, self.scores, self.judgement,
+            self.matches,
             threads=self.threads, state=state,
         )  # fmt: skip
         if state == "complete":

@@ -12,12 +12,13 @@ import numpy as np
 from biresnerf.data.area_resize import area_resize
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
+from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.data.images import ImageSet
 from biresnerf.data.packs.write_packs import write_packs
-from biresnerf.data.refined_points import with_given_points
+from biresnerf.data.refined_points import with_points_of
 from biresnerf.data.refined_set import refined_set
 from biresnerf.data.renders import picture_stems, write_orbit, write_view
-from biresnerf.data.write import write_transforms
+from biresnerf.data.write import stale_notes, write_transforms
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera import Intrinsics
 from biresnerf.geometry.similarity import Similarity
@@ -30,7 +31,7 @@ from biresnerf.refine.judgement import Judgement
 from biresnerf.refine.run_report import run_report
 from biresnerf.refine.start import Start
 from biresnerf.refine.two_stages import TwoStages
-from biresnerf.report import Report
+from biresnerf.report import PointsReport, Report
 
 REPORT, CONFIG, TRANSFORMS = "report.json", "config.json", "transforms.json"
 RENDERS, ORBIT = "renders", "orbit.mp4"
@@ -137,7 +138,8 @@ class OutputFolder:
         stages: TwoStages,
         held_out: list[int],
         scores: list[ViewScore],
-        judgement: Judgement | None,
+        judgement: Judgement | None = None,
+        matches: FeatureMatches | None = None,
         *,
         threads: int,
         state: Literal["complete", "partial"],
@@ -157,17 +159,21 @@ class OutputFolder:
         if judgement is not None and judgement.verdict.returned == "input":
             returned = dataset.world_from_cam
             if np.isfinite(refined).all():
-                self._write_poses(self.path / REFINED, dataset, refined, report)
-        notes = self._write_poses(self.path, dataset, returned, report)
-        report = report.model_copy(update={"warnings": report.warnings + notes})
+                self._write_poses(self.path / REFINED, dataset, images, refined, matches, report)
+        report = self._write_poses(self.path, dataset, images, returned, matches, report)
         self._write_text(REPORT, report.model_dump_json(indent=2))
         return report
 
     @staticmethod
     def _write_poses(
-        folder: Path, dataset: Dataset, world_from_cam: np.ndarray, report: Report
-    ) -> tuple[str, ...]:
-        """Poses [n, 4, 4] in all forms; returns a sentence for each that could not be written."""
+        folder: Path,
+        dataset: Dataset,
+        images: ImageSet,
+        world_from_cam: np.ndarray,
+        matches: FeatureMatches | None,
+        report: Report,
+    ) -> Report:
+        """Poses [n, 4, 4] in all forms; returns the report with what there is to say of them."""
         write_transforms(dataset, world_from_cam, folder / TRANSFORMS)
         tie = report.input_from_optimised
         refined = refined_set(
@@ -177,9 +183,10 @@ class OutputFolder:
             pose_sources=[image.pose_source for image in report.images],
             flags=[image.flags for image in report.images],
         )
-        if dataset.source.colmap is not None:
-            refined = with_given_points(refined, dataset.source.colmap)
-        return write_packs(refined, folder, report.options.packs)
+        refined = with_points_of(refined, dataset.source.colmap, matches, images)
+        notes = write_packs(refined, folder, report.options.packs) + stale_notes(dataset, world_from_cam)
+        points = PointsReport(source=refined.points_source, count=len(refined.model.points))
+        return report.model_copy(update={"points": points, "warnings": report.warnings + notes})
 
     def _write_text(self, name: str, text: str) -> None:
         with whole_file(self.path / name) as temporary:

@@ -179,6 +179,15 @@ class SimilarityReport(BaseModel):
     translation: tuple[float, float, float]
 
 
+class PointsReport(BaseModel):
+    """The sparse points of the COLMAP model; docs/formats.md says what the sources are."""
+
+    model_config = _FROZEN
+
+    source: Literal["none", "given", "features", "tracks", "moved"]
+    count: int
+
+
 class Report(BaseModel):
     """``report.json``."""
 
@@ -209,4 +218,5 @@ class Report(BaseModel):
         description="Width and height, px, of the largest image as optimised."
     )
     input_from_optimised: SimilarityReport
+    points: PointsReport | None = None
     warnings: tuple[str, ...] = ()

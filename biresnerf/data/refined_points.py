@@ -12,7 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.colmap_result import matrix_of_pose, with_points
-from biresnerf.data.colmap_scene import ColmapModel, ColmapPoints
+from biresnerf.data.colmap_scene import NO_POINT, ColmapModel, ColmapPoints
+from biresnerf.data.feature_matches import FeatureMatches
+from biresnerf.data.images import ImageSet
+from biresnerf.data.match_tracks import match_tracks
 from biresnerf.data.refined_set import RefinedSet
 from biresnerf.geometry.pixel_rays import pixels_of_points, rays_of_pixels
 from biresnerf.geometry.rigid import rigid_inverse
@@ -22,6 +25,60 @@ from biresnerf.geometry.triangulation import parallax_deg, triangulate
 MOST_ERROR_PX, LEAST_PARALLAX_DEG = 4.0, 1.5
 LEAST_AGREEING = 0.5  # of a track's observations: two of eight wrong ones agree on something by chance
 NEAREST = 4  # cameras that carry a point along that no image is known to see
+
+
+def with_points_of(
+    refined: RefinedSet, given: ColmapModel | None, matches: FeatureMatches | None, images: ImageSet
+) -> RefinedSet:
+    """The result with the best points there are: of the input's tracks, else of feature matches, else carried along.
+
+    Args:
+        refined: without points.
+        given: the input, where it was a COLMAP model.
+        matches: found on the way; between frames in the order of ``refined``.
+        images: the photos, for colours.
+    """
+    if given is not None and len(given.points.track_image_ids):
+        return with_given_points(refined, given)
+    if matches is not None:
+        matched = with_matched_points(refined, matches, images)
+        if len(matched.model.points):
+            return matched
+    return refined if given is None else with_given_points(refined, given)
+
+
+def with_matched_points(refined: RefinedSet, matches: FeatureMatches, images: ImageSet) -> RefinedSet:
+    """The result with points triangulated from feature matches; the model's features are then the matched ones."""
+    features, tracks = match_tracks(matches, len(refined))
+    if not tracks:
+        return refined
+    ids = np.array(refined.image_ids)
+    model_images = dict(refined.model.images)
+    for row, number in enumerate(refined.image_ids):
+        none = np.full(len(features[row]), NO_POINT)
+        model_images[number] = replace(model_images[number], points2d_px=features[row], point3d_ids=none)
+    elements = np.concatenate(tracks)
+    starts = np.concatenate(([0], np.cumsum([len(track) for track in tracks]))).astype(np.int64)
+    seen = np.stack([_colour(images, refined, photo, features[photo][k]) for photo, k in elements])
+    rgb = np.add.reduceat(seen, starts[:-1], axis=0) / np.diff(starts)[:, None]
+    count = len(tracks)
+    points = ColmapPoints(
+        np.arange(1, count + 1), np.zeros((count, 3)), np.rint(rgb).astype(np.uint8), np.full(count, -1.0),
+        starts, ids[elements[:, 0]], elements[:, 1].copy(),
+    )  # fmt: skip
+    model = replace(refined.model, images=model_images)
+    return replace(refined, model=with_points(model, triangulated(model, points)), points_source="features")
+
+
+def _colour(
+    images: ImageSet, refined: RefinedSet, photo: int, xy: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The photo's colour [3] at a position in full-size pixels."""
+    picture, camera = images.image(photo), refined.camera_of(photo)
+    height, width = picture.shape[:2]
+    column = min(max(int(xy[0] * width / camera.width), 0), width - 1)
+    row = min(max(int(xy[1] * height / camera.height), 0), height - 1)
+    return picture[row, column].astype(np.float64)
 
 
 def with_given_points(refined: RefinedSet, given: ColmapModel) -> RefinedSet:

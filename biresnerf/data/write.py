@@ -47,6 +47,14 @@ def write_transforms(dataset: Dataset, world_from_cam: NDArray[np.float64], path
         )
 
 
+def stale_notes(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> tuple[str, ...]:
+    """What a transforms file goes on naming that belongs to the poses before."""
+    named = bool(dataset.source.document.get("ply_file_path"))
+    if not named or all(_unmoved(dataset, i, pose) for i, pose in enumerate(world_from_cam)):
+        return ()
+    return ("transforms.json still names ply_file_path: these points belong to the poses before.",)
+
+
 def _unmoved(dataset: Dataset, index: int, world_from_cam: NDArray[np.float64]) -> bool:
     given = dataset.frames[index].world_from_cam
     return given is not None and np.array_equal(given, world_from_cam)

@@ -10,9 +10,12 @@ import pytest
 
 from biresnerf.data.colmap_reader import read_colmap_model
 from biresnerf.data.colmap_result import model_of_poses, with_points
-from biresnerf.data.colmap_scene import NO_POINT, ColmapModel, ColmapPoints
+from biresnerf.data.colmap_scene import NO_POINT, ColmapModel, ColmapPoints, no_points
 from biresnerf.data.dataset import Dataset, Frame, SourceFormat
-from biresnerf.data.refined_points import MOST_ERROR_PX, triangulated, with_given_points
+from biresnerf.data.feature_matches import FeatureMatches
+from biresnerf.data.images import ImageSet
+from biresnerf.data.match_tracks import match_tracks
+from biresnerf.data.refined_points import MOST_ERROR_PX, triangulated, with_given_points, with_points_of
 from biresnerf.data.refined_set import refined_set
 from biresnerf.geometry.camera_models import MODEL_PARAMETERS
 from biresnerf.geometry.pixel_rays import pixels_of_points, rays_of_pixels
@@ -21,6 +24,7 @@ from biresnerf.geometry.similarity import Similarity
 from biresnerf.geometry.triangulation import parallax_deg, triangulate
 from tests.data.packs.random_sets import random_camera, random_poses
 from tests.data.test_real_sets import ROOT
+from tests.refine.scene import photos_set
 
 
 def seen_model(
@@ -180,6 +184,80 @@ def test_points_without_tracks_go_with_the_cameras_near_them():
     moved = with_given_points(refined_set(dataset_of(model, poses), motion.apply_to_poses(poses)), model)
     assert moved.points_source == "moved"
     np.testing.assert_allclose(moved.model.points.xyz, motion.apply(xyz), atol=1e-9)
+
+
+def pairwise(model: ColmapModel, rng: np.random.Generator, wrong: int = 0) -> FeatureMatches:
+    """Every pair of images whose features see one point, as matches; some go astray."""
+    order = {number: row for row, number in enumerate(model.images)}
+    found = []
+    for k in range(len(model.points)):
+        track = slice(model.points.track_starts[k], model.points.track_starts[k + 1])
+        seen = [
+            (order[int(i)], model.images[int(i)].points2d_px[f])
+            for i, f in zip(
+                model.points.track_image_ids[track], model.points.track_point2d_indices[track], strict=True
+            )
+        ]
+        found += [(a, b) for one, a in enumerate(seen) for b in seen[one + 1 :]]
+    found = [found[i] for i in rng.permutation(len(found))]
+    for i in range(wrong):
+        (a, xy), (b, _) = found[i]
+        found[i] = ((a, xy), (b, found[i + 50][1][1] + 31.0))
+    images = np.array([[a[0], b[0]] for a, b in found])
+    return FeatureMatches.of(images, np.array([[a[1], b[1]] for a, b in found]))
+
+
+def photos_like(model: ColmapModel, colours: np.ndarray) -> ImageSet:
+    """Photos at half size in which each point's pixel has its colour."""
+    pictures = []
+    for image in model.images.values():
+        picture = np.zeros((240, 320, 3), np.uint8)
+        at = np.clip((image.points2d_px / 2).astype(int), 0, [319, 239])
+        rows = np.searchsorted(np.sort(model.points.ids), image.point3d_ids)
+        picture[at[:, 1], at[:, 0]] = colours[rows]
+        pictures.append(picture)
+    return photos_set(pictures)
+
+
+def test_feature_matches_become_the_points_that_their_rays_meet_in():
+    rng = np.random.default_rng(14)
+    poses, xyz = random_poses(rng, 6), rng.uniform(-0.6, 0.6, (40, 3))
+    model = seen_model(15, poses, xyz, model="SIMPLE_RADIAL")
+    matches = pairwise(model, rng, wrong=5)
+    dataset = dataset_of(replace(model), poses)
+    bare = refined_set(replace(dataset, source=replace(dataset.source, colmap=None)), poses)
+    images = photos_like(model, model.points.rgb)
+    result = with_points_of(bare, None, matches, images)
+    assert result.points_source == "features"
+    found = result.model.points
+    assert 35 <= len(found) <= 45
+    off = np.linalg.norm(found.xyz[:, None] - xyz[None], axis=2).min(1)
+    assert np.median(off) < 1e-6
+    assert off.max() < 0.02
+    nearest = np.linalg.norm(found.xyz[:, None] - xyz[None], axis=2).argmin(1)
+    assert np.median(np.abs(found.rgb.astype(int) - model.points.rgb[nearest]).max(1)) <= 40
+    for image in result.model.images.values():  # every feature says which point it is of
+        assert (image.point3d_ids >= 0).sum() == (found.track_image_ids == image.id).sum()
+
+
+def test_tracks_that_run_through_two_features_of_a_photo_leave_it_out():
+    images = np.array([[0, 1], [1, 2], [0, 2]])
+    xy = np.array([[[1, 1], [2, 2]], [[2, 2], [3, 3]], [[9, 9], [3, 3]]], float)
+    features, tracks = match_tracks(FeatureMatches(images, xy), 4)
+    assert [len(rows) for rows in features] == [2, 1, 1, 0]
+    assert [track.tolist() for track in tracks] == [[[1, 0], [2, 0]]]
+
+
+def test_the_inputs_own_tracks_go_before_matches_and_nothing_comes_of_nothing():
+    rng = np.random.default_rng(16)
+    poses, xyz = random_poses(rng, 5), rng.uniform(-0.6, 0.6, (20, 3))
+    model = seen_model(17, poses, xyz, model="PINHOLE")
+    dataset, images = dataset_of(model, poses), photos_like(model, model.points.rgb)
+    bare = refined_set(dataset, poses + 1e-9)
+    assert with_points_of(bare, model, pairwise(model, rng), images).points_source == "tracks"
+    empty = with_points(model, no_points())
+    assert with_points_of(bare, empty, pairwise(model, rng), images).points_source == "features"
+    assert with_points_of(bare, empty, None, images).points_source == "none"
 
 
 @pytest.mark.parametrize("path", ["kitchen25/sparse/0", "colmap_maupertuis/sparse_txt"])
