@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from biresnerf.data.colmap_reader import ColmapModel, read_colmap_model, world_from_cam_of
-from biresnerf.data.dataset import Camera, Dataset, SourceFormat
+from biresnerf.data.dataset import Dataset, SourceFormat
 from biresnerf.data.folder import IMAGE_FOLDER, images_below, images_in
 from biresnerf.data.given_images import GivenImage, dataset_of, match_files
 from biresnerf.data.image_files import read_header
@@ -42,16 +43,19 @@ def read_colmap_dataset(root: Path, model_folder: Path, within: Path | None = No
             model.cameras[image.camera_id],
             world_from_cam_of(image.cam_from_world),
             f"{table} image {image.id}",
+            camera_id=image.camera_id,
         )
         for image, file in zip(registered, found, strict=True)
     ]
     for file in sorted(files.keys() - set(found)):
-        camera = _likely_camera(model, files[file], file)
-        given.append(GivenImage(file, files[file], camera, None, file))
+        number = _likely_camera(model, files[file], file)
+        camera = None if number is None else model.cameras[number]
+        given.append(GivenImage(file, files[file], camera, None, file, camera_id=number))
     tables = tuple(sorted(path for path in model_folder.iterdir() if path.suffix == Path(table).suffix))
     source = SourceFormat("colmap", None, {}, np.eye(4), colmap=model, files=tables)
     ordered = sorted(given, key=lambda image: image.name)
-    return dataset_of(root, ordered, source, [*model.notes, *notes, *_beside_notes(model_folder)], within)
+    dataset = dataset_of(root, ordered, source, [*model.notes, *notes, *_beside_notes(model_folder)], within)
+    return replace(dataset, source=replace(source, colmap=_for_these_images(model, dataset, table)))
 
 
 def image_files(root: Path) -> dict[str, Path]:
@@ -80,14 +84,38 @@ def images_beside(root: Path) -> dict[str, Path]:
     return {path.relative_to(folder).as_posix(): path for path in paths}
 
 
-def _likely_camera(model: ColmapModel, path: Path, name: str) -> Camera | None:
+def _for_these_images(model: ColmapModel, dataset: Dataset, table: str) -> ColmapModel:
+    """The model, with cameras and features for the images' true size where the model's are for another."""
+    by_name = {image.name: image for image in model.images.values()}
+    cameras, images, scaled = dict(model.cameras), dict(model.images), set()
+    for index, frame in enumerate(dataset.frames):
+        image = by_name.get(frame.name)
+        if image is None:
+            continue
+        given, fitted = model.cameras[image.camera_id], dataset.camera_of(index)
+        if image.camera_id in scaled and cameras[image.camera_id] != fitted:
+            raise InputError(
+                "mixed_sizes",
+                f"images of camera {image.camera_id} differ in size.",
+                where=f"{table} image {image.id}",
+                mend="Give images of one size, that of the camera.",
+            )
+        scaled.add(image.camera_id)
+        cameras[image.camera_id] = fitted
+        if fitted != given:
+            ratio = (fitted.width / given.width, fitted.height / given.height)
+            images[image.id] = replace(image, points2d_px=image.points2d_px * ratio)
+    return replace(model, cameras=cameras, images=images)
+
+
+def _likely_camera(model: ColmapModel, path: Path, name: str) -> int | None:
     """Of an image that the model has not: the camera that took most of those of its shape; None where none did."""
     header = read_header(path, name)
     uses = Counter(image.camera_id for image in model.images.values())
     for number, _ in uses.most_common():
         camera = model.cameras[number]
         if same_shape(camera.width, camera.height, header.width, header.height):
-            return camera
+            return number
     return None
 
 

@@ -39,6 +39,7 @@ class GivenImage:
         world_from_cam: float64 [4, 4], OpenCV axes; None where the file has no pose for it.
         where: the file, and the place in it, for messages.
         timestamp_s: when it was taken, where the file says so.
+        camera_id: the file's own number of the camera: cameras of different numbers stay apart, equal as they may be.
     """
 
     name: str
@@ -47,6 +48,7 @@ class GivenImage:
     world_from_cam: NDArray[np.float64] | None
     where: str
     timestamp_s: float | None = None
+    camera_id: int | None = None
 
 
 def dataset_of(
@@ -75,14 +77,14 @@ def dataset_of(
     orientations = meant_orientations(stored, sizes)
     headers = [turned_header(header, turn) for header, turn in zip(stored, orientations, strict=True)]
     said = [*notes, *orientation_notes(stored, orientations, names), *page_notes(stored, names)]
-    cameras: dict[tuple[Camera, IntrinsicsSource], int] = {}
+    cameras: dict[tuple[Camera, IntrinsicsSource, int | None], int] = {}
     frames = []
     for image, header, orientation in zip(images, headers, orientations, strict=True):
         if image.camera is None:
             fitted, by = guessed_camera(header)
         else:
             fitted, by = fitted_camera(image.camera, header, image, said), "given"
-        index = cameras.setdefault((fitted, by), len(cameras))
+        index = cameras.setdefault((fitted, by, image.camera_id), len(cameras))
         mask, inverted = mask_beside(root, image.path, image.name, within)
         pose_source = None if image.world_from_cam is None else "given"
         frames.append(
@@ -93,12 +95,12 @@ def dataset_of(
         )  # fmt: skip
     refuse_coinciding([frame.world_from_cam for frame in frames if frame.world_from_cam is not None], place)
     said += _pose_notes(frames) + _mask_notes(frames)
-    sources = tuple(by for _, by in cameras)
+    sources = tuple(by for _, by, _ in cameras)
     if any(by != "given" for by in sources):
         said.append("no intrinsics are given: the focal length is a guess")
     return Dataset(
         root,
-        tuple(camera for camera, _ in cameras),
+        tuple(camera for camera, _, _ in cameras),
         tuple(frames),
         source,
         tuple(dict.fromkeys(said)),

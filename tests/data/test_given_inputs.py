@@ -79,6 +79,48 @@ def test_images_of_another_size_get_the_models_camera_scaled(tmp_path):
     dataset = read_dataset(tmp_path)
     assert dataset.cameras == (GIVEN_CAMERA,)
     assert any("were scaled to the images" in text for text in dataset.warnings)
+    assert dataset.source.colmap.cameras == {1: GIVEN_CAMERA}
+
+
+def test_features_are_scaled_with_the_camera_so_that_they_still_see_their_points(tmp_path):
+    """Real features and points: the error of reprojection, in the images' own pixels, shrinks as the images did."""
+    folder = ROOT / "lund_door"
+    if not folder.is_dir():
+        pytest.skip("no image set lund_door: set BIRESNERF_TEST_DATA to the folder that holds it")
+    (tmp_path / "images").symlink_to(folder / "images")
+    (tmp_path / "sparse").symlink_to(folder / "colmap_sparse_fullres")
+    dataset = read_dataset(tmp_path)
+    model = dataset.source.colmap
+    frame = dataset.frames[3]
+    image = next(image for image in model.images.values() if image.name == frame.name)
+    seen = image.point3d_ids >= 0
+    row_of_id = {number: row for row, number in enumerate(model.points.ids.tolist())}
+    points = model.points.xyz[[row_of_id[number] for number in image.point3d_ids[seen].tolist()]]
+    in_cam = (points - frame.world_from_cam[:3, 3]) @ frame.world_from_cam[:3, :3]
+    f, cx, cy, k1 = model.cameras[image.camera_id].params
+    plane = in_cam[:, :2] / in_cam[:, 2:]
+    pixels = f * plane * (1 + k1 * (plane**2).sum(1, keepdims=True)) + [cx, cy]
+    off = np.linalg.norm(pixels - image.points2d_px[seen], axis=1)
+    assert np.median(off) < 0.5
+    assert (image.points2d_px.max(axis=0) < [648, 968]).all()
+
+
+def test_images_of_one_camera_in_two_sizes_are_refused(tmp_path):
+    trajectories.colmap_set(tmp_path)
+    write_image(tmp_path / "images/c.png", size=(2 * WIDTH, 2 * HEIGHT))
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path)
+    assert caught.value.code == "mixed_sizes"
+
+
+def test_equal_cameras_of_different_ids_stay_apart(tmp_path):
+    model = trajectories.colmap_set(tmp_path)
+    cameras, images = model / "cameras.txt", model / "images.txt"
+    cameras.write_text(cameras.read_text() + cameras.read_text().replace("1 PINHOLE", "2 PINHOLE"))
+    images.write_text(images.read_text().replace(" 1 d.png", " 2 d.png"))
+    dataset = read_dataset(tmp_path)
+    assert dataset.cameras == (GIVEN_CAMERA, GIVEN_CAMERA)
+    assert [frame.camera for frame in dataset.frames] == [0, 0, 0, 1]
 
 
 @pytest.mark.parametrize(
