@@ -32,7 +32,7 @@ TRIAL_STEPS = 200
 # steps later at 1.03 with the full rate, 0.64 with a fifth of it, 0.28 with these.
 MATCHED_MOBILITY = (0.0, 0.3)
 # Where most cameras are placed, stage 1 has only to form the field: its lengths shrink to this share.
-MOSTLY_PLACED, MATCHED_COARSE_SHARE = 0.8, 0.4
+MOSTLY_PLACED, MATCHED_COARSE_SHARE = 0.8, 2 / 3
 DOUBTED_MOST = 0.5  # of the cameras: with more guesses there is no field of others to agree with
 MARGIN_DB = 0.3  # less is a tie
 # On a tie, matches are believed if the given poses differ from them by more than this (median).
