@@ -27,6 +27,7 @@ DetectorName = Literal["trend", "counter", "variance"]
 PoseParametrisation = Literal["se3_world", "so3xr3", "so3xr3_camp"]
 PackName = Literal["colmap-text", "instant-ngp", "kitti", "bundler", "pinhole"]
 StartPoses = Literal["auto", "given", "colmap", "none"]
+RefineIntrinsics = Literal["auto", "none", "focal", "all"]
 
 
 class RefineOptions(BaseModel):
@@ -70,6 +71,11 @@ class RefineOptions(BaseModel):
         (),
         max_length=10_000,
         description="Names of images whose poses stay as given, to the bit; the result's frame is tied to them.",
+    )
+
+    refine_intrinsics: RefineIntrinsics = Field(
+        "auto",
+        description="What of the lenses is refined too; auto: focal lengths that were guessed or read from EXIF.",
     )
 
     steps: int | None = Field(None, ge=20, le=1_000_000, description="Steps of both stages together.")

@@ -106,9 +106,10 @@ class OutputFolder:
     def write_preview(self, dataset: Dataset, images: ImageSet, optimiser: JointOptimiser, view: int) -> None:
         """How far the run is: poses so far, and one view at half the working size."""
         world_from_cam, _ = poses_in_input_frame(dataset, optimiser)
-        write_transforms(dataset, world_from_cam, self.path / PREVIEW / TRANSFORMS)
+        write_transforms(optimiser.lenses.refined(dataset), world_from_cam, self.path / PREVIEW / TRANSFORMS)
         halves = [
-            camera.resized(max(1, camera.width // 2), max(1, camera.height // 2)) for camera in images.cameras
+            camera.resized(max(1, camera.width // 2), max(1, camera.height // 2))
+            for camera in optimiser.lenses.refined_working(images.cameras)
         ]
         intrinsics = Intrinsics.from_cameras(halves).to(optimiser.device)
         pose = optimiser.poses.matrices()[view].detach()
@@ -155,12 +156,13 @@ class OutputFolder:
             dataset, start, images, stages, held_out, scores, judgement, refined, similarity,
             threads=threads, state=state,
         )  # fmt: skip
-        returned = refined
+        refined_dataset = optimiser.lenses.refined(dataset)
+        returned, returned_dataset = refined, refined_dataset
         if judgement is not None and judgement.verdict.returned == "input":
-            returned = dataset.world_from_cam
+            returned, returned_dataset = dataset.world_from_cam, dataset
             if np.isfinite(refined).all():
-                self._write_poses(self.path / REFINED, dataset, images, refined, matches, report)
-        report = self._write_poses(self.path, dataset, images, returned, matches, report)
+                self._write_poses(self.path / REFINED, refined_dataset, images, refined, matches, report)
+        report = self._write_poses(self.path, returned_dataset, images, returned, matches, report)
         self._write_text(REPORT, report.model_dump_json(indent=2))
         return report
 

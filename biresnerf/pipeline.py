@@ -28,6 +28,7 @@ from biresnerf.output_folder import OutputFolder
 from biresnerf.progress import OnProgress, Progress
 from biresnerf.refine.checkpoint import load_checkpoint
 from biresnerf.refine.history import Observer
+from biresnerf.refine.intrinsics_parameters import lenses_of
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.rigid_bodies import rigid_bodies
 from biresnerf.refine.scene_frame import scene_frame
@@ -176,9 +177,13 @@ def _optimiser(
     world_from_cam = bodies.held(start.world_from_cam, prepared.dataset.world_from_cam)
     frame = scene_frame(world_from_cam, prepared.images)
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
+    lenses = lenses_of(
+        prepared.dataset, prepared.images, options.refine_intrinsics, prepared.held_out, device,
+        dollies=not bodies.tied,
+    )  # fmt: skip
     optimiser = JointOptimiser(
-        prepared.images, frame, poses, options, prepared.held_out, device, threads, start.mobility, bodies
-    )
+        prepared.images, frame, poses, options, prepared.held_out, device, threads, start.mobility, bodies, lenses
+    )  # fmt: skip
     optimiser.camera_errors.doubt(start.doubted)
     return optimiser
 

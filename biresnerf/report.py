@@ -11,6 +11,7 @@ from biresnerf.config import RefineOptions
 _FROZEN = ConfigDict(frozen=True, extra="forbid")
 
 SwitchReason = Literal["stable", "cap"]
+IntrinsicsSource = Literal["given", "exif", "colmap", "guessed", "refined"]
 PoseSource = Literal[
     "given",
     "colmap",
@@ -147,6 +148,23 @@ class ImageReport(BaseModel):
         return tuple(name for name, value in self if value is True)
 
 
+class CameraReport(BaseModel):
+    """The intrinsics of one camera of the set, at full size: COLMAP's model, its parameters before and after."""
+
+    model_config = _FROZEN
+
+    model: str
+    width: int
+    height: int
+    source: IntrinsicsSource = Field(
+        description="Who found the intrinsics that the optimisation started from."
+    )
+    refined: Literal["none", "focal", "all"] = Field(description="What of them the optimisation moved.")
+    images: int = Field(description="How many images it took.")
+    params_before: tuple[float, ...]
+    params_after: tuple[float, ...]
+
+
 class HeldOut(BaseModel):
     """Mean quality of held-out views, their poses fitted to the frozen field first (BARF's test-time protocol)."""
 
@@ -201,6 +219,7 @@ class Report(BaseModel):
         description="None of a partial result, and where none was asked for; the poses are the refined ones then.",
     )
     images: tuple[ImageReport, ...]
+    cameras: tuple[CameraReport, ...] = ()
     heldout: HeldOut | None = Field(None, description="None where there were too few views to hold any out.")
     start_trials: tuple[TrialReport, ...] = Field(
         (),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # Guesses from other images: worth trying, not worth believing.
 GUESSES: frozenset[PoseSource] = frozenset({"neighbours", "nearest-view"})
-IntrinsicsSource = Literal["given", "exif", "colmap", "guessed"]
+IntrinsicsSource = Literal["given", "exif", "colmap", "guessed", "refined"]
 Dialect = Literal[
     "nerfstudio", "instant-ngp", "blender", "images", "colmap", "llff", "tum", "kitti", "bundler", "metashape"
 ]
@@ -167,3 +167,7 @@ class Dataset:
     def camera_of(self, index: int) -> Camera:
         """The camera of frame ``index``, at full size."""
         return self.cameras[self.frames[index].camera]
+
+    def source_of_intrinsics(self, camera: int) -> IntrinsicsSource:
+        """Who found the intrinsics of camera ``camera``."""
+        return self.intrinsics_sources[camera] if self.intrinsics_sources else "given"

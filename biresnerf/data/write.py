@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.conventions import file_from_world_from_cam
-from biresnerf.data.dataset import Camera, Dataset
+from biresnerf.data.dataset import Dataset
+from biresnerf.data.lens_json import family, lens_values, put_lens, says_lens
 
 
 def write_transforms(dataset: Dataset, world_from_cam: NDArray[np.float64], path: Path) -> None:
@@ -41,6 +42,8 @@ def write_transforms(dataset: Dataset, world_from_cam: NDArray[np.float64], path
     ]
     if not source.document:
         document = _with_intrinsics(document, dataset)
+    else:
+        _put_refined(document, dataset)
     with whole_file(path) as temporary:
         temporary.write_text(
             json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n", "utf-8"
@@ -75,35 +78,31 @@ def _frame_object(
 def _with_intrinsics(document: dict[str, Any], dataset: Dataset) -> dict[str, Any]:
     """Intrinsics shared by all frames, or in each frame where there are several cameras."""
     frames = document.pop("frames")
-    models = {_model(camera) for camera in dataset.cameras}
+    models = {family(camera) for camera in dataset.cameras}
     if len(models) == 1:
         document["camera_model"] = models.pop()
     if len(dataset.cameras) == 1:
-        return {**document, **_intrinsics(dataset.cameras[0]), "frames": frames}
+        return {**document, **lens_values(dataset.cameras[0]), "frames": frames}
     described = [
-        {"file_path": row.pop("file_path"), **_intrinsics(dataset.camera_of(index)), **row}
+        {"file_path": row.pop("file_path"), **lens_values(dataset.camera_of(index)), **row}
         for index, row in enumerate(frames)
     ]
     if models:
         document.pop("camera_model", None)
         for index, row in enumerate(described):
-            row["camera_model"] = _model(dataset.camera_of(index))
+            row["camera_model"] = family(dataset.camera_of(index))
     return {**document, "frames": described}
 
 
-def _model(camera: Camera) -> str:
-    """nerfstudio's name of the lens's family; FULL_OPENCV, which it does not know, where nothing less will do."""
-    if camera.full().fisheye:
-        return "OPENCV_FISHEYE"
-    return "FULL_OPENCV" if camera.model == "FULL_OPENCV" else "OPENCV"
-
-
-def _intrinsics(camera: Camera) -> dict[str, Any]:
-    p = camera.full()
-    values: dict[str, Any] = {"w": camera.width, "h": camera.height}
-    values |= {"fl_x": p.fx, "fl_y": p.fy, "cx": p.cx, "cy": p.cy}
-    # instant-ngp would take p1 and p2 of a fisheye for its k3 and k4.
-    names = ["k1", "k2", "k3", "k4"] if p.fisheye else ["k1", "k2", "p1", "p2"]
-    if camera.model == "FULL_OPENCV":
-        names += ["k3", "k4", "k5", "k6"]
-    return values | {name: getattr(p, name) for name in names}
+def _put_refined(document: dict[str, Any], dataset: Dataset) -> None:
+    """Intrinsics that were refined, where the input has them: in the frame that says its own, else at the top."""
+    shared = {
+        frame.camera
+        for frame, row in zip(dataset.frames, document["frames"], strict=True)
+        if not says_lens(row)
+    }
+    for frame, row in zip(dataset.frames, document["frames"], strict=True):
+        if dataset.source_of_intrinsics(frame.camera) != "refined":
+            continue
+        own = says_lens(row) or len(shared) > 1
+        put_lens(row if own else document, dataset.cameras[frame.camera])

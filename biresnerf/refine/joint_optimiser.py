@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -15,12 +14,14 @@ from biresnerf.config import RefineOptions
 from biresnerf.data.images import ImageSet
 from biresnerf.field.backends import directions_for, make_occupancy
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
-from biresnerf.geometry.camera import Intrinsics
+from biresnerf.geometry.camera import Intrinsics, directions_with_gradient
 from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.refine.camera_errors import CameraErrors
 from biresnerf.refine.camp_preconditioner import camp_preconditioner
-from biresnerf.refine.late_figures import LateFigures
+from biresnerf.refine.intrinsics_parameters import IntrinsicsParameters
+from biresnerf.refine.late_figures import LateFigures, StepResult
 from biresnerf.refine.methods import METHODS, build_field, occupancy_side
+from biresnerf.refine.parts_state import Part, load_state_of, state_of
 from biresnerf.refine.photo_sampler import PhotoSampler, PixelBatch
 from biresnerf.refine.pose_hypotheses import photo_distances
 from biresnerf.refine.pose_parameters import PoseParameters
@@ -31,19 +32,6 @@ MOST_SAMPLES = 768  # per ray
 RAYS_MOST = 1 << 15
 FIRST_SAMPLES = 64  # per ray, as guessed for the first step
 OCCUPANCY_PERIOD = 16
-
-
-@dataclass(frozen=True)
-class StepResult:
-    """Loss against the (blurred) targets, mean squared error of training rays against the sharp photos, and effort.
-
-    On CUDA the first two are those of the step before (see `LateFigures`).
-    """
-
-    loss: float
-    mean_squared_error: float
-    rays: int
-    samples: int
 
 
 class JointOptimiser:
@@ -57,6 +45,7 @@ class JointOptimiser:
         held_out: images whose rays move their own pose but never the field.
         mobility: each camera's factor of the pose rate [2, n] in stage 1 and stage 2; 1 where left out.
         bodies: which cameras move together, and which not at all; all by themselves where left out.
+        lenses: the intrinsics, where they may move; as the images have them where left out.
         sampler: of the same images and held-out views, where another optimiser has made it already.
     """
 
@@ -71,13 +60,14 @@ class JointOptimiser:
         threads: int,
         mobility: np.ndarray | None = None,
         bodies: RigidBodies | None = None,
+        lenses: IntrinsicsParameters | None = None,
         sampler: PhotoSampler | None = None,
     ) -> None:
         self.frame, self.options, self.device = frame, options, device
         self.bodies = bodies or RigidBodies.free(len(images))
         self.method = METHODS[options.method]
         self.field = build_field(self.method, options, frame, device, threads)
-        self.intrinsics = Intrinsics.from_cameras(images.cameras).to(device)
+        self.lenses = lenses or IntrinsicsParameters.held(images.cameras, device)
         self.poses = self._pose_parameters(torch.from_numpy(unit_from_cam))
         self.schedule = self.method.schedule(options, frame.pixel, frame.unbounded, frame.distance)
         self._images = images
@@ -109,6 +99,11 @@ class JointOptimiser:
     def photo_distances(self) -> NDArray[np.float32]:
         """How unlike the photos are, see `photo_distances`; worked out when a lost camera first needs it."""
         return photo_distances(self._images)
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Every image's intrinsics at working size, as they are now."""
+        return self.lenses.intrinsics
 
     def _pose_parameters(self, unit_from_cam: Tensor) -> PoseParameters:
         options, distance = self.options, self.frame.distance
@@ -151,7 +146,11 @@ class JointOptimiser:
 
         `matrix` [rays, 3, 4] is each ray's unit_from_cam; `intrinsics` are the run's images' where not given.
         """
-        in_cam = self.directions(intrinsics or self.intrinsics, image, xy).float()
+        lenses = intrinsics or self.intrinsics
+        with torch.no_grad():
+            in_cam = self.directions(lenses, image, xy).float()
+        if lenses.fx.requires_grad:
+            in_cam = directions_with_gradient(lenses, image, xy, in_cam)
         direction = (matrix[:, :, :3] @ in_cam[:, :, None])[:, :, 0]
         return matrix[:, :, 3].contiguous(), direction.contiguous()
 
@@ -186,7 +185,11 @@ class JointOptimiser:
         batch = self.sampler.draw(
             self.rays, schedule.blur(t, self.switch, self.sampler.long_side), self.draws
         )
-        origin, direction = self.cast(self.poses.matrices()[batch.image], batch.image, batch.xy)
+        lens_rate = schedule.lens_rate(t, self.switch) * self.pose_scale if self.lenses.moving else 0.0
+        matrices, lenses = self.poses.matrices(), self.intrinsics
+        if lens_rate > 0:
+            matrices, lenses = self.lenses.with_gradient(matrices)
+        origin, direction = self.cast(matrices[batch.image], batch.image, batch.xy, lenses)
         rendering = self.render(
             origin, direction, batch.trained, schedule.interval(t, self.switch),
             schedule.position_gradient(t, self.switch), jitter=True,
@@ -199,6 +202,8 @@ class JointOptimiser:
         if rate > 0:
             mobility = self.mobility[0 if self.switch is None else 1]
             self.poses.step(rate, mobility, field_rate=rates.networks)
+            if lens_rate > 0:
+                self.poses.dolly(self.lenses.step(lens_rate))
         else:
             self.poses.forget_gradients()
         self.step_index += 1
@@ -253,15 +258,16 @@ class JointOptimiser:
 
     def state(self) -> dict[str, Tensor]:
         """All tensors of the run (shared, not copied)."""
-        state = {"generator": self.generator.get_state()}
-        for part, tensors in (
-            ("field", self.field.state()),
-            ("poses", self.poses.state()),
-            ("occupancy", self.occupancy.state()),
-            ("camera_errors", self.camera_errors.state()),
-        ):
-            state.update({f"{part}.{name}": tensor for name, tensor in tensors.items()})
-        return state
+        return {"generator": self.generator.get_state(), **state_of(self._parts())}
+
+    def _parts(self) -> dict[str, Part]:
+        return {
+            "field": self.field,
+            "poses": self.poses,
+            "lenses": self.lenses,
+            "occupancy": self.occupancy,
+            "camera_errors": self.camera_errors,
+        }
 
     def notes(self) -> dict[str, float | int | None]:
         """The numbers of the run that are not tensors."""
@@ -283,10 +289,4 @@ class JointOptimiser:
 
     def _load_tensors(self, tensors: dict[str, Tensor]) -> None:
         self.generator.set_state(tensors["generator"])
-        for name, part in (
-            ("field.", self.field),
-            ("poses.", self.poses),
-            ("occupancy.", self.occupancy),
-            ("camera_errors.", self.camera_errors),
-        ):
-            part.load_state({k[len(name) :]: v for k, v in tensors.items() if k.startswith(name)})
+        load_state_of(self._parts(), tensors)

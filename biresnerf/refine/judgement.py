@@ -76,10 +76,10 @@ def judge(
     Raises:
         Interrupted: ``should_stop`` said so.
     """
-    cameras = tuple(dataset.camera_of(i) for i in range(len(dataset)))
-    before, after = (
-        Rig(poses, cameras) for poses in (dataset.world_from_cam, poses_in_input_frame(dataset, optimiser)[0])
-    )
+    refined = optimiser.lenses.refined(dataset)
+    everyone = range(len(dataset))
+    before = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in everyone))
+    after = Rig(poses_in_input_frame(dataset, optimiser)[0], tuple(refined.camera_of(i) for i in everyone))
     turned, shifted = motion(before.world_from_cam, after.world_from_cam)
     centres = before.world_from_cam[:, :3, 3]
     spread = float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))

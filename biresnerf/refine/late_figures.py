@@ -2,8 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """Loss against the (blurred) targets, mean squared error of training rays against the sharp photos, and effort.
+
+    On CUDA the first two are those of the step before (see `LateFigures`).
+    """
+
+    loss: float
+    mean_squared_error: float
+    rays: int
+    samples: int
 
 
 class LateFigures:

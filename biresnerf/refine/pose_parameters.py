@@ -125,6 +125,19 @@ class PoseParameters:
                     parameter.copy_(torch.lerp(kept, parameter, mobility[:, None]))
         self.forget_gradients()
 
+    @torch.no_grad()
+    def dolly(self, log_focal: Tensor) -> None:
+        """Move cameras along their axes as a change of their focal lengths [n] asks, so that the centre looks the same.
+
+        Their starting places move: increments and their moments stay as they are.
+        """
+        now = self.matrices()
+        move = dolly_directions(now) * log_focal.expm1().to(now)[:, None]
+        if self.parametrisation == "se3_world":
+            turn = now[:, :, :3] @ self.start[:, :, :3].transpose(1, 2)
+            move = (turn.transpose(1, 2) @ move[:, :, None])[:, :, 0]
+        self.start[:, :, 3] += move
+
     def restart_adam(self) -> None:
         """Forget the moments: what follows is another optimisation."""
         parameters = [self.rotation, self.translation]
@@ -180,3 +193,13 @@ class PoseParameters:
         load_adam_state("adam", self._adam, state)
         if self._second is not None:
             load_adam_state("second", self._second, state)
+
+
+def dolly_directions(unit_from_cam: Tensor) -> Tensor:
+    """Where camera centres [n, 3] go for each unit of the log of their focal length: back from the origin's plane.
+
+    What lies there looks the same then, and what lies near it nearly so: a dolly zoom. Cameras that look away stay.
+    """
+    forward, centre = unit_from_cam[:, :, 2], unit_from_cam[:, :, 3]
+    depth = -(forward * centre).sum(1, keepdim=True)
+    return -depth.clamp(min=0) * forward

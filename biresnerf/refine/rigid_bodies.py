@@ -44,6 +44,11 @@ class RigidBodies:
         groups = [np.flatnonzero(self.of == body) for body in range(int(self.of.max(initial=-1)) + 1)]
         return [group for group in groups if len(group) > 1]
 
+    @property
+    def tied(self) -> bool:
+        """Whether any camera may not move for itself."""
+        return bool(self.fixed.any() or self.shared)
+
     def held(self, world_from_cam: NDArray[np.float64], given: NDArray[np.float64]) -> NDArray[np.float64]:
         """Poses [n, 4, 4] with every body as it is in ``given``, and the fixed ones where they are there.
 

@@ -10,10 +10,11 @@ from biresnerf.data.dataset import Dataset
 from biresnerf.data.images import ImageSet
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.evaluation import ViewScore
+from biresnerf.refine.intrinsics_parameters import IntrinsicsParameters
 from biresnerf.refine.judgement import Judgement, motion
 from biresnerf.refine.start import Start
 from biresnerf.refine.two_stages import TwoStages
-from biresnerf.report import HeldOut, ImageReport, Report, SimilarityReport
+from biresnerf.report import CameraReport, HeldOut, ImageReport, Report, SimilarityReport
 
 
 def run_report(
@@ -56,6 +57,7 @@ def run_report(
             optimiser.bodies.fixed,
             judgement,
         ),
+        cameras=_camera_reports(dataset, optimiser.lenses),
         heldout=HeldOut(
             count=len(scores),
             psnr=float(np.mean([s.psnr for s in scores])),
@@ -79,6 +81,23 @@ def run_report(
             translation=tuple(float(v) for v in similarity.translation),
         ),
         warnings=dataset.warnings + _lost_warnings(dataset, lost),
+    )
+
+
+def _camera_reports(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[CameraReport, ...]:
+    used = [frame.camera for frame in dataset.frames]
+    return tuple(
+        CameraReport(
+            model=old.model,
+            width=old.width,
+            height=old.height,
+            source=dataset.source_of_intrinsics(i),
+            refined=lenses.parts[i] if lenses.moving else "none",
+            images=used.count(i),
+            params_before=old.params,
+            params_after=new.params,
+        )
+        for i, (old, new) in enumerate(zip(dataset.cameras, lenses.refined(dataset).cameras, strict=True))
     )
 
 

@@ -27,6 +27,8 @@ BLUR_PIXELS = 0.03  # blur at the start, as a share of the long side (6 px of 20
 FIELD_START, POSE_START = 200, 500  # steps of the paper's 40 000 over which rates rise from zero
 POSE_DIP = 0.05  # pose rate right after the switch, as a share
 POSE_STAGE2_CAP = 1e-3
+# Intrinsics begin to move at this share of the least length of stage 1, and rise over as many steps again.
+LENS_START, LENS_SHARE = 0.3, 0.5
 FIELD_DIP = 0.3
 FREEZE_SHARE = 0.95  # of all steps: poses stand still from then on
 # In stage 1 as NerfAcc; in stage 2 empty space hardly fills any more, and each look costs all levels.
@@ -136,6 +138,11 @@ class Schedule:
             share = POSE_DIP + (1 - POSE_DIP) * smooth_ramp((step - switch) / warmup)
             rate = min(rate, POSE_STAGE2_CAP) * share
         return rate
+
+    def lens_rate(self, step: int, switch: int | None) -> float:
+        """Learning rate of the intrinsics: a share of the poses', later: what these can explain is theirs."""
+        start = LENS_START * self._option("coarse_steps_min")
+        return LENS_SHARE * self.pose_rate(step, switch) * smooth_ramp((step - start) / start)
 
     def field_rates(self, step: int, switch: int | None) -> FieldRates:
         """Learning rates of the field: smooth warm-up of the reconstruction module after the switch."""

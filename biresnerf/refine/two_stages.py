@@ -18,7 +18,8 @@ from biresnerf.geometry.pose_error import rotation_angle_deg
 from biresnerf.progress import OnProgress, Progress
 from biresnerf.refine.checkpoint import CHECKPOINT, save_checkpoint
 from biresnerf.refine.history import History, Observer
-from biresnerf.refine.joint_optimiser import JointOptimiser, StepResult
+from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.late_figures import StepResult
 from biresnerf.refine.lost_cameras import LostCameraRepair
 from biresnerf.refine.stability import StabilityDetector
 from biresnerf.report import SwitchReason

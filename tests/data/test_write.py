@@ -17,6 +17,7 @@ from biresnerf.data.packs.colmap_binary import write_colmap_binary
 from biresnerf.data.read import read_dataset
 from biresnerf.data.refined_set import refined_set
 from biresnerf.data.write import write_transforms
+from biresnerf.geometry.camera_models import smallest_model
 from biresnerf.geometry.perturb import perturb_poses
 from tests.data.scenes import blender_scene, nerfstudio_scene, opengl_poses, save, write_image
 
@@ -187,3 +188,60 @@ def test_any_lens_of_a_folder_of_images_is_written_so_that_it_reads_back(tmp_pat
     for row in (written, *written["frames"]):
         if "FISHEYE" in row.get("camera_model", ""):
             assert not row.keys() & {"p1", "p2"}  # instant-ngp would take them for k3 and k4
+
+
+def refined(dataset, *, factor: float = 1.1):
+    """The set with every lens changed and marked as refined."""
+    cameras = []
+    for camera in dataset.cameras:
+        values = camera.full()._replace(fx=camera.full().fx * factor, fy=camera.full().fy * factor)
+        model, params = smallest_model(values, camera.model)
+        cameras.append(replace(camera, model=model, params=params))
+    return replace(dataset, cameras=tuple(cameras), intrinsics_sources=("refined",) * len(cameras))
+
+
+@pytest.mark.parametrize("scene", ["odd", "blender", "ngp", "fisheye", "scaled"])
+def test_refined_intrinsics_are_written_where_the_input_has_them_and_read_back(tmp_path, scene):
+    if scene == "odd":
+        dataset, document = odd_scene(tmp_path)
+    elif scene == "blender":
+        document = blender_scene(tmp_path)
+    else:
+        extra = {
+            "ngp": {"aabb_scale": 4, "camera_angle_x": 1.0, "x_fov": 50.0, "k1": 0.01},
+            "fisheye": {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k3": 0.002},
+            "scaled": {"w": 40, "h": 32, "fl_x": 36.0, "fl_y": 36.0, "cx": 20.0, "cy": 16.0},
+        }[scene]
+        document = nerfstudio_scene(tmp_path, **extra)
+    dataset = read_dataset(save(tmp_path, document))
+    changed = refined(dataset)
+    write_transforms(changed, dataset.world_from_cam, tmp_path / "out.json")
+    again = read_dataset(tmp_path / "out.json")
+    for i in range(len(dataset)):
+        assert again.camera_of(i).model == dataset.camera_of(i).model
+        np.testing.assert_allclose(again.camera_of(i).full(), changed.camera_of(i).full(), rtol=1e-12)
+    written = json.loads((tmp_path / "out.json").read_text("utf-8"))
+    lens_keys = {"w", "h", "fl_x", "fl_y", "cx", "cy"}
+    assert set(written) - lens_keys == set(document) - lens_keys
+    if scene == "blender":
+        assert not set(written) & {"fl_x", "cx"}
+    if scene == "ngp":  # instant-ngp takes fl_x first, others the angle: they must agree
+        assert np.tan(written["camera_angle_x"] / 2) == pytest.approx(10 / written["fl_x"])
+        assert np.radians(written["x_fov"]) == pytest.approx(written["camera_angle_x"])
+
+
+def test_lenses_that_were_not_refined_keep_their_numbers_to_the_letter(tmp_path):
+    dataset, document = odd_scene(tmp_path)
+    changed = refined(dataset)
+    own = dataset.frames[2].camera
+    changed = replace(
+        changed,
+        cameras=tuple(c if i == own else dataset.cameras[i] for i, c in enumerate(changed.cameras)),
+        intrinsics_sources=tuple("refined" if i == own else "given" for i in range(len(changed.cameras))),
+    )
+    write_transforms(changed, dataset.world_from_cam, tmp_path / "out.json")
+    written = json.loads((tmp_path / "out.json").read_text("utf-8"))
+    assert written["frames"][2]["fl_x"] == pytest.approx(1.1 * 25.0)
+    for row in (written, written["frames"][2]):
+        row.pop("frames", None)
+    assert written == {key: value for key, value in document.items() if key != "frames"}

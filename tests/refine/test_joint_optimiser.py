@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from biresnerf.data.dataset import Camera
 from biresnerf.field.radiance_field import PositionGradient
+from biresnerf.refine.evaluation import render_view
 from tests.refine.scene import tiny_optimiser, tiny_options, tiny_set
 
 
@@ -63,8 +67,6 @@ def test_held_out_photos_move_their_own_pose_but_never_the_field(scene):
     for shade in (0, 255):
         photos = images.pixels.copy()
         photos[images.offsets[2] : images.offsets[3]] = shade
-        from dataclasses import replace
-
         optimiser = tiny_optimiser(dataset, replace(images, pixels=photos), tiny_options(), held_out=[2])
         optimiser.background = torch.ones(3)
         for _ in range(12):
@@ -141,3 +143,21 @@ def test_lost_cameras_weigh_less_in_our_loss_and_in_no_other_methods(scene):
                 watch.weights = weights
             losses.append(float(optimiser.step().loss))
         assert (losses[1] < 0.99 * losses[0]) == weighed
+
+
+def test_a_set_of_several_lenses_with_one_that_sees_behind_itself_is_optimised_and_rendered(scene):
+    dataset, images = scene
+    behind = Camera("OPENCV_FISHEYE", 24, 24, (8.0, 8.0, 12.0, 12.0, 0.01, 0.0, 0.0, 0.0))
+    bent = Camera("SIMPLE_RADIAL", 24, 24, (33.0, 12.0, 12.0, -0.1))
+    cameras = (behind, bent, *images.cameras[2:])
+    optimiser = tiny_optimiser(dataset, replace(images, cameras=cameras), tiny_options())
+    image, corner = torch.tensor([0, 1, 2]), torch.full((3, 2), 0.5)
+    _, direction = optimiser.cast(optimiser.poses.matrices()[image], image, corner)
+    forward = optimiser.poses.matrices()[:3, :, 2].detach()
+    assert [float(c) > 0 for c in (direction.detach() * forward).sum(1)] == [False, True, True]
+    for _ in range(5):
+        assert np.isfinite(optimiser.step().loss)
+    assert bool(optimiser.poses.matrices().isfinite().all())
+    view = render_view(optimiser, optimiser.poses.matrices()[0].detach(), 0)
+    assert view.colour.shape == (24, 24, 3)
+    assert np.isfinite(view.colour).all()
