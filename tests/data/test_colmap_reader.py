@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -150,3 +155,39 @@ def test_a_camera_stands_where_its_pose_says(tmp_path):
     pose = world_from_cam_of(model.images[12].cam_from_world)
     np.testing.assert_array_equal(pose[:3, 3], [-12.0, -0.5, -2.0])
     np.testing.assert_array_equal(pose[:3, :3], np.eye(3))
+
+
+OTHER_VERSIONS = os.environ.get("BIRESNERF_TEST_PYCOLMAPS")
+REWRITE = """
+import zlib, sys, os
+import pycolmap
+assert pycolmap.__version__ == sys.argv[1], pycolmap.__version__
+rec = pycolmap.Reconstruction(sys.argv[2])
+for form in ("binary", "text"):
+    os.makedirs(os.path.join(sys.argv[3], form))
+    getattr(rec, "write_" + form)(os.path.join(sys.argv[3], form))
+"""
+
+
+@pytest.mark.skipif(
+    not OTHER_VERSIONS, reason="set BIRESNERF_TEST_PYCOLMAPS to a folder of `pip install --target VERSION`s"
+)
+@pytest.mark.parametrize("rigged", [False, True])
+@pytest.mark.parametrize("version", ["3.10.0", "3.11.1", "3.12.6", "3.13.0", "4.0.4"])
+def test_what_other_versions_of_colmap_write_is_read(tmp_path, version, rigged):
+    made = synthetic(5, "OPENCV", tmp_path / "made", 2, cameras_per_rig=3 if rigged else 1)
+    said = by_pycolmap([made])[0]
+    rewritten = subprocess.run(
+        [sys.executable, "-c", REWRITE, version, tmp_path / "made/binary", tmp_path / "rewritten"],
+        env={**os.environ, "PYTHONPATH": str(Path(OTHER_VERSIONS) / version)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert rewritten.returncode == 0, rewritten.stderr
+    for form in ("binary", "text"):
+        model = read_colmap_model(tmp_path / "rewritten" / form)
+        assert model.notes == ()
+        assert bool(model.rigs) == (version >= "3.12")
+        assert_reads_as_pycolmap(model, said)
