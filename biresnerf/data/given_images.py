@@ -26,6 +26,8 @@ from biresnerf.data.poses import refuse_coinciding
 from biresnerf.data.safe_names import refuse_outside
 from biresnerf.errors import InputError
 
+_IMAGES = "images/"
+
 
 @dataclass(frozen=True, eq=False)
 class GivenImage:
@@ -134,14 +136,19 @@ def match_files(
 ) -> tuple[list[str], list[str]]:
     """The file that each name means, and notes.
 
-    The same path; else, where one name and one file alone share it, the same file name in another folder, then with
-    letters of another case, then with another extension.
+    The same path, below images/ or with it; else, where one name and one file alone share it, the same file name in
+    another folder, then with letters of another case, then with another extension.
 
     Raises:
         InputError: ``image_missing``.
     """
-    present = set(files)
-    found = {name: name for name in names if name in present}
+    found: dict[str, str] = {}
+    free = set(files)
+    for key in (str, lambda name: name.removeprefix(_IMAGES), lambda name: _IMAGES + name):
+        for name in names:
+            if name not in found and key(name) in free:
+                found[name] = key(name)
+                free.remove(key(name))
     notes = []
     for rule, key in (
         ("by file name alone", posixpath.basename),
@@ -152,8 +159,8 @@ def match_files(
         ),
     ):
         open_names = _unique([name for name in names if name not in found], key)
-        free = _unique([file for file in files if file not in found.values()], key)
-        pairs = {name: free[shared] for shared, name in open_names.items() if shared in free}
+        open_files = _unique([file for file in files if file not in found.values()], key)
+        pairs = {name: open_files[shared] for shared, name in open_names.items() if shared in open_files}
         if pairs:
             example = next(iter(pairs.items()))
             notes.append(f"{len(pairs)} images were found {rule} ({example[0]} is {example[1]})")

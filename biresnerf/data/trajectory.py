@@ -14,7 +14,7 @@ from biresnerf.data.camera_file import read_camera_file
 from biresnerf.data.colmap_dataset import image_files
 from biresnerf.data.conventions import rotation_from_quat_wxyz
 from biresnerf.data.dataset import Dataset, Dialect, SourceFormat
-from biresnerf.data.given_images import GivenImage, dataset_of
+from biresnerf.data.given_images import GivenImage, dataset_of, match_files
 from biresnerf.data.poses import rigid_matrix
 from biresnerf.data.text_file import read_text
 from biresnerf.errors import InputError
@@ -116,12 +116,13 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
         InputError: ``pose_count_mismatch``.
     """
     count, times = len(trajectory.poses), trajectory.times_s
-    if trajectory.name_of_time:
-        by_base = {PurePosixPath(name).name: name for name in names}
-        said = [PurePosixPath(trajectory.name_of_time.get(time, "")).name for time in times]
-        pairs = {by_base[name]: index for index, name in enumerate(said) if name in by_base}
-        if len(pairs) == count and len(by_base) == len(names):
-            return pairs, "by the names in its comments"
+    said = [trajectory.name_of_time.get(time, "") for time in times]
+    if said and all(said) and len(set(said)) == count:
+        try:
+            found, _ = match_files(said, names, lambda _: trajectory.file.name)
+            return {name: index for index, name in enumerate(found)}, "by the names in its comments"
+        except InputError:
+            pass  # comments about something else
     if times:
         taken, by = _times_of_images(names, root)
         nearest = _nearest(taken, times)
