@@ -7,7 +7,7 @@ import json
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,6 +27,7 @@ from biresnerf.field.compile_kernels import compile_kernels
 from biresnerf.output_folder import OutputFolder
 from biresnerf.progress import OnProgress, Progress
 from biresnerf.refine.checkpoint import load_checkpoint
+from biresnerf.refine.forward_facing import find_forward_facing
 from biresnerf.refine.history import Observer
 from biresnerf.refine.intrinsics_parameters import lenses_of
 from biresnerf.refine.joint_optimiser import JointOptimiser
@@ -210,6 +211,11 @@ def _find_start(
 ) -> Start:
     """The poses that predict unseen photos best, where there is a choice."""
     candidates = [Start.of(candidate) for candidate in prepared.candidates]
+    if candidates[0].source == "forward-facing":
+        message = "looking for poses without features"
+        report(Progress(stage="seeding", fraction=0.016, message=message))
+        found = find_forward_facing(prepared.images, options, device, threads, stop)
+        return replace(candidates[0], world_from_cam=found)
     if len(candidates) == 1:
         return candidates[0]
     report(Progress(stage="seeding", fraction=0.016, message=f"trying {len(candidates)} sets of poses"))

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.dataset import Camera, Dataset, Frame, IntrinsicsSource, SourceFormat
+from biresnerf.data.guessed_lens import guess_lens
 from biresnerf.data.image_files import ImageHeader, read_header
-from biresnerf.data.image_folder import guessed_camera
 from biresnerf.data.mask_files import mask_beside
 from biresnerf.data.named_images import few_names, refuse_too_few
 from biresnerf.data.orientation import (
@@ -83,7 +83,7 @@ def dataset_of(
     frames = []
     for image, header, orientation in zip(images, headers, orientations, strict=True):
         if image.camera is None:
-            fitted, by = guessed_camera(header)
+            fitted, by = guess_lens(header)
         else:
             fitted, by = fitted_camera(image.camera, header, image, said), "given"
         index = cameras.setdefault((fitted, by, image.camera_id), len(cameras))

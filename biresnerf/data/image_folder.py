@@ -8,24 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from biresnerf.data.dataset import Camera, Dataset, Frame, IntrinsicsSource, SourceFormat
-from biresnerf.data.image_files import ImageHeader, read_header
+from biresnerf.data.guessed_lens import guess_lens
+from biresnerf.data.image_files import read_header
 from biresnerf.data.mask_files import mask_beside
 from biresnerf.data.named_images import refuse_too_few
 from biresnerf.data.orientation import orientation_notes, page_notes
 from biresnerf.data.safe_names import refuse_outside
 
-GUESSED_FOCAL = 1.2  # of the long side, as COLMAP guesses: a field of view of 45 degrees, a normal lens
-
-
-def guessed_camera(header: ImageHeader) -> tuple[Camera, IntrinsicsSource]:
-    """A first guess of the lens of a picture, as it is to be shown, and what the guess is made from."""
-    width, height = header.width, header.height
-    focal = GUESSED_FOCAL * max(width, height)
-    return Camera("SIMPLE_RADIAL", width, height, (focal, width / 2, height / 2, 0.0)), "guessed"
-
 
 def read_image_folder(root: Path, images: Sequence[Path], within: Path | None = None) -> Dataset:
-    """The images as frames without pose, named by their path relative to ``root``; one camera for each size.
+    """The images as frames without pose, named by their path relative to ``root``; one camera for each size and
+    focal length.
 
     Raises:
         InputError: ``too_few_images``, ``unsafe_path`` where a link leads out of ``within``, or a code of
@@ -38,10 +31,12 @@ def read_image_folder(root: Path, images: Sequence[Path], within: Path | None = 
     refuse_too_few(len(names), root.name)
     headers = [read_header(path, name) for path, name in zip(images, names, strict=True)]
     cameras: dict[Camera, int] = {}
+    sources: dict[Camera, IntrinsicsSource] = {}
     frames = []
     for name, header in zip(names, headers, strict=True):
-        camera, _ = guessed_camera(header)
+        camera, source = guess_lens(header)
         index = cameras.setdefault(camera, len(cameras))
+        sources.setdefault(camera, source)
         mask, inverted = mask_beside(root, root / name, name, within)
         frames.append(Frame(name, root / name, index, None, None, mask=mask, mask_inverted=inverted))
     return Dataset(
@@ -50,5 +45,5 @@ def read_image_folder(root: Path, images: Sequence[Path], within: Path | None = 
         tuple(frames),
         SourceFormat("images", None, {}, np.eye(4)),
         (*orientation_notes(headers, [1] * len(headers), names), *page_notes(headers, names)),
-        tuple("guessed" for _ in cameras),
+        tuple(sources[camera] for camera in cameras),
     )

@@ -196,13 +196,17 @@ def nearest_pairs(apart: NDArray[np.float64], count: int) -> set[tuple[int, int]
 
 
 def read_mapping(dataset: Dataset, answer: dict[str, Any]) -> Mapping:
-    """`ask_colmap`'s answer for this set, best model first: by images placed, then by what points explain of them."""
+    """`ask_colmap`'s answer for this set, best model first: by images placed, then by features explained, and how well.
+
+    Of lego with noisy poses (200 px) both ways of mapping place all; global mapping explains more features, with half
+    the error again, and its poses are off by half as much again.
+    """
     index = {name: i for i, name in enumerate(_numbered(dataset))}
     models = [_model(model, index) for model in answer["models"]]
     matches = np.zeros((len(dataset), len(dataset)), dtype=np.int64)
     for a, b, count in answer["matches"]:
         matches[index[a], index[b]] = matches[index[b], index[a]] = count
-    best_first = sorted(models, key=lambda m: (-len(m.rows), -m.observations, m.reprojection_px))
+    best_first = sorted(models, key=lambda m: (-len(m.rows), -m.observations / max(m.reprojection_px, 0.1)))
     return Mapping(tuple(best_first), matches)
 
 

@@ -11,22 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.config import StartPoses
+from biresnerf.data.compare_models import adds_to, model_lens_problem, with_found_lenses
 from biresnerf.data.dataset import GUESSES, Dataset
 from biresnerf.data.image_likeness import likeness
-from biresnerf.data.map_images import MappedModel, Mapping, known_intrinsics
+from biresnerf.data.map_images import MappedModel, Mapping
 from biresnerf.data.match_poses import MatchedPoses, can_match, carry_model
 from biresnerf.data.missing_poses import guess_missing
 from biresnerf.data.named_images import MIN_IMAGES, few_names
 from biresnerf.data.remembered_mapping import remembered_mapping
 from biresnerf.errors import InputError, RefinementError
-from biresnerf.geometry.lens import lens_problem
-from biresnerf.geometry.pose_error import rotation_angle_deg
-from biresnerf.geometry.similarity import align_robust
 from biresnerf.report import PoseSource
 
 LEAST_PLACED = 0.6  # of the images; a model of fewer says too little about a rig whose poses are given
 LEAST_REGISTERED = 0.4  # of images of which none has a pose; from fewer, the rest cannot be guessed
-SAME_DEG = 2.0  # models whose cameras differ by less (median) are not tried against each other
+# Median likeness of all pairs of photos: from nearly one place 0.56 (LLFF's horns) to 0.87, around a scene 0.1 to 0.66.
+FACING_ALIKE = 0.4
 MATCHED: dict[str, PoseSource] = {"incremental": "matches-incremental", "global": "matches-global"}
 OVERLAP_MEND = (
     "Take sharp photos that overlap by more than half, of something with texture, from many places; "
@@ -112,7 +111,7 @@ def seed_poses(
     file ``remember``, with colmap.log beside it. ``on_start`` is called only if COLMAP does run.
 
     Raises:
-        InputError: ``pose_missing``, ``colmap_missing``, ``seed_failed`` or ``seed_timeout``.
+        InputError: ``pose_missing``, ``colmap_missing``, ``seed_failed``, ``insufficient_overlap`` or ``seed_timeout``.
         Interrupted: ``should_stop`` said so.
         RefinementError: ``seeding_crashed``: COLMAP itself failed, and there are no given poses.
     """
@@ -140,7 +139,7 @@ def seed_poses(
         return _seeding(noted, given.candidate("given", None, "given", nothing))
     if start == "auto" and given.posed.any():
         return _beside_given(given, mapping)
-    return _from_scratch(given, mapping)
+    return _from_scratch(given, mapping, start)
 
 
 def _refuse_missing(dataset: Dataset) -> None:
@@ -181,9 +180,9 @@ def _beside_given(given: _Given, mapping: Mapping) -> Seeding:
     carried: list[tuple[MatchedPoses, MappedModel]] = []
     for model in mapping.models:
         matched = carry_model(model, given.poses, given.posed)
-        if matched is not None and _lens_problem(given.dataset, model) is None:
+        if matched is not None and model_lens_problem(given.dataset, model) is None:
             carried.append((matched, model))
-    dataset = _with_cameras(given.dataset, [model for _, model in carried])
+    dataset = with_found_lenses(given.dataset, [model for _, model in carried])
     given = replace(given, dataset=dataset)
     best = carried[0][0] if carried else None
     completing = (
@@ -197,35 +196,34 @@ def _beside_given(given: _Given, mapping: Mapping) -> Seeding:
     )
     source = "given" if best is None else MATCHED[best.mapper]
     candidates = [given.candidate("given", completing, source, mapping.matches)]
-    for matched, _ in carried:
-        if matched.placed.sum() >= max(MIN_IMAGES, LEAST_PLACED * len(dataset)):
+    for matched, model in carried:
+        enough = matched.placed.sum() >= max(MIN_IMAGES, LEAST_PLACED * len(dataset))
+        if enough and (matched is best or adds_to(carried[0][1], model)):
             name = MATCHED[matched.mapper]
             candidates.append(given.candidate(name, matched, name, mapping.matches))
     return _seeding(dataset, *candidates)
 
 
-def _from_scratch(given: _Given, mapping: Mapping) -> Seeding:
+def _from_scratch(given: _Given, mapping: Mapping, start: StartPoses) -> Seeding:
     """The best model, and another one that sees through the same lenses; in the frame of the given poses, if any."""
     dataset = given.dataset
-    models = [m for m in mapping.models if _lens_problem(dataset, m) is None]
+    models = [m for m in mapping.models if model_lens_problem(dataset, m) is None]
     placed = max((len(model.rows) for model in models), default=0)
-    if placed < max(MIN_IMAGES, LEAST_REGISTERED * len(dataset)):
-        raise InputError(
-            "seed_failed",
-            f"COLMAP could place {placed} of {len(dataset)} images; at least "
-            f"{max(MIN_IMAGES, int(np.ceil(LEAST_REGISTERED * len(dataset))))} are needed.",
-            where=dataset.root.name,
-            mend=OVERLAP_MEND,
-        )
+    least = max(MIN_IMAGES, int(np.ceil(LEAST_REGISTERED * len(dataset))))
+    if placed < least:
+        what = f"COLMAP could place {placed} of {len(dataset)} images; at least {least} are needed"
+        if start == "colmap":
+            raise InputError("seed_failed", f"{what}.", where=dataset.root.name, mend=OVERLAP_MEND)
+        return _facing_forward(given, what)
     best = models[0]
-    dataset = _with_cameras(dataset, [best])
+    dataset = with_found_lenses(dataset, [best])
     candidates = []
     for model in models:
-        if len(model.rows) < LEAST_PLACED * len(best.rows) or not _same_lenses(best, model):
+        if model is not best and (
+            len(model.rows) < LEAST_PLACED * len(best.rows) or not adds_to(best, model)
+        ):
             continue
         matched = _tied(model, given)
-        if model is not best and _agree(best, model):
-            continue
         unplaced = replace(given, dataset=dataset, posed=given.posed & ~matched.placed)
         name: PoseSource = "colmap" if model is best else MATCHED[model.mapper]
         candidates.append(unplaced.candidate(name, matched, "colmap", mapping.matches))
@@ -242,45 +240,21 @@ def _tied(model: MappedModel, given: _Given) -> MatchedPoses:
     return MatchedPoses(model.mapper, poses, placed)
 
 
-def _agree(best: MappedModel, other: MappedModel) -> bool:
-    """Whether a model adds nothing to the best one: no images, and no other rotations."""
-    shared, at, there = np.intersect1d(best.rows, other.rows, return_indices=True)
-    if len(shared) < len(other.rows):
-        return False
-    poses = best.world_from_cam[at]
-    carried = align_robust(other.world_from_cam[there], poses, with_rotations=True).apply_to_poses(
-        other.world_from_cam[there]
-    )
-    turned = rotation_angle_deg(np.swapaxes(poses[:, :3, :3], 1, 2) @ carried[:, :3, :3])
-    return float(np.median(turned)) < SAME_DEG
-
-
-def _lens_problem(dataset: Dataset, model: MappedModel) -> str | None:
-    """An impossible lens is what COLMAP finds where the views fix too little."""
-    known = known_intrinsics(dataset)
-    for i, camera in model.cameras.items():
-        problem = None if known[i] else lens_problem(camera.full(), camera.width, camera.height)
-        if problem is not None:
-            return problem
-    return None
-
-
-def _same_lenses(one: MappedModel, other: MappedModel) -> bool:
-    return all(
-        i in one.cameras and np.allclose(one.cameras[i].params, camera.params, rtol=1e-3, atol=1e-3)
-        for i, camera in other.cameras.items()
-    )
-
-
-def _with_cameras(dataset: Dataset, models: list[MappedModel]) -> Dataset:
-    """The first model's lenses in place of guessed ones."""
-    if not models or all(known_intrinsics(dataset)):
-        return dataset
-    cameras, sources = list(dataset.cameras), list(dataset.intrinsics_sources)
-    for i, camera in models[0].cameras.items():
-        if sources[i] != "given":
-            cameras[i], sources[i] = camera, "colmap"
-    return replace(dataset, cameras=tuple(cameras), intrinsics_sources=tuple(sources))
+def _facing_forward(given: _Given, what: str) -> Seeding:
+    """All cameras at one place, if the photos are alike enough to have been taken from nearly there."""
+    dataset = given.dataset
+    alike = likeness(dataset)
+    pairs = alike[np.triu_indices(len(alike), 1)]
+    if float(np.median(pairs)) < FACING_ALIKE:
+        raise InputError(
+            "insufficient_overlap",
+            f"{what}, and the photos are too different to have been taken from nearly one place.",
+            where=dataset.root.name,
+            mend=OVERLAP_MEND,
+        )
+    warning = f"{what}: all cameras begin at one place, looking the same way, and find their poses without features."
+    noted = replace(dataset, warnings=(*dataset.warnings, warning))
+    return _seeding(noted, _without_features(given, np.zeros((0, 0), dtype=np.int64)))
 
 
 def _seeding(dataset: Dataset, *candidates: PoseCandidate) -> Seeding:

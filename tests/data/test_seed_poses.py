@@ -122,8 +122,23 @@ def test_images_that_show_nothing_in_common_are_refused_with_counts(tmp_path):
         write_image(tmp_path / f"{index}.png", index, size=(64, 48))
     with pytest.raises(InputError) as caught:
         seeded(tmp_path)
-    assert_complete(caught.value, "seed_failed", tmp_path.name)
+    assert_complete(caught.value, "insufficient_overlap", tmp_path.name)
     assert "0 of 4" in caught.value.what
+    with pytest.raises(InputError) as caught:
+        seeded(tmp_path, start="colmap")
+    assert_complete(caught.value, "seed_failed", tmp_path.name)
+
+
+@needs_colmap
+def test_photos_too_smooth_for_features_but_alike_face_forward(tmp_path):
+    rows, columns = np.mgrid[0:48, 0:64]
+    for index in range(4):
+        wave = np.sin((columns + 2 * index) / 20) * np.cos(rows / 17)
+        grey = np.repeat(np.uint8(127 + 90 * wave)[..., None], 3, axis=2)
+        Image.fromarray(grey).save(tmp_path / f"{index}.png")
+    found = seed_poses(read_dataset(tmp_path))
+    assert [c.name for c in found.candidates] == ["forward-facing"]
+    assert any("without features" in text for text in found.dataset.warnings)
 
 
 @needs_colmap
@@ -204,7 +219,7 @@ def test_known_intrinsics_are_kept_and_given_poses_only_say_what_the_frame_is(fo
     poses = found.candidates[0].world_from_cam
     assert set(found.candidates[0].sources) == {"colmap"}
     assert turned_deg(poses, arc_poses(VIEWS)).max() < 3  # in the given frame, to within its noise
-    assert pose_error(poses, arc_poses(VIEWS)).aligned.rotation_deg.max < 2.0
+    assert pose_error(poses, arc_poses(VIEWS)).aligned.rotation_deg.max < 3.0
 
 
 def test_given_poses_are_taken_as_they_are_and_missing_ones_refused_by_name(folder):
