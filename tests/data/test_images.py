@@ -120,55 +120,6 @@ def test_blender_images_lie_over_white(tmp_path):
     assert images.background.tolist() == [1.0, 1.0, 1.0]
 
 
-def _grey16() -> np.ndarray:
-    return np.random.default_rng(0).integers(0, 65536, (HEIGHT, WIDTH), dtype=np.uint16)
-
-
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_sixteen_bit_grey_keeps_its_full_range(tmp_path, suffix):
-    document = nerfstudio_scene(tmp_path)
-    grey = _grey16()
-    grey[0, :2] = 0, 65535
-    Image.fromarray(grey).save(tmp_path / f"images/x{suffix}")
-    document["frames"][0]["file_path"] = f"images/x{suffix}"
-    image = load_images(read_dataset(save(tmp_path, document))).image(0)
-    np.testing.assert_allclose(image[..., 0], grey / 257.0, atol=0.51)
-    assert (image[..., 0] == image[..., 2]).all()
-
-
-@pytest.mark.parametrize("mode", ["L", "LA", "P", "1", "CMYK", "YCbCr"])
-def test_other_modes_become_rgb_as_pillow_converts_them(tmp_path, mode):
-    document = nerfstudio_scene(tmp_path)
-    picture = Image.fromarray(noise(5, HEIGHT, WIDTH, 3)).convert(mode)
-    suffix = ".tif" if mode in ("CMYK", "YCbCr") else ".png"
-    picture.save(tmp_path / f"images/x{suffix}")
-    document["frames"][0]["file_path"] = f"images/x{suffix}"
-    image = load_images(read_dataset(save(tmp_path, document))).image(0)
-    assert np.array_equal(image, np.asarray(picture.convert("RGB")))
-
-
-def test_a_palette_with_a_transparent_colour_is_transparent(tmp_path):
-    document = nerfstudio_scene(tmp_path)
-    picture = Image.new("P", (WIDTH, HEIGHT), 0)
-    picture.putpalette([10, 20, 30, 200, 100, 50])
-    picture.putpixel((3, 2), 1)
-    picture.save(tmp_path / "images/x.png", transparency=0)
-    document["frames"][0]["file_path"] = "images/x.png"
-    images = load_images(read_dataset(save(tmp_path, document)))
-    assert images.image(0)[2, 3].tolist() == [200, 100, 50]
-    assert images.image(0)[0, 0].tolist() == [255, 255, 255]
-    assert images.alpha_image(1).min() == 255
-
-
-def test_floating_point_images_are_refused(tmp_path):
-    document = nerfstudio_scene(tmp_path)
-    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.float32)).save(tmp_path / "images/x.tif")
-    document["frames"][0]["file_path"] = "images/x.tif"
-    with pytest.raises(InputError) as caught:
-        load_images(read_dataset(save(tmp_path, document)))
-    assert_complete(caught.value, "image_format_unsupported", "images/x.tif")
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tif", ".bmp"])
 @pytest.mark.parametrize("kept", [0.5, 0.9])
 def test_cut_off_images_are_refused_by_name(tmp_path, suffix, kept):
