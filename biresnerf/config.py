@@ -22,6 +22,7 @@ from biresnerf.presets import (
 
 Device = Literal["auto", "cpu", "cuda"]
 Background = Literal["auto", "white", "black", "none"]
+ExposureChoice = Literal["auto", "none", "on"]
 Wiring = Literal["concat", "replace", "residual"]
 DetectorName = Literal["trend", "counter", "variance"]
 PoseParametrisation = Literal["se3_world", "so3xr3", "so3xr3_camp"]
@@ -60,6 +61,11 @@ class RefineOptions(BaseModel):
         "auto", description="What lies behind the scene: a colour, or none where photos show surroundings."
     )
 
+    exposure: ExposureChoice | None = Field(
+        None,
+        description="on: find how bright each photo is against the others, with poses and field; none: all alike; "
+        "auto: on where opaque photos differ in brightness.",
+    )
     start: StartPoses | None = Field(
         None,
         description="auto: feature matches find missing poses, and poses they support are tried against the given "

@@ -113,7 +113,7 @@ class OutputFolder:
         ]
         intrinsics = Intrinsics.from_cameras(halves).to(optimiser.device)
         pose = optimiser.poses.matrices()[view].detach()
-        rendered = render_view(optimiser, pose, view, intrinsics)
+        rendered = render_view(optimiser, pose, view, intrinsics, as_photo=True)
         write_view(
             self.path / PREVIEW,
             picture_stems(dataset.names)[view],

@@ -88,12 +88,14 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
 }
 
 COMMON_VALUES: dict[str, Any] = {
+    "exposure": "auto",
     "start": "auto",
     "reconstruction_resolution_min": 128,
     "double_pose_step": False,
 }
 
 _BAA_NGP = {
+    "exposure": "none",
     "start": "given",
     "double_pose_step": True,
     "pose_rate": 1e-3,
@@ -102,6 +104,7 @@ _BAA_NGP = {
     "field_rate_final": 1e-4,
 }
 _BARF = {
+    "exposure": "none",
     "start": "given",
     "pose_rate": 1e-3,
     "pose_rate_final": 1e-5,

@@ -129,6 +129,10 @@ class ImageReport(BaseModel):
         None, description="Variance of the Laplacian over that of its neighbours' photos; at working size."
     )
     gain: float | None = Field(None, description="Brightness of the photo over that of its render.")
+    exposure: tuple[float, float, float] | None = Field(
+        None,
+        description="The factors on red, green and blue that exposure compensation found; none without it.",
+    )
     trial_psnr_before: float | None = Field(
         None, description="In the verdict's training on the input's poses, dB; its unseen views only."
     )

@@ -16,6 +16,7 @@ from biresnerf.refine.image_metrics import psnr, ssim
 from biresnerf.refine.joint_optimiser import JointOptimiser
 
 FIT_STEPS, FIT_RATE, FIT_RAYS = 100, 1e-3, 1024  # BARF's test-time pose refinement
+FIT_EXPOSURE_RATE = 1e-2
 CHUNK = 8192  # rays rendered at once
 SWING_BELOW_DEG = 200.0  # cameras spread less than this about the scene: the orbit swings to and fro
 
@@ -45,7 +46,10 @@ def fit_rays(optimiser: JointOptimiser) -> int:
 
 
 def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
-    """Fit the poses of held-out views to the frozen field by their photometric error (method 2.4, item 4)."""
+    """Fit the poses of held-out views to the frozen field by their photometric error (method 2.4, item 4).
+
+    And their exposures, where those are compensated.
+    """
     if not held_out:
         return
     mobility = torch.zeros(len(optimiser.poses), device=optimiser.device)
@@ -55,14 +59,18 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
     gradient = PositionGradient()
     poses = optimiser.poses
     poses.restart_adam()
+    exposure = optimiser.exposure
+    exposure.restart_adam()
     rays = fit_rays(optimiser)
     for step in range(FIT_STEPS):
         batch = optimiser.sampler.draw(rays, 0.0, optimiser.generator, held_out_only=True)
         matrices = poses.matrices()[batch.image]
         origin, direction = optimiser.cast(matrices, batch.image, batch.xy)
         rendering = optimiser.render(origin, direction, 0, schedule.fine_interval, gradient, jitter=True)
-        optimiser.method.loss(rendering.colour, batch.sharp).backward()
+        colour = exposure.forgiven(exposure.shown(rendering, batch.image), batch.sharp)
+        optimiser.method.loss(colour, batch.sharp).backward()
         poses.step(FIT_RATE * 0.1 ** (step / FIT_STEPS), mobility)
+        exposure.step(FIT_EXPOSURE_RATE * 0.1 ** (step / FIT_STEPS))
 
 
 @torch.no_grad()
@@ -72,10 +80,13 @@ def render_view(
     image: int,
     intrinsics: Intrinsics | None = None,
     stride: int = 1,
+    *,
+    as_photo: bool = False,
 ) -> RenderedView:
     """Render what a camera at `unit_from_cam` [3, 4] with the intrinsics of `image` sees, whole.
 
-    `intrinsics` are the run's images' where not given; of rows and columns every `stride`-th is rendered.
+    `intrinsics` are the run's images' where not given; of rows and columns every `stride`-th is rendered. `as_photo`
+    gives it the exposure of photo `image`, to be compared with it; else it has the mean exposure of all.
     """
     lenses = intrinsics or optimiser.intrinsics
     width, height = int(lenses.width[image]), int(lenses.height[image])
@@ -91,7 +102,8 @@ def render_view(
         part = optimiser.render(
             origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=False
         )
-        parts.append(torch.cat([part.colour, part.depth[:, None], part.opacity[:, None]], 1).cpu())
+        colour = optimiser.exposure.shown(part, index) if as_photo else part.colour
+        parts.append(torch.cat([colour, part.depth[:, None], part.opacity[:, None]], 1).cpu())
     whole = torch.cat(parts).reshape(len(rows), len(columns), 5).numpy()
     return RenderedView(whole[..., :3].clip(0, 1), whole[..., 3], whole[..., 4])
 
@@ -100,7 +112,7 @@ def score_views(optimiser: JointOptimiser, images: ImageSet, views: list[int]) -
     """Render each view at its present pose and score it against its photo, where its pixels count."""
     matrices = optimiser.poses.matrices().detach()
     for image in views:
-        view = render_view(optimiser, matrices[image], image)
+        view = render_view(optimiser, matrices[image], image, as_photo=True)
         photo = torch.from_numpy(images.image(image).astype(np.float32) / 255)
         colour = torch.from_numpy(view.colour)
         mask = images.counts_image(image)

@@ -115,9 +115,8 @@ class FrozenTrials:
         matrices = optimiser.poses.matrices().detach()
         scores = []
         for view in self.unseen:
-            rendered = torch.from_numpy(
-                render_view(optimiser, matrices[view], view, stride=self._stride).colour
-            )
+            view_of = render_view(optimiser, matrices[view], view, stride=self._stride, as_photo=True)
+            rendered = torch.from_numpy(view_of.colour)
             sampled = images.image(view)[:: self._stride, :: self._stride]
             photo = torch.from_numpy(sampled.astype(np.float32) / 255)
             mask = images.counts_image(view)

@@ -18,6 +18,7 @@ from biresnerf.geometry.camera import Intrinsics, directions_with_gradient
 from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.refine.camera_errors import CameraErrors
 from biresnerf.refine.camp_preconditioner import camp_preconditioner
+from biresnerf.refine.exposure import Exposure
 from biresnerf.refine.intrinsics_parameters import IntrinsicsParameters
 from biresnerf.refine.late_figures import LateFigures, StepResult
 from biresnerf.refine.methods import METHODS, build_field, occupancy_side
@@ -82,6 +83,8 @@ class JointOptimiser:
         seen = images.pixels if images.counts is None else images.pixels[images.counts]
         behind = frame.background if frame.background is not None else seen.mean(0) / 255
         self.background = torch.as_tensor(behind, dtype=torch.float32, device=device)
+        around = self.background if frame.background is not None else None
+        self.exposure = Exposure(images, options.exposure or "auto", held_out, around, device)
         self.step_index = 0
         # The step that stage 2 began at. What has one stage is in its last from the first step on.
         self.switch: int | None = None if self.method.two_stages else 0
@@ -128,6 +131,7 @@ class JointOptimiser:
         """Start one camera over from another pose [3, 4]: as free as any, with nothing known of it yet."""
         self.poses.replace(camera, unit_from_cam)
         self.camera_errors.forget(camera)
+        self.exposure.forget(camera)
         self.mobility[:, self.poses.members(camera)] = 1.0
         if self.poses.preconditioner is not None:
             fresh = self._pose_parameters(self.poses.poses()).preconditioner
@@ -135,7 +139,8 @@ class JointOptimiser:
             self.poses.preconditioner[camera] = fresh[camera]
 
     def marching(self, interval: float) -> Marching:
-        near = self.frame.distance * self.schedule.near(self.step_index, self.switch)
+        near = self.schedule.near(self.step_index, self.switch)
+        near = self.frame.distance * (max(near, self.frame.near) if self.method.additions else near)
         far = self.schedule.far(self.frame.far)
         return Marching(interval, near, far, MOST_SAMPLES, self.occupancy.occupied)
 
@@ -194,10 +199,12 @@ class JointOptimiser:
             origin, direction, batch.trained, schedule.interval(t, self.switch),
             schedule.position_gradient(t, self.switch), jitter=True,
         )  # fmt: skip
-        loss = self._loss(rendering.colour, batch)
+        colour = self.exposure.shown(rendering, batch.image)
+        loss = self._loss(self.exposure.forgiven(colour, batch.target), batch)
         loss.backward()
         rates = schedule.field_rates(t, self.switch)
         self.field.step(rates)
+        self.exposure.step(rates.networks)
         rate = self.pose_rate()
         if rate > 0:
             mobility = self.mobility[0 if self.switch is None else 1]
@@ -208,10 +215,9 @@ class JointOptimiser:
             self.poses.forget_gradients()
         self.step_index += 1
         self._adapt_rays(rendering.samples, schedule.samples(t, self.switch))
-        self.camera_errors.add(
-            batch.image, rendering.colour.detach(), batch.target, rendering.opacity.detach()
-        )
-        error = ((rendering.colour.detach() - batch.sharp) ** 2)[: batch.trained].mean()
+        shown = colour.detach().clamp(max=1)
+        self.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach())
+        error = ((shown - batch.sharp) ** 2)[: batch.trained].mean()
         told_loss, told_error = self.figures.read(loss.detach(), error)
         return StepResult(told_loss, told_error, len(origin), rendering.samples)
 
@@ -267,6 +273,7 @@ class JointOptimiser:
             "lenses": self.lenses,
             "occupancy": self.occupancy,
             "camera_errors": self.camera_errors,
+            "exposure": self.exposure,
         }
 
     def notes(self) -> dict[str, float | int | None]:

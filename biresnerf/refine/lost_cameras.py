@@ -27,6 +27,7 @@ logger = logging.getLogger(__name__)
 SCORE_SIDE = 20  # a pose is scored on 20 x 20 pixels spread over the photo
 REFERENCES = 16  # cameras that stand for all others in the acceptance
 CHUNK = 4096  # rays rendered at once
+SCORED_AT_ONCE = 10  # poses
 ROUNDS = ((6, 48, 40), (2, 128, 50))  # poses kept, rays a step of each, steps
 RATES = (1e-2, 1e-3)  # pose learning rate of the first and the last step
 DISTINCT_DEG = 8.0  # poses nearer than this to a better one are not tried beside it
@@ -183,13 +184,19 @@ class LostCameraRepair:
         rays = image[owner]
         xy = self._grid(rays, SCORE_SIDE)
         target = optimiser.sampler.colours(rays, xy, self._blur())
+        counting = optimiser.sampler.counting(rays, xy)
         errors = []
-        for part in torch.arange(len(rays), device=optimiser.device).split(CHUNK):
+        for part in torch.arange(len(rays), device=optimiser.device).split(SCORED_AT_ONCE * SCORE_SIDE**2):
             rendering = self._render(matrices[owner[part]], rays[part], xy[part], PositionGradient())
             self._spent += FORWARD_COST * rendering.samples
-            errors.append(((rendering.colour - target[part]) ** 2).mean(1))
+            colour = optimiser.exposure.refitted(
+                rendering,
+                target[part],
+                None if counting is None else counting[part],
+                len(part) // SCORE_SIDE**2,
+            )
+            errors.append(((colour - target[part]) ** 2).mean(1))
         squared = torch.cat(errors).reshape(len(image), -1)
-        counting = optimiser.sampler.counting(rays, xy)
         if counting is None:
             mean = squared.mean(1)
         else:
@@ -215,7 +222,8 @@ class LostCameraRepair:
                 poses.matrices()[owner], image, xy, PositionGradient(1.0, 1.0, 1.0), jitter=True
             )
             self._spent += rendering.samples
-            torch.nn.functional.smooth_l1_loss(rendering.colour, target, reduction="sum").backward()
+            colour = optimiser.exposure.refitted(rendering, target, None, len(matrices))
+            torch.nn.functional.smooth_l1_loss(colour, target, reduction="sum").backward()
             poses.step(first * (last / first) ** (step / steps))
         return poses.matrices().detach()
 

@@ -55,6 +55,7 @@ def run_report(
             lost,
             stages.repair.repaired,
             optimiser.bodies.fixed,
+            optimiser.exposure.gains(),
             judgement,
         ),
         cameras=_camera_reports(dataset, optimiser.lenses),
@@ -117,6 +118,7 @@ def _image_reports(
     lost: list[int],
     repaired: list[int],
     fixed: np.ndarray,
+    exposures: np.ndarray | None,
     judgement: Judgement | None,
 ) -> tuple[ImageReport, ...]:
     turn, shift = motion(dataset.world_from_cam, refined)
@@ -131,6 +133,7 @@ def _image_reports(
             moved_units=float(shift[i]),
             lost=i in lost,
             repaired=i in repaired,
+            exposure=None if exposures is None else tuple(exposures[i].tolist()),
             psnr=scored[i].psnr if i in scored else None,
             ssim=scored[i].ssim if i in scored else None,
             **_judged(judgement, i),

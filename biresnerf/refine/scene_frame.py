@@ -18,6 +18,7 @@ from biresnerf.data.images import ImageSet
 from biresnerf.geometry.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.similarity import Similarity
+from biresnerf.refine.near_plane import watched_from
 
 logger = logging.getLogger(__name__)
 
@@ -39,6 +40,7 @@ class SceneFrame:
         distance: mean distance of the cameras from the centre.
         pixel: what one pixel of the working size spans at that distance.
         background: colour [3], 0 to 1, behind the scene; None where the scene has surroundings.
+        near: nothing nearer to a camera is sampled; a share of `distance`.
     """
 
     unit_from_world: Similarity
@@ -47,6 +49,7 @@ class SceneFrame:
     pixel: float
     far: float
     background: np.ndarray | None
+    near: float = 0.0
 
 
 def _slopes(images: ImageSet, image: int, pixel_xy: np.ndarray) -> np.ndarray:
@@ -95,7 +98,10 @@ def _pixel_slope(images: ImageSet) -> float:
 
 
 def scene_frame(poses: np.ndarray, images: ImageSet) -> SceneFrame:
-    """The unit frame of a set, from its poses world_from_cam [n, 4, 4] (noisy ones will do) and images."""
+    """The unit frame of a set, from its poses world_from_cam [n, 4, 4] (noisy ones will do) and images.
+
+    Several sets of poses of the same images, one after the other, get a frame that suits them all.
+    """
     centres = poses[:, :3, 3]
     focus = focus_point(poses)
     centre, distance = focus.point, focus.mean_distance
@@ -120,4 +126,11 @@ def scene_frame(poses: np.ndarray, images: ImageSet) -> SceneFrame:
         pixel=_pixel_slope(images) * distance / half,
         far=FAR_BOXES if images.background is None else 4 * distance / half + 4,
         background=images.background,
+        near=_near(poses, images, distance) if images.background is None else 0.0,
     )
+
+
+def _near(poses: np.ndarray, images: ImageSet, distance: float) -> float:
+    intrinsics = Intrinsics.from_cameras(images.cameras)
+    rigs = poses.reshape(-1, len(images), 4, 4)
+    return min(watched_from(rig, intrinsics, distance) for rig in rigs)
