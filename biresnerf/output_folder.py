@@ -14,11 +14,12 @@ from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.data.images import ImageSet
+from biresnerf.data.packs.input_form import forms_of_input, write_input_form
 from biresnerf.data.packs.write_packs import write_packs
 from biresnerf.data.refined_points import with_points_of
 from biresnerf.data.refined_set import refined_set
 from biresnerf.data.renders import picture_stems, write_orbit, write_view
-from biresnerf.data.write import stale_notes, write_transforms
+from biresnerf.data.write import transforms_notes, write_transforms
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera import Intrinsics
 from biresnerf.geometry.similarity import Similarity
@@ -186,7 +187,9 @@ class OutputFolder:
             flags=[image.flags for image in report.images],
         )
         refined = with_points_of(refined, dataset.source.colmap, matches, images)
-        notes = write_packs(refined, folder, report.options.packs) + stale_notes(dataset, world_from_cam)
+        asked = dict.fromkeys((*forms_of_input(dataset), *report.options.packs))
+        notes = write_packs(refined, folder, asked) + transforms_notes(dataset, world_from_cam)
+        write_input_form(dataset, refined, folder)
         points = PointsReport(source=refined.points_source, count=len(refined.model.points))
         return report.model_copy(update={"points": points, "warnings": report.warnings + notes})
 

@@ -50,12 +50,20 @@ def write_transforms(dataset: Dataset, world_from_cam: NDArray[np.float64], path
         )
 
 
-def stale_notes(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> tuple[str, ...]:
-    """What a transforms file goes on naming that belongs to the poses before."""
-    named = bool(dataset.source.document.get("ply_file_path"))
-    if not named or all(_unmoved(dataset, i, pose) for i, pose in enumerate(world_from_cam)):
-        return ()
-    return ("transforms.json still names ply_file_path: these points belong to the poses before.",)
+def transforms_notes(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> tuple[str, ...]:
+    """What a user of the transforms file at these poses [n, 4, 4] should know."""
+    notes = []
+    document = dataset.source.document
+    if document.get("ply_file_path") and not all(
+        _unmoved(dataset, i, pose) for i, pose in enumerate(world_from_cam)
+    ):
+        notes.append("transforms.json still names ply_file_path: these points belong to the poses before.")
+    if not document and len({family(camera) for camera in dataset.cameras}) > 1:
+        notes.append(
+            "transforms.json holds lenses of several kinds, which nerfstudio takes for one: "
+            "give it the COLMAP model or the pinhole pack."
+        )
+    return tuple(notes)
 
 
 def _unmoved(dataset: Dataset, index: int, world_from_cam: NDArray[np.float64]) -> bool:
