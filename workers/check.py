@@ -53,7 +53,6 @@ def check(folder: Path) -> dict[str, Any]:
     dataset = read_dataset(folder, within=folder)
     images = load_images(dataset, THUMBNAIL_PX)
     posed = int(dataset.posed.sum())
-    guessed = "guessed" in dataset.intrinsics_sources
     return {
         "images": len(dataset),
         "with_pose": posed,
@@ -61,7 +60,7 @@ def check(folder: Path) -> dict[str, Any]:
         "poses": "missing" if posed == 0 else "given" if posed == len(dataset) else "partial",
         "cameras": len(dataset.cameras),
         "camera_models": sorted({camera.model for camera in dataset.cameras}),
-        "intrinsics": "guessed" if guessed else "given",
+        "intrinsics": sorted(set(dataset.intrinsics_sources) or {"given"}),
         "format": dataset.source.dialect,
         "masks": sum(frame.mask is not None for frame in dataset.frames),
         "transparency": images.alpha is not None,

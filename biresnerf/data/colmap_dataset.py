@@ -29,7 +29,7 @@ def read_colmap_dataset(root: Path, model_folder: Path, within: Path | None = No
     model = read_colmap_model(model_folder)
     files = image_files(root)
     prefix = f"{IMAGE_FOLDER}/"
-    if all(image.name.startswith(prefix) for image in model.images.values()):
+    if model.images and all(image.name.startswith(prefix) for image in model.images.values()):
         files = {(name if name.startswith(prefix) else prefix + name): path for name, path in files.items()}
     registered = sorted(model.images.values(), key=lambda image: image.name)
     table = "images.bin" if model.form == "binary" else "images.txt"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import posixpath
+import unicodedata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -136,21 +137,29 @@ def match_files(
 ) -> tuple[list[str], list[str]]:
     """The file that each name means, and notes.
 
-    The same path, below images/ or with it; else, where one name and one file alone share it, the same file name in
-    another folder, then with letters of another case, then with another extension.
+    The same path, below images/ or with it; else, where one name and one file alone share it, the same in another
+    Unicode form, then the same file name in another folder, then with letters of another case, then with another
+    extension.
 
     Raises:
         InputError: ``image_missing``.
     """
     found: dict[str, str] = {}
     free = set(files)
-    for key in (str, lambda name: name.removeprefix(_IMAGES), lambda name: _IMAGES + name):
+    spellings: tuple[Callable[[str], str], ...] = (
+        lambda name: name,
+        lambda name: name.replace("\\", "/"),
+        lambda name: name.removeprefix(_IMAGES),
+        lambda name: _IMAGES + name,
+    )
+    for key in spellings:
         for name in names:
             if name not in found and key(name) in free:
                 found[name] = key(name)
                 free.remove(key(name))
     notes = []
     for rule, key in (
+        ("by the same name in another Unicode form", lambda name: unicodedata.normalize("NFC", name)),
         ("by file name alone", posixpath.basename),
         ("by file name, whatever its case", lambda name: posixpath.basename(name).casefold()),
         (

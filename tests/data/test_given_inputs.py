@@ -144,6 +144,18 @@ def test_images_under_other_names_are_found_where_just_one_can_be_meant_and_it_i
     assert dataset.warnings == (f"4 images were found {said}",)
 
 
+def test_names_with_backslashes_or_composed_otherwise_are_found(tmp_path):
+    trajectories.colmap_set(tmp_path, ("left\\a.png", "b\u00e4.png", "c.png", "d.png"))
+    for path in list((tmp_path / "images").iterdir()):
+        path.unlink()
+    for name in ("left/a.png", "ba\u0308.png", "c.png", "d.png"):
+        write_image(tmp_path / "images" / name)
+    dataset = read_dataset(tmp_path)
+    assert dataset.file_names == ("images/ba\u0308.png", "images/c.png", "images/d.png", "images/left/a.png")
+    assert len(dataset.warnings) == 1
+    assert "another Unicode form" in dataset.warnings[0]
+
+
 def test_names_that_hold_the_folder_of_images_are_taken_from_the_root(tmp_path):
     trajectories.colmap_set(tmp_path)
     text = tmp_path / "sparse/0/images.txt"

@@ -17,7 +17,7 @@ def test_what_was_found_is_counted(tmp_path: Path) -> None:
     write_image(tmp_path / "masks/a.png.png", mode="L")
     assert check(tmp_path) == {
         "images": 4, "with_pose": 3, "without_pose": 1, "poses": "partial", "cameras": 1,
-        "camera_models": ["PINHOLE"], "intrinsics": "given", "format": "colmap", "masks": 1, "transparency": False,
+        "camera_models": ["PINHOLE"], "intrinsics": ["given"], "format": "colmap", "masks": 1, "transparency": False,
         "warnings": ["1 of 4 images have no pose yet: d.png", "masks were found for 1 of 4 images"],
     }  # fmt: skip
 
@@ -25,7 +25,7 @@ def test_what_was_found_is_counted(tmp_path: Path) -> None:
 def test_images_alone_are_decoded_and_have_no_pose(tmp_path: Path) -> None:
     trajectories.write_images(tmp_path)
     report = check(tmp_path)
-    assert (report["poses"], report["without_pose"], report["intrinsics"]) == ("missing", 4, "guessed")
+    assert (report["poses"], report["without_pose"], report["intrinsics"]) == ("missing", 4, ["guessed"])
     whole = (tmp_path / "images/a.png").read_bytes()
     (tmp_path / "images/a.png").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError) as caught:
