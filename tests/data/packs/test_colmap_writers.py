@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from biresnerf.data.conventions import rotation_from_quat_wxyz
 from biresnerf.data.packs.colmap_binary import write_colmap_binary
 from biresnerf.data.packs.colmap_text import write_colmap_text
 from biresnerf.errors import InputError
+from biresnerf.geometry.pixel_rays import pixels_of_points
 from biresnerf.geometry.rigid import rigid_inverse
 from tests.data.packs.random_sets import random_model, random_poses, random_result
 from tests.data.scenes import assert_complete
@@ -24,6 +27,7 @@ from tests.data.scenes import assert_complete
 needs_colmap = pytest.mark.skipif(
     importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed"
 )
+OTHER_VERSIONS = os.environ.get("BIRESNERF_TEST_PYCOLMAPS")
 PYCOLMAP = """
 import zlib, json, sys
 import pycolmap
@@ -43,6 +47,29 @@ for folder in sys.argv[1:]:
         "frames": {i: [f.rig_id, pose(f.rig_from_world), sorted(d.id for d in f.data_ids)]
                    for i, f in m.frames.items()},
     })
+json.dump(answer, sys.stdout)
+"""
+
+
+# The same questions as every version since 3.11 takes them.
+ANY_PYCOLMAP = """
+import zlib, json, sys
+import numpy as np
+import pycolmap
+assert pycolmap.__version__ == sys.argv[1], pycolmap.__version__
+answer = []
+for folder in sys.argv[2:]:
+    m = pycolmap.Reconstruction(folder)
+    said = {"cameras": {}, "images": {}, "points": {i: p.xyz.tolist() for i, p in m.points3D.items()}}
+    for i, c in m.cameras.items():
+        said["cameras"][i] = [c.model.name, c.width, c.height, c.params.tolist()]
+    for i, image in m.images.items():
+        pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+        matrix = np.array(pose.matrix())
+        points = np.array([p.xyz for p in m.points3D.values()]) @ matrix[:, :3].T + matrix[:, 3] + [0, 0, 8]
+        seen = [m.cameras[image.camera_id].img_from_cam(x).tolist() for x in points]
+        said["images"][i] = [image.name, image.camera_id, matrix.tolist(), dict(zip(m.points3D, seen))]
+    answer.append(said)
 json.dump(answer, sys.stdout)
 """
 
@@ -213,3 +240,37 @@ def test_images_that_the_model_did_not_have_get_ids_and_frames_of_their_own(tmp_
     assert_equal_models(
         read_colmap_model(tmp_path), again
     )  # every image is in a frame, or it would be refused
+
+
+@pytest.mark.skipif(
+    not OTHER_VERSIONS, reason="set BIRESNERF_TEST_PYCOLMAPS to a folder of `pip install --target VERSION`s"
+)
+@pytest.mark.parametrize("version", ["3.11.1", "3.12.6", "3.13.0", "4.0.4"])
+def test_other_versions_of_colmap_read_the_same_ids_names_poses_and_points_and_project_alike(
+    tmp_path, version
+):
+    models, folders = [], []
+    for seed in range(12):
+        models.append(random_model(seed, rigs=bool(seed % 2), spaces=seed % 3 > 0))
+        folders.append(tmp_path / str(seed))
+        (write_colmap_binary if seed % 3 else write_colmap_text)(models[-1], folders[-1])
+    environment = {**os.environ, "PYTHONPATH": str(Path(OTHER_VERSIONS) / version)}
+    command = [sys.executable, "-c", ANY_PYCOLMAP, version, *map(str, folders)]
+    said = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert said.returncode == 0, said.stderr
+    for model, read in zip(models, json.loads(said.stdout), strict=True):
+        assert {int(i): (*c[:3], tuple(c[3])) for i, c in read["cameras"].items()} == {
+            i: (c.model, c.width, c.height, c.params) for i, c in model.cameras.items()
+        }
+        xyz = dict(zip(model.points.ids.tolist(), model.points.xyz, strict=True))
+        assert {int(i): x for i, x in read["points"].items()} == {i: x.tolist() for i, x in xyz.items()}
+        assert {int(i) for i in read["images"]} == set(model.images)
+        for number, image in model.images.items():
+            name, camera, matrix, seen = read["images"][str(number)]
+            assert (name, camera) == (image.name, image.camera_id)
+            pose = matrix_of_pose(image.cam_from_world)
+            np.testing.assert_allclose(matrix, pose[:3], atol=1e-13)
+            for point, pixel in seen.items():
+                there = (xyz[int(point)] @ pose[:3, :3].T + pose[:3, 3] + [0, 0, 8])[None]
+                ours = pixels_of_points(model.cameras[camera].full(), there)[0]
+                np.testing.assert_allclose(np.ravel(pixel), ours, atol=1e-9)
