@@ -77,21 +77,22 @@ def shrink_mask(counts: NDArray[np.bool_], width: int, height: int) -> NDArray[n
 def write_masks(dataset: Dataset, names: Sequence[str], folder: Path) -> bool:
     """Writes the masks as COLMAP wants them, ``folder``/``name``.png of the photo's full size; False if there are none.
 
-    ``names`` are those that COLMAP is given for the frames, in their order.
+    Photos without a mask get a white one: COLMAP leaves out photos whose mask it does not find. ``names`` are those
+    that COLMAP is given for the frames, in their order.
     """
-    found = False
+    if all(frame.mask is None for frame in dataset.frames):
+        return False
     for index, (frame, name) in enumerate(zip(dataset.frames, names, strict=True)):
         camera = dataset.camera_of(index)
         with quiet_pillow():
             counts = load_mask(frame, camera)
-        if counts is None:
-            continue
-        found = True
+        full = np.ones((camera.height, camera.width), dtype=np.bool_)
+        if counts is not None:
+            full = shrink_mask(counts, camera.width, camera.height)
         path = folder / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        full = shrink_mask(counts, camera.width, camera.height)
         Image.fromarray(full.astype(np.uint8) * 255).save(path)
-    return found
+    return True
 
 
 def _meaning(frame: Frame) -> str:

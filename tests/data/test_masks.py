@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,12 +12,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from biresnerf.data.dataset import Camera, Dataset, Frame
+from biresnerf.data.dataset import Camera, Dataset, Frame, SourceFormat
 from biresnerf.data.images import load_images
 from biresnerf.data.masks import load_mask, refuse_unfit_mask, shrink_mask, write_masks
 from biresnerf.data.read import read_dataset
 from biresnerf.errors import InputError
-from tests.data.scenes import HEIGHT, WIDTH, assert_complete, nerfstudio_scene, save
+from tests.data.scenes import HEIGHT, WIDTH, assert_complete, nerfstudio_scene, save, textured_arc
 
 CAMERA = Camera("SIMPLE_PINHOLE", WIDTH, HEIGHT, (20.0, WIDTH / 2, HEIGHT / 2))
 PATTERN = np.random.default_rng(0).random((HEIGHT, WIDTH)) < 0.6  # no symmetry, so no turn goes unseen
@@ -190,12 +193,53 @@ def test_colmap_is_given_full_size_masks_under_its_own_names(tmp_path):
     dataset = _masked_set(tmp_path, {1: PATTERN, 3: small})
     names = ["a.jpg", "b/c.jpg", "d.jpg", "e.jpg"]
     assert write_masks(dataset, names, tmp_path / "masks")
-    written = sorted(
-        p.relative_to(tmp_path / "masks").as_posix() for p in (tmp_path / "masks").rglob("*.png")
-    )
-    assert written == ["b/c.jpg.png", "e.jpg.png"]
+    assert (np.asarray(Image.open(tmp_path / "masks/a.jpg.png")) == 255).all()
     assert np.array_equal(np.asarray(Image.open(tmp_path / "masks/b/c.jpg.png")), PATTERN * np.uint8(255))
     corner = np.asarray(Image.open(tmp_path / "masks/e.jpg.png"))
     assert (corner[:2, :2] == 0).all()
     assert (corner > 0).sum() == HEIGHT * WIDTH - 4
     assert not write_masks(_masked_set(tmp_path, {}), names, tmp_path / "none")
+
+
+FEATURES = """
+import zlib, json, sys  # zlib first: pycolmap's own breaks Python's
+import pycolmap
+
+reader = pycolmap.ImageReaderOptions()
+reader.mask_path = "masks"
+extraction = pycolmap.FeatureExtractionOptions()
+extraction.num_threads = 1
+pycolmap.extract_features(
+    "made.db", "photos", image_names=json.loads(sys.argv[1]), reader_options=reader, extraction_options=extraction
+)
+database = pycolmap.Database.open("made.db")
+found = {i.name: [float(x) for x in database.read_keypoints(i.image_id)[:, 0]] for i in database.read_all_images()}
+print("FOUND " + json.dumps(found))
+"""
+
+
+def test_colmap_finds_nothing_under_a_mask_and_leaves_no_photo_out(tmp_path):
+    size = 120
+    textured_arc(tmp_path / "photos", 2, size)
+    names = ["00.png", "01.png"]
+    camera = Camera("SIMPLE_PINHOLE", size, size, (100.0, size / 2, size / 2))
+    counts = np.ones((size, size), dtype=bool)
+    counts[:, : size // 2] = False
+    _stored(counts, "L").save(tmp_path / "half.png")
+    frames = tuple(Frame(name, tmp_path / "photos" / name, 0, np.eye(4), "given") for name in names)
+    frames = (replace(frames[0], mask=tmp_path / "half.png"), frames[1])
+    dataset = Dataset(tmp_path / "photos", (camera,), frames, SourceFormat("images", None, {}, np.eye(4)))
+    assert write_masks(dataset, names, tmp_path / "masks")
+    outcome = subprocess.run(
+        [sys.executable, "-c", FEATURES, json.dumps(names)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found = json.loads(
+        next(line for line in outcome.stdout.splitlines() if line.startswith("FOUND ")).removeprefix("FOUND ")
+    )
+    assert min(found["00.png"]) >= size // 2
+    assert len(found["00.png"]) > 5
+    assert min(found["01.png"]) < size // 2
