@@ -58,7 +58,7 @@ def run_report(
             optimiser.exposure.gains(),
             judgement,
         ),
-        cameras=_camera_reports(dataset, optimiser.lenses),
+        cameras=camera_reports(dataset, optimiser.lenses),
         heldout=HeldOut(
             count=len(scores),
             psnr=float(np.mean([s.psnr for s in scores])),
@@ -85,7 +85,8 @@ def run_report(
     )
 
 
-def _camera_reports(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[CameraReport, ...]:
+def camera_reports(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[CameraReport, ...]:
+    """The set's cameras before and after."""
     used = [frame.camera for frame in dataset.frames]
     return tuple(
         CameraReport(

@@ -10,12 +10,22 @@ import torch
 
 from biresnerf.data.dataset import Camera
 from biresnerf.data.images import ImageSet
+from biresnerf.data.read import read_dataset
+from biresnerf.data.refined_set import refined_set
 from biresnerf.data.synthetic import render_synthetic, synthetic_cameras, synthetic_focal
+from biresnerf.data.write import write_transforms
 from biresnerf.geometry.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.camera_models import MODEL_PARAMETERS
-from biresnerf.refine.intrinsics_parameters import COLUMNS, FOCAL, IntrinsicsParameters, refined_part
+from biresnerf.refine.intrinsics_parameters import (
+    COLUMNS,
+    FOCAL,
+    IntrinsicsParameters,
+    lenses_of,
+    refined_part,
+)
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.pose_parameters import PoseParameters, dolly_directions
+from biresnerf.refine.run_report import camera_reports
 from biresnerf.refine.scene_frame import scene_frame
 from tests.refine.scene import photos_set, tiny_optimiser, tiny_options, tiny_set
 
@@ -169,6 +179,32 @@ def test_the_rule_of_auto():
     ]  # fmt: skip
     assert refined_part("all", "given") == "all"
     assert refined_part("none", "guessed") == "none"
+
+
+def test_every_file_holds_the_refined_lens_in_the_model_given(tmp_path):
+    dataset, images = tiny_set(tmp_path / "scene")
+    camera = Camera("SIMPLE_RADIAL", 24, 24, (33.0, 12.0, 12.0, 0.01))
+    document = {
+        "fl_x": 33.0,
+        "fl_y": 33.0,
+        "cx": 12.0,
+        "cy": 12.0,
+        "k1": 0.01,
+        "camera_model": "SIMPLE_RADIAL",
+    }
+    source = replace(dataset.source, document={**document, "frames": None})
+    given = replace(dataset, cameras=(camera,), source=source)
+    lenses = lenses_of(given, images, "all", [], CPU)
+    fill(lenses)
+    after = lenses.refined(given)
+    assert after.intrinsics_sources == ("refined",)
+    assert all(new != old for new, old in zip(after.cameras[0].params, camera.params, strict=True))
+    write_transforms(after, given.world_from_cam, tmp_path / "scene" / "out.json")
+    assert read_dataset(tmp_path / "scene" / "out.json").cameras == after.cameras
+    assert list(refined_set(after, given.world_from_cam).model.cameras.values()) == list(after.cameras)
+    report = camera_reports(given, lenses)[0]
+    assert (report.params_before, report.params_after) == (camera.params, after.cameras[0].params)
+    assert (report.source, report.refined, report.images) == ("given", "all", len(given))
 
 
 @pytest.fixture(scope="module")
