@@ -25,6 +25,17 @@ PoseSource = Literal[
 
 VerdictName = Literal["improved", "unchanged", "kept_input", "inconclusive", "failed_check"]
 Finding = Literal["better", "worse", "same", "open"]
+_VERDICT_WORDS: dict[VerdictName, str] = {
+    "improved": "improved",
+    "unchanged": "unchanged",
+    "kept_input": "input kept",
+    "inconclusive": "inconclusive",
+    "failed_check": "check failed",
+}
+_RETURNED_WORDS = {
+    "refined": "The result holds the refined poses.",
+    "input": "The result holds the input's poses, refined/ the refined ones.",
+}
 
 
 class PairedDifference(BaseModel):
@@ -99,6 +110,14 @@ class Verdict(BaseModel):
     )
     heldout: HeldOutEvidence | None = None
     epipolar: EpipolarEvidence | None = None
+
+    def in_words(self) -> list[str]:
+        """The verdict in one sentence, whose poses the result holds, and a line for each proof."""
+        ground, *proofs = self.why
+        return [
+            f"{_VERDICT_WORDS[self.verdict]}: {ground} {_RETURNED_WORDS[self.returned]}",
+            *(f"  {p}" for p in proofs),
+        ]
 
 
 class ImageReport(BaseModel):

@@ -159,6 +159,8 @@ def _tell(folders: Folders, truth: Path | None, scene: Path) -> None:
     """The outcome in numbers."""
     report = Report.model_validate_json((folders.result / "report.json").read_bytes())
     click.echo()
+    for line in report.verdict.in_words() if report.verdict is not None else []:
+        click.echo(line)
     if truth is not None:
         before, after = (_pose_error(path, truth) for path in (scene, folders.result))
         click.echo("pose error (mean over the cameras)   before      after")

@@ -14,6 +14,7 @@ from typing import Literal
 from pydantic import ValidationError
 
 from biresnerf.progress import Progress
+from biresnerf.report import Verdict, VerdictName
 from workers.child import Child, log_tail
 from workers.courier import Courier
 from workers.database import Database
@@ -134,7 +135,7 @@ class Attempt:
         keep = (self._claim.name, self._settings.stall_s)
         if status == 0:
             artifacts = await self._upload_result()
-            if not await self._ledger.publish(artifacts, *keep):
+            if not await self._ledger.publish(artifacts, self._verdict(), *keep):
                 await self._ledger.cancelled(artifacts, *keep)
             return False
         if status in EXIT_ERRORS:
@@ -171,6 +172,15 @@ class Attempt:
         artifacts = await self._upload_result(log_only=True)
         await self._ledger.fail(error, artifacts, self._claim.name, self._settings.stall_s)
         return False
+
+    def _verdict(self) -> VerdictName | None:
+        """What the report says of the result; None where it passes no verdict."""
+        try:
+            passed = json.loads((self._output / "report.json").read_bytes()).get("verdict")
+            return None if passed is None else Verdict.model_validate(passed).verdict
+        except (OSError, ValueError) as error:
+            log.error("no verdict of %s: %s", self._claim.job_id, error)
+            return None
 
     def _reported_error(self) -> JobError:
         """What the process wrote to ``error.json`` before it exited with 2 or 3."""

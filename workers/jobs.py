@@ -264,7 +264,7 @@ def job_from_row(row: dict[str, Any]) -> Job:
         "cancel_requested",
         "created_at",
     )
-    also = ("started_at", "finished_at", "options", "metrics", "message", "labels", "revision")
+    also = ("started_at", "finished_at", "options", "metrics", "message", "verdict", "labels", "revision")
     progress = JobProgress(**{key: row[key] for key in ("fraction", "step", "steps_total", "eta_s")})
     error = JobError.model_validate(row["error"]) if row["error"] else None
     return Job(**{key: row[key] for key in same + also}, progress=progress, error=error)

@@ -16,6 +16,7 @@ from typing import Any, Literal, TypeVar
 from psycopg.types.json import Jsonb
 
 from biresnerf.progress import Progress
+from biresnerf.report import VerdictName
 from workers.database import Connection, Database
 from workers.errors import Unavailable
 from workers.records import Artifact, EventType, JobError
@@ -131,7 +132,9 @@ class Ledger:
 
         await self._fenced(write)
 
-    async def publish(self, artifacts: Sequence[Artifact], keep: str, stall_s: float) -> bool:
+    async def publish(
+        self, artifacts: Sequence[Artifact], verdict: VerdictName | None, keep: str, stall_s: float
+    ) -> bool:
         """Make the result the job's one result; False where a cancellation was asked for first.
 
         What other attempts left is deleted once nobody can be writing it any more.
@@ -140,6 +143,9 @@ class Ledger:
         async def write(connection: Connection) -> bool:
             if await _cancel_requested(connection, self.claim.job_id):
                 return False
+            await connection.execute(
+                "UPDATE jobs SET verdict = %s WHERE id = %s", (verdict, self.claim.job_id)
+            )
             await _finish(connection, self.claim.job_id, "succeeded", None, artifacts)
             await _trash_attempts(connection, self.claim.job_id, keep, stall_s)
             return True

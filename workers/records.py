@@ -8,6 +8,7 @@ from typing import Any, Generic, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.progress import Stage
+from biresnerf.report import VerdictName
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 DatasetState = Literal["open", "finalizing", "ready", "rejected"]
@@ -76,6 +77,10 @@ class Job(Record):
     options: dict[str, Any] = Field(description="Resolved RefineOptions.")
     metrics: dict[str, float] = {}
     message: str = ""
+    verdict: VerdictName | None = Field(
+        None,
+        description="Whether refinement helped, once the job has succeeded; the report has the evidence.",
+    )
     error: JobError | None = None
     labels: dict[str, str] = {}
     revision: int = 0

@@ -135,32 +135,10 @@ def refine_command(
     return 0
 
 
-VERDICT_WORDS = {
-    "improved": "improved",
-    "unchanged": "unchanged",
-    "kept_input": "input kept",
-    "inconclusive": "inconclusive",
-    "failed_check": "check failed",
-}
-RETURNED_WORDS = {
-    "refined": "Written are the refined poses.",
-    "input": "Written are the input's poses; refined/ holds the refined ones.",
-}
-
-
-def verdict_lines(report: Report) -> list[str]:
-    """The verdict in one sentence, whose poses were written, and the proof."""
-    if report.verdict is None:
-        return []
-    first, *proof = report.verdict.why
-    words = VERDICT_WORDS[report.verdict.verdict]
-    return [f"{words}: {first} {RETURNED_WORDS[report.verdict.returned]}", *(f"  {line}" for line in proof)]
-
-
 def summary(report: Report, output: Path) -> str:
     """What a person wants to know at the end."""
     moved = sorted(image.moved_deg for image in report.images)
-    lines = verdict_lines(report)
+    lines = report.verdict.in_words() if report.verdict is not None else []
     lines += [
         f"{len(report.images)} cameras, moved by {moved[len(moved) // 2]:.3g} deg (median), {moved[-1]:.3g} deg (most)",
         f"{report.options.method}: {report.steps_done} steps"

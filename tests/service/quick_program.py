@@ -52,5 +52,13 @@ shutil.copy(poses, output / "transforms.json")
 (output / "renders").mkdir()
 (output / "renders" / "orbit.mp4").write_bytes(bytes(range(256)) * 40)
 (output / "renders" / "Blick über «Dach».png").write_bytes(b"\x89PNG")
-(output / "report.json").write_text(json.dumps({"state": "complete", "options": options}))
+verdict = {
+    "verdict": "kept_input",
+    "returned": "input",
+    "compared_with": "given",
+    "why": ["No better."],
+    "moved_px": 1,
+}
+report = {"state": "complete", "options": options, "verdict": verdict}
+(output / "report.json").write_text(json.dumps(report))
 tell("exporting", steps)

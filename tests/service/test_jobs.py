@@ -46,7 +46,9 @@ def test_a_submitted_job_is_202_with_location_and_runs_to_its_end(http: httpx.Cl
     assert 0 < seen["progress"]["fraction"] < 1
     assert seen["progress"]["eta_s"] > 0
     assert seen["metrics"]["loss"] > 0
+    assert seen["verdict"] is None
     done = finished(http, job["id"])
+    assert done["verdict"] == "kept_input"  # as the report has it
     assert done["state"] == "succeeded"
     assert done["progress"]["fraction"] == 1.0
     assert done["started_at"] <= done["finished_at"]
