@@ -26,7 +26,7 @@ from biresnerf.refine.pose_evidence import (
     moved_px,
 )
 from biresnerf.refine.start import Start
-from biresnerf.refine.verdict import Findings, decide, failed_checks
+from biresnerf.refine.verdict import MEASURABLE_PX, Findings, decide, failed_checks
 from biresnerf.report import Verdict
 
 Array = NDArray[np.float64]
@@ -93,10 +93,11 @@ def judge(
         moved = moved_px(before, after, images)
         if matches is not None:
             epipolar = compare_on_matches(before, after, matches, independent=not start.placed.any())
-        heldout = compare_on_unseen_views(
-            before, after, images, held_out, optimiser.options, optimiser.device, threads, should_stop,
-            lambda done: tell(0.45 * done),
-        )  # fmt: skip
+        if moved >= MEASURABLE_PX:
+            heldout = compare_on_unseen_views(
+                before, after, images, held_out, optimiser.options, optimiser.device, threads, should_stop,
+                lambda done: tell(0.45 * done),
+            )  # fmt: skip
     verdict = decide(
         Findings(
             failed=failed,
