@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from biresnerf.config import PackName
 from biresnerf.data.area_resize import area_resize
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
@@ -162,8 +163,10 @@ class OutputFolder:
         if judgement is not None and judgement.verdict.returned == "input":
             returned, returned_dataset = dataset.world_from_cam, dataset
             if np.isfinite(refined).all():
-                self._write_poses(self.path / REFINED, refined_dataset, images, refined, matches, report)
-        report = self._write_poses(self.path, returned_dataset, images, returned, matches, report)
+                self._write_poses(self.path / REFINED, refined_dataset, images, refined, matches, report, ())
+        # On the way to the end nobody waits for large packs.
+        packs = optimiser.options.packs if state == "complete" else ()
+        report = self._write_poses(self.path, returned_dataset, images, returned, matches, report, packs)
         self._write_text(REPORT, report.model_dump_json(indent=2))
         return report
 
@@ -175,8 +178,9 @@ class OutputFolder:
         world_from_cam: np.ndarray,
         matches: FeatureMatches | None,
         report: Report,
+        packs: Sequence[PackName],
     ) -> Report:
-        """Poses [n, 4, 4] in all forms; returns the report with what there is to say of them."""
+        """Poses [n, 4, 4] in the input's form, those of every result and ``packs``; the report with notes on them."""
         write_transforms(dataset, world_from_cam, folder / TRANSFORMS)
         tie = report.input_from_optimised
         refined = refined_set(
@@ -187,7 +191,7 @@ class OutputFolder:
             flags=[image.flags for image in report.images],
         )
         refined = with_points_of(refined, dataset.source.colmap, matches, images)
-        asked = dict.fromkeys((*forms_of_input(dataset), *report.options.packs))
+        asked = dict.fromkeys((*forms_of_input(dataset), *packs))
         notes = write_packs(refined, folder, asked) + transforms_notes(dataset, world_from_cam)
         write_input_form(dataset, refined, folder)
         points = PointsReport(source=refined.points_source, count=len(refined.model.points))

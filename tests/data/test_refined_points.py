@@ -11,7 +11,7 @@ import pytest
 from biresnerf.data.colmap_reader import read_colmap_model
 from biresnerf.data.colmap_result import model_of_poses, with_points
 from biresnerf.data.colmap_scene import NO_POINT, ColmapModel, ColmapPoints, no_points
-from biresnerf.data.dataset import Dataset, Frame, SourceFormat
+from biresnerf.data.dataset import Camera, Dataset, Frame, SourceFormat
 from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.data.images import ImageSet
 from biresnerf.data.match_tracks import match_tracks
@@ -28,11 +28,17 @@ from tests.refine.scene import photos_set
 
 
 def seen_model(
-    seed: int, poses: np.ndarray, xyz: np.ndarray, *, model: str | None = None, noise_px: float = 0.0
+    seed: int,
+    poses: np.ndarray,
+    xyz: np.ndarray,
+    *,
+    model: str | None = None,
+    noise_px: float = 0.0,
+    camera: Camera | None = None,
 ) -> ColmapModel:
     """Cameras at ``poses`` with a feature of each point [m, 3], in another order in each image; all tracks complete."""
     rng = np.random.default_rng(seed)
-    camera = random_camera(rng, model, (640, 480))
+    camera = camera or random_camera(rng, model, (640, 480))
     built = model_of_poses([f"{i}.jpg" for i in range(len(poses))], [camera], [0] * len(poses), poses)
     images, orders = {}, {}
     for number, pose in zip(built.images, rigid_inverse(poses), strict=True):
