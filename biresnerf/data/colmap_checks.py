@@ -140,7 +140,7 @@ def rigid_pose(numbers: Sequence[float], where: str) -> RigidPose:
     values = np.array(numbers, dtype=np.float64)
     if not np.isfinite(values).all():
         raise broken(where, "NaN or an infinite number in the pose", "pose_not_finite", "Remove the image.")
-    length = float(np.linalg.norm(values[:4]))
+    length = float(np.linalg.norm(np.clip(values[:4], -9.0, 9.0)))  # a square overflows
     if abs(length - 1.0) > QUAT_LENGTH_ERROR:
         raise broken(where, f"the quaternion has length {length:.3g}, not 1", "pose_not_rotation")
     if np.abs(values[4:]).max() > MAX_COORDINATE:

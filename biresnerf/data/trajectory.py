@@ -191,7 +191,7 @@ def _nearest(taken: dict[str, float], times: Sequence[float]) -> dict[str, int]:
 
 def _tum_pose(values: NDArray[np.float64], where: str) -> NDArray[np.float64]:
     x, y, z, w = values[4:]
-    length = float(np.linalg.norm(values[4:]))
+    length = float(np.linalg.norm(np.clip(values[4:], -9.0, 9.0)))  # a square overflows
     if abs(length - 1.0) > _QUAT_LENGTH_ERROR:
         raise _invalid(where, f"the quaternion has length {length:.3g}, not 1.", "pose_not_rotation")
     rotation = rotation_from_quat_wxyz(np.array([w, x, y, z]))
