@@ -152,7 +152,7 @@ def migrate_command() -> None:
 def submit_command(
     path: Path, preset: str | None, settings: dict[str, Any], wait: bool, output: Path | None, url: str
 ) -> None:
-    """Send PATH (a folder or a transforms.json with its images) to a service.
+    """Send PATH (a folder, or a file with poses in a folder of images) to a service.
 
     Exit status: 0 done, 2 the input or options have to change, 1 anything else. Ctrl-C ends the waiting; the
     job goes on.

@@ -110,7 +110,7 @@ def refine_command(
     settings: dict[str, Any],
     verbose: bool,
 ) -> int:
-    """Refine the camera poses of INPUT, a folder of images or a transforms.json.
+    """Refine the camera poses of INPUT: a folder of images, with poses in any form that is read or without.
 
     Results go to OUT: transforms.json and colmap/sparse/0 in the input's own frame and scale, report.json,
     renders/ and config.json. The same command goes on where an interrupted one stopped.
