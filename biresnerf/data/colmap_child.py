@@ -14,13 +14,18 @@ import zlib  # noqa: F401
 from pathlib import Path
 from typing import Any
 
+from biresnerf.data.colmap_pairs import (
+    drop_contradicting_pairs,
+    match_features,
+    matched_pairs,
+    write_position_priors,
+)
+
 SAYS = "seeding: "  # before lines meant for the job's log; all others are COLMAP's own
 # Small photos have few features: faint ones count as well, and fewer matches than COLMAP asks for must do.
-FAINTEST_PEAK, LEAST_MATCHES, LEAST_SEEN = 0.003, 12, 10
+FAINTEST_PEAK, LEAST_SEEN = 0.003, 10
 ENOUGH_PLACED = 0.8  # of the images: where all poses are given, no other way of mapping is tried then
 INTRINSICS_FROM = 0.5  # of the images: a model of fewer does not say what the lens is
-PAIR_OUTLIER = 3.0  # median disagreements beyond which a pair's matches are taken for repeated structure
-PAIR_OUTLIER_DEG = 30.0  # but not below this
 # Matches handed on to measure poses by: so many do, and checkpoints carry them.
 MATCHES_PER_PAIR, MATCHES_IN_ALL, LEAST_KEPT = 50, 100_000, 8
 
@@ -49,6 +54,7 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     database, images = work / "database.db", Path(request["root"])
     count = sum(len(camera["names"]) for camera in request["cameras"])
     pycolmap.set_random_seed(request["seed"])
+    given = [camera["known"] for camera in request["cameras"]]
     numbers = extract_features(request, database, images)
     say(f"features of {count} images found")
     match_features(request, database, work)
@@ -60,6 +66,7 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     say(f"{len(matches)} pairs of images match")
 
     answer: list[dict[str, Any]] = []
+    largest: Any = None
     for mapper, run in (("incremental", map_incrementally), ("global", map_globally)):
         (work / mapper).mkdir()
         models = run(database, images, work / mapper, request, numbers)
@@ -68,6 +75,8 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
             continue
         best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
         answer.append({"mapper": mapper, **describe(best, numbers)})
+        if largest is None or best.num_reg_images() > largest.num_reg_images():
+            largest = best
         placed = best.num_reg_images()
         say(
             f"{mapper} mapping: {placed} of {count} images, {best.num_points3D()} points, "
@@ -77,7 +86,8 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
             break
         if mapper == "incremental" and placed >= INTRINSICS_FROM * count:
             keep_intrinsics(database, best, request, numbers)
-    return {"models": answer, "matches": matches}
+    focals = {} if largest is None else preferred_focals(largest, given, numbers)
+    return {"models": answer, "matches": matches, "focals": focals}
 
 
 def extract_features(request: dict[str, Any], database: Path, images: Path) -> list[int]:
@@ -110,29 +120,6 @@ def extract_features(request: dict[str, Any], database: Path, images: Path) -> l
     return [camera_of.get(name, -1) for name in firsts]
 
 
-def match_features(request: dict[str, Any], database: Path, work: Path) -> None:
-    """Matches of all pairs, or of those listed, and the relative poses they support."""
-    import pycolmap
-
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = request["threads"]
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.compute_relative_pose = True
-    verification.min_num_inliers = LEAST_MATCHES
-    verification.ransac.random_seed = request["seed"]
-    verification.ransac.max_error *= request["error_scale"]
-    if request["pairs"] is None:
-        pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification)
-        return
-    listed = work / "pairs.txt"
-    listed.write_text("".join(f"{a} {b}\n" for a, b in request["pairs"]), "utf-8")
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = str(listed)
-    pycolmap.match_image_pairs(
-        database, matching_options=matching, pairing_options=pairing, verification_options=verification
-    )
-
-
 def write_matches(database_path: Path, work: Path) -> None:
     """All verified matches, thinned evenly, to matches.npz: images by their number, the order of names; px."""
     import numpy as np
@@ -153,65 +140,6 @@ def write_matches(database_path: Path, work: Path) -> None:
         images.append(np.tile(np.array([[number[a], number[b]]], np.int32), (len(found), 1)))
         xy.append(np.hstack([points[a][found[:, 0]], points[b][found[:, 1]]]).astype(np.float32))
     np.savez(work / "matches.npz", images=np.concatenate(images), xy=np.concatenate(xy))
-
-
-def matched_pairs(database_path: Path) -> list[tuple[str, str, int]]:
-    """Names of the images of each pair that matches, and how many matches."""
-    import pycolmap
-
-    database = pycolmap.Database.open(database_path)
-    names = {image.image_id: image.name for image in database.read_all_images()}
-    found = []
-    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
-        if len(geometry.inlier_matches) >= LEAST_MATCHES:
-            a, b = pycolmap.pair_id_to_image_pair(pair)
-            found.append((names[a], names[b], len(geometry.inlier_matches)))
-    database.close()
-    return found
-
-
-def drop_contradicting_pairs(database_path: Path, cam_from_world: dict[str, Any]) -> None:
-    """Remove pairs whose relative rotation by matches and by given poses differ by far more than most do."""
-    import numpy as np
-    import pycolmap
-
-    database = pycolmap.Database.open(database_path)
-    names = {image.image_id: image.name for image in database.read_all_images()}
-    rotation = {name: np.array(pose)[:3, :3] for name, pose in cam_from_world.items()}
-    angles = {}
-    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
-        a, b = pycolmap.pair_id_to_image_pair(pair)
-        if geometry.cam2_from_cam1 is None or names[a] not in rotation or names[b] not in rotation:
-            continue
-        matched = geometry.cam2_from_cam1.rotation.matrix()
-        given = rotation[names[b]] @ rotation[names[a]].T
-        cosine = (np.trace(matched.T @ given) - 1) / 2
-        angles[a, b] = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-    if angles:
-        bound = max(PAIR_OUTLIER_DEG, PAIR_OUTLIER * float(np.median(list(angles.values()))))
-        for (a, b), angle in angles.items():
-            if angle > bound:
-                database.delete_two_view_geometry(a, b)
-    database.close()
-
-
-def write_position_priors(database_path: Path, cam_from_world: dict[str, Any], deviation: float) -> None:
-    """Given camera centres as priors of this standard deviation."""
-    import numpy as np
-    import pycolmap
-
-    database = pycolmap.Database.open(database_path)
-    for image in database.read_all_images():
-        if image.name not in cam_from_world:
-            continue
-        pose = np.array(cam_from_world[image.name])
-        prior = pycolmap.PosePrior()
-        prior.position = -pose[:3, :3].T @ pose[:3, 3]
-        prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
-        prior.position_covariance = np.eye(3) * deviation**2
-        prior.corr_data_id = image.data_id
-        database.write_pose_prior(prior)
-    database.close()
 
 
 def map_incrementally(
@@ -251,6 +179,28 @@ def map_globally(
     adjustment.refine_focal_length = adjustment.refine_extra_params = not fixed
     adjustment.refine_principal_point = False
     return pycolmap.global_mapping(database, images, work, options)
+
+
+def preferred_focals(model: Any, known: list[bool], numbers: list[int]) -> dict[str, Any]:
+    """What known focal lengths the matches would rather have: by a bundle adjustment that lets them go, too.
+
+    By the camera's place in the request: the focal length preferred over the known one; and the mean reprojection
+    errors before and after. The model is not to be used afterwards.
+    """
+    import pycolmap
+
+    places = [i for i, number in enumerate(numbers) if known[i] and number in model.cameras]
+    before = {i: model.cameras[numbers[i]].mean_focal_length() for i in places}
+    errors = [float(model.compute_mean_reprojection_error())]
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = True
+    options.refine_principal_point = options.refine_extra_params = False
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    errors.append(float(model.compute_mean_reprojection_error()))
+    ratios = {str(i): model.cameras[numbers[i]].mean_focal_length() / before[i] for i in places}
+    return {"ratios": ratios, "errors_px": errors}
 
 
 def keep_intrinsics(database_path: Path, model: Any, request: dict[str, Any], numbers: list[int]) -> None:

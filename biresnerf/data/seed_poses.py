@@ -137,6 +137,7 @@ def seed_poses(
         warning = f"The given poses could not be compared with feature matches: {error}"
         noted = replace(dataset, warnings=(*dataset.warnings, warning))
         return _seeding(noted, given.candidate("given", None, "given", nothing))
+    given = replace(given, dataset=_with_focal_notes(dataset, mapping))
     if start == "auto" and given.posed.any():
         return _beside_given(given, mapping)
     return _from_scratch(given, mapping, start)
@@ -173,6 +174,17 @@ def _without_colmap(given: _Given, start: StartPoses, nothing: NDArray[np.int64]
     warning = "COLMAP is not installed: the given poses were not compared with feature matches."
     noted = replace(given.dataset, warnings=(*given.dataset.warnings, warning))
     return _seeding(noted, given.candidate("given", None, "given", nothing))
+
+
+def _with_focal_notes(dataset: Dataset, mapping: Mapping) -> Dataset:
+    """The set, with a warning for every camera whose given focal length the matches contradict."""
+    notes = tuple(
+        f"Feature matches fit better with a focal length {abs(ratio - 1):.1%} {'longer' if ratio > 1 else 'shorter'} "
+        f"than given for {dataset.names[next(j for j, f in enumerate(dataset.frames) if f.camera == i)]} and the "
+        "images that share its camera: where it is not certain, set refine_intrinsics=focal."
+        for i, ratio in sorted(mapping.focal_ratios.items())
+    )
+    return replace(dataset, warnings=dataset.warnings + notes)
 
 
 def _beside_given(given: _Given, mapping: Mapping) -> Seeding:

@@ -190,7 +190,7 @@ def test_the_request_is_plain_json(monkeypatch, noisy, tmp_path):
 
     def keep(request, work, should_stop, limit_s, log_folder):
         asked.update(json.loads(json.dumps(request)))
-        return {"models": [], "matches": []}
+        return {"models": [], "matches": [], "focals": {}}
 
     monkeypatch.setattr(map_images, "run_colmap", keep)
     first, second = (
@@ -235,3 +235,21 @@ def test_a_failure_of_colmap_leaves_the_given_poses_and_is_told(noisy, monkeypat
     found = seed_poses(noisy)
     assert set(found.candidates[0].sources) == {"given"}
     assert any("out of luck" in text for text in found.dataset.warnings)
+
+
+def with_focal(dataset: Dataset, times: float) -> Dataset:
+    camera = dataset.cameras[0]
+    return replace(dataset, cameras=(replace(camera, params=(times * camera.params[0], *camera.params[1:])),))
+
+
+def test_a_given_focal_length_that_matches_contradict_is_told(noisy):
+    answer = {"models": [], "matches": [], "focals": {"ratios": {"0": 0.93}, "errors_px": [0.32, 0.31]}}
+    assert map_images.read_mapping(noisy, answer).focal_ratios == {0: 0.93}
+    answer["focals"]["errors_px"] = [0.32, 0.319]  # hardly any better
+    assert map_images.read_mapping(noisy, answer).focal_ratios == {}
+    # The arc is short and its texture smooth: it tells gross errors only.
+    wrong = seed_poses(with_focal(noisy, 1.5))
+    (warning,) = (text for text in wrong.dataset.warnings if "focal length" in text)
+    assert "shorter than given" in warning
+    assert "00.png" in warning
+    assert not any("focal length" in text for text in seed_poses(noisy).dataset.warnings)
