@@ -99,7 +99,9 @@ def dataset_of(
     refuse_coinciding([frame.world_from_cam for frame in frames if frame.world_from_cam is not None], place)
     said += _pose_notes(frames) + _mask_notes(frames)
     sources = tuple(by for _, by, _ in cameras)
-    if any(by != "given" for by in sources):
+    if "exif" in sources:
+        said.append("no intrinsics are given: the focal length is taken from EXIF")
+    if "guessed" in sources:
         said.append("no intrinsics are given: the focal length is a guess")
     return Dataset(
         root,

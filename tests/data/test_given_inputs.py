@@ -327,6 +327,16 @@ def test_a_trajectory_without_camera_gets_a_guess_and_says_so(tmp_path):
     dataset = read_dataset(tmp_path)
     assert dataset.intrinsics_sources == ("guessed",)
     assert any("focal length is a guess" in text for text in dataset.warnings)
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 50  # mm on 35 mm film
+    for name in NAMES:
+        picture = Image.open(tmp_path / "images" / name)
+        (tmp_path / "images" / name).unlink()
+        picture.save(tmp_path / "images" / name.replace("png", "jpg"), exif=exif)
+    dataset = read_dataset(tmp_path)
+    assert dataset.intrinsics_sources == ("exif",)
+    assert any("is taken from EXIF" in text for text in dataset.warnings)
+    assert not any("is a guess" in text for text in dataset.warnings)
 
 
 def test_kitti_poses_are_read_in_order_with_the_projection_of_their_camera(tmp_path):
