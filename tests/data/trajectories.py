@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from biresnerf.data.dataset import Camera, Dataset
 from tests.data.colmap_files import write_tables
 from tests.data.scenes import HEIGHT, WIDTH, opengl_poses, write_image
 
@@ -21,6 +22,16 @@ def truth() -> np.ndarray:
     poses = np.array(opengl_poses(4))
     poses[:, :3, :3] = poses[:, :3, :3] @ FLIP
     return poses
+
+
+GIVEN_CAMERA = Camera("PINHOLE", WIDTH, HEIGHT, (18.0, 18.5, 10.25, 7.75))
+
+
+def assert_at_truth(dataset: Dataset, poses: np.ndarray | None = None) -> None:
+    """All frames have the given pose `truth` says, or ``poses`` [4, 4, 4]."""
+    assert dataset.posed.all()
+    np.testing.assert_allclose(dataset.world_from_cam, truth() if poses is None else poses, atol=1e-12)
+    assert {frame.pose_source for frame in dataset.frames} == {"given"}
 
 
 def write_images(folder: Path, names: tuple[str, ...] = NAMES) -> None:
