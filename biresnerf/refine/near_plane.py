@@ -15,13 +15,13 @@ from biresnerf.geometry.camera import Intrinsics, directions_in_cam, in_view
 
 WITNESSES = 2  # other cameras, looking less than a right angle elsewhere, that must have a point in view
 WATCHED = 0.8  # of what cameras see at a distance must be so
-# Distances looked at, as shares of the cameras' distance. Sampling begins one of them sooner: poses are noisy.
+# Distances looked at, as shares of the cameras' distance. Noisy poses share less: beyond 0.5 scenes may begin.
 NEAREST, FARTHEST, SPACING = 0.1, 0.5, 0.05
 SEERS, SIDE = 24, 5  # cameras that are asked, and pixels of each along either side
 
 
 def watched_from(unit_from_cam: NDArray[np.float64], intrinsics: Intrinsics, distance: float) -> float:
-    """The share of ``distance`` from which on `WATCHED` of what cameras see is seen by two others, less `SPACING`.
+    """The share of ``distance`` from which on `WATCHED` of what cameras see is seen by two others.
 
     `NEAREST` where that is nowhere so: a set that shares so little needs all it has.
 
@@ -46,7 +46,7 @@ def watched_from(unit_from_cam: NDArray[np.float64], intrinsics: Intrinsics, dis
             _witnessed(points.reshape(-1, 3), seer, matrices, intrinsics).reshape(len(shares), -1).mean(1)
         )
     enough = np.flatnonzero(watched / len(seers) >= WATCHED)
-    return max(NEAREST, float(shares[enough[0]]) - SPACING) if len(enough) else NEAREST
+    return float(shares[enough[0]]) if len(enough) else NEAREST
 
 
 def _witnessed(

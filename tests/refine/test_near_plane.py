@@ -39,7 +39,7 @@ def test_cameras_closer_together_may_see_nearer_things():
 @pytest.mark.parametrize("apart", [4, 6])
 def test_where_sampling_begins_most_of_a_view_is_in_two_others(apart):
     """By the geometry of the arc, in its plane: of the neighbours and theirs, two must have the point in view."""
-    near = near_of(arc(60, apart)) + SPACING
+    near = near_of(arc(60, apart))
     across = np.linspace(-0.5, 0.5, 200)  # half the angle of view is arctan 0.5
 
     def seen(share: float) -> float:
