@@ -21,16 +21,20 @@ from biresnerf.errors import InputError
 def read_colmap_dataset(root: Path, model_folder: Path, within: Path | None = None) -> Dataset:
     """The images of a model, by name, and those beside them that the model has not registered, without pose.
 
-    Images lie in ``root``/images, or in ``root`` itself.
+    Images lie in ``root``/images, or in ``root`` itself and those of its folders that the model names.
 
     Raises:
         InputError: codes as in docs/input.md.
     """
     model = read_colmap_model(model_folder)
-    files = image_files(root)
+    files = images_beside(root)
     prefix = f"{IMAGE_FOLDER}/"
     if model.images and all(image.name.startswith(prefix) for image in model.images.values()):
         files = {(name if name.startswith(prefix) else prefix + name): path for name, path in files.items()}
+    # Without images/, the model's folders of images lie in the root itself.
+    elsewhere = {image.name: root / image.name for image in model.images.values() if image.name not in files}
+    files |= {name: path for name, path in elsewhere.items() if path.is_file()}
+    refuse_no_images(files, root)
     registered = sorted(model.images.values(), key=lambda image: image.name)
     table = "images.bin" if model.form == "binary" else "images.txt"
     found, notes = match_files(
@@ -65,6 +69,12 @@ def image_files(root: Path) -> dict[str, Path]:
         InputError: ``no_images``.
     """
     files = images_beside(root)
+    refuse_no_images(files, root)
+    return files
+
+
+def refuse_no_images(files: dict[str, Path], root: Path) -> None:
+    """Raises InputError ``no_images`` where there are none."""
     if not files:
         raise InputError(
             "no_images",
@@ -72,7 +82,6 @@ def image_files(root: Path) -> dict[str, Path]:
             where=str(root),
             mend="Put the images into images/ beside the poses.",
         )
-    return files
 
 
 def images_beside(root: Path) -> dict[str, Path]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -154,6 +156,26 @@ def test_names_that_hold_the_folder_of_images_are_taken_from_the_root(tmp_path):
     dataset = read_dataset(tmp_path)
     assert dataset.names == dataset.file_names == tuple(f"images/{name}" for name in NAMES)
     assert dataset.warnings == ()
+
+
+@pytest.mark.parametrize("names", [NAMES, ("left/a.png", "left/b.png", "right/a.png", "right/b.png")])
+def test_images_may_lie_in_the_root_itself_or_in_folders_of_it(tmp_path, names):
+    trajectories.colmap_set(tmp_path, names)
+    for path in list((tmp_path / "images").iterdir()):
+        path.rename(tmp_path / path.name)
+    (tmp_path / "images").rmdir()
+    dataset = read_dataset(tmp_path)
+    assert_at_truth(dataset)
+    assert dataset.names == dataset.file_names == names
+    assert dataset.warnings == ()
+
+
+def test_a_model_without_images_is_refused(tmp_path):
+    trajectories.colmap_set(tmp_path)
+    shutil.rmtree(tmp_path / "images")
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path)
+    assert caught.value.code == "no_images"
 
 
 def test_a_colmap_set_written_back_has_the_models_names_and_a_transforms_file_that_finds_the_images(tmp_path):
