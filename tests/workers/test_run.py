@@ -151,6 +151,9 @@ async def test_a_real_job_survives_the_kill_of_its_process(
             "config.json",
             "log.txt",
             "colmap/sparse/0/images.bin",
+            "poses.json",
+            "tum.txt",
+            "scene.glb",
         } <= names
         report = await watched.result()
         assert report["state"] == "complete"
