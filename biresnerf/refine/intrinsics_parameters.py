@@ -150,14 +150,21 @@ class IntrinsicsParameters:
             self.differentiable()
         )
 
-    def step(self, rate: float) -> Tensor:
-        """A step of Adam; returns the log focal length by which each image's camera is to dolly, [images]."""
+    def step(self, rate: float, *, focal: bool = True) -> Tensor:
+        """A step of Adam; returns the log focal length by which each image's camera is to dolly, [images].
+
+        Args:
+            focal: whether focal lengths take part.
+        """
         before = self.increments.detach().clone()
         if self.increments.grad is not None:
             self.increments.grad += 2 * self.precision * before
         self._adam.param_groups[0]["lr"] = rate
         self._adam.step()
         self.forget_gradients()
+        if not focal:
+            with torch.no_grad():
+                self.increments[:, FOCAL] = before[:, FOCAL]
         return self._moved(before)
 
     @torch.no_grad()

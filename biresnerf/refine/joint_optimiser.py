@@ -210,7 +210,7 @@ class JointOptimiser:
             mobility = self.mobility[0 if self.switch is None else 1]
             self.poses.step(rate, mobility, field_rate=rates.networks)
             if lens_rate > 0:
-                self.poses.dolly(self.lenses.step(lens_rate))
+                self.poses.dolly(self.lenses.step(lens_rate, focal=schedule.focal_moves(self.switch)))
         else:
             self.poses.forget_gradients()
         self.step_index += 1

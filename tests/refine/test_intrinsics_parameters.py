@@ -173,6 +173,20 @@ def test_the_gradient_of_a_focal_length_counts_what_the_dolly_costs():
     assert float(lenses.increments.grad[0, FOCAL]) == pytest.approx(float(expected), rel=1e-9)
 
 
+def test_focal_lengths_stay_where_stage_1_left_them_and_other_parts_go_on(scene):
+    optimiser = with_lenses(scene, tiny_options(), 1.05, "all")
+    for _ in range(10):
+        optimiser.step()
+    optimiser.start_reconstruction()
+    before = optimiser.lenses.increments.detach().clone()
+    for _ in range(3):
+        optimiser.step()
+    after = optimiser.lenses.increments.detach()
+    assert before[0, FOCAL] != 0
+    assert after[0, FOCAL] == before[0, FOCAL]
+    assert bool((after[0, 2:4] != before[0, 2:4]).all())
+
+
 def test_the_rule_of_auto():
     assert [refined_part("auto", s) for s in ("given", "colmap", "exif", "guessed")] == [
         "none", "none", "focal", "focal",
