@@ -25,12 +25,13 @@ from biresnerf.refine.scene_frame import SceneFrame, scene_frame
 
 logger = logging.getLogger(__name__)
 
-FIRST_STEPS, SECOND_STEPS = 800, 400
+FIRST_STEPS, SECOND_STEPS = 800, 800
 SAMPLES = 1 << 14  # a step
 MIRROR = np.diag([1.0, 1.0, -1.0])
-BETTER_DB = (
-    1.0  # unseen photos must be predicted this much better than by a mean of photos that resemble them
-)
+# Unseen photos must be predicted this much better than by a mean of photos that resemble them: at 100 px, after 600 to
+# 800 steps with a guessed lens, lund_door +4.3 dB, fern +1.2 dB; cameras around a scene, temple -1.6 dB, lego +0.9 dB.
+# Where a background is known, it alone makes some of the difference.
+BETTER_DB, BETTER_DB_BOUNDED = 1.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,7 @@ def find_forward_facing(
     logger.info("forward-facing: %.2f dB, mirrored in depth %.2f dB", tries[0].psnr, tries[1].psnr)
     best = max(tries, key=lambda found: found.psnr)
     bound = resemblance_psnr(images, trial_views(len(images)))
-    if best.psnr < bound + BETTER_DB:
+    if best.psnr < bound + (BETTER_DB if frame.unbounded else BETTER_DB_BOUNDED):
         raise InputError(
             "insufficient_overlap",
             f"no poses were found that explain the photos: a scene built from some predicts others at {best.psnr:.1f} "
