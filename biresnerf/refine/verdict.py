@@ -29,9 +29,9 @@ STUDENT = (
     2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
 )  # fmt: skip
 # What matters, and what chance cannot make: trainings on the same poses differ by less (docs/verdict.md).
-PSNR_MATTERS, SSIM_MATTERS = 0.3, 0.01  # dB, and 1
+PSNR_MATTERS, SSIM_MATTERS = 0.5, 0.01  # dB, and 1
 EPIPOLAR_MATTERS = 0.1  # log2: 7 % of the error
-SAME_WITHIN = 2.0  # times that: an interval inside it says that there is nothing to gain or lose
+SAME_WITHIN = 1.5  # times that: an interval inside it says that there is nothing to gain or lose
 MEASURABLE_PX = 0.1  # at working size: motion that no photo of that size tells
 # Feature matches that miss by more than this share of the image fit no scene: neither set of poses is to be trusted.
 FITS_BELOW = 0.02
