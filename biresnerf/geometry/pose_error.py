@@ -89,6 +89,11 @@ def rotation_angle_deg(rotation: Array) -> Array:
     return np.degrees(np.arctan2(twice_sine, twice_cosine))
 
 
+def turned_deg(before: Array, after: Array) -> Array:
+    """By what angle [n] (deg) each camera's ``world_from_cam`` [n, 4, 4] differs from another in the same frame."""
+    return rotation_angle_deg(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+
+
 def camera_errors(estimate: Array, truth: Array) -> CameraErrors:
     """Errors of poses ``world_from_cam`` [n, 4, 4] against true ones in the same frame, without alignment."""
     estimate, truth = np.asarray(estimate, dtype=np.float64), np.asarray(truth, dtype=np.float64)

@@ -13,7 +13,7 @@ from biresnerf.data.dataset import GUESSES, Dataset
 from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.data.images import ImageSet
 from biresnerf.geometry.focus import focus_point
-from biresnerf.geometry.pose_error import rotation_angle_deg
+from biresnerf.geometry.pose_error import turned_deg
 from biresnerf.refine import image_flags
 from biresnerf.refine.input_frame import poses_in_input_frame
 from biresnerf.refine.joint_optimiser import JointOptimiser
@@ -113,7 +113,7 @@ def judge(
 
 def motion(before: Array, after: Array) -> tuple[Array, Array]:
     """Rotation (deg) and distance of the centres [n] between poses [n, 4, 4] of the same cameras."""
-    turned = rotation_angle_deg(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+    turned = turned_deg(before, after)
     return turned, np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
 
 

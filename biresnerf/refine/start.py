@@ -17,7 +17,7 @@ from biresnerf.config import RefineOptions
 from biresnerf.data.dataset import GUESSES
 from biresnerf.data.images import ImageSet
 from biresnerf.data.seed_poses import PoseCandidate
-from biresnerf.geometry.pose_error import rotation_angle_deg
+from biresnerf.geometry.pose_error import turned_deg
 from biresnerf.refine.frozen_trials import FrozenTrials, trial_views
 from biresnerf.refine.methods import METHODS
 from biresnerf.report import PoseSource, TrialReport
@@ -121,7 +121,9 @@ def choose_start(
     best = int(np.argmax(scores))
     if scores[best] < scores[0] + MARGIN_DB:
         matched = int(np.argmax(scores[1:])) + 1
-        disagree = _turned_deg(candidates[0].world_from_cam, candidates[matched].world_from_cam)
+        disagree = float(
+            np.median(turned_deg(candidates[0].world_from_cam, candidates[matched].world_from_cam))
+        )
         believed = candidates[0].source == "given" and disagree > DISAGREE_DEG
         best = matched if believed and scores[matched] > scores[0] - MARGIN_DB else 0
     trials = tuple(
@@ -131,8 +133,3 @@ def choose_start(
     chosen = candidates[best]
     logger.info("start: %s of %s", chosen.source, ", ".join(f"{t.source} {t.psnr:.2f} dB" for t in trials))
     return replace(chosen, trials=trials)
-
-
-def _turned_deg(given: np.ndarray, other: np.ndarray) -> float:
-    """Median rotation (deg) between two rigs [n, 4, 4] in one frame."""
-    return float(np.median(rotation_angle_deg(np.swapaxes(given[:, :3, :3], 1, 2) @ other[:, :3, :3])))

@@ -18,7 +18,7 @@ from biresnerf.data.seed_poses import PoseCandidate, Seeding, seed_poses
 from biresnerf.data.synthetic import synthetic_focal
 from biresnerf.errors import Interrupted, RefinementError
 from biresnerf.geometry.perturb import perturb_poses
-from biresnerf.geometry.pose_error import rotation_angle_deg
+from biresnerf.geometry.pose_error import rotation_angle_deg, turned_deg
 from biresnerf.geometry.similarity import Similarity, align_umeyama
 from tests.data.scenes import textured_arc
 
@@ -34,7 +34,7 @@ def with_poses(dataset: Dataset, poses: np.ndarray) -> Dataset:
 
 def errors_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     aligned = align_umeyama(found, truth).apply_to_poses(found)
-    return rotation_angle_deg(np.swapaxes(aligned[:, :3, :3], 1, 2) @ truth[:, :3, :3])
+    return turned_deg(aligned, truth)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -10,7 +10,7 @@ from biresnerf.data.dataset import Camera, Dataset, Frame, SourceFormat
 from biresnerf.data.image_likeness import likeness
 from biresnerf.data.image_order import natural_order, taken_along_a_path
 from biresnerf.data.missing_poses import guess_missing
-from biresnerf.geometry.pose_error import rotation_angle_deg
+from biresnerf.geometry.pose_error import turned_deg
 from tests.data.scenes import arc_poses, textured_arc, write_image
 
 VIEWS = 12
@@ -30,10 +30,6 @@ def guess(poses: np.ndarray, missing: list[int], names=None, matches=None, alike
     sources = guess_missing(found, known, names, nothing if matches is None else matches, alike)
     np.testing.assert_array_equal(found[known], poses[known])
     return found, sources
-
-
-def turned_deg(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return rotation_angle_deg(np.swapaxes(one[:, :3, :3], 1, 2) @ other[:, :3, :3])
 
 
 def test_names_are_ordered_by_their_numbers():

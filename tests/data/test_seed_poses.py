@@ -20,17 +20,13 @@ from biresnerf.data.synthetic import synthetic_focal
 from biresnerf.data.write import write_transforms
 from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.geometry.perturb import perturb_poses
-from biresnerf.geometry.pose_error import pose_error, rotation_angle_deg
+from biresnerf.geometry.pose_error import pose_error, turned_deg
 from tests.data.scenes import arc_poses, assert_complete, textured_arc, write_image
 
 needs_colmap = pytest.mark.skipif(
     importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed (extra: colmap)"
 )
 VIEWS, SIZE = 10, 320
-
-
-def turned_deg(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return rotation_angle_deg(np.swapaxes(one[:, :3, :3], 1, 2) @ other[:, :3, :3])
 
 
 def with_poses(folder: Path, poses: np.ndarray) -> Dataset:

@@ -17,7 +17,7 @@ from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.packs.glb_file import LINES, POINTS, GlbFile
 from biresnerf.data.refined_set import RefinedSet
 from biresnerf.data.renders import ramp_colours
-from biresnerf.geometry.pose_error import rotation_angle_deg
+from biresnerf.geometry.pose_error import turned_deg
 
 SCENE = "scene.glb"
 GREY = (150, 150, 150)
@@ -97,7 +97,7 @@ def _turn_colours(refined: RefinedSet) -> NDArray[np.uint8]:
     turned = [
         TURN_AT_TOP_DEG
         if image.given is None
-        else float(rotation_angle_deg((image.given[:3, :3].T @ image.world_from_cam[:3, :3])[None])[0])
+        else float(turned_deg(image.given[None], image.world_from_cam[None])[0])
         for image in refined.images
     ]
     return ramp_colours(np.array(turned) / TURN_AT_TOP_DEG)
