@@ -132,6 +132,14 @@ def test_every_answer_is_declared(http: httpx.Client) -> None:
     assert references <= set(schema["components"]["schemas"])
 
 
+def _command(process: psutil.Process) -> list[str]:
+    """Its command line; empty once it has ended, as processes of the database do at any time."""
+    try:
+        return process.cmdline()
+    except psutil.NoSuchProcess:
+        return []
+
+
 def test_the_web_process_loads_nothing_heavy(
     service: Running, http: httpx.Client, done_job: dict[str, Any]
 ) -> None:
@@ -141,7 +149,7 @@ def test_the_web_process_loads_nothing_heavy(
     children = psutil.Process(service.process.pid).children(recursive=True)
     sizes = {}
     for name in ("service.server", "workers.slot"):
-        (process,) = [child for child in children if name in child.cmdline()]
+        (process,) = [child for child in children if name in _command(child)]
         libraries = {Path(mapping.path).name for mapping in process.memory_maps()}
         assert not [
             library for library in libraries if re.search(r"torch|numba|colmap|openblas|llvm", library)
