@@ -99,7 +99,7 @@ class Run:
             optimiser,
             self.start,
             self.held_out,
-            None,
+            self.matches,
             self.threads,
             self.stop,
             tell,

@@ -15,6 +15,7 @@ from biresnerf.errors import InputError, Interrupted
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
 from biresnerf.refine.checkpoint import CHECKPOINT
+from biresnerf.report import Report
 from tests.data.scenes import textured_arc
 
 pytestmark = pytest.mark.skipif(
@@ -51,6 +52,16 @@ def without_colmap(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(colmap_process, "CHILD", tmp_path / "no_such_program.py")
 
 
+def assert_matches_were_heard(report: Report) -> None:
+    """The verdict knows the feature matches that the poses to start from came by, and that they are not independent."""
+    assert report.verdict is not None
+    epipolar = report.verdict.epipolar
+    assert epipolar is not None
+    assert epipolar.matches > 100
+    assert not epipolar.independent
+    assert epipolar.error_px.before < 2
+
+
 def test_seeding_is_a_stage_of_its_own(stopped):
     _, told = stopped
     stages = list(dict.fromkeys(progress.stage for progress in told))
@@ -69,12 +80,15 @@ def test_a_resumed_run_goes_on_from_the_poses_colmap_gave_the_first_time(
     assert {image.pose_source for image in report.images} == {"colmap"}
     assert [image.name for image in report.images] == [f"{i:02}.png" for i in range(6)]
     assert not (output / "checkpoint").exists()
+    assert_matches_were_heard(report)
 
 
 def test_the_checkpoint_alone_is_enough(photos, stopped, tmp_path, without_colmap):
     (tmp_path / "out" / CHECKPOINT).parent.mkdir(parents=True)
     shutil.copy(stopped[0] / CHECKPOINT, tmp_path / "out" / CHECKPOINT)
-    assert refine_poses(photos, tmp_path / "out", QUICK).resumed == 1
+    report = refine_poses(photos, tmp_path / "out", QUICK)
+    assert report.resumed == 1
+    assert_matches_were_heard(report)
 
 
 def test_a_run_killed_before_its_first_checkpoint_does_not_ask_again(
@@ -83,7 +97,9 @@ def test_a_run_killed_before_its_first_checkpoint_does_not_ask_again(
     (tmp_path / "out").mkdir()
     shutil.copytree(stopped[0] / "checkpoint", tmp_path / "out" / "checkpoint")
     (tmp_path / "out" / CHECKPOINT).unlink()
-    assert refine_poses(photos, tmp_path / "out", QUICK).resumed == 0
+    report = refine_poses(photos, tmp_path / "out", QUICK)
+    assert report.resumed == 0
+    assert_matches_were_heard(report)
 
 
 def test_a_changed_photo_is_not_taken_for_the_same_run(photos, stopped, tmp_path):
