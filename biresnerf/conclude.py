@@ -44,7 +44,7 @@ class Run:
 
     def evaluate(self) -> None:
         """Fit the poses of held-out views, score and render views, film the orbit."""
-        started = rendering_from = time.monotonic()
+        started = time.monotonic()
         optimiser = self.stages.optimiser
         self.report(Progress(stage="evaluating", fraction=LAST_FRACTION))
         fit_held_out_poses(optimiser, self.held_out)

@@ -11,6 +11,11 @@ from numpy.typing import NDArray
 PARALLEL_BELOW = 1e-6
 
 
+def rms_spread(centres: NDArray[np.float64]) -> float:
+    """Root mean square distance of camera centres [n, 3] from their mean."""
+    return float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
+
+
 @dataclass(frozen=True, eq=False)
 class Focus:
     """The point nearest to all optical axes, and how far that is to be trusted.

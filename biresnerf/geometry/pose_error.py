@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from biresnerf.geometry.focus import focus_point
+from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.similarity import Similarity, align_robust, align_row_flip, align_umeyama
 
 Array = NDArray[np.float64]
@@ -163,7 +163,7 @@ def _reference(truth: Array) -> tuple[Array, float, Literal["focus", "spread", "
     if focus.well_posed and focus.mean_distance > 1e-9 * max(float(np.abs(centres).max()), 1e-300):
         return focus.point, focus.mean_distance, "focus"
     middle = centres.mean(axis=0)
-    spread = float(np.sqrt(((centres - middle) ** 2).sum(axis=1).mean()))
+    spread = rms_spread(centres)
     if spread > 1e-9 * max(float(np.abs(centres).max()), 1e-300):
         return middle, spread, "spread"
     return middle, 1.0, "unit"

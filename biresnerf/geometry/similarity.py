@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.geometry.focus import rms_spread
+
 Array = NDArray[np.float64]
 
 # Centres whose correlation across a line is below this share of that along it leave the turn about the line
@@ -132,7 +134,7 @@ def align_robust(
     weights_centre = weights_rotation = np.ones(len(a))
     free = {"with_rotations": with_rotations, "with_scale": with_scale}
     b_from_a = _align_weighted(a, b, weights_centre, weights_rotation, **free)
-    spread = float(np.sqrt(((b[:, :3, 3] - b[:, :3, 3].mean(0)) ** 2).sum(1).mean()))
+    spread = rms_spread(b[:, :3, 3])
     for _ in range(_ROBUST_ROUNDS):
         moved = b_from_a.apply_to_poses(a)
         centre_residual = np.linalg.norm(moved[:, :3, 3] - b[:, :3, 3], axis=1)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from biresnerf.data.dataset import GUESSES, Dataset
 from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.data.images import ImageSet
-from biresnerf.geometry.focus import focus_point
+from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.pose_error import turned_deg
 from biresnerf.refine import image_flags
 from biresnerf.refine.input_frame import poses_in_input_frame
@@ -81,8 +81,7 @@ def judge(
     before = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in everyone))
     after = Rig(poses_in_input_frame(dataset, optimiser)[0], tuple(refined.camera_of(i) for i in everyone))
     turned, shifted = motion(before.world_from_cam, after.world_from_cam)
-    centres = before.world_from_cam[:, :3, 3]
-    spread = float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
+    spread = rms_spread(before.world_from_cam[:, :3, 3])
     grounded = sum(frame.pose_source not in GUESSED for frame in dataset.frames) > len(dataset) / 2
     lost = int(optimiser.camera_errors.lost.sum())
     failed = failed_checks(after.world_from_cam, lost, turned, shifted, spread, grounded)

@@ -16,7 +16,7 @@ import torch
 from biresnerf.data.dataset import Camera
 from biresnerf.data.images import ImageSet
 from biresnerf.geometry.camera import Intrinsics, directions_in_cam
-from biresnerf.geometry.focus import focus_point
+from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.near_plane import watched_from
 
@@ -106,7 +106,7 @@ def scene_frame(poses: np.ndarray, images: ImageSet) -> SceneFrame:
     focus = focus_point(poses)
     centre, distance = focus.point, focus.mean_distance
     if focus.conditioning < CONVERGING or focus.in_front < 0.5:
-        spread = float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
+        spread = rms_spread(centres)
         axis = poses[:, :3, 2].mean(0)
         length = float(np.linalg.norm(axis))
         forward = axis / length if length > 0.2 else np.zeros(3)

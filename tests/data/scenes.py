@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import json
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from biresnerf.data import map_images
 from biresnerf.data.synthetic import render_synthetic, synthetic_cameras
 from biresnerf.errors import InputError
 
@@ -72,6 +78,29 @@ def assert_complete(error: InputError, code: str, *where: str) -> None:
         assert part in error.where, f"{part!r} is not in {error.where!r}"
     assert error.what.endswith("."), error.what
     assert error.mend.endswith("."), error.mend
+
+
+def refused_at_once(read: Callable[[], object]) -> InputError:
+    """The error that ``read`` raises: within a second and 200 MB, and saying what and how to mend it."""
+    tracemalloc.start()
+    started = time.perf_counter()
+    with pytest.raises(InputError) as caught:
+        read()
+    assert time.perf_counter() - started < 1.0
+    assert tracemalloc.get_traced_memory()[1] < 200 * 2**20
+    tracemalloc.stop()
+    assert caught.value.what.endswith(".")
+    assert caught.value.mend.endswith(".")
+    return caught.value
+
+
+@contextmanager
+def plain_features() -> Iterator[None]:
+    """Plain features do for these scenes, at a seventh of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(map_images, "THOROUGH_UP_TO", 0)
+        patch.setattr(map_images, "THOROUGH_ALONE_UP_TO", 0)
+        yield
 
 
 def arc_poses(views: int) -> np.ndarray:

@@ -20,7 +20,7 @@ from biresnerf.errors import Interrupted, RefinementError
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import rotation_angle_deg, turned_deg
 from biresnerf.geometry.similarity import Similarity, align_umeyama
-from tests.data.scenes import textured_arc
+from tests.data.scenes import plain_features, textured_arc
 
 pytest.importorskip("pycolmap", reason="needs pycolmap (pip install 'biresnerf[colmap]')")
 VIEWS, SIZE = 10, 200
@@ -39,10 +39,7 @@ def errors_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module", autouse=True)
 def quick():
-    """Plain features do for these scenes, at a seventh of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(map_images, "THOROUGH_UP_TO", 0)
-        patch.setattr(map_images, "THOROUGH_ALONE_UP_TO", 0)
+    with plain_features():
         yield
 
 

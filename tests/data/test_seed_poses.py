@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from biresnerf.data import colmap_process, map_images
+from biresnerf.data import colmap_process
 from biresnerf.data.dataset import Camera, Dataset
 from biresnerf.data.read import read_dataset
 from biresnerf.data.seed_poses import seed_poses
@@ -21,7 +21,7 @@ from biresnerf.data.write import write_transforms
 from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error, turned_deg
-from tests.data.scenes import arc_poses, assert_complete, textured_arc, write_image
+from tests.data.scenes import arc_poses, assert_complete, plain_features, textured_arc, write_image
 
 needs_colmap = pytest.mark.skipif(
     importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed (extra: colmap)"
@@ -55,10 +55,7 @@ def seeded(folder, **how):
 
 @pytest.fixture(scope="module", autouse=True)
 def quick():
-    """Plain features do for these scenes, at a seventh of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(map_images, "THOROUGH_UP_TO", 0)
-        patch.setattr(map_images, "THOROUGH_ALONE_UP_TO", 0)
+    with plain_features():
         yield
 
 

@@ -17,6 +17,7 @@ from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.packs.glb_file import LINES, POINTS, GlbFile
 from biresnerf.data.refined_set import RefinedSet
 from biresnerf.data.renders import ramp_colours
+from biresnerf.geometry.focus import rms_spread
 from biresnerf.geometry.pose_error import turned_deg
 
 SCENE = "scene.glb"
@@ -65,7 +66,7 @@ def write_scene(refined: RefinedSet, path: Path) -> None:
 def _depth(world_from_cam: NDArray[np.float64]) -> float:
     """How long frusta are drawn: a share of the rig's size that shrinks as cameras crowd."""
     centres = world_from_cam[:, :3, 3]
-    spread = float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
+    spread = rms_spread(centres)
     return max(spread / math.sqrt(len(centres)), 1e-9)
 
 
