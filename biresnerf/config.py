@@ -210,7 +210,7 @@ def parse_options(values: dict[str, Any]) -> RefineOptions:
             problems.append(f"{path}: {known}")
         raise InputError(
             "invalid_options",
-            "; ".join(problems),
+            "; ".join(problems) + ".",
             where="options",
             mend="`biresnerf refine --help` and GET /v1/options list what there is.",
         ) from None
