@@ -24,7 +24,10 @@ log = logging.getLogger(__name__)
 
 Connection = psycopg.AsyncConnection[DictRow]
 # What a database that is away, or just went away, raises.
-AWAY = (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout, PoolClosed)
+AWAY = (
+    *(psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout, PoolClosed),
+    psycopg.errors.IdleInTransactionSessionTimeout,
+)
 QUEUE = "refine"
 TASK = "refine"
 # A peer that vanished without a word (a host that lost power) is noticed within a minute.
@@ -91,7 +94,12 @@ class Database:
 
 @asynccontextmanager
 async def open_database(
-    url: str, *, connections: int = 8, patience_s: float = 10.0, opening_s: float = 30.0
+    url: str,
+    *,
+    connections: int = 8,
+    patience_s: float = 10.0,
+    opening_s: float = 30.0,
+    silence_s: float = 60.0,
 ) -> AsyncIterator[Database]:
     """Pool and queue app, closed at the end.
 
@@ -99,9 +107,19 @@ async def open_database(
         connections: most connections of the pool.
         patience_s: how long a caller waits for a free and living connection.
         opening_s: how long to wait for the database at the start.
+        silence_s: a transaction in which nothing is asked for so long is rolled back by the database.
 
     Raises `SetupError` if the database does not answer in time or is not migrated.
     """
+
+    async def end_if_silent(connection: Connection) -> None:
+        # A process frozen within a transaction, or a host gone without a word, would hold its locks for ever.
+        await connection.execute(
+            "SELECT set_config('idle_in_transaction_session_timeout', %s, false)",
+            (str(round(1000 * silence_s)),),
+        )
+        await connection.commit()
+
     pool: AsyncConnectionPool[Connection] = AsyncConnectionPool(
         url,
         min_size=1,
@@ -112,6 +130,7 @@ async def open_database(
         reconnect_failed=_keep_trying,
         kwargs={"row_factory": dict_row, **CONNECT},
         connection_class=psycopg.AsyncConnection[DictRow],
+        configure=end_if_silent,
         check=AsyncConnectionPool.check_connection,  # connections killed with the server are replaced unseen
         open=False,
     )

@@ -83,7 +83,9 @@ class Slot:
         """Until SIGTERM or SIGINT. A running job then writes a checkpoint and goes back to the queue."""
         shutil.rmtree(self._scratch, ignore_errors=True)  # a predecessor's; the lock says it is gone
         self._scratch.mkdir(parents=True)
-        async with open_database(self._settings.require_database_url(), connections=5) as database:
+        async with open_database(
+            self._settings.require_database_url(), connections=5, silence_s=self._settings.stall_s
+        ) as database:
             if self._lock.predecessor is not None:
                 await release_worker(database, self._lock.predecessor)
             self._register(database)

@@ -33,7 +33,7 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
     Raises `SetupError`. Opening waits up to 30 s for the database.
     """
     files = FileStore(settings.files_dir)
-    async with open_database(settings.require_database_url()) as database:
+    async with open_database(settings.require_database_url(), silence_s=settings.stall_s) as database:
         listener = Listener(database, FOLLOW_POLL_S)
         listening = asyncio.create_task(listener.run())
         try:

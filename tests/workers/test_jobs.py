@@ -11,7 +11,7 @@ import pytest
 from biresnerf.config import RefineOptions
 from biresnerf.errors import InputError
 from tests.workers.conftest import Slots, ready_dataset
-from workers.database import open_database
+from workers.database import Database, open_database
 from workers.errors import Conflict, LimitReached, NotFound, SetupError, Unavailable
 from workers.records import JobUpdate
 from workers.settings import Settings
@@ -252,6 +252,22 @@ async def test_a_database_that_is_away_is_unavailable_and_not_a_crash(settings: 
         await database.pool.close()
         with pytest.raises(Unavailable):
             await database.fetch("SELECT 1")
+
+
+async def test_a_transaction_that_falls_silent_gives_its_locks_back(settings: Settings):
+    url = settings.require_database_url()
+
+    async def fall_silent(silent: Database, other: Database) -> None:
+        async with silent.transaction() as connection:
+            await connection.execute("SELECT pg_advisory_xact_lock(1)")
+            async with asyncio.timeout(10):
+                await other.fetch("SELECT pg_advisory_xact_lock(1)")
+            await connection.execute("SELECT 1")
+
+    async with open_database(url, silence_s=0.3) as silent, open_database(url) as other:
+        with pytest.raises(Unavailable):
+            await fall_silent(silent, other)
+        assert await silent.fetch("SELECT 1 AS one") == [{"one": 1}], "a new transaction is possible"
 
 
 async def test_healthy_tells_whether_the_database_answers(stores: Stores):

@@ -173,26 +173,43 @@ async def test_sigterm_gives_the_job_back_without_counting_the_attempt(
     await assert_one_result(counting, 60)
 
 
+@pytest.mark.parametrize("within_transaction", [False, True])
 async def test_a_frozen_worker_that_wakes_up_is_fenced_and_one_result_is_published(
-    counting: Counting, settings: Settings, slots: Slots
+    counting: Counting, settings: Settings, slots: Slots, within_transaction: bool
 ):
+    """Within a transaction it holds locks on the job or the janitor's office, which the database must end."""
     first = slots.start(settings, "a")
-    await counting.submit(80, 0.05)
+    await counting.submit(120, 0.05)
     await counting.until(lambda job: job.progress.step >= 10)
     slots.start(settings, "b")
-    os.kill(first.pid, signal.SIGSTOP)
+    await _freeze(first.pid, counting.stores, within_transaction)
     await counting.until(lambda job: job.attempt == 2)
     os.kill(first.pid, signal.SIGCONT)
     assert await asyncio.to_thread(first.wait, 15) == 75
     job = await counting.until_final()
     assert (job.state, job.attempt) == ("succeeded", 2)
-    await assert_one_result(counting, 80)
+    await assert_one_result(counting, 120)
     await _trash_is_empty(counting.stores)
     left = {
         file.key.split("/")[3] for file in await counting.stores.files.list(f"jobs/{counting.id}/results")
     }
     assert len(left) == 1, "what the loser wrote was collected"
     assert await counting.stores.files.list(f"jobs/{counting.id}/checkpoints") == []
+
+
+async def _freeze(pid: int, stores: Stores, within_transaction: bool) -> None:
+    """Stop the process at any moment, or in the middle of a transaction."""
+    os.kill(pid, signal.SIGSTOP)
+    while within_transaction:
+        await asyncio.sleep(0.02)  # what was on its way to the database arrives
+        held = await stores.jobs._database.fetch(
+            "SELECT 1 FROM pg_stat_activity WHERE state = 'idle in transaction'"
+        )
+        if held:
+            return
+        os.kill(pid, signal.SIGCONT)
+        await asyncio.sleep(0.003)
+        os.kill(pid, signal.SIGSTOP)
 
 
 async def _trash_is_empty(stores: Stores) -> None:
