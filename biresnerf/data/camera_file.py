@@ -12,6 +12,7 @@ from biresnerf.data.image_files import read_header
 from biresnerf.data.intrinsics_json import Fields, camera_of_frame
 from biresnerf.data.json_document import read_json_object
 from biresnerf.data.text_file import read_text
+from biresnerf.errors import InputError
 
 CAMERA_NAMES = ("camera.json", "cameras.txt", "calib.txt")
 # The image file and its name -> its camera.
@@ -35,7 +36,15 @@ def read_camera_file(root: Path) -> tuple[CameraOf, tuple[Path, ...]]:
         document = read_json_object(file)
 
         def of_json(path: Path, name: str) -> Camera:
-            return camera_of_frame(Fields({}, document, file.name, 0), read_header(path, name), name).camera
+            found = camera_of_frame(Fields({}, document, file.name, 0), read_header(path, name), name)
+            if found.source != "given":
+                raise InputError(
+                    "intrinsics_missing",
+                    "no focal length: neither fl_x nor camera_angle_x.",
+                    where=file.name,
+                    mend="Add fl_x (pixels), or remove the file: a focal length is then guessed and refined.",
+                )
+            return found.camera
 
         return of_json, (file,)
     if file.name == "cameras.txt":

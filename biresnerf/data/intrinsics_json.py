@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from biresnerf.data.dataset import Camera
+from biresnerf.data.dataset import Camera, IntrinsicsSource
+from biresnerf.data.guessed_lens import guess_lens
 from biresnerf.data.image_files import ImageHeader
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera_models import (
@@ -20,6 +21,7 @@ from biresnerf.geometry.lens import lens_problem
 _UNSUPPORTED = "camera_model_unsupported"
 # Keys of instant-ngp that mean a lens of neither family.
 _OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
+_FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 _MODEL_MEND = (
     f"Supported are {', '.join(MODEL_IDS)}; undistort the images to one of them "
     "(for example with COLMAP's image_undistorter)."
@@ -56,10 +58,11 @@ class Fields:
 
 
 class FrameCamera(NamedTuple):
-    """The camera, whether the frame brought its own intrinsics, and notes for the user."""
+    """The camera, who found its intrinsics, whether other frames share them, and notes for the user."""
 
     camera: Camera
-    own: bool
+    source: IntrinsicsSource
+    shared: bool
     notes: tuple[str, ...]
 
 
@@ -72,6 +75,8 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
     """
     preferred, fisheye = _declared_lens(fields)
     width, height, notes = _declared_size(fields, header, name)
+    if not any(fields.get(key) is not None for key in _FOCAL_KEYS):
+        return _guessed(fields, header, preferred, fisheye, notes)
     full, more = _parameters(fields, preferred, fisheye, width, height)
     # nerfstudio writes OPENCV with zeros for a pinhole; PINHOLE is the same camera and more programs read it.
     if preferred == "OPENCV" and not full.distorted:
@@ -86,8 +91,33 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
         )
     model, params = smallest_model(full, preferred)
     camera = Camera(model, width, height, params).resized(header.width, header.height)
-    own = any(fields.own(key) for key in ("fl_x", "fl_y", "camera_angle_x", "x_fov"))
-    return FrameCamera(camera, own, (*notes, *more))
+    shared = not any(fields.own(key) for key in ("fl_x", "fl_y", "camera_angle_x", "x_fov"))
+    return FrameCamera(camera, "given", shared, (*notes, *more))
+
+
+def _guessed(
+    fields: Fields, header: ImageHeader, model: str | None, fisheye: bool, notes: list[str]
+) -> FrameCamera:
+    """The lens of a frame for which nobody gives a focal length: EXIF's, or a normal lens, in the model declared.
+
+    Raises:
+        InputError: ``intrinsics_missing`` where the file describes the rest of the lens, or a fisheye.
+    """
+    said = [key for key in ("cx", "cy", *COEFFICIENTS) if fields.get(key)]
+    if fisheye or said:
+        what = f"{said[0]} is given" if said else "the lens is a fisheye"
+        raise InputError(
+            "intrinsics_missing",
+            f"{what}, but no focal length: neither fl_x nor camera_angle_x.",
+            where=f"{fields.file} frames[{fields.index}]",
+            mend="Add fl_x (pixels) or camera_angle_x (radians), for all frames or in each; or leave out all of it.",
+        )
+    camera, source = guess_lens(header)
+    if model is not None:
+        name, params = smallest_model(camera.full(), model)
+        camera = Camera(name, header.width, header.height, params)
+    by = "taken from EXIF" if source == "exif" else "a guess"
+    return FrameCamera(camera, source, False, (*notes, f"no intrinsics are given: the focal length is {by}"))
 
 
 def _short(value: Any) -> str:
@@ -183,13 +213,8 @@ def _parameters(
         # axes.
         fy = fx if fx is not None else fy
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
-    if fx is None or fy is None:
-        raise InputError(
-            "intrinsics_missing",
-            "no focal length: neither fl_x nor camera_angle_x.",
-            where=f"{fields.file} frames[{fields.index}]",
-            mend="Add fl_x (pixels) or camera_angle_x (radians), for all frames or in each.",
-        )
+    assert fx is not None, "who has none is told so before"
+    assert fy is not None
     cx, cy = fields.get("cx"), fields.get("cy")
     notes = []
     if key_x == "fl_x" and (cx is None or cy is None):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.conventions import world_from_cam_of_file
-from biresnerf.data.dataset import Camera, Dataset, Dialect, Frame, SourceFormat
+from biresnerf.data.dataset import Camera, Dataset, Dialect, Frame, IntrinsicsSource, SourceFormat
 from biresnerf.data.image_files import ImageHeader, read_header
 from biresnerf.data.intrinsics_json import Fields, camera_of_frame
 from biresnerf.data.json_document import read_json_object
@@ -54,7 +54,7 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
     sizes = [_named_size(row, document) for row in rows]
     orientations = meant_orientations(stored, sizes)
     headers = [turned_header(header, o) for header, o in zip(stored, orientations, strict=True)]
-    cameras, camera_indices, more = _cameras(rows, source, headers, names, path.name)
+    cameras, sources, camera_indices, more = _cameras(rows, source, headers, names, path.name)
     poses, pose_notes = _poses(rows, names, source, path.name)
     masks = _masks(path, rows, paths, within)
     notes += more + pose_notes + orientation_notes(stored, orientations, names) + page_notes(stored, names)
@@ -67,7 +67,7 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
         )
         for i, name in enumerate(names)
     )  # fmt: skip
-    return Dataset(path.parent, cameras, frames, source, tuple(notes))
+    return Dataset(path.parent, cameras, frames, source, tuple(notes), sources)
 
 
 def _named_size(row: dict[str, Any], document: dict[str, Any]) -> tuple[float | None, float | None]:
@@ -157,16 +157,17 @@ def _names(rows: list[dict[str, Any]], file: str) -> list[str]:
 
 def _cameras(
     rows: list[dict[str, Any]], source: SourceFormat, headers: list[ImageHeader], names: list[str], file: str
-) -> tuple[tuple[Camera, ...], list[int], list[str]]:
-    cameras: dict[Camera, int] = {}
+) -> tuple[tuple[Camera, ...], tuple[IntrinsicsSource, ...], list[int], list[str]]:
+    """The cameras, who found each (empty where the file gives all), each frame's, and notes."""
+    cameras: dict[tuple[Camera, IntrinsicsSource], int] = {}
     shared_sizes: dict[tuple[int, int], int] = {}
     indices: list[int] = []
     notes: dict[str, None] = {}
     for index, (row, header, name) in enumerate(zip(rows, headers, names, strict=True)):
         result = camera_of_frame(Fields(row, source.document, file, index), header, name)
-        if not result.own:
+        if result.shared:
             shared_sizes.setdefault((header.width, header.height), index)
-        indices.append(cameras.setdefault(result.camera, len(cameras)))
+        indices.append(cameras.setdefault((result.camera, result.source), len(cameras)))
         notes.update(dict.fromkeys(result.notes))
     if len(shared_sizes) > 1:
         (size_a, a), (size_b, b) = list(shared_sizes.items())[:2]
@@ -177,7 +178,9 @@ def _cameras(
             where=f"{file} frames[{b}]",
             mend="Give each frame its own fl_x, fl_y, cx, cy, w and h, or images of one size.",
         )
-    return tuple(cameras), indices, list(notes)
+    sources = tuple(by for _, by in cameras)
+    found = sources if any(by != "given" for by in sources) else ()
+    return tuple(camera for camera, _ in cameras), found, indices, list(notes)
 
 
 def _poses(

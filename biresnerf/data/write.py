@@ -43,7 +43,7 @@ def write_transforms(dataset: Dataset, world_from_cam: NDArray[np.float64], path
     if not source.document:
         document = _with_intrinsics(document, dataset)
     else:
-        _put_refined(document, dataset)
+        _put_found(document, dataset)
     with whole_file(path) as temporary:
         temporary.write_text(
             json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n", "utf-8"
@@ -102,15 +102,15 @@ def _with_intrinsics(document: dict[str, Any], dataset: Dataset) -> dict[str, An
     return {**document, "frames": described}
 
 
-def _put_refined(document: dict[str, Any], dataset: Dataset) -> None:
-    """Intrinsics that were refined, where the input has them: in the frame that says its own, else at the top."""
+def _put_found(document: dict[str, Any], dataset: Dataset) -> None:
+    """Intrinsics that the input does not give, or others: in the frame that says its own, else at the top."""
     shared = {
         frame.camera
         for frame, row in zip(dataset.frames, document["frames"], strict=True)
         if not says_lens(row)
     }
     for frame, row in zip(dataset.frames, document["frames"], strict=True):
-        if dataset.source_of_intrinsics(frame.camera) != "refined":
+        if dataset.source_of_intrinsics(frame.camera) == "given":
             continue
         own = says_lens(row) or len(shared) > 1
         put_lens(row if own else document, dataset.cameras[frame.camera])

@@ -141,7 +141,7 @@ BAD = {
     "focal is text": ("intrinsics_invalid", "fl_x", lambda d: d.update(fl_x="18")),
     "nan focal": ("pose_not_finite", "fl_x", lambda d: d.update(fl_x=math.nan)),
     "huge focal": ("intrinsics_invalid", "fl_x", lambda d: d.update(fl_x=10**400)),
-    "no focal": ("intrinsics_missing", "frames[0]", _without("fl_x", "fl_y")),
+    "centre without focal": ("intrinsics_missing", "frames[0]", _without("fl_x", "fl_y")),
     "negative angle": ("intrinsics_invalid", "camera_angle_x", _angle(-0.7)),
     "angle in degrees": ("intrinsics_invalid", "camera_angle_x", _angle(40.0)),
     "endless focal": ("intrinsics_invalid", "camera_angle_x", _angle(1e-9)),

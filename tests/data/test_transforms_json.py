@@ -73,6 +73,41 @@ def test_images_of_mixed_sizes_with_their_own_intrinsics_are_read(tmp_path):
     assert [c.full().fx for c in dataset.cameras] == [20.0, 21.0, 22.0, 23.0]
 
 
+def test_a_file_without_any_lens_gets_a_guessed_one_which_the_result_then_names(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    for key in ("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h"):
+        del document[key]
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 50  # focal length on 35 mm film
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "images/003.jpg", exif=exif)
+    dataset = read_dataset(save(tmp_path, document))
+    from_exif = 50 * math.hypot(WIDTH, HEIGHT) / math.hypot(36, 24)
+    middle = (WIDTH / 2, HEIGHT / 2, 0.0)
+    assert dataset.cameras == (
+        Camera("SIMPLE_RADIAL", WIDTH, HEIGHT, (1.2 * WIDTH, *middle)),
+        Camera("SIMPLE_RADIAL", WIDTH, HEIGHT, (from_exif, *middle)),
+    )
+    assert dataset.intrinsics_sources == ("guessed", "exif")
+    assert {note.rpartition(" ")[2] for note in dataset.warnings if "focal length" in note} == {
+        "guess",
+        "EXIF",
+    }
+    write_transforms(dataset, dataset.world_from_cam, tmp_path / "out.json")
+    again = read_dataset(tmp_path / "out.json")
+    assert again.intrinsics_sources == ()
+    assert [again.camera_of(i).full() for i in range(4)] == [dataset.camera_of(i).full() for i in range(4)]
+
+
+def test_a_guessed_lens_is_of_the_model_that_the_file_declares(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    for key in ("fl_x", "fl_y", "cx", "cy"):
+        del document[key]
+    (camera,) = read_dataset(save(tmp_path, document)).cameras
+    assert camera == Camera(
+        "OPENCV", WIDTH, HEIGHT, (1.2 * WIDTH, 1.2 * WIDTH, WIDTH / 2, HEIGHT / 2, 0, 0, 0, 0)
+    )
+
+
 def test_blender_takes_the_focal_length_from_the_angle_and_the_true_width(tmp_path):
     dataset = read_dataset(save(tmp_path, blender_scene(tmp_path), "transforms_train.json"))
     focal = 0.5 * WIDTH / math.tan(0.5 * 0.6911112070083618)
