@@ -9,6 +9,7 @@ from pathlib import Path
 from pydantic import Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from workers.addresses import Network
 from workers.errors import SetupError
 
 MIB = 2**20
@@ -53,6 +54,19 @@ class Settings(BaseSettings):
     max_dataset_bytes: int = Field(8 * GIB, ge=1)
     max_archive_bytes: int = Field(8 * GIB, ge=1, description="Size of an uploaded archive.")
     max_unpacked_bytes: int = Field(20 * GIB, ge=1, description="Size of all that comes out of an archive.")
+
+    webhook_timeout_s: float = Field(
+        10.0, gt=0, le=60, description="Longest delivery of one webhook message."
+    )
+    webhook_http: bool = Field(False, description="Take webhook addresses with http too.")
+    webhook_ports: tuple[int, ...] = Field((443,), description="Ports that webhook addresses may have.")
+    webhook_networks: tuple[Network, ...] = Field(
+        (), description="Networks that are not public but may receive webhooks, for example 10.0.0.0/8."
+    )
+    webhook_give_up_days: float = Field(
+        5.0, gt=0, description="A webhook that only failed for so long is switched off."
+    )
+    max_webhooks: int = Field(20, ge=0, description="Webhooks of one tenant.")
 
     job_command: tuple[str, ...] = Field(
         (sys.executable, "-m", "workers.run"),
