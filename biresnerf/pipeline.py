@@ -32,6 +32,7 @@ from biresnerf.refine.history import Observer
 from biresnerf.refine.intrinsics_parameters import lenses_of
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.rigid_bodies import rigid_bodies
+from biresnerf.refine.scene_depth import matched_depth
 from biresnerf.refine.scene_frame import scene_frame
 from biresnerf.refine.start import Start, choose_start
 from biresnerf.refine.two_stages import TwoStages
@@ -126,7 +127,7 @@ def _begin(
 
     matches = _matches(folder, prepared.dataset, checkpoint)
     options = start.stage_lengths(asked, options)
-    optimiser = _optimiser(prepared, start, options, device, threads)
+    optimiser = _optimiser(prepared, start, matches, options, device, threads)
     stages = TwoStages(
         optimiser, folder.path, prepared.fingerprint, report, stop, prepared.seeding, start.as_json(), observer,
         lambda: folder.write_preview(prepared.dataset, prepared.images, optimiser, (prepared.held_out or [0])[0]),
@@ -171,12 +172,18 @@ def _carried(matches: FeatureMatches | None) -> dict[str, Tensor]:
 
 
 def _optimiser(
-    prepared: Prepared, start: Start, options: RefineOptions, device: torch.device, threads: int
+    prepared: Prepared,
+    start: Start,
+    matches: FeatureMatches | None,
+    options: RefineOptions,
+    device: torch.device,
+    threads: int,
 ) -> JointOptimiser:
     """The optimisation at its first step, in the unit frame of the poses it starts from."""
     bodies = rigid_bodies(prepared.dataset, options)
     world_from_cam = bodies.held(start.world_from_cam, prepared.dataset.world_from_cam)
-    frame = scene_frame(world_from_cam, prepared.images)
+    depth = matched_depth(prepared.dataset, world_from_cam, matches)
+    frame = scene_frame(world_from_cam, prepared.images, depth)
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
     lenses = lenses_of(
         prepared.dataset, prepared.images, options.refine_intrinsics, prepared.held_out, device,

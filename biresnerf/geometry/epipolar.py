@@ -36,6 +36,27 @@ def epipolar_angles(
     return (np.arcsin(np.minimum(sine_a, 1.0)) + np.arcsin(np.minimum(sine_b, 1.0))) / 2
 
 
+def match_depths(
+    world_from_cam: Array, a: NDArray[np.int64], b: NDArray[np.int64], ray_a: Array, ray_b: Array
+) -> Array:
+    """How far in front of the two cameras of a match its point lies [m, 2]: along z, in the poses' unit.
+
+    The point is the middle of the shortest line between the rays. NaN where they are parallel. Arguments as for
+    `epipolar_angles`.
+    """
+    towards = [np.einsum("mij,mj->mi", world_from_cam[i, :3, :3], ray) for i, ray in ((a, ray_a), (b, ray_b))]
+    apart = world_from_cam[b, :3, 3] - world_from_cam[a, :3, 3]
+    cosine = (towards[0] * towards[1]).sum(1)
+    sine_squared = 1 - cosine**2
+    along = [(apart * ray).sum(1) for ray in towards]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = (along[0] - cosine * along[1]) / np.where(sine_squared > 1e-12, sine_squared, np.nan)
+    t = cosine * s - along[1]
+    middle = (s[:, None] * towards[0] + apart + t[:, None] * towards[1]) / 2  # seen from a
+    axis_a, axis_b = world_from_cam[a, :3, 2], world_from_cam[b, :3, 2]
+    return np.stack([(middle * axis_a).sum(1), ((middle - apart) * axis_b).sum(1)], axis=1)
+
+
 def _unit(vectors: Array, shortest: float) -> Array:
     """Vectors [m, 3] at length 1, NaN where they are no longer than `shortest`."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -97,10 +97,11 @@ def _pixel_slope(images: ImageSet) -> float:
     return float(np.median(spans) / np.median([max(c.width, c.height) for c in images.cameras]))
 
 
-def scene_frame(poses: np.ndarray, images: ImageSet) -> SceneFrame:
+def scene_frame(poses: np.ndarray, images: ImageSet, depth: float | None = None) -> SceneFrame:
     """The unit frame of a set, from its poses world_from_cam [n, 4, 4] (noisy ones will do) and images.
 
-    Several sets of poses of the same images, one after the other, get a frame that suits them all.
+    Several sets of poses of the same images, one after the other, get a frame that suits them all. Where the optical
+    axes do not meet, the scene is taken to lie at ``depth`` before the cameras, in the poses' unit.
     """
     centres = poses[:, :3, 3]
     focus = focus_point(poses)
@@ -110,7 +111,8 @@ def scene_frame(poses: np.ndarray, images: ImageSet) -> SceneFrame:
         axis = poses[:, :3, 2].mean(0)
         length = float(np.linalg.norm(axis))
         forward = axis / length if length > 0.2 else np.zeros(3)
-        distance = FORWARD_FACING_DEPTH * spread if spread > 0 else 1.0
+        guess = FORWARD_FACING_DEPTH * spread if spread > 0 else 1.0
+        distance = guess if depth is None else depth
         centre = centres.mean(0) + distance * forward
         logger.info("optical axes do not meet: taking the scene %.3g ahead of the cameras", distance)
     tangent = _half_angle_tangent(images)

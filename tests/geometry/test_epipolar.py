@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from biresnerf.data.synthetic import synthetic_cameras
-from biresnerf.geometry.epipolar import epipolar_angles
+from biresnerf.geometry.epipolar import epipolar_angles, match_depths
 from biresnerf.geometry.similarity import Similarity
 
 POINTS = np.random.default_rng(1).uniform(-0.7, 0.7, (200, 3))
@@ -63,3 +63,20 @@ def test_cameras_at_one_point_say_nothing(rig):
     same = rig.copy()
     same[B] = same[A[0]]
     assert np.isnan(errors(same, same)[A[0] == A]).all()
+
+
+def test_depths_of_matches_are_those_of_their_points_in_either_camera(rig):
+    def depth(index: np.ndarray) -> np.ndarray:
+        return np.einsum("mj,mj->m", POINTS - rig[index, :3, 3], rig[index, :3, 2])
+
+    expected = np.stack([depth(A), depth(B)], axis=1)
+    np.testing.assert_allclose(match_depths(rig, A, B, rays(rig, A), rays(rig, B)), expected, rtol=1e-9)
+
+
+def test_a_point_without_parallax_has_no_depth_and_one_behind_a_negative_one():
+    side_by_side = np.stack([np.eye(4), np.eye(4)])
+    side_by_side[1, 0, 3] = 1.0
+    ahead, crossing = np.array([[0.0, 0.0, 1.0]]), np.array([[0.6, 0.0, 0.8]])
+    a, b = np.array([0]), np.array([1])
+    assert np.isnan(match_depths(side_by_side, a, b, ahead, ahead)).all()
+    np.testing.assert_allclose(match_depths(side_by_side, a, b, ahead, crossing), -4 / 3, rtol=1e-9)

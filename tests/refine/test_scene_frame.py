@@ -9,7 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from biresnerf.data.dataset import Camera
+from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.geometry.similarity import Similarity
+from biresnerf.refine.scene_depth import matched_depth
 from biresnerf.refine.scene_frame import scene_frame
 from tests.refine.scene import tiny_set
 
@@ -110,6 +112,36 @@ def test_parallel_cameras_see_the_scene_ahead_of_them(scene):
     in_cam = (centre - rows[:, :3, 3]) @ rows[0, :3, :3]
     assert (in_cam[:, 2] > 0).all()
     assert in_cam[:, 2].min() > np.ptp(rows[:, :3, 3], axis=0).max() / 2
+
+
+def test_where_axes_do_not_meet_matches_tell_how_far_the_scene_is(scene):
+    """Cameras in a row that look the same way, at points 20 times as far away as the row is long."""
+    dataset, images = scene
+    n = len(dataset)
+    rows = np.tile(np.eye(4), (n, 1, 1))
+    rows[:, 0, 3] = np.linspace(-2, 2, n)
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-2, 2, (200, 2)), rng.uniform(30, 50, (200, 1))], axis=1)
+    a, b = np.zeros(200, dtype=np.int64), np.full(200, n - 1)
+    focal, cx, cy = images.cameras[0].full().fx, images.cameras[0].full().cx, images.cameras[0].full().cy
+    full = dataset.cameras[0].width / images.cameras[0].width
+    seen = [focal * (points[:, :2] - rows[i, :2, 3]) / points[:, 2:] + [cx, cy] for i in (0, n - 1)]
+    matches = FeatureMatches(np.stack([a, b], axis=1), full * np.stack(seen, axis=1))
+    depth = matched_depth(dataset, rows, matches)
+    assert depth == pytest.approx(np.median(points[:, 2]), rel=0.02)
+    frame = scene_frame(rows, images, depth)
+    assert frame.distance / frame.unit_from_world.scale == pytest.approx(depth)
+    centre = frame.unit_from_world.inverse().apply(np.zeros(3))
+    np.testing.assert_allclose(centre, [0, 0, depth], atol=1e-6)
+
+
+def test_matches_that_contradict_the_poses_tell_no_depth(scene):
+    dataset, _ = scene
+    rng = np.random.default_rng(1)
+    pairs = np.stack([np.zeros(100, dtype=np.int64), np.ones(100, dtype=np.int64)], axis=1)
+    few = FeatureMatches(pairs[:20], rng.uniform(0, dataset.cameras[0].width, (20, 2, 2)))
+    assert matched_depth(dataset, dataset.world_from_cam, few) is None
+    assert matched_depth(dataset, dataset.world_from_cam, None) is None
 
 
 def test_cameras_all_in_one_place_still_give_a_frame(scene):
