@@ -19,9 +19,11 @@ from biresnerf.errors import InputError
 from service import docs_page
 from service.dependencies import Service
 from service.json_body import validation_problem
+from service.metrics import WebMetrics
+from service.observe import Observed
 from service.problems import CATALOGUE, MEDIA_TYPE, ProblemError
 from service.request_context import RequestContext, render
-from service.routes import artifacts, datasets, events, jobs, meta
+from service.routes import artifacts, datasets, events, health, jobs, meta
 from service.uploads import sweep_staging
 from workers.errors import EngineError, NotFound, Unavailable
 from workers.settings import Settings
@@ -29,7 +31,7 @@ from workers.stores import open_stores
 
 logger = logging.getLogger(__name__)
 
-_ROUTERS = [module.router for module in (datasets, jobs, events, artifacts, meta, docs_page)]
+_ROUTERS = [module.router for module in (datasets, jobs, events, artifacts, meta, health, docs_page)]
 _DESCRIPTION = """
 Refines the camera poses of an image set.
 
@@ -46,10 +48,12 @@ Every error is `application/problem+json` (RFC 9457) with a stable `code`.
 def create_app(settings: Settings) -> FastAPI:
     """The application; opens the engine when it starts (needs ``settings.database_url``, migrated)."""
 
+    metrics = WebMetrics()
+
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         async with open_stores(settings) as stores:
-            service = Service(settings, stores)
+            service = Service(settings, stores, metrics)
             app.state.service = service
             swept = await asyncio.to_thread(sweep_staging, service.staging_dir)
             if swept:
@@ -75,6 +79,7 @@ def create_app(settings: Settings) -> FastAPI:
         redirect_slashes=False,
     )
     app.add_middleware(RequestContext)
+    app.add_middleware(Observed, metrics=metrics)
     _answer_with_problems(app)
     for router in _ROUTERS:
         app.include_router(router)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import socket
 import sys
 from collections.abc import Callable, Coroutine, Iterator
@@ -73,11 +72,12 @@ def up_command(host: str | None, port: int | None, slots: int | None, data_dir: 
     """
     import asyncio
 
+    from workers.logs import set_up_logging
     from workers.supervise import ChildSpec, slot_specs, supervise
 
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s up %(levelname)s %(message)s")
     with setup_problems():
         settings = settings_with(host=host, port=port, slots=slots, data_dir=data_dir)
+        set_up_logging("up", settings)
         if settings.port == 0:
             settings = settings.model_copy(update={"port": free_port()})
         variables = {"BIRESNERF_HOST": settings.host, "BIRESNERF_PORT": str(settings.port)}
@@ -112,10 +112,12 @@ def _answers(url: str) -> bool:
 def api_command(host: str | None, port: int | None) -> None:
     """Run the web process alone (needs BIRESNERF_DATABASE_URL and `biresnerf migrate`)."""
     from service.server import serve
+    from workers.logs import set_up_logging
 
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s api %(levelname)s %(message)s")
     with setup_problems():
-        serve(settings_with(host=host, port=port))
+        settings = settings_with(host=host, port=port)
+        set_up_logging("api", settings)
+        serve(settings)
 
 
 @click.command("worker")

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from fastapi import Depends, Request
 from fastapi import Path as PathParameter
 
+from service.metrics import WebMetrics
 from service.problems import ProblemError
 from workers.settings import Settings
 from workers.stores import Stores
@@ -24,6 +25,8 @@ class Service:
 
     settings: Settings
     stores: Stores
+    metrics: WebMetrics
+    started: asyncio.Event = field(default_factory=asyncio.Event)
     closing: asyncio.Event = field(default_factory=asyncio.Event)
     background: set[asyncio.Task[Any]] = field(default_factory=set)
 

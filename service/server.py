@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from service.app import create_app
 from workers.errors import SetupError
+from workers.logs import set_up_logging
 from workers.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -75,9 +76,10 @@ def serve(settings: Settings) -> None:
 
 def main() -> int:
     """Returns the exit status: 0 stopped, 2 the operator has to change something."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s api %(levelname)s %(message)s")
     try:
-        serve(Settings())
+        settings = Settings()
+        set_up_logging("api", settings)
+        serve(settings)
     except (SetupError, ValidationError) as error:
         sys.stderr.write(f"{error}\n")
         return 2

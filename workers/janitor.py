@@ -20,6 +20,7 @@ from workers.database import QUEUE, Connection, Database
 from workers.errors import Unavailable
 from workers.files import FileStore
 from workers.settings import Settings
+from workers.statistics import fold_tallies
 
 log = logging.getLogger(__name__)
 
@@ -80,6 +81,7 @@ class Janitor:
                 if self._silence_means_death(row["database_age_s"]):
                     await self._release_stalled(connection)
                 await self._requeue_lost(connection)
+                await fold_tallies(connection)
         await self._take_trash_out()
         if time.monotonic() >= self._upkeep_at:
             self._upkeep_at = time.monotonic() + UPKEEP_S

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from importlib import resources
+from importlib.resources.abc import Traversable
 
 import psycopg
 from procrastinate.schema import SchemaManager
@@ -49,13 +50,21 @@ def migrate(database_url: str, *, wait_s: float = 30.0) -> list[str]:
         return applied
 
 
+def step_names() -> list[str]:
+    """The steps that this version knows, in order."""
+    return [QUEUE_STEP, *(file.name.removesuffix(".sql") for file in _files())]
+
+
 def _steps() -> list[tuple[str, str]]:
+    ours = [(file.name.removesuffix(".sql"), file.read_text()) for file in _files()]
+    return [(QUEUE_STEP, SchemaManager.get_schema()), *ours]
+
+
+def _files() -> list[Traversable]:
     folder = resources.files("workers").joinpath("migrations")
-    files = sorted(
+    return sorted(
         (file for file in folder.iterdir() if file.name.endswith(".sql")), key=lambda file: file.name
     )
-    ours = [(file.name.removesuffix(".sql"), file.read_text()) for file in files]
-    return [(QUEUE_STEP, SchemaManager.get_schema()), *ours]
 
 
 def _connect(database_url: str, wait_s: float) -> psycopg.Connection:

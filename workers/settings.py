@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from workers.addresses import Network
@@ -35,6 +36,15 @@ class Settings(BaseSettings):
     pg_bin: Path | None = Field(None, description="Folder with initdb and postgres for the private database.")
     host: str = "127.0.0.1"
     port: int = Field(8000, ge=0, le=65535)
+
+    log_format: Literal["plain", "json"] = Field("plain", description="Lines for people, or JSON lines.")
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
+    metrics_token: SecretStr | None = Field(
+        None, description="Bearer token of /metrics; without one it answers on loopback only."
+    )
+    traces: Literal["off", "otlp"] = Field(
+        "off", description="OpenTelemetry traces, sent where OTEL_EXPORTER_OTLP_ENDPOINT says (extra otel)."
+    )
 
     slots: int = Field(1, ge=0, le=64, description="Jobs that run at the same time on this machine.")
     beat_s: float = Field(10.0, gt=0, description="Seconds between two signs of life of a worker.")

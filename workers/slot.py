@@ -26,8 +26,10 @@ from workers.database import QUEUE, TASK, Database, first_line, open_database
 from workers.errors import SetupError
 from workers.files import FileStore
 from workers.janitor import Janitor, release_worker
-from workers.ledger import Fenced, claim_job
+from workers.ledger import Fenced, claim_job, insist
+from workers.logs import about, set_up_logging
 from workers.settings import Settings
+from workers.statistics import announce_slot
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +106,7 @@ class Slot:
             beat = Beat(database.url, self._settings.beat_s, self._worker_id)
             beat.start()
             janitor = Janitor(database, self._files, self._settings, self._worker_id, self._running)
-            side = [asyncio.create_task(janitor.run()), asyncio.create_task(self._remember())]
+            side = [asyncio.create_task(janitor.run()), asyncio.create_task(self._remember(database))]
             try:
                 log.info("slot %s is ready", self._name)
                 await worker.run()
@@ -116,10 +118,12 @@ class Slot:
     def _worker_id(self) -> int | None:
         return self._worker.worker_id if self._worker is not None else None
 
-    async def _remember(self) -> None:
+    async def _remember(self, database: Database) -> None:
         while (worker_id := self._worker_id()) is None:
             await asyncio.sleep(0.01)
         self._lock.remember(worker_id)
+        host = platform.node() or "localhost"
+        await insist(lambda: announce_slot(database, host, self._name, worker_id))
 
     def _register(self, database: Database) -> None:
         # No cap on the engine's side: attempts are counted in the job, where shutdowns do not count.
@@ -129,7 +133,8 @@ class Slot:
             assert queue_id is not None, "fetched from the database"
             self._running.add(queue_id)
             try:
-                again = await self._run_job(database, context, job_id)
+                with about(job_id=job_id):
+                    again = await self._run_job(database, context, job_id)
             except Fenced as fenced:
                 log.warning("%s; leaving", fenced)
                 # Without a word to the queue: its row belongs to the new owner.
@@ -145,7 +150,7 @@ class Slot:
         claim = await _relay(claiming, lambda: stopped.append("early"))
         if claim is None:
             return False
-        log.info("job %s, attempt %s", job_id, claim.name)
+        log.info("attempt %s begins", claim.name)
         folder = self._scratch / f"{job_id}-{claim.name}"
         attempt = Attempt(database, self._files, self._settings, claim, folder, self._variables())
 
@@ -189,10 +194,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--slot", default="cpu0")
     arguments = parser.parse_args()
-    logging.basicConfig(level=logging.INFO, format=f"%(asctime)s {arguments.slot} %(levelname)s %(message)s")
+    settings = Settings()
+    set_up_logging(arguments.slot, settings)
     logging.getLogger("procrastinate").setLevel(logging.CRITICAL)  # outcomes are in the job's own history
     try:
-        asyncio.run(Slot(Settings(), arguments.slot).run())
+        asyncio.run(Slot(settings, arguments.slot).run())
     except SetupError as error:
         sys.stderr.write(f"{error.what}\n")
         return 2

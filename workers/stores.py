@@ -12,6 +12,7 @@ from workers.datasets import DatasetStore
 from workers.files import FileStore
 from workers.follow import Listener
 from workers.jobs import JobStore
+from workers.monitor import Monitor
 from workers.settings import Settings
 
 FOLLOW_POLL_S = 1.5
@@ -24,6 +25,7 @@ class Stores:
     jobs: JobStore
     datasets: DatasetStore
     files: FileStore
+    monitor: Monitor
 
 
 @asynccontextmanager
@@ -38,6 +40,7 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
         listening = asyncio.create_task(listener.run())
         try:
             jobs = JobStore(database, listener, settings)
-            yield Stores(jobs, DatasetStore(database, files, settings), files)
+            monitor = Monitor(database, files, settings.stall_s)
+            yield Stores(jobs, DatasetStore(database, files, settings), files, monitor)
         finally:
             listening.cancel()

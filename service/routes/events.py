@@ -11,6 +11,7 @@ from fastapi import APIRouter, Header, Query
 from fastapi.responses import StreamingResponse
 
 from service.dependencies import JobId, ServiceHere
+from service.metrics import WebMetrics
 from service.problems import FieldProblem, ProblemError, declared
 from service.schemas import JobView
 from workers.errors import NotFound, Unavailable
@@ -61,7 +62,8 @@ async def follow_job(
     # The first update before the answer begins: a missing job is a 404, not an empty stream.
     first = await anext(updates, None)
     headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
-    return EventStream(_stream(first, updates, service.closing), headers=headers)
+    events = _counted(_stream(first, updates, service.closing), service.metrics)
+    return EventStream(events, headers=headers)
 
 
 def _start(after: int | None, last_event_id: str | None) -> int:
@@ -76,9 +78,17 @@ def _start(after: int | None, last_event_id: str | None) -> int:
     return int(last_event_id)
 
 
+async def _counted(events: AsyncGenerator[str], metrics: WebMetrics) -> AsyncIterator[str]:
+    """The events, with one listener more for as long as somebody follows them."""
+    with metrics.listeners.track_inprogress():
+        async with contextlib.aclosing(events):
+            async for event in events:
+                yield event
+
+
 async def _stream(
     first: JobUpdate | None, updates: AsyncGenerator[JobUpdate | None], closing: asyncio.Event
-) -> AsyncIterator[str]:
+) -> AsyncGenerator[str]:
     yield f"retry: {_RETRY_MS}\n\n"
     update: JobUpdate | None = first
     async with contextlib.aclosing(updates):

@@ -12,8 +12,8 @@ from biresnerf.config import PRESETS, RefineOptions
 from service.conditions import none_match
 from service.dependencies import ServiceHere
 from service.intake import RATIO_MAX
-from service.problems import ProblemError, declared
-from service.schemas import Health, Info, OptionsView, SizeLimits
+from service.problems import declared
+from service.schemas import Info, OptionsView, SizeLimits
 
 router = APIRouter(tags=["service"])
 ARCHIVES = ["application/zip", "application/x-tar", "application/gzip"]
@@ -54,23 +54,3 @@ async def get_info(service: ServiceHere) -> Info:
         archives=ARCHIVES,
         job_counts=await service.stores.jobs.counts(),
     )
-
-
-@router.get("/livez", operation_id="livez", responses=declared("internal_error"))
-async def livez() -> Health:
-    """The process runs. Says nothing about what it needs."""
-    return Health()
-
-
-@router.get(
-    "/readyz",
-    operation_id="readyz",
-    responses=declared("database_unavailable", "storage_unavailable", "internal_error"),
-)
-async def readyz(service: ServiceHere) -> Health:
-    """Database and storage answer: jobs can be taken."""
-    if not await service.stores.jobs.healthy():
-        raise ProblemError("database_unavailable", "The database does not answer.")
-    if not await service.stores.files.healthy():
-        raise ProblemError("storage_unavailable", "Files cannot be written.")
-    return Health()

@@ -120,7 +120,7 @@ def test_every_answer_is_declared(http: httpx.Client) -> None:
             statuses = set(operation["responses"])
             assert any(status.startswith("2") for status in statuses), (path, method)
             assert "500" in statuses, (path, method)
-            assert path in {"/livez", "/v1/options"} or "503" in statuses, (path, method)
+            assert path in {"/livez", "/metrics", "/v1/options"} or "503" in statuses, (path, method)
             assert "{" not in path or "404" in statuses, (path, method)
             for status, answer in operation["responses"].items():
                 if status >= "400":
@@ -177,17 +177,33 @@ def test_without_database_or_storage_the_service_says_503_and_comes_back(tmp_pat
         url, port = postgres.start(), free_port()
         migrate(url)
         settings = {"DATABASE_URL": url, "DATA_DIR": str(tmp_path / "data"), "PORT": str(port)}
+        settings["METRICS_TOKEN"] = "figures-for-me"
         environment = {**os.environ, **{f"BIRESNERF_{name}": value for name, value in settings.items()}}
         server = subprocess.Popen([sys.executable, "-m", "service.server"], env=environment)
         try:
             with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0) as http:
+                until_status(http, "/startupz", 200)
                 until_status(http, "/readyz", 200)
+                told = problem(http.get("/metrics"), 401, "metrics_token_required")
+                assert "figures-for-me" not in str(told)
+                scraper = {"Authorization": "Bearer figures-for-me"}
+                assert "\nbiresnerf_database_up 1.0\n" in http.get("/metrics", headers=scraper).text
                 postgres.stop()
                 until_status(http, "/readyz", 503)
                 assert http.get("/livez").status_code == 200
+                assert (
+                    http.get("/startupz").status_code == 200
+                )  # it has started; how it is now is another question
+                figures = http.get("/metrics", headers=scraper).text
+                assert "\nbiresnerf_database_up 0.0\n" in figures
+                assert 'route="/readyz",status="503"' in figures
                 answer = http.get("/readyz")
                 assert int(answer.headers["retry-after"]) > 0
                 assert problem(answer, 503, "database_unavailable")["retryable"]
+                assert {item["pointer"] for item in answer.json()["errors"]} == {
+                    "check/database",
+                    "check/queue",
+                }
                 problem(http.get("/v1/jobs"), 503, "database_unavailable")
                 postgres.start()
                 until_status(http, "/readyz", 200)

@@ -1,0 +1,109 @@
+"""Probes for whoever runs the service, and figures for Prometheus. None of them needs an API key."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+from typing import Annotated
+
+from fastapi import APIRouter, Header
+from fastapi.responses import PlainTextResponse, Response
+
+from service.dependencies import Service, ServiceHere
+from service.metrics import Exposition
+from service.problems import FieldProblem, ProblemError, declared
+from service.schemas import Health
+from workers.errors import Unavailable
+from workers.monitor import Need
+
+router = APIRouter(tags=["service"])
+_CODES: dict[Need, str] = {
+    "database": "database_unavailable",
+    "storage": "storage_unavailable",
+    "queue": "queue_unavailable",
+}
+_LACKING = ("database_unavailable", "storage_unavailable", "queue_unavailable", "unavailable")
+
+
+@router.get("/livez", operation_id="livez", responses=declared("internal_error"))
+async def livez() -> Health:
+    """The process runs and answers. Says nothing about what it needs: restarting it would not help."""
+    return Health()
+
+
+@router.get("/readyz", operation_id="readyz", responses=declared(*_LACKING, "internal_error"))
+async def readyz(service: ServiceHere) -> Health:
+    """Database, file storage and queue answer: jobs can be taken. 503 as soon as the service is stopping."""
+    await _require_everything(service)
+    return Health()
+
+
+@router.get("/startupz", operation_id="startupz", responses=declared(*_LACKING, "internal_error"))
+async def startupz(service: ServiceHere) -> Health:
+    """The service has been ready once since its start; from then on `readyz` tells how it is."""
+    if not service.started.is_set():
+        await _require_everything(service)
+    return Health()
+
+
+async def _require_everything(service: Service) -> None:
+    if service.closing.is_set():
+        raise ProblemError("unavailable", "The service is stopping.")
+    lacking = await service.stores.monitor.lacking()
+    if not lacking:
+        service.started.set()
+        return
+    need = min(lacking, key=list(_CODES).index)
+    found = [FieldProblem(pointer=f"check/{name}", detail=why) for name, why in lacking.items()]
+    raise ProblemError(_CODES[need], lacking[need], errors=found)
+
+
+@router.get(
+    "/metrics",
+    operation_id="getMetrics",
+    response_class=PlainTextResponse,
+    responses={
+        200: {
+            "description": "Prometheus' text form, or OpenMetrics where `Accept` asks for it.",
+            "content": {
+                "text/plain": {"schema": {"type": "string"}, "example": "biresnerf_database_up 1.0\n"}
+            },
+        },
+        **declared("metrics_token_required", "internal_error"),
+    },
+)
+async def get_metrics(
+    service: ServiceHere,
+    accept: Annotated[str, Header()] = "",
+    authorization: Annotated[str, Header(description="`Bearer` and BIRESNERF_METRICS_TOKEN.")] = "",
+) -> Response:
+    """Figures of this process and of the whole installation. Without the database: of this process alone."""
+    _require_scraper(service, authorization)
+    try:
+        installation = await service.stores.monitor.statistics()
+    except Unavailable:
+        installation = None
+    text, media_type = Exposition(service.metrics, installation).rendered(accept)
+    return Response(text, media_type=media_type, headers={"Cache-Control": "no-store"})
+
+
+def _require_scraper(service: Service, authorization: str) -> None:
+    """Figures tell what goes on here, so they are not for everybody who can reach the port."""
+    token = service.settings.metrics_token
+    if token is None and _loopback(service.settings.host):
+        return
+    said = authorization.removeprefix("Bearer ").strip()
+    if token is None or not hmac.compare_digest(said.encode(), token.get_secret_value().encode()):
+        raise ProblemError(
+            "metrics_token_required",
+            "The token of /metrics is missing, wrong, or not set.",
+            mend="Set BIRESNERF_METRICS_TOKEN and send it as Authorization: Bearer.",
+            headers={"WWW-Authenticate": "Bearer"},
+        )
+
+
+def _loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
