@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -50,7 +51,6 @@ class Prepared:
 
     dataset: Dataset
     images: ImageSet
-    held_out: list[int]
     fingerprint: str
     candidates: tuple[PoseCandidate, ...]
     seeding: str | None  # what COLMAP answered, where it was asked
@@ -125,12 +125,13 @@ def _begin(
     stage: Literal["seeding", "preparing"] = "seeding" if prepared.seeding is not None else "preparing"
     report(Progress(stage=stage, fraction=0.02, message=message))
 
+    held_out = held_out_views(len(prepared.dataset), options.holdout, start.sound)
     matches = _matches(folder, prepared.dataset, checkpoint)
     options = start.stage_lengths(asked, options)
-    optimiser = _optimiser(prepared, start, matches, options, device, threads)
+    optimiser = _optimiser(prepared, start, held_out, matches, options, device, threads)
     stages = TwoStages(
         optimiser, folder.path, prepared.fingerprint, report, stop, prepared.seeding, start.as_json(), observer,
-        lambda: folder.write_preview(prepared.dataset, prepared.images, optimiser, (prepared.held_out or [0])[0]),
+        lambda: folder.write_preview(prepared.dataset, prepared.images, optimiser, (held_out or [0])[0]),
         _carried(matches),
     )  # fmt: skip
     if checkpoint is not None:
@@ -140,7 +141,7 @@ def _begin(
     return Run(
         prepared.dataset,
         prepared.images,
-        prepared.held_out,
+        held_out,
         start,
         matches,
         stages,
@@ -174,6 +175,7 @@ def _carried(matches: FeatureMatches | None) -> dict[str, Tensor]:
 def _optimiser(
     prepared: Prepared,
     start: Start,
+    held_out: list[int],
     matches: FeatureMatches | None,
     options: RefineOptions,
     device: torch.device,
@@ -186,11 +188,11 @@ def _optimiser(
     frame = scene_frame(world_from_cam, prepared.images, depth)
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
     lenses = lenses_of(
-        prepared.dataset, prepared.images, options.refine_intrinsics, prepared.held_out, device,
+        prepared.dataset, prepared.images, options.refine_intrinsics, held_out, device,
         dollies=not bodies.tied,
     )  # fmt: skip
     optimiser = JointOptimiser(
-        prepared.images, frame, poses, options, prepared.held_out, device, threads, start.mobility, bodies, lenses
+        prepared.images, frame, poses, options, held_out, device, threads, start.mobility, bodies, lenses
     )  # fmt: skip
     optimiser.camera_errors.doubt(start.doubted)
     return optimiser
@@ -229,12 +231,19 @@ def _find_start(
     return choose_start(candidates, prepared.images, options, device, threads, stop)
 
 
-def held_out_views(count: int, asked: int | None) -> list[int]:
-    """Evenly spread indices of the views kept from the field: a tenth, at most 10; none of fewer than 6."""
+def held_out_views(count: int, asked: int | None, sound: np.ndarray | None = None) -> list[int]:
+    """Indices of the views kept from the field, evenly spread: a tenth, at most 10; none of fewer than 6.
+
+    Args:
+        count: all views.
+        asked: how many are wanted instead.
+        sound: bool [count], views to choose from, where there are any: one whose own pose may be wrong proves nothing.
+    """
     if asked is None:
         asked = 0 if count < HOLD_OUT_FROM else max(1, min(HOLD_OUT_MOST, count // HOLD_OUT_ONE_IN))
-    asked = min(asked, max(0, count - 3))
-    return sorted({int((i + 0.5) * count / asked) for i in range(asked)})
+    among = np.arange(count) if sound is None or not sound.any() else np.flatnonzero(sound)
+    asked = min(asked, max(0, count - 3), len(among))
+    return sorted({int(among[int((i + 0.5) * len(among) / asked)]) for i in range(asked)})
 
 
 def _prepare(
@@ -268,7 +277,6 @@ def _prepare(
     return Prepared(
         dataset,
         images,
-        held_out_views(len(dataset), options.holdout),
         digest.hexdigest(),
         found.candidates,
         seeding.read_text("utf-8") if seeding.is_file() else None,

@@ -71,6 +71,11 @@ class Start:
         return guessed if guessed.mean() <= DOUBTED_MOST else np.zeros_like(guessed)
 
     @property
+    def sound(self) -> np.ndarray:
+        """Bool [n], whose pose is as good as the set's can be: placed by matches, where they placed most."""
+        return self.placed if self.placed.mean() >= MOSTLY_PLACED else ~self.doubted
+
+    @property
     def mobility(self) -> np.ndarray:
         """Each camera's factor of the pose rate [2, n] in stage 1 and stage 2."""
         return np.where(self.placed[None], np.array(MATCHED_MOBILITY)[:, None], 1.0)

@@ -36,6 +36,16 @@ def test_held_out_views_are_spread_evenly():
     assert gaps.max() <= 11
 
 
+def test_views_whose_own_pose_is_doubtful_are_not_held_out():
+    sound = np.ones(11, dtype=bool)
+    assert held_out_views(11, None, sound) == held_out_views(11, None) == [5]
+    sound[5] = False
+    (view,) = held_out_views(11, None, sound)
+    assert view in (4, 6)
+    assert not {5} & set(held_out_views(11, 8, sound))
+    assert held_out_views(11, None, np.zeros(11, dtype=bool)) == [5], "nothing better: any will do"
+
+
 def turned(rig: np.ndarray) -> np.ndarray:
     tilt = np.eye(4)
     tilt[:3, :3] = Rotation.from_euler("xyz", [40, 25, 10], degrees=True).as_matrix()

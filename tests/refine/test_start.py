@@ -84,6 +84,19 @@ def test_stage_1_is_shorter_where_matches_placed_the_cameras_and_its_length_was_
     assert matched.stage_lengths(fixed, fixed.resolved()) == fixed.resolved()
 
 
+def test_cameras_that_matches_left_out_where_they_placed_most_are_not_sound(scene):
+    dataset, _ = scene
+    matched, guess = "matches-incremental", "neighbours"
+    for sources, expected in (
+        ((matched,) * 8 + ("given",), [True] * 8 + [False]),
+        ((matched,) * 2 + ("given",) * 7, [True] * 9),
+        (("given",) * 8 + (guess,), [True] * 8 + [False]),
+        ((guess,) * 9, [True] * 9),
+    ):
+        start = Start(dataset.world_from_cam, sources[0], sources)
+        assert start.sound.tolist() == expected
+
+
 def test_a_stop_ends_the_trial(scene):
     dataset, images = scene
     tried = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
