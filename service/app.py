@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -31,6 +32,7 @@ from workers.stores import open_stores
 
 logger = logging.getLogger(__name__)
 
+_UNFINISHED_EVERY_S = 15.0
 _ROUTERS = [module.router for module in (datasets, jobs, events, artifacts, meta, health, docs_page)]
 _DESCRIPTION = """
 Refines the camera poses of an image set.
@@ -89,12 +91,17 @@ def create_app(settings: Settings) -> FastAPI:
 
 
 async def _check_unfinished(service: Service) -> None:
-    """Checks that a process before us began and did not end."""
-    try:
-        for dataset_id in await service.stores.datasets.unfinished():
-            await service.stores.datasets.check(dataset_id)
-    except Unavailable as error:
-        logger.warning("unfinished checks wait for the next start: %s", error.what)
+    """Checks that another process began, or should have, and will not end: it was killed, here or elsewhere."""
+    while True:
+        try:
+            for dataset_id in await service.stores.datasets.unfinished():
+                with contextlib.suppress(NotFound):  # deleted meanwhile
+                    await service.stores.datasets.check(dataset_id)
+        except Unavailable as error:
+            logger.warning("unfinished checks wait: %s", error.what)
+        except Exception:
+            logger.exception("a check failed on our side; it is tried again")
+        await asyncio.sleep(_UNFINISHED_EVERY_S)
 
 
 def _answer_with_problems(app: FastAPI) -> None:

@@ -1,26 +1,34 @@
-"""Validates a dataset in a child process, so that no long-lived process decodes strangers' files."""
+"""Validates datasets in a child process, so that no long-lived process decodes strangers' files."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import shutil
 import tempfile
 import time
+import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from psycopg.types.json import Jsonb
+
 from workers.child import Child, log_tail
+from workers.database import Database
+from workers.errors import Unavailable
 from workers.files import FileStore
+from workers.ledger import insist
 from workers.records import JobError
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)
 
 EXIT_INPUT_ERROR = 2
+LOOK_S = 0.5  # between two looks at a check that another process makes
 
 
 @dataclass(frozen=True)
@@ -31,8 +39,79 @@ class Verdict:
     error: JobError | None
 
 
+class Checker:
+    """Checks ``finalizing`` datasets, one at a time in this process and each by one process only."""
+
+    def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:
+        self._database, self._files, self._settings = database, files, settings
+        self._turn = asyncio.Semaphore(1)  # decoding a thousand photos is enough work for one machine
+
+    async def check(self, dataset_id: str) -> None:
+        """Until the dataset is not ``finalizing`` any more, through our check or another process's."""
+        token = uuid.uuid4()
+        while True:
+            async with self._turn:
+                if await insist(lambda: self._take(dataset_id, token)):
+                    await self._check(dataset_id, token)
+            rows = await insist(
+                lambda: self._database.fetch("SELECT state FROM datasets WHERE id = %s", dataset_id)
+            )
+            if not rows or rows[0]["state"] != "finalizing":
+                return
+            await asyncio.sleep(LOOK_S)
+
+    async def unfinished(self) -> tuple[str, ...]:
+        """Ids of ``finalizing`` datasets that nobody checks just now."""
+        rows = await self._database.fetch(
+            "SELECT id FROM datasets WHERE state = 'finalizing'"
+            " AND coalesce(check_until < clock_timestamp(), true) ORDER BY created_at"
+        )
+        return tuple(row["id"] for row in rows)
+
+    async def _take(self, dataset_id: str, token: uuid.UUID) -> bool:
+        """Take or renew the lease. A lease, not a lock: who is frozen or cut off loses it."""
+        rows = await self._database.fetch(
+            "UPDATE datasets SET check_token = %s, check_until = clock_timestamp() + make_interval(secs => %s)"
+            " WHERE id = %s AND state = 'finalizing'"
+            " AND (check_token = %s OR check_until IS NULL OR check_until < clock_timestamp()) RETURNING id",
+            *(token, 2 * self._settings.beat_s, dataset_id, token),
+        )
+        return bool(rows)
+
+    async def _check(self, dataset_id: str, token: uuid.UUID) -> None:
+        rows = await insist(
+            lambda: self._database.fetch(
+                "SELECT key, path FROM dataset_files WHERE dataset_id = %s", dataset_id
+            )
+        )
+        renewing = asyncio.create_task(self._renew(dataset_id, token))
+        try:
+            files = [(row["key"], row["path"]) for row in rows]
+            verdict = await check_files(self._files, files, self._settings)
+        finally:
+            renewing.cancel()
+        await insist(
+            lambda: self._database.fetch(
+                "UPDATE datasets SET state = %s, report = %s, error = %s, revision = revision + 1,"
+                " check_token = NULL, check_until = NULL"
+                " WHERE id = %s AND state = 'finalizing' AND check_token = %s",
+                *("rejected" if verdict.error else "ready", Jsonb(verdict.report)),
+                *(Jsonb(verdict.error.model_dump()) if verdict.error else None, dataset_id, token),
+            )
+        )
+
+    async def _renew(self, dataset_id: str, token: uuid.UUID) -> None:
+        while True:
+            await asyncio.sleep(self._settings.beat_s / 2)
+            with contextlib.suppress(Unavailable):  # the next time will do
+                await self._take(dataset_id, token)
+
+
 async def check_files(files: FileStore, members: Sequence[tuple[str, str]], settings: Settings) -> Verdict:
-    """Run the check program on the files, given as (key, path). Its crash or timeout is a rejection too."""
+    """Run the check program on the files, given as (key, path). Its crash or timeout is a rejection too.
+
+    Where it is killed (by the kernel, say, for another process's hunger) it is tried once more.
+    """
     parent = settings.scratch_dir / "checks"
     parent.mkdir(parents=True, exist_ok=True)
     for old in parent.iterdir():  # of processes that were killed
@@ -42,12 +121,17 @@ async def check_files(files: FileStore, members: Sequence[tuple[str, str]], sett
     try:
         dataset = folder / "input"
         await files.stage(members, dataset)
-        return await _run(dataset, folder / "log.txt", settings)
+        verdict, killed = await _run(dataset, folder / "log.txt", settings)
+        if killed:
+            log.warning("the check of %d files was killed; trying once more", len(members))
+            verdict, _ = await _run(dataset, folder / "log.txt", settings)
+        return verdict
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-async def _run(dataset: Path, errors: Path, settings: Settings) -> Verdict:
+async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[Verdict, bool]:
+    """The outcome, and whether a signal ended the program."""
     child = await Child.start(settings.check_command, dataset, errors, {"OMP_NUM_THREADS": "1"})
     try:
         async with asyncio.timeout(settings.check_timeout_s):
@@ -55,19 +139,18 @@ async def _run(dataset: Path, errors: Path, settings: Settings) -> Verdict:
             status = await child.wait()
     except TimeoutError:
         detail = f"The check took longer than {settings.check_timeout_s:g} s."
-        return Verdict(
-            {}, JobError(code="check_timeout", detail=detail, mend="Send fewer or smaller images.")
-        )
+        error = JobError(code="check_timeout", detail=detail, mend="Send fewer or smaller images.")
+        return Verdict({}, error), False
     finally:
         child.kill()
         await child.wait()
     try:
         answer = json.loads(said)
         if status == 0:
-            return Verdict(dict(answer["report"]), None)
+            return Verdict(dict(answer["report"]), None), False
         if status == EXIT_INPUT_ERROR:
-            return Verdict({}, JobError(**answer["error"]))
+            return Verdict({}, JobError(**answer["error"])), False
     except (ValueError, TypeError, KeyError) as error:
         log.error("the check program's answer is unreadable: %s", error)
     detail = f"The check of the files ended unexpectedly (status {status})."
-    return Verdict({}, JobError(code="check_crashed", detail=detail, log_tail=log_tail(errors)))
+    return Verdict({}, JobError(code="check_crashed", detail=detail, log_tail=log_tail(errors))), status < 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import re
 from collections.abc import AsyncIterable, Sequence
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 from psycopg.types.json import Jsonb
 
 from biresnerf.errors import InputError
-from workers.checking import check_files
+from workers.checking import Checker
 from workers.database import Connection, Database
 from workers.errors import Conflict, LimitReached, NotFound
 from workers.files import FileStore, StoredFile
@@ -40,7 +39,7 @@ class DatasetStore:
 
     def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:
         self._database, self._files, self._settings = database, files, settings
-        self._checks = asyncio.Semaphore(1)  # decoding a thousand photos is enough work for one machine
+        self._checker = Checker(database, files, settings)
 
     async def create(self, name: str, manifest: Sequence[ManifestEntry] = ()) -> DatasetRecord:
         """An empty dataset in state ``open``; raises `LimitReached` (``too_many_files``)."""
@@ -187,39 +186,15 @@ class DatasetStore:
     async def check(self, dataset_id: str) -> DatasetRecord:
         """Validate a ``finalizing`` dataset in a child process and write the outcome; idempotent.
 
-        Only one check of a dataset runs at a time, over all processes. Other states come back as they are.
+        Only one check of a dataset runs at a time, over all processes; the others wait for its outcome. Other
+        states come back as they are. Raises `NotFound`.
         """
-        async with self._checks:
-            return await insist(lambda: self._check(dataset_id))
-
-    async def _check(self, dataset_id: str) -> DatasetRecord:
-        async with self._database.transaction() as connection:
-            # Held while the child works; another process waits here and then finds the outcome.
-            await connection.execute("SELECT pg_advisory_xact_lock(hashtextextended(%s, 0))", (dataset_id,))
-            dataset = await _required(connection, dataset_id)
-            if dataset.state != "finalizing":
-                return dataset
-            cursor = await connection.execute(
-                "SELECT key, path FROM dataset_files WHERE dataset_id = %s", (dataset_id,)
-            )
-            files = [(row["key"], row["path"]) for row in await cursor.fetchall()]
-            verdict = await check_files(self._files, files, self._settings)
-            await connection.execute(
-                "UPDATE datasets SET state = %s, report = %s, error = %s, revision = revision + 1"
-                " WHERE id = %s",
-                (
-                    *("rejected" if verdict.error else "ready", Jsonb(verdict.report)),
-                    *(Jsonb(verdict.error.model_dump()) if verdict.error else None, dataset_id),
-                ),
-            )
-            return await _required(connection, dataset_id)
+        await self._checker.check(dataset_id)
+        return await insist(lambda: self.get(dataset_id))
 
     async def unfinished(self) -> tuple[str, ...]:
-        """Ids left in ``finalizing`` (by a process that died): `check` them at start."""
-        rows = await self._database.fetch(
-            "SELECT id FROM datasets WHERE state = 'finalizing' ORDER BY created_at"
-        )
-        return tuple(row["id"] for row in rows)
+        """Ids left in ``finalizing`` that nobody checks (their process died, or has others to do first)."""
+        return await self._checker.unfinished()
 
     async def delete(self, dataset_id: str) -> None:
         """Delete a dataset with its files; raises `NotFound`, `Conflict` (``dataset_in_use`` by jobs)."""

@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import sys
 from collections.abc import AsyncIterator
+from pathlib import Path
 
 import pytest
 
@@ -13,7 +14,7 @@ from biresnerf.config import RefineOptions
 from biresnerf.errors import InputError
 from tests.workers.conftest import quick_settings, ready_dataset
 from workers.errors import Conflict, LimitReached, NotFound
-from workers.records import ManifestEntry
+from workers.records import DatasetRecord, ManifestEntry
 from workers.settings import Settings
 from workers.stores import Stores, open_stores
 
@@ -165,6 +166,50 @@ async def test_two_checks_at_once_run_the_program_once(database_url: str, tmp_pa
         checked = await asyncio.gather(one.datasets.check(dataset.id), other.datasets.check(dataset.id))
     assert {item.state for item in checked} == {"ready"}
     assert marks.read_text() == "x"
+
+
+async def checking(database_url: str, folder: Path, program: str) -> DatasetRecord:
+    """The outcome of a check by this program."""
+    settings = quick_settings(
+        folder / "data", database_url=database_url, check_command=(sys.executable, "-c", program)
+    )
+    async with open_stores(settings) as stores:
+        dataset = await stores.datasets.create("fox")
+        await stores.datasets.add_file(dataset.id, "a", chunks(b"x"))
+        await stores.datasets.finalize(dataset.id)
+        return await stores.datasets.check(dataset.id)
+
+
+async def test_a_check_longer_than_the_stall_time_comes_to_its_end_and_runs_once(database_url: str, tmp_path):
+    marks = tmp_path / "marks"
+    mark = f"open({str(marks)!r}, 'a').write('x')"
+    program = f"{mark}; import time; time.sleep(2.5); print('{{\"report\": {{}}}}')"
+    assert (await checking(database_url, tmp_path, program)).state == "ready"
+    assert marks.read_text() == "x"
+
+
+async def test_a_check_that_is_killed_once_is_made_again(database_url: str, tmp_path):
+    marks = tmp_path / "marks"
+    program = f"""
+import os
+open({str(marks)!r}, 'a').write('x')
+if os.path.getsize({str(marks)!r}) == 1:
+    os.kill(os.getpid(), 9)
+print('{{"report": {{}}}}')
+"""
+    assert (await checking(database_url, tmp_path, program)).state == "ready"
+    assert marks.read_text() == "xx"
+
+
+async def test_a_check_that_a_dead_process_began_is_taken_over(stores: Stores):
+    dataset = await stores.datasets.create("fox")
+    await stores.datasets.add_file(dataset.id, "a", chunks(b"x"))
+    await stores.datasets.finalize(dataset.id)
+    await stores.jobs._database.fetch(
+        "UPDATE datasets SET check_token = gen_random_uuid(), check_until = now() + interval '1 s'"
+    )
+    assert await stores.datasets.unfinished() == (), "its owner may live yet"
+    assert (await stores.datasets.check(dataset.id)).state == "ready"
 
 
 async def test_a_dataset_with_a_job_is_not_deleted(stores: Stores):
