@@ -36,6 +36,8 @@ CONNECT: dict[str, Any] = {
     "keepalives_idle": 30,
     "keepalives_interval": 10,
     "keepalives_count": 3,
+    # Keepalives rest while bytes are under way; without this a query into a dead line waits a quarter of an hour.
+    "tcp_user_timeout": 60_000,
 }
 LISTEN_CHANNEL = "biresnerf_jobs"
 RECONNECT_S = 1.0

@@ -7,7 +7,6 @@ client cannot undo each other's work.
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import time
 from collections.abc import Callable, Collection
@@ -19,6 +18,7 @@ from psycopg.types.json import Jsonb
 from workers.database import QUEUE, Connection, Database
 from workers.errors import Unavailable
 from workers.files import FileStore
+from workers.receipts import offer_again
 from workers.settings import Settings
 from workers.statistics import fold_tallies
 
@@ -50,6 +50,7 @@ class Janitor:
         self._worker_id, self._running = worker_id, running
         self._healthy_since: float | None = None
         self._saw_outage = False
+        self._round_at: float | None = None
         self._unacknowledged: dict[int, int] = {}
         self._upkeep_at = time.monotonic()
 
@@ -69,11 +70,13 @@ class Janitor:
         async with self._database.transaction() as connection:
             cursor = await connection.execute(
                 "SELECT pg_try_advisory_xact_lock(%s) AS mine,"
-                " extract(epoch FROM now() - pg_postmaster_start_time())::float8 AS database_age_s",
+                " extract(epoch FROM now() - pg_postmaster_start_time())::float8 AS database_age_s,"
+                " extract(epoch FROM clock_timestamp())::float8 AS now_s",
                 (JANITOR_LOCK,),
             )
             row = await cursor.fetchone()
             assert row is not None, "a SELECT without FROM gives a row"
+            self._distrust_after_a_pause(row["now_s"])
             if self._healthy_since is None:
                 self._healthy_since = time.monotonic()
             await self._release_unacknowledged(connection)
@@ -89,6 +92,17 @@ class Janitor:
                 KEEP_QUEUE_ROWS_H, include_failed=True, include_cancelled=True, include_aborted=True
             )
 
+    def _distrust_after_a_pause(self, now_s: float) -> None:
+        """A machine that slept, or a database that froze: everybody was silent, and everybody lives.
+
+        Told by the database's clock, for the one we measure pauses with stands still while a machine sleeps.
+        """
+        paused_s = now_s - self._round_at if self._round_at is not None else 0.0
+        self._round_at = now_s
+        if paused_s > self._settings.janitor_s + self._settings.stall_s / 2:
+            log.warning("janitor: nothing went on for %.0f s; workers get time to give a sign", paused_s)
+            self._healthy_since, self._saw_outage = None, True
+
     def _silence_means_death(self, database_age_s: float) -> bool:
         """After an outage of the database living workers first need time to give a sign."""
         patience_s = 1.5 * self._settings.stall_s
@@ -99,7 +113,8 @@ class Janitor:
         cursor = await connection.execute(
             "SELECT job.id FROM procrastinate_jobs AS job LEFT JOIN procrastinate_workers AS worker"
             " ON worker.id = job.worker_id WHERE job.status = 'doing' AND job.queue_name = %s"
-            " AND (worker.id IS NULL OR worker.last_heartbeat < now() - make_interval(secs => %s))",
+            " AND (worker.id IS NULL OR worker.last_heartbeat < now() - make_interval(secs => %s))"
+            " ORDER BY job.id",
             (QUEUE, self._settings.stall_s),
         )
         for row in await cursor.fetchall():
@@ -184,12 +199,7 @@ async def release(connection: Connection, queue_id: int, why: str) -> None:
         "UPDATE jobs SET state = 'queued', run_token = NULL, eta_s = NULL WHERE id = %s", (job["id"],)
     )
     await connection.execute("SELECT add_job_event(%s, 'requeued', %s)", (job["id"], Jsonb({"why": why})))
-    await connection.execute("SELECT procrastinate_retry_job_v2(%s, NULL, NULL, NULL, NULL)", (queue_id,))
-    # The engine notifies of new rows only; without this an idle worker finds it at its next look.
-    await connection.execute(
-        "SELECT pg_notify(%s, %s)",
-        (f"procrastinate_queue_v1#{QUEUE}", json.dumps({"type": "job_inserted", "job_id": queue_id})),
-    )
+    await offer_again(connection, queue_id)
 
 
 async def release_worker(database: Database, worker_id: int | None) -> None:
@@ -197,7 +207,7 @@ async def release_worker(database: Database, worker_id: int | None) -> None:
     async with database.transaction() as connection:
         cursor = await connection.execute(
             "SELECT id FROM procrastinate_jobs WHERE status = 'doing' AND queue_name = %s"
-            " AND (%s::bigint IS NULL OR worker_id = %s)",
+            " AND (%s::bigint IS NULL OR worker_id = %s) ORDER BY id",  # two of us lock in the same order
             (QUEUE, worker_id, worker_id),
         )
         for row in await cursor.fetchall():

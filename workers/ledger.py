@@ -54,15 +54,22 @@ async def claim_job(database: Database, job_id: str, max_attempts: int) -> Claim
 
     A job whose cancellation was asked for ends ``cancelled``, one that had its attempts ends ``failed``.
     """
-    return await insist(lambda: _claim(database, job_id, max_attempts))
+    token = uuid.uuid4()
+    return await insist(lambda: _claim(database, job_id, max_attempts, token))
 
 
-async def _claim(database: Database, job_id: str, max_attempts: int) -> Claim | None:
+async def _claim(database: Database, job_id: str, max_attempts: int, token: uuid.UUID) -> Claim | None:
     async with database.transaction() as connection:
         cursor = await connection.execute(
-            "SELECT state, attempt, cancel_requested FROM jobs WHERE id = %s FOR UPDATE", (job_id,)
+            "SELECT state, attempt, cancel_requested, run_token, dataset_id, options, checkpoint"
+            " FROM jobs WHERE id = %s FOR UPDATE",
+            (job_id,),
         )
         row = await cursor.fetchone()
+        if row is not None and row["run_token"] == token:
+            # An earlier try got through, though its acknowledgement was lost: the attempt counts once.
+            same = {key: row[key] for key in ("dataset_id", "attempt", "options", "checkpoint")}
+            return Claim(job_id, token=token, **same)
         if row is None or row["state"] not in ("queued", "running"):
             return None
         if row["cancel_requested"]:
@@ -71,7 +78,6 @@ async def _claim(database: Database, job_id: str, max_attempts: int) -> Claim | 
         if row["attempt"] >= max_attempts:
             await _finish(connection, job_id, "failed", crashed_too_often(row["attempt"]))
             return None
-        token = uuid.uuid4()
         cursor = await connection.execute(
             "UPDATE jobs SET state = 'running', attempt = attempt + 1, run_token = %s, fraction = 0,"
             " step = 0, stage = NULL, eta_s = NULL, message = '',"

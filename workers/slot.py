@@ -18,7 +18,6 @@ from typing import IO, TypeVar
 from procrastinate import JobContext, RetryStrategy
 from procrastinate.exceptions import ConnectorException
 from procrastinate.job_context import AbortReason
-from procrastinate.worker import Worker
 
 from workers.attempt import Attempt
 from workers.beat import Beat
@@ -28,6 +27,7 @@ from workers.files import FileStore
 from workers.janitor import Janitor, release_worker
 from workers.ledger import Fenced, claim_job, insist
 from workers.logs import about, set_up_logging
+from workers.receipts import FencedWorker
 from workers.settings import Settings
 from workers.statistics import announce_slot
 
@@ -79,7 +79,7 @@ class Slot:
         self._lock = SlotLock(settings.data_dir, name)
         self._scratch = settings.scratch_dir / f"{platform.node() or 'localhost'}.{name}"
         self._running: set[int] = set()
-        self._worker: Worker | None = None
+        self._worker: FencedWorker | None = None
 
     async def run(self) -> None:
         """Until SIGTERM or SIGINT. A running job then writes a checkpoint and goes back to the queue."""
@@ -88,11 +88,11 @@ class Slot:
         async with open_database(
             self._settings.require_database_url(), connections=5, silence_s=self._settings.stall_s
         ) as database:
-            if self._lock.predecessor is not None:
-                await release_worker(database, self._lock.predecessor)
+            if (predecessor := self._lock.predecessor) is not None:
+                await insist(lambda: release_worker(database, predecessor))
             self._register(database)
-            worker = self._worker = Worker(
-                database.app,
+            worker = self._worker = FencedWorker(
+                database,
                 queues=[QUEUE],
                 name=self._name,
                 concurrency=1,

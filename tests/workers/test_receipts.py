@@ -1,0 +1,114 @@
+"""A worker that is late, that lost an answer, or that slept with all the others."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from procrastinate import JobContext
+from procrastinate.jobs import Job, Status
+from procrastinate.retry import RetryDecision
+from procrastinate.utils import utcnow
+
+from biresnerf.config import RefineOptions
+from tests.workers.conftest import ready_dataset
+from workers import ledger
+from workers.database import QUEUE, Database, open_database
+from workers.errors import Unavailable
+from workers.files import FileStore
+from workers.janitor import Janitor
+from workers.ledger import claim_job
+from workers.receipts import FencedWorker
+from workers.settings import Settings
+from workers.stores import Stores
+
+pytestmark = pytest.mark.anyio
+AGAIN = RetryDecision(retry_at=utcnow())
+
+
+@pytest.fixture
+async def database(database_url: str) -> AsyncIterator[Database]:
+    async with open_database(database_url) as opened:
+        yield opened
+
+
+async def registered(database: Database) -> FencedWorker:
+    worker = FencedWorker(database, queues=[QUEUE])
+    worker.worker_id = await database.app.job_manager.register_worker()
+    return worker
+
+
+async def fetched(database: Database, worker: FencedWorker) -> Job:
+    job = await database.app.job_manager.fetch_job(queues=[QUEUE], worker_id=worker.worker_id)
+    assert job is not None
+    return job
+
+
+async def queued(stores: Stores) -> str:
+    dataset_id = await ready_dataset(stores, {"plan.json": b"{}"})
+    job, _ = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"))
+    return job.id
+
+
+async def receipt(worker: FencedWorker, job: Job, status: Status, decision: RetryDecision | None) -> None:
+    context = JobContext(app=worker.app, job=job, abort_reason=lambda: None, start_timestamp=0.0)
+    await worker._persist_job_status(job, status, decision, context, None)
+
+
+@pytest.mark.parametrize("decision", [None, AGAIN])
+async def test_a_late_receipt_leaves_a_row_that_another_worker_has_alone(
+    stores: Stores, database: Database, decision: RetryDecision | None
+):
+    await queued(stores)
+    frozen, other = await registered(database), await registered(database)
+    job = await fetched(database, frozen)
+    await receipt(frozen, job, Status.FAILED, AGAIN)
+    await fetched(database, other)
+    await receipt(frozen, job, Status.SUCCEEDED, decision)
+    (row,) = await database.fetch("SELECT status, worker_id FROM procrastinate_jobs")
+    assert (row["status"], row["worker_id"]) == ("doing", other.worker_id)
+    await receipt(other, job, Status.SUCCEEDED, None)
+    (row,) = await database.fetch("SELECT status FROM procrastinate_jobs")
+    assert row["status"] == "succeeded"
+
+
+async def test_a_claim_whose_acknowledgement_was_lost_counts_once(
+    stores: Stores, database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    job_id = await queued(stores)
+    claim, lost = ledger._claim, []
+
+    async def loses_the_first_answer(*arguments):
+        answer = await claim(*arguments)
+        if not lost:
+            lost.append(answer)
+            raise Unavailable("database_unavailable", "the connection broke after the commit")
+        return answer
+
+    monkeypatch.setattr(ledger, "_claim", loses_the_first_answer)
+    assert await claim_job(database, job_id, 3) == lost[0]
+    assert (await stores.jobs.get(job_id)).attempt == 1
+    assert [event.type for event in await stores.jobs.events(job_id)] == ["queued", "started"]
+
+
+async def test_a_machine_that_slept_takes_no_job_from_its_workers(
+    stores: Stores, database: Database, settings: Settings, tmp_path: Path
+):
+    """To who looks at the clock afterwards everybody was silent for long; who goes on being silent is dead."""
+    await queued(stores)
+    await fetched(database, await registered(database))
+    quick = settings.model_copy(update={"stall_s": 0.8, "janitor_s": 0.1})
+    janitor = Janitor(database, FileStore(tmp_path / "files"), quick, lambda: None, ())
+
+    async def status_after_a_round() -> str:
+        await janitor._round()
+        (row,) = await database.fetch("SELECT status FROM procrastinate_jobs")
+        return str(row["status"])
+
+    assert await status_after_a_round() == "doing"
+    await asyncio.sleep(2.0)  # longer than the stall time, with every janitor and every beat asleep
+    assert await status_after_a_round() == "doing"
+    while await status_after_a_round() == "doing":
+        await asyncio.sleep(0.1)
