@@ -8,14 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
-from biresnerf.data.dataset import Dataset
-from biresnerf.data.feature_matches import FeatureMatches
-from biresnerf.data.images import ImageSet
 from biresnerf.output_folder import OutputFolder
 from biresnerf.progress import OnProgress, Progress
 from biresnerf.refine.evaluation import ViewScore, fit_held_out_poses, render_orbit, score_views
 from biresnerf.refine.judgement import Judgement, judge
-from biresnerf.refine.start import Start
+from biresnerf.refine.run_input import RunInput
 from biresnerf.refine.two_stages import LAST_FRACTION, TwoStages
 from biresnerf.report import Report
 
@@ -29,11 +26,7 @@ SHOWN_WITHOUT_HELD_OUT = 2  # training views rendered when none is held out
 class Run:
     """A refinement on its way: what its last steps need, and what they have found out so far."""
 
-    dataset: Dataset
-    images: ImageSet
-    held_out: list[int]
-    start: Start
-    matches: FeatureMatches | None
+    given: RunInput
     stages: TwoStages
     folder: OutputFolder
     threads: int
@@ -45,10 +38,10 @@ class Run:
     def evaluate(self) -> None:
         """Fit the poses of held-out views, score and render views, film the orbit."""
         started = time.monotonic()
-        optimiser = self.stages.optimiser
+        optimiser, held_out = self.stages.optimiser, self.given.held_out
         self.report(Progress(stage="evaluating", fraction=LAST_FRACTION))
-        fit_held_out_poses(optimiser, self.held_out)
-        views = self.held_out or list(range(min(SHOWN_WITHOUT_HELD_OUT, len(self.dataset))))
+        fit_held_out_poses(optimiser, held_out)
+        views = held_out or list(range(min(SHOWN_WITHOUT_HELD_OUT, len(self.given.dataset))))
         frames = int(optimiser.options.orbit_frames or 0)
         work = len(views) + frames
         rendering_from = time.monotonic()
@@ -67,14 +60,14 @@ class Run:
             )
 
         scores = []
-        for score in score_views(optimiser, self.images, views):
-            self.folder.write_view(self.dataset.names, self.images, score)
+        for score in score_views(optimiser, self.given.images, views):
+            self.folder.write_view(self.given.dataset.names, self.given.images, score)
             scores.append(score)
             tell(len(scores))
         if frames:
             self.folder.write_orbit(render_orbit(optimiser, frames, lambda i: tell(len(views) + i + 1)))
         self.stages.record.seconds["evaluating"] = time.monotonic() - started
-        self.scores = scores if self.held_out else []
+        self.scores = scores if held_out else []
 
     def judge(self) -> None:
         """Pass the verdict on the refined poses, if one is asked for.
@@ -93,17 +86,7 @@ class Run:
             self.report(Progress(stage="evaluating", fraction=fraction, message=message))
 
         tell(0.0)
-        self.judgement = judge(
-            self.dataset,
-            self.images,
-            optimiser,
-            self.start,
-            self.held_out,
-            self.matches,
-            self.threads,
-            self.stop,
-            tell,
-        )
+        self.judgement = judge(self.given, optimiser, self.threads, self.stop, tell)
         logger.info("verdict: %s", self.judgement.verdict.verdict)
         self.stages.record.seconds["judging"] = time.monotonic() - started
 
@@ -112,10 +95,8 @@ class Run:
         if state == "complete":
             self.report(Progress(stage="exporting", fraction=EXPORTING_FRACTION))
         result = self.folder.write_result(
-            self.dataset, self.start, self.images, self.stages, self.held_out, self.scores, self.judgement,
-            self.matches,
-            threads=self.threads, state=state,
-        )  # fmt: skip
+            self.given, self.stages, self.scores, self.judgement, threads=self.threads, state=state
+        )
         if state == "complete":
             self.folder.drop_traces()
             self.report(Progress(stage="exporting", fraction=1.0, eta_s=0.0))

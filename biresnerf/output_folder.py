@@ -13,7 +13,6 @@ from biresnerf.config import PackName
 from biresnerf.data.area_resize import area_resize
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
-from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.data.images import ImageSet
 from biresnerf.data.packs.input_form import forms_of_input, write_input_form
 from biresnerf.data.packs.write_packs import write_packs
@@ -30,8 +29,8 @@ from biresnerf.refine.history import HISTORY
 from biresnerf.refine.input_frame import poses_in_input_frame
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.judgement import Judgement
+from biresnerf.refine.run_input import RunInput
 from biresnerf.refine.run_report import run_report
-from biresnerf.refine.start import Start
 from biresnerf.refine.two_stages import TwoStages
 from biresnerf.report import PointsReport, Report
 
@@ -135,14 +134,10 @@ class OutputFolder:
 
     def write_result(
         self,
-        dataset: Dataset,
-        start: Start,
-        images: ImageSet,
+        given: RunInput,
         stages: TwoStages,
-        held_out: list[int],
         scores: list[ViewScore],
         judgement: Judgement | None = None,
-        matches: FeatureMatches | None = None,
         *,
         threads: int,
         state: Literal["complete", "partial"],
@@ -151,36 +146,37 @@ class OutputFolder:
 
         Where the verdict keeps the input's poses, those are written, and the refined ones beside them in refined/.
         """
-        optimiser = stages.optimiser
+        dataset, optimiser = given.dataset, stages.optimiser
         self._write_text(CONFIG, optimiser.options.model_dump_json(indent=2))
         refined, similarity = poses_in_input_frame(dataset, optimiser)
         report = run_report(
-            dataset, start, images, stages, held_out, scores, judgement, refined, similarity,
-            threads=threads, state=state,
-        )  # fmt: skip
+            given, stages, scores, judgement, refined, similarity, threads=threads, state=state
+        )
         refined_dataset = optimiser.lenses.refined(dataset)
         returned, returned_dataset = refined, refined_dataset
         if judgement is not None and judgement.verdict.returned == "input":
             returned, returned_dataset = dataset.world_from_cam, dataset
             if np.isfinite(refined).all():
-                self._write_poses(self.path / REFINED, refined_dataset, images, refined, matches, report, ())
+                self._write_poses(self.path / REFINED, given, refined_dataset, refined, report, ())
         # On the way to the end nobody waits for large packs.
         packs = optimiser.options.packs if state == "complete" else ()
-        report = self._write_poses(self.path, returned_dataset, images, returned, matches, report, packs)
+        report = self._write_poses(self.path, given, returned_dataset, returned, report, packs)
         self._write_text(REPORT, report.model_dump_json(indent=2))
         return report
 
     @staticmethod
     def _write_poses(
         folder: Path,
+        given: RunInput,
         dataset: Dataset,
-        images: ImageSet,
         world_from_cam: np.ndarray,
-        matches: FeatureMatches | None,
         report: Report,
         packs: Sequence[PackName],
     ) -> Report:
-        """Poses [n, 4, 4] in the input's form, those of every result and ``packs``; the report with notes on them."""
+        """Poses [n, 4, 4] of ``dataset``, the input with other lenses or none, in the input's form, and the packs.
+
+        Returns the report with notes on them.
+        """
         write_transforms(dataset, world_from_cam, folder / TRANSFORMS)
         tie = report.input_from_optimised
         refined = refined_set(
@@ -190,7 +186,7 @@ class OutputFolder:
             pose_sources=[image.pose_source for image in report.images],
             flags=[image.flags for image in report.images],
         )
-        refined = with_points_of(refined, dataset.source.colmap, matches, images)
+        refined = with_points_of(refined, dataset.source.colmap, given.matches, given.images)
         asked = dict.fromkeys((*forms_of_input(dataset), *packs))
         notes = write_packs(refined, folder, asked) + transforms_notes(dataset, world_from_cam)
         write_input_form(dataset, refined, folder)

@@ -33,6 +33,7 @@ from biresnerf.refine.history import Observer
 from biresnerf.refine.intrinsics_parameters import lenses_of
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.rigid_bodies import rigid_bodies
+from biresnerf.refine.run_input import RunInput
 from biresnerf.refine.scene_depth import matched_depth
 from biresnerf.refine.scene_frame import scene_frame
 from biresnerf.refine.start import Start, choose_start
@@ -125,31 +126,25 @@ def _begin(
     stage: Literal["seeding", "preparing"] = "seeding" if prepared.seeding is not None else "preparing"
     report(Progress(stage=stage, fraction=0.02, message=message))
 
-    held_out = held_out_views(len(prepared.dataset), options.holdout, start.sound)
-    matches = _matches(folder, prepared.dataset, checkpoint)
+    given = RunInput(
+        prepared.dataset,
+        prepared.images,
+        start,
+        held_out_views(len(prepared.dataset), options.holdout, start.sound),
+        _matches(folder, prepared.dataset, checkpoint),
+    )
     options = start.stage_lengths(asked, options)
-    optimiser = _optimiser(prepared, start, held_out, matches, options, device, threads)
+    optimiser = _optimiser(given, options, device, threads)
     stages = TwoStages(
         optimiser, folder.path, prepared.fingerprint, report, stop, prepared.seeding, start.as_json(), observer,
-        lambda: folder.write_preview(prepared.dataset, prepared.images, optimiser, (held_out or [0])[0]),
-        _carried(matches),
+        lambda: folder.write_preview(given.dataset, given.images, optimiser, (given.held_out or [0])[0]),
+        _carried(given.matches),
     )  # fmt: skip
     if checkpoint is not None:
         stages.resume(*checkpoint)
         logger.info("going on from step %d", optimiser.step_index)
     stages.record.seconds["preparing"] = time.monotonic() - started
-    return Run(
-        prepared.dataset,
-        prepared.images,
-        held_out,
-        start,
-        matches,
-        stages,
-        folder,
-        threads,
-        report,
-        stop,
-    )
+    return Run(given, stages, folder, threads, report, stop)
 
 
 def _matches(
@@ -172,28 +167,19 @@ def _carried(matches: FeatureMatches | None) -> dict[str, Tensor]:
     return {MATCHED_IMAGES: torch.from_numpy(images), MATCHED_XY: torch.from_numpy(xy)}
 
 
-def _optimiser(
-    prepared: Prepared,
-    start: Start,
-    held_out: list[int],
-    matches: FeatureMatches | None,
-    options: RefineOptions,
-    device: torch.device,
-    threads: int,
-) -> JointOptimiser:
+def _optimiser(given: RunInput, options: RefineOptions, device: torch.device, threads: int) -> JointOptimiser:
     """The optimisation at its first step, in the unit frame of the poses it starts from."""
-    bodies = rigid_bodies(prepared.dataset, options)
-    world_from_cam = bodies.held(start.world_from_cam, prepared.dataset.world_from_cam)
-    depth = matched_depth(prepared.dataset, world_from_cam, matches)
-    frame = scene_frame(world_from_cam, prepared.images, depth)
+    dataset, images, start = given.dataset, given.images, given.start
+    bodies = rigid_bodies(dataset, options)
+    world_from_cam = bodies.held(start.world_from_cam, dataset.world_from_cam)
+    frame = scene_frame(world_from_cam, images, matched_depth(dataset, world_from_cam, given.matches))
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
     lenses = lenses_of(
-        prepared.dataset, prepared.images, options.refine_intrinsics, held_out, device,
-        dollies=not bodies.tied,
-    )  # fmt: skip
+        dataset, images, options.refine_intrinsics, given.held_out, device, dollies=not bodies.tied
+    )
     optimiser = JointOptimiser(
-        prepared.images, frame, poses, options, held_out, device, threads, start.mobility, bodies, lenses
-    )  # fmt: skip
+        images, frame, poses, options, given.held_out, device, threads, start.mobility, bodies, lenses
+    )
     optimiser.camera_errors.doubt(start.doubted)
     return optimiser
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.dataset import GUESSES, Dataset
-from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.data.images import ImageSet
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.pose_error import turned_deg
@@ -25,7 +24,7 @@ from biresnerf.refine.pose_evidence import (
     compare_on_unseen_views,
     moved_px,
 )
-from biresnerf.refine.start import Start
+from biresnerf.refine.run_input import RunInput
 from biresnerf.refine.verdict import MEASURABLE_PX, Findings, decide, failed_checks
 from biresnerf.report import Verdict
 
@@ -56,12 +55,8 @@ class Judgement:
 
 
 def judge(
-    dataset: Dataset,
-    images: ImageSet,
+    given: RunInput,
     optimiser: JointOptimiser,
-    start: Start,
-    held_out: list[int],
-    matches: FeatureMatches | None,
     threads: int,
     should_stop: Callable[[], bool],
     tell: Callable[[float], None] = lambda _share: None,
@@ -69,13 +64,12 @@ def judge(
     """Compare the optimised poses with the dataset's own.
 
     Args:
-        held_out: views that the optimisation never trained its field on.
-        matches: feature matches of the dataset's images.
         tell: called with the share of the work that is done.
 
     Raises:
         Interrupted: ``should_stop`` said so.
     """
+    dataset, images = given.dataset, given.images
     refined = optimiser.lenses.refined(dataset)
     everyone = range(len(dataset))
     before = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in everyone))
@@ -90,11 +84,13 @@ def judge(
     moved = 0.0
     if np.isfinite(after.world_from_cam).all():
         moved = moved_px(before, after, images)
-        if matches is not None:
-            epipolar = compare_on_matches(before, after, matches, independent=not start.placed.any())
+        if given.matches is not None:
+            epipolar = compare_on_matches(
+                before, after, given.matches, independent=not given.start.placed.any()
+            )
         if moved >= MEASURABLE_PX:
             heldout = compare_on_unseen_views(
-                before, after, images, held_out, optimiser.options, optimiser.device, threads, should_stop,
+                before, after, images, given.held_out, optimiser.options, optimiser.device, threads, should_stop,
                 lambda done: tell(0.45 * done),
             )  # fmt: skip
     verdict = decide(

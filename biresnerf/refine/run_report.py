@@ -7,22 +7,18 @@ from typing import Literal
 import numpy as np
 
 from biresnerf.data.dataset import Dataset
-from biresnerf.data.images import ImageSet
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.evaluation import ViewScore
 from biresnerf.refine.intrinsics_parameters import IntrinsicsParameters
 from biresnerf.refine.judgement import Judgement, motion
-from biresnerf.refine.start import Start
+from biresnerf.refine.run_input import RunInput
 from biresnerf.refine.two_stages import TwoStages
 from biresnerf.report import CameraReport, HeldOut, ImageReport, Report, SimilarityReport
 
 
 def run_report(
-    dataset: Dataset,
-    start: Start,
-    images: ImageSet,
+    given: RunInput,
     stages: TwoStages,
-    held_out: list[int],
     scores: list[ViewScore],
     judgement: Judgement | None,
     refined: np.ndarray,
@@ -39,25 +35,14 @@ def run_report(
     """
     from biresnerf import __version__
 
-    optimiser, record = stages.optimiser, stages.record
+    dataset, optimiser, record = given.dataset, stages.optimiser, stages.record
     lost = [i for i, flag in enumerate(optimiser.camera_errors.lost.tolist()) if flag]
     return Report(
         version=__version__,
         state=state,
         options=optimiser.options,
         verdict=judgement.verdict if judgement is not None else None,
-        images=_image_reports(
-            dataset,
-            start,
-            refined,
-            held_out,
-            scores,
-            lost,
-            stages.repair.repaired,
-            optimiser.bodies.fixed,
-            optimiser.exposure.gains(),
-            judgement,
-        ),
+        images=_image_reports(given, stages, scores, judgement, refined),
         cameras=camera_reports(dataset, optimiser.lenses),
         heldout=HeldOut(
             count=len(scores),
@@ -66,7 +51,7 @@ def run_report(
         )
         if scores
         else None,
-        start_trials=start.trials,
+        start_trials=given.start.trials,
         steps_done=optimiser.step_index,
         switch_step=optimiser.switch if optimiser.method.two_stages else None,
         switch_reason=record.switch_reason,
@@ -75,7 +60,7 @@ def run_report(
         backend=optimiser.field.backend,
         device=str(optimiser.device),
         threads=threads,
-        working_size=(int(images.widths.max()), int(images.heights.max())),
+        working_size=(int(given.images.widths.max()), int(given.images.heights.max())),
         input_from_optimised=SimilarityReport(
             scale=similarity.scale,
             rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
@@ -111,35 +96,32 @@ def _lost_warnings(dataset: Dataset, lost: list[int]) -> tuple[str, ...]:
 
 
 def _image_reports(
-    dataset: Dataset,
-    start: Start,
-    refined: np.ndarray,
-    held_out: list[int],
+    given: RunInput,
+    stages: TwoStages,
     scores: list[ViewScore],
-    lost: list[int],
-    repaired: list[int],
-    fixed: np.ndarray,
-    exposures: np.ndarray | None,
     judgement: Judgement | None,
+    refined: np.ndarray,
 ) -> tuple[ImageReport, ...]:
-    turn, shift = motion(dataset.world_from_cam, refined)
+    optimiser, repaired = stages.optimiser, stages.repair.repaired
+    lost, exposures = optimiser.camera_errors.lost, optimiser.exposure.gains()
+    turn, shift = motion(given.dataset.world_from_cam, refined)
     scored = {score.image: score for score in scores}
     return tuple(
         ImageReport(
             name=frame.name,
-            pose_source=start.sources[i],
-            held_out=i in held_out,
-            fixed=bool(fixed[i]),
+            pose_source=given.start.sources[i],
+            held_out=i in given.held_out,
+            fixed=bool(optimiser.bodies.fixed[i]),
             moved_deg=float(turn[i]),
             moved_units=float(shift[i]),
-            lost=i in lost,
+            lost=bool(lost[i]),
             repaired=i in repaired,
             exposure=None if exposures is None else tuple(exposures[i].tolist()),
             psnr=scored[i].psnr if i in scored else None,
             ssim=scored[i].ssim if i in scored else None,
             **_judged(judgement, i),
         )
-        for i, frame in enumerate(dataset.frames)
+        for i, frame in enumerate(given.dataset.frames)
     )
 
 

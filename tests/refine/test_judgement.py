@@ -15,6 +15,7 @@ from biresnerf.refine import frozen_trials
 from biresnerf.refine.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refine.judgement import Judgement, judge
 from biresnerf.refine.pose_evidence import Rig, moved_px, unseen_views
+from biresnerf.refine.run_input import RunInput
 from biresnerf.refine.start import Start
 from tests.refine.scene import CPU, tiny_optimiser, tiny_options, tiny_set
 
@@ -62,7 +63,8 @@ def judged(
     dataset, images = scene
     optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3])
     start = Start(given, "given", ("given",) * VIEWS)
-    return judge(with_poses(dataset, given), images, optimiser, start, [3], matches, 2, lambda: False)
+    run = RunInput(with_poses(dataset, given), images, start, [3], matches)
+    return judge(run, optimiser, 2, lambda: False)
 
 
 def test_true_poses_in_place_of_noisy_ones_are_an_improvement(scene, noisy):

@@ -19,6 +19,7 @@ from biresnerf.refine import lost_cameras
 from biresnerf.refine.checkpoint import load_checkpoint
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.pose_parameters import PoseParameters
+from biresnerf.refine.run_input import RunInput
 from biresnerf.refine.scene_frame import scene_frame
 from biresnerf.refine.start import Start
 from biresnerf.refine.two_stages import TwoStages
@@ -180,10 +181,9 @@ def test_the_report_names_those_that_stay_lost(scene, tmp_path):
     stages.optimiser.camera_errors._stood_out[TURNED] = 2
     stages.repair.repaired = [ORBITED]
     dataset, images = scene
-    given = Start(dataset.world_from_cam, "given", ("given",) * len(dataset))
-    report = OutputFolder(tmp_path).write_result(
-        dataset, given, images, stages, HELD_OUT, [], None, threads=1, state="partial"
-    )
+    begun = Start(dataset.world_from_cam, "given", ("given",) * len(dataset))
+    given = RunInput(dataset, images, begun, HELD_OUT)
+    report = OutputFolder(tmp_path).write_result(given, stages, [], None, threads=1, state="partial")
     assert [image.name for image in report.images if image.lost] == [dataset.names[TURNED]]
     assert [image.name for image in report.images if image.repaired] == [dataset.names[ORBITED]]
     assert [dataset.names[TURNED] in warning for warning in report.warnings] == [True]

@@ -1,0 +1,29 @@
+"""What a run works on, once it is known where it starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from biresnerf.data.dataset import Dataset
+from biresnerf.data.feature_matches import FeatureMatches
+from biresnerf.data.images import ImageSet
+from biresnerf.refine.start import Start
+
+
+@dataclass(frozen=True, eq=False)
+class RunInput:
+    """The set, its photos, where it starts, which views are kept from the field, and what else is known.
+
+    Attributes:
+        dataset: the set, with the poses that the result is compared with.
+        images: its photos at the working size.
+        start: the poses that the optimisation starts from.
+        held_out: indices of the views that teach the field nothing.
+        matches: feature matches of the photos, where any were looked for and found.
+    """
+
+    dataset: Dataset
+    images: ImageSet
+    start: Start
+    held_out: list[int]
+    matches: FeatureMatches | None = None
