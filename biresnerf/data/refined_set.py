@@ -138,22 +138,7 @@ def refined_set(
             zip(dataset.frames, dataset.file_names, np.asarray(world_from_cam, np.float64), strict=True)
         )
     )
-    indices = [frame.camera for frame in dataset.frames]
-    model = dataset.source.colmap
-    if model is None:
-        model = model_of_poses(dataset.file_names, dataset.cameras, indices, world_from_cam)
-        image_ids = tuple(range(1, count + 1))
-    else:
-        changed = np.array(
-            [
-                old is None or not np.array_equal(old, new)
-                for old, new in zip(before, world_from_cam, strict=True)
-            ]
-        )
-        model = model_at_poses(model, dataset.names, dataset.cameras, indices, world_from_cam, changed)
-        model = with_points(model, no_points())  # the given ones belong to the poses before
-        id_of_name = {image.name: image.id for image in model.images.values()}
-        image_ids = tuple(id_of_name[name] for name in dataset.names)
+    model, image_ids = _model(dataset, before, world_from_cam)
     return RefinedSet(
         dataset.cameras,
         images,
@@ -163,6 +148,24 @@ def refined_set(
         similarity or Similarity.identity(),
         _times(dataset) if timestamps_s is None else timestamps_s,
     )
+
+
+def _model(
+    dataset: Dataset, before: Sequence[NDArray[np.float64] | None], world_from_cam: NDArray[np.float64]
+) -> tuple[ColmapModel, tuple[int, ...]]:
+    """The set as a COLMAP model without points, the caller's own where the input was one, and the images' ids."""
+    indices = [frame.camera for frame in dataset.frames]
+    given = dataset.source.colmap
+    if given is None:
+        made = model_of_poses(dataset.file_names, dataset.cameras, indices, world_from_cam)
+        return made, tuple(range(1, len(dataset) + 1))
+    changed = np.array(
+        [old is None or not np.array_equal(old, new) for old, new in zip(before, world_from_cam, strict=True)]
+    )
+    moved = model_at_poses(given, dataset.names, dataset.cameras, indices, world_from_cam, changed)
+    model = with_points(moved, no_points())  # the given ones belong to the poses before
+    id_of_name = {image.name: image.id for image in model.images.values()}
+    return model, tuple(id_of_name[name] for name in dataset.names)
 
 
 def _times(dataset: Dataset) -> tuple[float, ...] | None:
