@@ -29,7 +29,9 @@ class Conflict(EngineError):
 
 
 class LimitReached(EngineError):
-    """A configured limit is reached. Codes: ``body_too_large``, ``too_many_files``, ``queue_full``."""
+    """A configured limit is reached. Codes: ``body_too_large``, ``too_many_files``, ``queue_full``,
+    ``storage_full``.
+    """
 
 
 class Unavailable(EngineError):

@@ -45,6 +45,19 @@ class Settings(BaseSettings):
     traces: Literal["off", "otlp"] = Field(
         "off", description="OpenTelemetry traces, sent where OTEL_EXPORTER_OTLP_ENDPOINT says (extra otel)."
     )
+    storage_url: str | None = Field(
+        None,
+        description="s3://bucket/prefix of an S3-compatible store; none: the folder `files` in data_dir.",
+    )
+    storage_endpoint: str | None = Field(
+        None, description="http(s)://host:port of the store; none: Amazon's own for the region."
+    )
+    storage_public_endpoint: str | None = Field(
+        None, description="How clients reach the store, where they use another address than this service."
+    )
+    storage_region: str = "us-east-1"
+    storage_access_key_id: str | None = Field(None, description="None: AWS_… variables or the host's role.")
+    storage_secret_access_key: str | None = Field(None, repr=False)
 
     slots: int = Field(1, ge=0, le=64, description="Jobs that run at the same time on this machine.")
     beat_s: float = Field(10.0, gt=0, description="Seconds between two signs of life of a worker.")
@@ -100,7 +113,7 @@ class Settings(BaseSettings):
 
     @property
     def files_dir(self) -> Path:
-        """Root of the file store."""
+        """Root of the file store where `storage_url` is none."""
         return self.data_dir / "files"
 
     @property

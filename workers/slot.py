@@ -23,10 +23,11 @@ from workers.attempt import Attempt
 from workers.beat import Beat
 from workers.database import QUEUE, TASK, Database, first_line, open_database
 from workers.errors import SetupError
-from workers.files import FileStore
+from workers.files import open_files
 from workers.janitor import Janitor, release_worker
 from workers.ledger import Fenced, claim_job, insist
 from workers.logs import about, set_up_logging
+from workers.one_store import require_same_store
 from workers.receipts import FencedWorker
 from workers.settings import Settings
 from workers.statistics import announce_slot
@@ -35,6 +36,7 @@ log = logging.getLogger(__name__)
 
 EXIT_FENCED = 75
 NEVER_S = 10 * 365 * 86_400.0
+STORE_PATIENCE_S = 180.0  # a job that has run for an hour waits for its store to come back
 T = TypeVar("T")
 
 
@@ -75,7 +77,7 @@ class Slot:
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", name):
             raise SetupError("bad_slot_name", f"--slot {name!r}: letters, digits, - and _ only, at most 40.")
         self._settings, self._name = settings, name
-        self._files = FileStore(settings.files_dir)
+        self._files = open_files(settings, patience_s=STORE_PATIENCE_S)
         self._lock = SlotLock(settings.data_dir, name)
         self._scratch = settings.scratch_dir / f"{platform.node() or 'localhost'}.{name}"
         self._running: set[int] = set()
@@ -90,6 +92,7 @@ class Slot:
         ) as database:
             if (predecessor := self._lock.predecessor) is not None:
                 await insist(lambda: release_worker(database, predecessor))
+            await require_same_store(database, self._files)
             self._register(database)
             worker = self._worker = FencedWorker(
                 database,

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 from workers.database import open_database
 from workers.datasets import DatasetStore
-from workers.files import FileStore
+from workers.files import FileStore, open_files
 from workers.follow import Listener
 from workers.jobs import JobStore
 from workers.monitor import Monitor
+from workers.one_store import require_same_store
 from workers.settings import Settings
 
 FOLLOW_POLL_S = 1.5
@@ -34,8 +35,9 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
 
     Raises `SetupError`. Opening waits up to 30 s for the database.
     """
-    files = FileStore(settings.files_dir)
+    files = open_files(settings)
     async with open_database(settings.require_database_url(), silence_s=settings.stall_s) as database:
+        await require_same_store(database, files)
         listener = Listener(database, FOLLOW_POLL_S)
         listening = asyncio.create_task(listener.run())
         try:

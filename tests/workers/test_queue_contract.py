@@ -15,6 +15,7 @@ from procrastinate.worker import Worker
 
 from tests.workers.conftest import Slots
 from workers.database import QUEUE, Database, open_database
+from workers.file_places import LocalPlace
 from workers.files import FileStore
 from workers.janitor import Janitor, release, release_worker
 from workers.settings import Settings
@@ -107,7 +108,7 @@ async def test_a_job_that_the_queue_lost_is_queued_again(database_url: str, sett
                 "INSERT INTO jobs (id, dataset_id, options, fingerprint, queue_id, updated_at)"
                 " VALUES ('job_1', 'ds_1', '{}', '', 4711, now() - interval '1 hour')"
             )
-        janitor = Janitor(database, FileStore(tmp_path / "files"), settings, lambda: None, ())
+        janitor = Janitor(database, FileStore(LocalPlace(tmp_path / "files")), settings, lambda: None, ())
         await janitor._round()
         (row,) = await database.fetch(
             "SELECT queue.status FROM jobs JOIN procrastinate_jobs AS queue ON queue.id = jobs.queue_id"

@@ -17,6 +17,7 @@ from tests.workers.conftest import ready_dataset
 from workers import ledger
 from workers.database import QUEUE, Database, open_database
 from workers.errors import Unavailable
+from workers.file_places import LocalPlace
 from workers.files import FileStore
 from workers.janitor import Janitor
 from workers.ledger import claim_job
@@ -100,7 +101,7 @@ async def test_a_machine_that_slept_takes_no_job_from_its_workers(
     await queued(stores)
     await fetched(database, await registered(database))
     quick = settings.model_copy(update={"stall_s": 0.8, "janitor_s": 0.1})
-    janitor = Janitor(database, FileStore(tmp_path / "files"), quick, lambda: None, ())
+    janitor = Janitor(database, FileStore(LocalPlace(tmp_path / "files")), quick, lambda: None, ())
 
     async def status_after_a_round() -> str:
         await janitor._round()
