@@ -57,6 +57,18 @@ def test_held_out_views_too_few_for_a_median_must_stand_out_further():
     assert torch.nonzero(outliers(errors, held_out))[:, 0].tolist() == [0]
 
 
+def test_an_unseen_view_among_few_is_lost_only_if_most_of_its_photo_is_unexplained():
+    watch = CameraErrors(striped_set(), [3], CPU)  # a variance of 1/4
+    squared = [0.001] * 12
+    for share, lost in ((0.3, False), (0.9, True), (0.3, False)):
+        squared[3] = share / 4
+        for _ in range(6):
+            block(watch, squared)
+            watch.close_block()
+        assert bool(watch.lost[3]) == lost
+        assert bool(watch.suspects[3]), "other poses are tried for it all the same"
+
+
 def striped_set(count: int = 12):
     """Photos of a variance of 1/4: half black, half white, and no background."""
     photo = np.zeros((8, 8, 3), np.uint8)
