@@ -1,4 +1,4 @@
-"""What the operator sets, by environment variables ``BIRESNERF_*`` (lists as JSON)."""
+"""What the operator sets, by environment variables ``BIRESNERF_*`` (lists as JSON), each also by a file: ``…_FILE``."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Literal
 
 from pydantic import Field, SecretStr, model_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict
 
 from workers.addresses import Network
 from workers.errors import SetupError
+from workers.settings_files import FileSettingsSource
 
 MIB = 2**20
 GIB = 2**30
@@ -99,6 +100,18 @@ class Settings(BaseSettings):
         (sys.executable, "-m", "workers.check"),
         description="Program that validates a dataset; gets the folder as its last argument.",
     )
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """What the code gives, the environment, and files that the environment names."""
+        return init_settings, env_settings, FileSettingsSource(settings_cls)
 
     @model_validator(mode="after")
     def _consistent(self) -> Settings:

@@ -18,6 +18,7 @@ from workers.errors import SetupError
 from workers.janitor import release_worker
 from workers.migrate import migrate
 from workers.settings import Settings
+from workers.settings_files import environment_with
 from workers.tether import tethered
 from workers.waiting import first_done
 
@@ -91,12 +92,13 @@ class _Supervisor:
         self, settings: Settings, url: str, postgres: EmbeddedPostgres | None, children: Sequence[ChildSpec]
     ) -> None:
         self._postgres, self._children = postgres, children
-        self._environment = {
-            **os.environ,
-            "BIRESNERF_DATABASE_URL": url,
-            "BIRESNERF_DATA_DIR": str(settings.data_dir.absolute()),
-            "BIRESNERF_SLOTS": str(settings.slots),
-        }
+        self._environment = environment_with(
+            {
+                "BIRESNERF_DATABASE_URL": url,
+                "BIRESNERF_DATA_DIR": str(settings.data_dir.absolute()),
+                "BIRESNERF_SLOTS": str(settings.slots),
+            }
+        )
         self._stop = asyncio.Event()
         self._now = asyncio.Event()
         self._status = 0
