@@ -19,12 +19,13 @@ from biresnerf import __version__
 from biresnerf.errors import InputError
 from service import docs_page
 from service.dependencies import Service
+from service.intake import take_upload
 from service.json_body import validation_problem
 from service.metrics import WebMetrics
 from service.observe import Observed
 from service.problems import CATALOGUE, MEDIA_TYPE, ProblemError
 from service.request_context import RequestContext, render
-from service.routes import artifacts, datasets, events, health, jobs, meta
+from service.routes import artifacts, datasets, events, health, jobs, meta, uploads
 from service.uploads import sweep_staging
 from workers.errors import EngineError, NotFound, Unavailable
 from workers.settings import Settings
@@ -33,7 +34,7 @@ from workers.stores import open_stores
 logger = logging.getLogger(__name__)
 
 _UNFINISHED_EVERY_S = 15.0
-_ROUTERS = [module.router for module in (datasets, jobs, events, artifacts, meta, health, docs_page)]
+_ROUTERS = [module.router for module in (datasets, uploads, jobs, events, artifacts, meta, health, docs_page)]
 _DESCRIPTION = """
 Refines the camera poses of an image set.
 
@@ -61,6 +62,7 @@ def create_app(settings: Settings) -> FastAPI:
             if swept:
                 logger.info("removed %d unfinished uploads", swept)
             service.keep_running(asyncio.create_task(_check_unfinished(service)))
+            service.keep_running(asyncio.create_task(_tend_uploads(service)))
             try:
                 yield
             finally:
@@ -101,6 +103,20 @@ async def _check_unfinished(service: Service) -> None:
             logger.warning("unfinished checks wait: %s", error.what)
         except Exception:
             logger.exception("a check failed on our side; it is tried again")
+        await asyncio.sleep(_UNFINISHED_EVERY_S)
+
+
+async def _tend_uploads(service: Service) -> None:
+    """Brings in what another process received and will not bring in; gives up what does not go on."""
+    while True:
+        try:
+            for upload_id in await service.stores.uploads.untaken():
+                await take_upload(service, upload_id)
+            await service.stores.uploads.expire()
+        except Unavailable as error:
+            logger.warning("received uploads wait: %s", error.what)
+        except Exception:
+            logger.exception("an upload was not brought in on our side; it is tried again")
         await asyncio.sleep(_UNFINISHED_EVERY_S)
 
 

@@ -65,8 +65,13 @@ def _dataset_id(dataset_id: Annotated[str, PathParameter(examples=["ds_01JD8Y3V1
     return _known_form(dataset_id)
 
 
+def _upload_id(upload_id: Annotated[str, PathParameter(examples=["up_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])]) -> str:
+    return _known_form(upload_id)
+
+
 JobId = Annotated[str, Depends(_job_id)]
 DatasetId = Annotated[str, Depends(_dataset_id)]
+UploadId = Annotated[str, Depends(_upload_id)]
 
 
 def next_link(request: Request, cursor: str | None) -> dict[str, str]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
 from pathlib import Path
 
 from fastapi import Request
 
 from service.dependencies import Service
-from service.intake import take_archive
+from service.intake import file_sha256, take_archive
 from service.json_body import fit, load_json
 from service.problems import FieldProblem, ProblemError
 from service.routes.datasets import begin_check, finish_check
@@ -41,7 +40,7 @@ async def submit_form(service: Service, request: Request, idempotency_key: str |
                 "invalid_request", detail, errors=[FieldProblem(pointer="#/archive", detail=detail)]
             )
         texts = _texts(form)
-        digest = await asyncio.to_thread(_sha256, archive)
+        digest = await asyncio.to_thread(file_sha256, archive)
         if idempotency_key is not None:
             known = await service.stores.jobs.repeated(digest, texts.options, texts.labels, idempotency_key)
             if known is not None:
@@ -78,8 +77,3 @@ async def _make_job(
 def _texts(form: Form) -> JobTexts:
     values = {name: load_json(text) for name, text in form.texts.items() if text.strip()}
     return fit(values, JobTexts)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -30,6 +30,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "dataset_not_complete": (409, "Files of the dataset are missing"),
     "state_conflict": (409, "The state does not allow that"),
     "idempotency_in_progress": (409, "The first request with this key is still running"),
+    "offset_mismatch": (409, "The upload goes on elsewhere"),
     "result_not_ready": (409, "The job has no result yet"),
     "file_exists": (412, "The file is there already"),
     "precondition_failed": (412, "A condition of the request does not hold"),

@@ -59,6 +59,8 @@ class RequestContext:
                 headers = MutableHeaders(scope=message)
                 headers["X-Request-ID"] = request_id(request)
                 headers.setdefault("X-Content-Type-Options", "nosniff")
+                for name, value in scope.get("state", {}).get("extra_headers", {}).items():
+                    headers.setdefault(name, value)
             await send(message)
 
         try:

@@ -96,7 +96,7 @@ class DatasetStore:
         """
         # A folder of its own for each upload: one that fails or comes too late never touches an older file.
         folder = f"datasets/{dataset_id}/files/{new_id('v')}"
-        key = _key(folder, path)
+        key = file_key(folder, path)
         async with self._database.transaction() as connection:
             row = await self._require_open(connection, dataset_id, path, overwrite=overwrite)
         room = min(self._settings.max_file_bytes, self._settings.max_dataset_bytes - row["bytes"])
@@ -113,16 +113,7 @@ class DatasetStore:
         self, connection: Connection, dataset_id: str, path: str, *, overwrite: bool, size: int = 0
     ) -> dict[str, Any]:
         """The dataset's row, locked, with the bytes and files it would have besides ``path``."""
-        cursor = await connection.execute(
-            "SELECT state FROM datasets WHERE id = %s FOR UPDATE", (dataset_id,)
-        )
-        dataset = await cursor.fetchone()
-        if dataset is None:
-            raise NotFound(f"No dataset {dataset_id}.")
-        if dataset["state"] != "open":
-            raise Conflict(
-                "dataset_not_open", f"Dataset {dataset_id} is {dataset['state']}; it takes no more files."
-            )
+        await require_open(connection, dataset_id)
         cursor = await connection.execute(
             "SELECT count(*) FILTER (WHERE path <> %s) AS files, count(*) FILTER (WHERE path = %s) AS same,"
             " coalesce(sum(size) FILTER (WHERE path <> %s), 0)::bigint AS bytes"
@@ -234,7 +225,19 @@ async def _record_file(
     return DatasetFile.model_validate(await cursor.fetchone()), before is None
 
 
-def _key(folder: str, path: str) -> str:
+async def require_open(connection: Connection, dataset_id: str) -> None:
+    """Locks the dataset's row; raises `NotFound`, `Conflict` (``dataset_not_open``)."""
+    cursor = await connection.execute("SELECT state FROM datasets WHERE id = %s FOR UPDATE", (dataset_id,))
+    dataset = await cursor.fetchone()
+    if dataset is None:
+        raise NotFound(f"No dataset {dataset_id}.")
+    if dataset["state"] != "open":
+        raise Conflict(
+            "dataset_not_open", f"Dataset {dataset_id} is {dataset['state']}; it takes no more files."
+        )
+
+
+def file_key(folder: str, path: str) -> str:
     """The key of a client's path; raises `InputError` (``unsafe_path``)."""
     parts = path.split("/")
     bad = any(part in ("", ".", "..") or len(part.encode()) > 255 for part in parts) or "\0" in path

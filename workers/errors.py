@@ -24,7 +24,7 @@ class Conflict(EngineError):
     """The thing exists, but its state does not allow this.
 
     Codes: ``state_conflict``, ``dataset_not_open``, ``dataset_not_ready``, ``dataset_not_complete``,
-    ``dataset_in_use``, ``idempotency_key_reused``.
+    ``dataset_in_use``, ``idempotency_key_reused``, ``offset_mismatch``.
     """
 
 

@@ -151,6 +151,27 @@ class DatasetFile(Record):
     created_at: datetime
 
 
+UploadKind = Literal["archive", "file", "signed"]
+UploadState = Literal["receiving", "received", "stored", "rejected"]
+
+
+class Upload(Record):
+    """Bytes on their way into a dataset: an archive, one file, or one file that is sent to the store itself."""
+
+    id: str
+    dataset_id: str
+    kind: UploadKind
+    path: str | None = Field(None, description="The file's path; none for an archive.")
+    size: int
+    sha256: str | None = Field(None, description="As announced; what arrives must have it.")
+    state: UploadState
+    received: int = Field(description="Bytes that are safe; the next byte to send has this number.")
+    error: JobError | None = Field(None, description="Why it was rejected.")
+    created_at: datetime
+    expires_at: datetime = Field(description="It is given up then, unless it goes on.")
+    folder: str = Field(description="Where its pieces lie in the FileStore.")
+
+
 T = TypeVar("T")
 
 

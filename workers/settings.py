@@ -92,6 +92,10 @@ class Settings(BaseSettings):
     )
     max_webhooks: int = Field(20, ge=0, description="Webhooks of one tenant.")
 
+    upload_expiry_s: float = Field(
+        24 * 3600, gt=0, description="An upload that does not go on for so long is given up."
+    )
+
     job_command: tuple[str, ...] = Field(
         (sys.executable, "-m", "workers.run"),
         description="Program of a job; gets the job folder as its last argument.",

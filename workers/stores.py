@@ -15,6 +15,7 @@ from workers.jobs import JobStore
 from workers.monitor import Monitor
 from workers.one_store import require_same_store
 from workers.settings import Settings
+from workers.uploads import UploadStore
 
 FOLLOW_POLL_S = 1.5
 
@@ -26,6 +27,7 @@ class Stores:
     jobs: JobStore
     datasets: DatasetStore
     files: FileStore
+    uploads: UploadStore
     monitor: Monitor
 
 
@@ -43,6 +45,7 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
         try:
             jobs = JobStore(database, listener, settings)
             monitor = Monitor(database, files, settings.stall_s)
-            yield Stores(jobs, DatasetStore(database, files, settings), files, monitor)
+            uploads = UploadStore(database, files, settings)
+            yield Stores(jobs, DatasetStore(database, files, settings), files, uploads, monitor)
         finally:
             listening.cancel()

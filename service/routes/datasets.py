@@ -13,7 +13,7 @@ from fastapi.responses import JSONResponse, Response
 
 from biresnerf.errors import InputError
 from service.dependencies import DatasetId, Service, ServiceHere, next_link
-from service.intake import take_archive
+from service.intake import settle_uploads, take_archive
 from service.json_body import json_content, read_json
 from service.problems import ProblemError, declared
 from service.safe_paths import NameSet, checked_path
@@ -249,6 +249,7 @@ async def begin_check(service: Service, dataset_id: str) -> DatasetRecord:
         ProblemError: ``name_collision``; then the dataset stays open.
     """
     store = service.stores.datasets
+    await settle_uploads(service, dataset_id)
     names, cursor = NameSet(), None
     while True:
         page = await store.files(dataset_id, cursor=cursor)

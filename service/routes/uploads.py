@@ -1,0 +1,197 @@
+"""Uploads that survive broken connections and restarts: tus 1.0 (core, creation, expiration, termination).
+
+https://tus.io/protocols/resumable-upload. This is the only file that knows the protocol.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import re
+from datetime import UTC
+from email.utils import format_datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Header, Request
+from fastapi.responses import JSONResponse, Response
+
+from service.dependencies import DatasetId, ServiceHere, UploadId
+from service.intake import begin_taking
+from service.problems import ProblemError, declared
+from service.safe_paths import checked_path
+from service.schemas import UploadView, upload_url
+from service.uploads import capped, refuse_announced_excess
+from workers.records import Upload
+
+VERSION = "1.0.0"
+CONTENT_TYPE = "application/offset+octet-stream"
+SPEAKS = {"Tus-Resumable": VERSION}
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_ALWAYS = ("precondition_failed", "database_unavailable", "storage_unavailable", "internal_error")
+_METADATA = (
+    "`name BASE64` pairs with commas between. `path`: the upload is this one file; without it, an archive. "
+    "`sha256`: what the whole must have, in hex."
+)
+
+
+def _speak_tus(request: Request) -> None:
+    """Every answer names the version, errors too."""
+    request.state.extra_headers = SPEAKS
+
+
+def _same_version(tus_resumable: Annotated[str, Header(description="`1.0.0`")] = "") -> None:
+    if tus_resumable.strip() != VERSION:
+        raise ProblemError(
+            "precondition_failed",
+            f"The header Tus-Resumable must be {VERSION}.",
+            where="Tus-Resumable",
+            headers={"Tus-Version": VERSION},
+        )
+
+
+router = APIRouter(prefix="/v1", tags=["uploads"], dependencies=[Depends(_speak_tus)])
+SameVersion = Depends(_same_version)
+
+
+def _where(upload: Upload) -> dict[str, str]:
+    return {
+        "Upload-Offset": str(upload.received),
+        "Upload-Length": str(upload.size),
+        "Upload-Expires": format_datetime(upload.expires_at.astimezone(UTC), usegmt=True),
+        "Cache-Control": "no-store",
+    }
+
+
+@router.options(
+    "/datasets/{dataset_id}/uploads",
+    status_code=204,
+    operation_id="describeUploads",
+    responses=declared("not_found", "internal_error"),
+)
+async def describe_uploads(dataset_id: DatasetId, service: ServiceHere) -> Response:
+    """What of the tus protocol is spoken here."""
+    headers = {
+        "Tus-Version": VERSION,
+        "Tus-Extension": "creation,expiration,termination",
+        "Tus-Max-Size": str(service.settings.max_archive_bytes),
+    }
+    return Response(status_code=204, headers=headers)
+
+
+@router.post(
+    "/datasets/{dataset_id}/uploads",
+    status_code=201,
+    operation_id="createUpload",
+    response_model=UploadView,
+    responses=declared(
+        *("not_found", "dataset_not_open", "invalid_request", "unsafe_path", "body_too_large"),
+        *("too_many_files", "storage_full", "cross_site", *_ALWAYS),
+    ),
+    dependencies=[SameVersion],
+)
+async def create_upload(
+    dataset_id: DatasetId,
+    service: ServiceHere,
+    upload_length: Annotated[int, Header(ge=0, lt=2**62, description="Bytes that are going to be sent.")],
+    upload_metadata: Annotated[str, Header(description=_METADATA, max_length=8192)] = "",
+) -> Response:
+    """A new resumable upload of one archive (zip, tar, tar.gz) or one large file."""
+    said = _metadata(upload_metadata)
+    path, sha256 = said.get("path"), said.get("sha256")
+    if sha256 is not None and not _DIGEST.fullmatch(sha256):
+        raise ProblemError("invalid_request", "The value of sha256 is no SHA-256.", where="Upload-Metadata")
+    upload = await service.stores.uploads.create(
+        dataset_id,
+        "archive" if path is None else "file",
+        upload_length,
+        path=None if path is None else checked_path(path),
+        sha256=sha256,
+    )
+    if upload.state == "received":
+        begin_taking(service, upload.id)
+    headers = {"Location": upload_url(upload.id), **_where(upload)}
+    return JSONResponse(UploadView.of(upload).model_dump(mode="json"), status_code=201, headers=headers)
+
+
+def _metadata(header: str) -> dict[str, str]:
+    said = {}
+    for pair in filter(None, (part.strip() for part in header.split(","))):
+        name, _, value = pair.partition(" ")
+        try:
+            said[name] = base64.b64decode(value.strip(), validate=True).decode()
+        except (binascii.Error, UnicodeDecodeError):
+            raise ProblemError(
+                "invalid_request", f"The value of {name[:50]!r} is no Base64 text.", where="Upload-Metadata"
+            ) from None
+    return said
+
+
+@router.head(
+    "/uploads/{upload_id}",
+    operation_id="headUpload",
+    responses=declared("not_found", *_ALWAYS),
+    dependencies=[SameVersion],
+)
+async def head_upload(upload_id: UploadId, service: ServiceHere) -> Response:
+    """At which byte the upload goes on (`Upload-Offset`)."""
+    return Response(status_code=200, headers=_where(await service.stores.uploads.get(upload_id)))
+
+
+@router.get("/uploads/{upload_id}", operation_id="getUpload", responses=declared("not_found", *_ALWAYS))
+async def get_upload(upload_id: UploadId, service: ServiceHere) -> UploadView:
+    """How far the upload is, and once all is received, what became of it (`stored` or `rejected`)."""
+    return UploadView.of(await service.stores.uploads.get(upload_id))
+
+
+_APPENDS: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {CONTENT_TYPE: {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+
+@router.patch(
+    "/uploads/{upload_id}",
+    status_code=204,
+    operation_id="appendUpload",
+    responses=declared(
+        *("not_found", "offset_mismatch", "body_too_large", "unsupported_media", "invalid_request"),
+        *("body_timeout", "storage_full", "cross_site", *_ALWAYS),
+    ),
+    dependencies=[SameVersion],
+    openapi_extra=_APPENDS,
+)
+async def append_upload(
+    upload_id: UploadId,
+    request: Request,
+    service: ServiceHere,
+    upload_offset: Annotated[int, Header(ge=0, lt=2**62, description="Number of the first byte sent.")],
+) -> Response:
+    """The next bytes. What arrived is kept however the connection ends; `HEAD` says how much that is.
+
+    With the last byte the upload is brought into the dataset: an archive is unpacked, all or nothing.
+    `POST …/finalize` waits for that, and tells where it went wrong.
+    """
+    if request.headers.get("content-type", "").partition(";")[0].strip() != CONTENT_TYPE:
+        raise ProblemError("unsupported_media", f"The Content-Type must be {CONTENT_TYPE}.")
+    uploads = service.stores.uploads
+    upload = await uploads.get(upload_id)
+    room = upload.size - upload_offset
+    refuse_announced_excess(request.headers.get("content-length"), max(room, 0))
+    upload = await uploads.append(upload_id, upload_offset, capped(request.stream(), max(room, 0)))
+    if upload.state == "received":
+        begin_taking(service, upload_id)
+    return Response(status_code=204, headers=_where(upload))
+
+
+@router.delete(
+    "/uploads/{upload_id}",
+    status_code=204,
+    operation_id="deleteUpload",
+    responses=declared("not_found", "cross_site", *_ALWAYS),
+    dependencies=[SameVersion],
+)
+async def delete_upload(upload_id: UploadId, service: ServiceHere) -> None:
+    """Gives the upload up. What it has brought into the dataset already stays there."""
+    await service.stores.uploads.delete(upload_id)
