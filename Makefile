@@ -10,7 +10,7 @@ export PIP_CONSTRAINT := constraints.txt
 export PIP_BUILD_CONSTRAINT := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test lint format demo serve bench
+.PHONY: help setup test lint format demo serve bench openapi fuzz
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -36,6 +36,12 @@ serve: setup  ## the service on this machine
 
 bench: setup  ## the measurements; BENCH="arguments"
 	$(BIN)/python -m benchmarks $(BENCH)
+
+openapi: setup  ## write docs/openapi.json anew, after a change of the HTTP interface
+	$(BIN)/python -m service.openapi docs/openapi.json
+
+fuzz: setup  ## thousands of made-up requests against a real service; FUZZ="arguments"
+	$(BIN)/python -m tests.service.fuzzing $(FUZZ)
 
 # Without ensurepip the venv module leaves half an environment behind, so it is looked for first.
 $(BIN)/python:

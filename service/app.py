@@ -7,7 +7,6 @@ import contextlib
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -23,7 +22,8 @@ from service.intake import take_upload
 from service.json_body import validation_problem
 from service.metrics import WebMetrics
 from service.observe import Observed
-from service.problems import CATALOGUE, MEDIA_TYPE, ProblemError
+from service.openapi import describe
+from service.problems import CATALOGUE, ProblemError
 from service.request_context import RequestContext, render
 from service.routes import artifacts, datasets, events, health, jobs, meta, uploads
 from service.uploads import sweep_staging
@@ -88,7 +88,7 @@ def create_app(settings: Settings) -> FastAPI:
     for router in _ROUTERS:
         app.include_router(router)
     app.add_api_route("/", lambda: RedirectResponse("docs"), include_in_schema=False)
-    _describe_problems(app)
+    describe(app)
     return app
 
 
@@ -170,28 +170,3 @@ def _from_http_exception(error: HTTPException) -> ProblemError:
         "method_not_allowed": "This address answers other methods; the Allow header names them.",
     }.get(code, str(error.detail))
     return ProblemError(code, detail, headers=dict(error.headers or {}))
-
-
-def _describe_problems(app: FastAPI) -> None:
-    """In the schema, problems have their own media type, and FastAPI's own 422 form is gone."""
-    generate = app.openapi
-
-    def openapi() -> dict[str, Any]:
-        if app.openapi_schema:
-            return app.openapi_schema
-        schema = generate()
-        for path in schema["paths"].values():
-            for operation in path.values():
-                for status, response in operation["responses"].items():
-                    content = response.get("content", {})
-                    if int(status) >= 400:
-                        response["content"] = {
-                            MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}
-                        }
-                    response["content"] = response.get("content", content)
-        for unused in ("HTTPValidationError", "ValidationError"):
-            schema["components"]["schemas"].pop(unused, None)
-        app.openapi_schema = schema
-        return schema
-
-    app.openapi = openapi  # type: ignore[method-assign]

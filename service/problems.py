@@ -170,6 +170,14 @@ def declared(*codes: str) -> dict[int | str, dict[str, Any]]:
         status: {
             "model": Problem,
             "description": f"{HTTPStatus(status).phrase}: `{'`, `'.join(names)}`",
+            "content": {MEDIA_TYPE: {"examples": {name: _example(name) for name in names}}},
         }
         for status, names in sorted(by_status.items())
     }
+
+
+def _example(code: str) -> dict[str, Any]:
+    """The problem as it looks where there is nothing special to say."""
+    title = CATALOGUE[code][1]
+    problem = ProblemError(code, f"{title}.").problem("/v1/…", "5f1c0d9e6a0b4a3c")
+    return {"summary": title, "value": problem.model_dump(mode="json", exclude_none=True)}

@@ -20,7 +20,8 @@ from workers.records import Artifact
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
 REPORT = "report.json"
 _BINARY: dict[str, Any] = {
-    "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+    # Each file in its own media type, which the list of artifacts tells.
+    "content": {"*/*": {"schema": {"description": "The bytes."}}}
 }
 _ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"description": "The file.", **_BINARY},

@@ -28,7 +28,21 @@ _STREAM: dict[int | str, dict[str, Any]] = {
             "`progress` carries the job as it is now, at most once a second. Comments keep the connection "
             "alive. The stream ends after the job."
         ),
-        "content": {"text/event-stream": {"schema": {"type": "string"}}},
+        # OpenAPI 3.1 has no word for a stream: this is one event of it.
+        "content": {
+            "text/event-stream": {
+                "schema": {
+                    "type": "object",
+                    "required": ["event", "data"],
+                    "properties": {
+                        "event": {"type": "string"},
+                        "id": {"type": "string", "description": "Send it back as Last-Event-ID."},
+                        "data": {"type": "string", "description": "JSON: a JobEvent, or the job (progress)."},
+                    },
+                },
+                "example": {"event": "started", "id": "2", "data": '{"seq": 2, "type": "started"}'},
+            }
+        },
     }
 }
 

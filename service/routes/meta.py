@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Header, Response
 
@@ -22,11 +22,12 @@ ARCHIVES = ["application/zip", "application/x-tar", "application/gzip"]
 @router.get(
     "/v1/options",
     operation_id="getOptions",
+    response_model=OptionsView,
     responses={304: {"description": "As you have it."}, **declared("internal_error")},
 )
 async def get_options(
     response: Response, if_none_match: Annotated[str | None, Header()] = None
-) -> OptionsView | Any:
+) -> OptionsView | Response:
     """JSON Schema of the options, and the presets with every value filled in."""
     view = OptionsView(
         json_schema=RefineOptions.model_json_schema(),

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 from biresnerf.progress import Progress
+from service.examples import EXAMPLES
 
 folder = Path(sys.argv[1])
 order = json.loads((folder / "job.json").read_text())
@@ -59,6 +60,6 @@ verdict = {
     "why": ["No better."],
     "moved_px": 1,
 }
-report = {"state": "complete", "options": options, "verdict": verdict}
+report = {**EXAMPLES["Report"], "options": options, "verdict": verdict}
 (output / "report.json").write_text(json.dumps(report))
 tell("exporting", steps)

@@ -1,0 +1,95 @@
+"""Made-up requests against a real service: `python -m tests.service.fuzzing --seconds 600`.
+
+schemathesis reads the OpenAPI document and sends what fits it and what does not, in chains too (a dataset made
+here is filled there, deleted, asked for again). A server error, an answer that the document does not declare, or
+one that does not fit its schema ends the command with 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import httpx
+
+from biresnerf.data.synthetic import write_synthetic_scene
+from tests.service.conftest import PROGRAM, finished, ready_dataset, running_service, short_folder, submit
+
+ROOT = Path(__file__).parents[2]
+# Not ensure_resource_availability: it mistakes ids that an earlier phase has deleted for new ones.
+CHECKS = (
+    "not_a_server_error",
+    "status_code_conformance",
+    "content_type_conformance",
+    "response_headers_conformance",
+    "response_schema_conformance",
+    "unsupported_method",
+    "allow_header_conformance",
+    "use_after_free",
+)
+# Ids that exist, for what only reads: the chances to guess one are nil. What deletes gets made-up ones and,
+# in chains, those of its own making.
+_CONFIG = """
+hooks = "tests/service/fuzz_hooks.py"
+
+[[operations]]
+include-method = ["GET", "HEAD"]
+include-path-regex = "jobs/"
+parameters = {{ job_id = "{job_id}", name = "report.json" }}
+
+[[operations]]
+include-method = ["GET", "HEAD"]
+include-path-regex = "datasets/"
+parameters = {{ dataset_id = "{dataset_id}" }}
+"""
+
+
+def fuzz(url: str, folder: Path, arguments: list[str]) -> subprocess.CompletedProcess[str]:
+    """Runs schemathesis against the service, which has a finished job by then."""
+    scene = folder / "scene"
+    write_synthetic_scene(scene, n_views=6, size=32, seed=1)
+    with httpx.Client(base_url=url, timeout=60.0) as http:
+        dataset_id = ready_dataset(http, scene)
+        job_id = finished(http, submit(http, dataset_id)["id"])["id"]
+    config = folder / "schemathesis.toml"
+    config.write_text(_CONFIG.format(job_id=job_id, dataset_id=dataset_id))
+    command = ["schemathesis", "--config-file", str(config), "run", f"{url}/openapi.json"]
+    options = ["--checks", ",".join(CHECKS), "--request-timeout", "70", "--suppress-health-check", "all"]
+    return subprocess.run(
+        [str(Path(sys.executable).parent / command[0]), *command[1:], *options, *arguments],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+
+
+def fuzzed(seconds: int, *arguments: str) -> tuple[subprocess.CompletedProcess[str], str]:
+    """A service of its own fuzzed for so long; also what the service found worth a warning."""
+    with (
+        TemporaryDirectory() as folder,
+        short_folder() as data,
+        running_service(data, job_command=(sys.executable, str(PROGRAM))) as service,
+    ):
+        done = fuzz(service.url, Path(folder), ["--max-time", str(seconds), *arguments])
+        log = service.log.read_text()
+    return done, "\n".join(line for line in log.splitlines() if " INFO " not in line)
+
+
+def main() -> int:
+    """Returns the exit status of schemathesis."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=int, default=600)
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    done, log = fuzzed(arguments.seconds, "--seed", str(arguments.seed))
+    sys.stdout.write(f"{log}\n{done.stdout}{done.stderr}")
+    return done.returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())
