@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI
 
 from service.examples import EXAMPLES
-from service.problems import MEDIA_TYPE
+from service.problems import MEDIA_TYPE, declared
 
 _PROBLEM = {"$ref": "#/components/schemas/Problem"}
 # Where the next call takes its values from, as far as the path alone does not tell: operation -> (status, links).
@@ -29,6 +30,8 @@ _LINKS: dict[str, tuple[str, dict[str, Any]]] = {
         },
     ),
 }
+# What a request may be answered with before it reaches its operation.
+_ANYWHERE = declared("malformed_request", "head_timeout", "headers_too_large", "internal_error")
 # FastAPI's own form of a 422, which this service never answers with.
 _UNUSED = ("HTTPValidationError", "ValidationError")
 
@@ -59,15 +62,21 @@ def describe(app: FastAPI) -> None:
 
 
 def _answers(responses: dict[str, Any]) -> dict[str, Any]:
-    """The answers in order of status, problems as problems."""
-    told = {}
-    for status, response in sorted(responses.items()):
-        if int(status) >= 400:
-            examples = response.get("content", {}).get(MEDIA_TYPE, {}).get("examples")
-            if examples is None:
-                continue  # FastAPI declares its own 422 wherever there are parameters
-            response["content"] = {MEDIA_TYPE: {"schema": _PROBLEM, "examples": examples}}
-        told[status] = response
+    """The answers in order of status, problems as problems, with those that any request may get."""
+    told: dict[str, Any] = {}
+    for status, response in sorted({**{str(key): {} for key in _ANYWHERE}, **responses}.items()):
+        if int(status) < 400:
+            told[status] = response
+            continue
+        # Without examples it is FastAPI's own 422, which it declares wherever there are parameters.
+        examples = dict(response.get("content", {}).get(MEDIA_TYPE, {}).get("examples", {}))
+        if int(status) in _ANYWHERE:
+            examples |= _ANYWHERE[int(status)]["content"][MEDIA_TYPE]["examples"]
+        if examples:
+            told[status] = {
+                "description": f"{HTTPStatus(int(status)).phrase}: `{'`, `'.join(examples)}`",
+                "content": {MEDIA_TYPE: {"schema": _PROBLEM, "examples": examples}},
+            }
     return told
 
 

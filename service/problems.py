@@ -14,6 +14,7 @@ RETRY_AFTER_S = "5"
 
 # code -> (status, title). A code stands for one kind of mistake and never changes its meaning.
 CATALOGUE: dict[str, tuple[int, str]] = {
+    "malformed_request": (400, "The request is not well-formed HTTP"),
     "malformed_json": (400, "The body is not valid JSON"),
     "malformed_body": (400, "The body could not be read"),
     "bad_range": (400, "The Range header is malformed"),
@@ -23,6 +24,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "cross_site": (403, "Another web site sent this request"),
     "not_found": (404, "There is no such thing here"),
     "method_not_allowed": (405, "This address does not answer that method"),
+    "head_timeout": (408, "The request did not come"),
     "body_timeout": (408, "The body did not go on"),
     "dataset_not_ready": (409, "The dataset is not ready for jobs"),
     "dataset_in_use": (409, "A job uses the dataset"),
@@ -50,6 +52,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "dataset_invalid": (422, "The images and poses cannot be used"),
     "validation_timeout": (422, "Checking the files took too long"),
     "validation_resources": (422, "Checking the files took too much memory or crashed"),
+    "headers_too_large": (431, "The head of the request is too large"),
     "queue_full": (429, "Too many jobs are waiting"),
     "internal_error": (500, "Something is wrong with the service"),
     "unavailable": (503, "The service is not ready"),

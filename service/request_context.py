@@ -16,6 +16,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.problems import MEDIA_TYPE, ProblemError
 
 logger = logging.getLogger(__name__)
+# A browser sends at most 8 KiB of cookies; a few long headers beside them fit in too.
+HEAD_BYTES_MAX = 32 * 2**10
 _SAFE = {"GET", "HEAD", "OPTIONS"}
 _ID = re.compile(r"^[\w.:-]{1,128}$", re.ASCII)
 
@@ -64,6 +66,7 @@ class RequestContext:
             await send(message)
 
         try:
+            _refuse_ambiguous(request)
             _refuse_other_sites(request)
             await self._app(scope, receive, send_with_headers)
         except ProblemError as problem:
@@ -72,6 +75,21 @@ class RequestContext:
             if started:
                 raise
             await render(_last_net(error, request), request)(scope, receive, send_with_headers)
+
+
+def _refuse_ambiguous(request: Request) -> None:
+    """What the parser lets through, though a proxy before us may have read it differently."""
+    close = {"Connection": "close"}
+    if request.scope["http_version"] not in {"1.0", "1.1"}:
+        raise ProblemError("malformed_request", "This is not HTTP/1.", headers=close)
+    if "content-length" in request.headers and "transfer-encoding" in request.headers:
+        detail = "Content-Length and Transfer-Encoding exclude each other."
+        raise ProblemError("malformed_request", detail, headers=close)
+    # The parser counts only while it waits for more; a head that came in one piece is counted here.
+    head = [request.scope["raw_path"], request.scope["query_string"], *sum(request.scope["headers"], ())]
+    if sum(map(len, head)) > HEAD_BYTES_MAX:
+        detail = f"The head of the request is larger than {HEAD_BYTES_MAX} bytes."
+        raise ProblemError("headers_too_large", detail, headers=close)
 
 
 def _refuse_other_sites(request: Request) -> None:

@@ -13,6 +13,8 @@ from fastapi import FastAPI
 from pydantic import ValidationError
 
 from service.app import create_app
+from service.request_context import HEAD_BYTES_MAX
+from service.strict_http import StrictHttp
 from workers.errors import SetupError
 from workers.logs import set_up_logging
 from workers.settings import Settings
@@ -20,6 +22,8 @@ from workers.settings import Settings
 logger = logging.getLogger(__name__)
 # Long downloads may use it; event streams end at once (see `_Server`).
 _SHUTDOWN_GRACE_S = 5
+# Longer than proxies keep idle connections, which would otherwise send into one that we are closing.
+KEEP_ALIVE_S = 75
 
 
 class _Server(uvicorn.Server):
@@ -65,6 +69,10 @@ def serve(settings: Settings) -> None:
         server_header=False,
         timeout_graceful_shutdown=_SHUTDOWN_GRACE_S,
         lifespan="on",
+        http=StrictHttp,
+        ws="none",
+        h11_max_incomplete_event_size=HEAD_BYTES_MAX,
+        timeout_keep_alive=KEEP_ALIVE_S,
     )
     server = _Server(config, app)
     host, port = bound.getsockname()[:2]
