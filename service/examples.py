@@ -56,6 +56,7 @@ _DATASET_VIEW: dict[str, Any] = {
         "files": f"{_DATASET}/files",
         "archive": f"{_DATASET}/archive",
         "finalize": f"{_DATASET}/finalize",
+        "uploads": f"{_DATASET}/uploads",
     },
 }
 _FILE_VIEW = {"path": "images/0001.jpg", "size": 803_120, "sha256": _SHA256, "created_at": _AT}
@@ -122,11 +123,26 @@ _REPORT: dict[str, Any] = {
     "points": {"source": "features", "count": 5210},
 }
 
+_UPLOAD_VIEW: dict[str, Any] = {
+    "id": "up_01JD8Y3V1QKZ5M0C7W2N4T6XAB",
+    "dataset_id": _DATASET_ID,
+    "kind": "archive",
+    "path": None,
+    "size": 48_211_034,
+    "sha256": _SHA256,
+    "state": "receiving",
+    "received": 16_777_216,
+    "error": None,
+    "created_at": _AT,
+    "expires_at": "2026-11-22T19:00:00Z",
+}
+
 EXAMPLES: dict[str, Any] = {
     "JobView": _JOB_VIEW,
     "JobList": {"items": [_JOB_VIEW], "next_cursor": None},
     "DatasetView": _DATASET_VIEW,
     "DatasetList": {"items": [_DATASET_VIEW], "next_cursor": None},
+    "UploadView": _UPLOAD_VIEW,
     "FileView": _FILE_VIEW,
     "FileList": {"items": [_FILE_VIEW], "next_cursor": None},
     "ArtifactView": _ARTIFACT_VIEW,

@@ -45,8 +45,10 @@ def describe(app: FastAPI) -> None:
             return app.openapi_schema
         document = generate()
         for path in document["paths"].values():
-            for operation in path.values():
+            for method, operation in path.items():
                 operation["responses"] = _answers(operation["responses"])
+                if method == "head":
+                    operation["responses"]["200"].pop("content", None)
                 status, links = _LINKS.get(operation["operationId"], ("", {}))
                 if links:
                     operation["responses"][status]["links"] = links

@@ -23,6 +23,5 @@ _ARCHIVES = strategies.one_of(
     strategies.just(zip_of({"../evil.png": b"x"})),
     strategies.binary(max_size=200),
 )
-schemathesis.openapi.media_type(
-    "application/zip", _ARCHIVES, aliases=["application/x-tar", "application/gzip"]
-)
+_ALIASES = ["application/x-tar", "application/gzip", "application/offset+octet-stream"]
+schemathesis.openapi.media_type("application/zip", _ARCHIVES, aliases=_ALIASES)
