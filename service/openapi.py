@@ -14,21 +14,30 @@ from service.examples import EXAMPLES
 from service.problems import MEDIA_TYPE, declared
 
 _PROBLEM = {"$ref": "#/components/schemas/Problem"}
+
+
 # Where the next call takes its values from, as far as the path alone does not tell: operation -> (status, links).
+def _by_path(operation: str, parameter: str, answer: str = "$response.body#/id") -> dict[str, Any]:
+    return {operation: {"operationId": operation, "parameters": {parameter: answer}}}
+
+
 _LINKS: dict[str, tuple[str, dict[str, Any]]] = {
+    "createDataset": (
+        "201",
+        {
+            **_by_path("putFile", "dataset_id"),
+            **_by_path("uploadArchive", "dataset_id"),
+            **_by_path("createUpload", "dataset_id"),
+            **_by_path("finalizeDataset", "dataset_id"),
+        },
+    ),
+    "createUpload": ("201", {**_by_path("appendUpload", "upload_id"), **_by_path("getUpload", "upload_id")}),
+    "uploadArchive": ("200", _by_path("finalizeDataset", "dataset_id")),
     "finalizeDataset": (
         "200",
         {"submitJob": {"operationId": "submitJob", "requestBody": {"dataset_id": "$response.body#/id"}}},
     ),
-    "uploadArchive": (
-        "200",
-        {
-            "finalizeDataset": {
-                "operationId": "finalizeDataset",
-                "parameters": {"dataset_id": "$response.body#/id"},
-            }
-        },
-    ),
+    "submitJob": ("202", {**_by_path("getJob", "job_id"), **_by_path("cancelJob", "job_id")}),
 }
 # What a request may be answered with before it reaches its operation.
 _ANYWHERE = declared("malformed_request", "head_timeout", "headers_too_large", "internal_error")
