@@ -13,6 +13,7 @@ from fastapi import Path as PathParameter
 
 from service.metrics import WebMetrics
 from service.problems import ProblemError
+from workers.room import Room, room_for_uploads
 from workers.settings import Settings
 from workers.stores import Stores
 
@@ -34,6 +35,11 @@ class Service:
     def staging_dir(self) -> Path:
         """Where bodies lie until they are checked."""
         return self.settings.data_dir / "staging"
+
+    @property
+    def room(self) -> Room:
+        """What uploads may still take of the local disks."""
+        return room_for_uploads(self.settings)
 
     def keep_running(self, task: asyncio.Task[Any]) -> None:
         """Holds a task that outlives its request, so that it is not collected."""

@@ -45,11 +45,14 @@ async def take_archive(service: Service, dataset_id: str, archive: Path, into: P
         raise ProblemError(
             "dataset_not_open", f"The dataset is {dataset.state}.", mend="Create a new dataset."
         )
+    allowed = min(settings.max_unpacked_bytes, settings.max_dataset_bytes - dataset.bytes)
+    # Twice: unpacked here, and then stored, which may be on the same disk.
+    room = await asyncio.to_thread(service.room.free_bytes) // 2
     request = UnpackRequest(
         archive=archive,
         into=into,
         files_max=settings.max_files - dataset.files,
-        bytes_max=min(settings.max_unpacked_bytes, settings.max_dataset_bytes - dataset.bytes),
+        bytes_max=min(allowed, room),
         file_bytes_max=settings.max_file_bytes,
         ratio_max=RATIO_MAX,
     )
@@ -58,7 +61,12 @@ async def take_archive(service: Service, dataset_id: str, archive: Path, into: P
         memory_bytes=_UNPACK_MEMORY_BYTES,
         file_bytes=settings.max_file_bytes + 2**20,
     )
-    await run_confined("service.unpack", request, limits)
+    try:
+        await run_confined("service.unpack", request, limits)
+    except ProblemError as error:
+        if error.code == "archive_too_large" and room < allowed:
+            raise ProblemError("storage_full", "There is no room to unpack the archive.") from None
+        raise
     root = await asyncio.to_thread(content_root, into)
     for path in await asyncio.to_thread(_files_below, root):
         name = path.relative_to(root).as_posix()
@@ -141,7 +149,7 @@ async def _bring_in(service: Service, upload: Upload) -> None:
     async with staging_folder(service.staging_dir) as folder:
         archive, into = folder / "archive", folder / "content"
         into.mkdir()
-        await write_stream(uploads.content(upload), archive, upload.size)
+        await write_stream(uploads.content(upload), archive, upload.size, service.room)
         if upload.sha256 is not None:
             found = await asyncio.to_thread(file_sha256, archive)
             if found != upload.sha256:

@@ -29,10 +29,10 @@ async def submit_form(service: Service, request: Request, idempotency_key: str |
     Where anything is wrong, the dataset made for it is deleted again.
     """
     limit = service.settings.max_archive_bytes + _FORM_BYTES
-    refuse_announced_excess(request.headers.get("content-length"), limit)
+    refuse_announced_excess(request.headers.get("content-length"), limit, service.room)
     async with staging_folder(service.staging_dir) as folder:
         archive = folder / "archive"
-        form = Form("archive", {"options", "labels"}, archive, limit)
+        form = Form("archive", {"options", "labels"}, archive, limit, service.room)
         await form.read(request.headers["content-type"], request.stream())
         if not form.has_file:
             detail = "The form has no file field `archive`."

@@ -17,12 +17,14 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from service.problems import FieldProblem, ProblemError
+from workers.room import Room
 
 _FIELD_BYTES_MAX = 256 * 1024
 _HEADER_BYTES_MAX = 8 * 1024
 _LOCK = ".in-use"
 # A client that sends nothing for so long holds a connection and a folder for nothing.
 IDLE_S = 60.0
+_LOOK_BYTES = 16 * 2**20  # between two looks at the disk
 
 
 def too_large(limit_bytes: int) -> ProblemError:
@@ -34,22 +36,26 @@ def too_large(limit_bytes: int) -> ProblemError:
     )
 
 
-def refuse_announced_excess(content_length: str | None, limit_bytes: int) -> None:
+def refuse_announced_excess(content_length: str | None, limit_bytes: int, room: Room | None = None) -> None:
     """Refuses by Content-Length before a byte is read; the count while reading holds in any case."""
-    if content_length is not None and content_length.isdigit() and int(content_length) > limit_bytes:
-        raise too_large(limit_bytes)
+    if content_length is not None and content_length.isdigit():
+        if int(content_length) > limit_bytes:
+            raise too_large(limit_bytes)
+        if room is not None:
+            room.require(int(content_length))
 
 
 async def capped(
-    stream: AsyncIterator[bytes], limit_bytes: int, idle_s: float = IDLE_S
+    stream: AsyncIterator[bytes], limit_bytes: int, idle_s: float = IDLE_S, room: Room | None = None
 ) -> AsyncIterator[bytes]:
     """The stream.
 
     Raises:
         ProblemError: ``body_too_large`` at the first byte beyond the limit; ``body_timeout`` where nothing
             comes for ``idle_s``.
+        LimitReached: ``storage_full`` where ``room`` says so, at the start or on the way.
     """
-    total = 0
+    total, looked_at = 0, -_LOOK_BYTES
     while True:
         try:
             async with asyncio.timeout(idle_s):
@@ -61,14 +67,19 @@ async def capped(
         total += len(chunk)
         if total > limit_bytes:
             raise too_large(limit_bytes)
+        if room is not None and total - looked_at >= _LOOK_BYTES:
+            await asyncio.to_thread(room.require)
+            looked_at = total
         yield chunk
 
 
-async def write_stream(stream: AsyncIterator[bytes], target: Path, limit_bytes: int) -> int:
-    """Writes the stream into a new file; returns its bytes."""
+async def write_stream(
+    stream: AsyncIterator[bytes], target: Path, limit_bytes: int, room: Room | None = None
+) -> int:
+    """Writes the stream into a new file; returns its bytes. Raises as `capped` does."""
     total = 0
     with target.open("xb") as out:
-        async for chunk in capped(stream, limit_bytes):
+        async for chunk in capped(stream, limit_bytes, room=room):
             total += len(chunk)
             await asyncio.to_thread(out.write, chunk)
     return total
@@ -115,11 +126,13 @@ def _younger_than(path: Path, seconds: float) -> bool:
 class Form:
     """A multipart form read from a stream: one file part to disk, small text fields to memory."""
 
-    def __init__(self, file_field: str, text_fields: set[str], target: Path, limit_bytes: int) -> None:
+    def __init__(
+        self, file_field: str, text_fields: set[str], target: Path, limit_bytes: int, room: Room | None = None
+    ) -> None:
         self.texts: dict[str, str] = {}
         self.has_file = False
         self._file_field, self._text_fields = file_field, text_fields
-        self._target, self._limit = target, limit_bytes
+        self._target, self._limit, self._room = target, limit_bytes, room
         self._out: IO[bytes] | None = None
         self._pending: list[bytes] = []
         self._header_name = self._header_value = b""
@@ -134,6 +147,7 @@ class Form:
         Raises:
             ProblemError: ``malformed_body``, ``invalid_request`` (unknown or repeated field),
                 ``body_too_large``.
+            LimitReached: ``storage_full``.
         """
         _, parameters = parse_options_header(content_type)
         boundary = parameters.get(b"boundary")
@@ -141,7 +155,7 @@ class Form:
             raise ProblemError("malformed_body", "The Content-Type has no boundary.", where="Content-Type")
         try:
             parser = MultipartParser(boundary, self._callbacks())  # type: ignore[arg-type]
-            async for chunk in capped(stream, self._limit):
+            async for chunk in capped(stream, self._limit, room=self._room):
                 parser.write(chunk)
                 await self._flush()
             parser.finalize()

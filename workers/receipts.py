@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from datetime import datetime
 
 from procrastinate import JobContext
 from procrastinate.job_context import JobResult
@@ -49,7 +50,7 @@ class FencedWorker(Worker):
                 if await cursor.fetchone() is None:
                     log.warning("queue row %d is not ours any more", queue_id)
                 elif retry_decision is not None:
-                    await offer_again(connection, queue_id)
+                    await offer_again(connection, queue_id, retry_decision.retry_at)
                 else:
                     await connection.execute(
                         "SELECT procrastinate_finish_job_v1(%s, %s, false)", (queue_id, status.value)
@@ -59,9 +60,13 @@ class FencedWorker(Worker):
         self._job_ids_to_abort.pop(queue_id, None)
 
 
-async def offer_again(connection: Connection, queue_id: int) -> None:
+async def offer_again(connection: Connection, queue_id: int, not_before: datetime | None = None) -> None:
     """Put a row that is worked on back into the queue, in the caller's transaction, and wake idle workers."""
-    await connection.execute("SELECT procrastinate_retry_job_v2(%s, NULL, NULL, NULL, NULL)", (queue_id,))
+    await connection.execute(
+        "SELECT procrastinate_retry_job_v2(%s,"
+        " CASE WHEN %s::timestamptz > clock_timestamp() THEN %s::timestamptz END, NULL, NULL, NULL)",
+        (queue_id, not_before, not_before),
+    )
     # The engine notifies of new rows only; without this an idle worker finds it at its next look.
     await connection.execute(
         "SELECT pg_notify(%s, %s)",

@@ -59,6 +59,16 @@ class Settings(BaseSettings):
     storage_region: str = "us-east-1"
     storage_access_key_id: str | None = Field(None, description="None: AWS_… variables or the host's role.")
     storage_secret_access_key: str | None = Field(None, repr=False)
+    storage_presign: bool = Field(
+        False,
+        description="Clients get signed addresses of the bucket, to download and upload files there themselves.",
+    )
+    storage_presign_s: int = Field(900, ge=10, le=604_800, description="How long such an address is good.")
+    share_key: str | None = Field(
+        None,
+        repr=False,
+        description="Signs links to results; none: one that is made and kept in the database.",
+    )
 
     slots: int = Field(1, ge=0, le=64, description="Jobs that run at the same time on this machine.")
     beat_s: float = Field(10.0, gt=0, description="Seconds between two signs of life of a worker.")
@@ -92,6 +102,11 @@ class Settings(BaseSettings):
     )
     max_webhooks: int = Field(20, ge=0, description="Webhooks of one tenant.")
 
+    disk_reserve_bytes: int = Field(
+        GIB,
+        ge=0,
+        description="Stays free on local disks: uploads are refused (507) and jobs wait before that is used.",
+    )
     upload_expiry_s: float = Field(
         24 * 3600, gt=0, description="An upload that does not go on for so long is given up."
     )

@@ -12,23 +12,26 @@ import re
 import shutil
 import sys
 from collections.abc import Callable, Mapping
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import IO, TypeVar
 
-from procrastinate import JobContext, RetryStrategy
+from procrastinate import BaseRetryStrategy, JobContext, RetryDecision
 from procrastinate.exceptions import ConnectorException
 from procrastinate.job_context import AbortReason
+from procrastinate.jobs import Job
 
 from workers.attempt import Attempt
 from workers.beat import Beat
 from workers.database import QUEUE, TASK, Database, first_line, open_database
-from workers.errors import SetupError
+from workers.errors import LimitReached, SetupError
 from workers.files import open_files
 from workers.janitor import Janitor, release_worker
 from workers.ledger import Fenced, claim_job, insist
 from workers.logs import about, set_up_logging
 from workers.one_store import require_same_store
 from workers.receipts import FencedWorker
+from workers.room import room_for_jobs
 from workers.settings import Settings
 from workers.statistics import announce_slot
 
@@ -41,7 +44,20 @@ T = TypeVar("T")
 
 
 class BackToQueue(Exception):
-    """Tells the queue engine to offer the job again."""
+    """Tells the queue engine to offer the job again, after some seconds."""
+
+    def __init__(self, after_s: float = 0) -> None:
+        super().__init__(after_s)
+        self.after_s = after_s
+
+
+class OfferAgain(BaseRetryStrategy):
+    """No cap on the engine's side: attempts are counted in the job, where shutdowns do not count."""
+
+    def get_retry_decision(self, *, exception: BaseException, job: Job) -> RetryDecision:
+        """At once, unless the job was sent back to wait."""
+        wait_s = exception.after_s if isinstance(exception, BackToQueue) else 0
+        return RetryDecision(retry_at=datetime.now(UTC) + timedelta(seconds=wait_s))
 
 
 class SlotLock:
@@ -129,14 +145,15 @@ class Slot:
         await insist(lambda: announce_slot(database, host, self._name, worker_id))
 
     def _register(self, database: Database) -> None:
-        # No cap on the engine's side: attempts are counted in the job, where shutdowns do not count.
-        @database.app.task(name=TASK, queue=QUEUE, pass_context=True, retry=RetryStrategy(wait=0))
+        @database.app.task(name=TASK, queue=QUEUE, pass_context=True, retry=OfferAgain())
         async def refine(context: JobContext, job_id: str) -> None:
             queue_id = context.job.id
             assert queue_id is not None, "fetched from the database"
             self._running.add(queue_id)
             try:
                 with about(job_id=job_id):
+                    if not await _relay(asyncio.create_task(self._has_room(database, job_id)), lambda: None):
+                        raise BackToQueue(self._settings.stall_s / 4)
                     again = await self._run_job(database, context, job_id)
             except Fenced as fenced:
                 log.warning("%s; leaving", fenced)
@@ -146,6 +163,22 @@ class Slot:
                 self._running.discard(queue_id)
             if again:
                 raise BackToQueue
+
+    async def _has_room(self, database: Database, job_id: str) -> bool:
+        """Whether the job's files fit on the local disk; where not, another host may have room now, or we later."""
+        rows = await insist(
+            lambda: database.fetch(
+                "SELECT sum(file.size)::bigint AS bytes FROM jobs"
+                " JOIN dataset_files AS file ON file.dataset_id = jobs.dataset_id WHERE jobs.id = %s",
+                job_id,
+            )
+        )
+        try:
+            room_for_jobs(self._settings).require(rows[0]["bytes"] or 0)
+        except LimitReached as full:
+            log.warning("the job waits: %s", full.what)
+            return False
+        return True
 
     async def _run_job(self, database: Database, context: JobContext, job_id: str) -> bool:
         claiming = asyncio.create_task(claim_job(database, job_id, self._settings.max_attempts))

@@ -148,11 +148,11 @@ async def put_file(
     """One file, as raw bytes. The same request again changes nothing."""
     limit = service.settings.max_file_bytes
     safe = checked_path(path)
-    refuse_announced_excess(None if content_length is None else str(content_length), limit)
+    refuse_announced_excess(None if content_length is None else str(content_length), limit, service.room)
     file, new = await service.stores.datasets.add_file(
         dataset_id,
         safe,
-        capped(request.stream(), limit),
+        capped(request.stream(), limit, room=service.room),
         sha256=_announced_digest(repr_digest),
         overwrite=(if_none_match or "").strip() != "*",
     )
@@ -201,10 +201,10 @@ async def upload_archive(dataset_id: DatasetId, request: Request, service: Servi
     All or nothing: where one entry is not acceptable, no file is taken.
     """
     limit = service.settings.max_archive_bytes
-    refuse_announced_excess(request.headers.get("content-length"), limit)
+    refuse_announced_excess(request.headers.get("content-length"), limit, service.room)
     await service.stores.datasets.get(dataset_id)
     async with staging_folder(service.staging_dir) as folder:
-        await write_stream(request.stream(), folder / "archive", limit)
+        await write_stream(request.stream(), folder / "archive", limit, service.room)
         into = folder / "content"
         into.mkdir()
         return DatasetView.of(await take_archive(service, dataset_id, folder / "archive", into))

@@ -5,6 +5,7 @@ https://tus.io/protocols/resumable-upload. This is the only file that knows the 
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import binascii
 import re
@@ -100,6 +101,7 @@ async def create_upload(
     path, sha256 = said.get("path"), said.get("sha256")
     if sha256 is not None and not _DIGEST.fullmatch(sha256):
         raise ProblemError("invalid_request", "The value of sha256 is no SHA-256.", where="Upload-Metadata")
+    await asyncio.to_thread(service.room.require, upload_length)
     upload = await service.stores.uploads.create(
         dataset_id,
         "archive" if path is None else "file",
@@ -179,7 +181,8 @@ async def append_upload(
     upload = await uploads.get(upload_id)
     room = upload.size - upload_offset
     refuse_announced_excess(request.headers.get("content-length"), max(room, 0))
-    upload = await uploads.append(upload_id, upload_offset, capped(request.stream(), max(room, 0)))
+    body = capped(request.stream(), max(room, 0), room=service.room)
+    upload = await uploads.append(upload_id, upload_offset, body)
     if upload.state == "received":
         begin_taking(service, upload_id)
     return Response(status_code=204, headers=_where(upload))
