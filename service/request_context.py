@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import logging
 import re
@@ -71,6 +72,12 @@ class RequestContext:
             await self._app(scope, receive, send_with_headers)
         except ProblemError as problem:
             await render(problem, request)(scope, receive, send_with_headers)
+        except asyncio.CancelledError:
+            if started or not _stopping(request):
+                raise
+            # What the server cuts off at its end was not served, and another one, or the next, can serve it.
+            stopping = ProblemError("unavailable", "The service is stopping.")
+            await render(stopping, request)(scope, receive, send_with_headers)
         except Exception as error:
             if started:
                 raise
@@ -96,6 +103,11 @@ def _refuse_other_sites(request: Request) -> None:
     """Browsers send forms to any address, so any page could use a service on the reader's own machine."""
     if request.method not in _SAFE and request.headers.get("sec-fetch-site") == "cross-site":
         raise ProblemError("cross_site", "Requests from pages of other sites are not taken.")
+
+
+def _stopping(request: Request) -> bool:
+    service = getattr(request.app.state, "service", None)
+    return service is not None and service.closing.is_set()
 
 
 def _last_net(error: Exception, request: Request) -> ProblemError:

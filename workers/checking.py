@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import json
 import logging
 import shutil
@@ -28,6 +29,9 @@ from workers.settings import Settings
 log = logging.getLogger(__name__)
 
 EXIT_INPUT_ERROR = 2
+CHECKS = "checks"
+IN_USE = "in-use"
+SETTLED_S = 1.0
 LOOK_S = 0.5  # between two looks at a check that another process makes
 
 
@@ -61,7 +65,8 @@ class Checker:
             await asyncio.sleep(LOOK_S)
 
     async def unfinished(self) -> tuple[str, ...]:
-        """Ids of ``finalizing`` datasets that nobody checks just now."""
+        """Ids of ``finalizing`` datasets that nobody checks just now; clears away what the dead left here."""
+        await asyncio.to_thread(_sweep, self._settings.scratch_dir / CHECKS)
         rows = await self._database.fetch(
             "SELECT id FROM datasets WHERE state = 'finalizing'"
             " AND coalesce(check_until < clock_timestamp(), true) ORDER BY created_at"
@@ -112,13 +117,12 @@ async def check_files(files: FileStore, members: Sequence[tuple[str, str]], sett
 
     Where it is killed (by the kernel, say, for another process's hunger) it is tried once more.
     """
-    parent = settings.scratch_dir / "checks"
+    parent = settings.scratch_dir / CHECKS
     parent.mkdir(parents=True, exist_ok=True)
-    for old in parent.iterdir():  # of processes that were killed
-        if time.time() - old.stat().st_mtime > 2 * settings.check_timeout_s:
-            shutil.rmtree(old, ignore_errors=True)
     folder = Path(tempfile.mkdtemp(dir=parent))
+    lock = (folder / IN_USE).open("w")
     try:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel frees it, however we die
         dataset = folder / "input"
         await files.stage(members, dataset)
         verdict, killed = await _run(dataset, folder / "log.txt", settings)
@@ -128,6 +132,19 @@ async def check_files(files: FileStore, members: Sequence[tuple[str, str]], sett
         return verdict
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+        lock.close()
+
+
+def _sweep(parent: Path) -> None:
+    """Remove folders of processes that were killed."""
+    for folder in parent.iterdir() if parent.is_dir() else ():
+        with contextlib.suppress(OSError):  # in use, or gone by now
+            if time.time() - folder.stat().st_mtime < SETTLED_S:
+                continue  # perhaps made, and not locked yet
+            if (folder / IN_USE).exists():
+                with (folder / IN_USE).open() as lock:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[Verdict, bool]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from typing import Annotated, Any
 
@@ -9,12 +10,13 @@ from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import JSONResponse, Response
 
 from service.conditions import none_match
-from service.dependencies import JobId, ServiceHere, next_link
+from service.dependencies import JobId, Service, ServiceHere, next_link
 from service.json_body import json_content, read_json
 from service.one_shot import submit_form
 from service.problems import FieldProblem, ProblemError, declared
 from service.schemas import JobList, JobView, NewJob, job_url
 from workers.records import Job, JobState
+from workers.waiting import first_done
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 _ALWAYS = ("database_unavailable", "internal_error")
@@ -130,8 +132,7 @@ async def get_job(
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
     """The job now: state, stage, step, loss, seconds left, place in the queue."""
-    jobs = service.stores.jobs
-    job = await (jobs.wait(job_id, timeout_s=wait) if wait else jobs.get(job_id))
+    job = await (_waited_for(service, job_id, wait) if wait else service.stores.jobs.get(job_id))
     headers = {} if job.final else {"Retry-After": _POLL_S}
     if not none_match(if_none_match, _etag(job)):
         return Response(status_code=304, headers={"ETag": _etag(job), **headers})
@@ -162,6 +163,16 @@ async def cancel_job(job_id: JobId, service: ServiceHere) -> Response:
 async def delete_job(job_id: JobId, service: ServiceHere) -> None:
     """Deletes a job that is over, with its results."""
     await service.stores.jobs.delete(job_id)
+
+
+async def _waited_for(service: Service, job_id: str, seconds: float) -> Job:
+    """The job when it is over, after so many seconds, or when the service stops."""
+    waiting = asyncio.create_task(service.stores.jobs.wait(job_id, timeout_s=seconds))
+    try:
+        await first_done(waiting, service.closing.wait())
+        return await (waiting if waiting.done() else service.stores.jobs.get(job_id))
+    finally:
+        waiting.cancel()
 
 
 def _etag(job: Job) -> str:

@@ -201,6 +201,24 @@ print('{{"report": {{}}}}')
     assert marks.read_text() == "xx"
 
 
+async def test_what_a_killed_check_left_is_cleared_away_and_what_is_in_use_stays(
+    database_url: str, tmp_path: Path
+):
+    program = "import time; time.sleep(2.0); print('{\"report\": {}}')"
+    checking_it = asyncio.create_task(checking(database_url, tmp_path, program))
+    checks = quick_settings(tmp_path / "data").scratch_dir / "checks"
+    while not list(checks.glob("*/log.txt")):
+        await asyncio.sleep(0.05)
+    (checks / "left" / "input").mkdir(parents=True)
+    (checks / "left" / "in-use").touch()
+    settings = quick_settings(tmp_path / "data", database_url=database_url)
+    async with open_stores(settings) as stores:
+        while (checks / "left").exists():
+            await stores.datasets.unfinished()
+            await asyncio.sleep(0.2)
+    assert (await checking_it).state == "ready"
+
+
 async def test_a_check_that_a_dead_process_began_is_taken_over(stores: Stores):
     dataset = await stores.datasets.create("fox")
     await stores.datasets.add_file(dataset.id, "a", chunks(b"x"))
