@@ -5,6 +5,7 @@ The dataset's ``plan.json`` says how many steps, how long each takes and what go
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import signal
@@ -36,17 +37,17 @@ def tell(step: int, stage: str = "coarse", checkpoint: str | None = None) -> Non
 def save(step: int) -> None:
     state.parent.mkdir(parents=True, exist_ok=True)
     fresh = state.with_suffix(".new")
-    fresh.write_text(json.dumps({"step": step}))
+    fresh.write_text(json.dumps({"step": step, "chain": chain}))
     fresh.rename(state)
     tell(step, checkpoint="checkpoint/latest.json")
 
 
-start = json.loads(state.read_text())["step"] if state.exists() else 0
+begun = json.loads(state.read_text()) if state.exists() else {"step": 0, "chain": plan.get("seed", "")}
+start, chain = begun["step"], begun["chain"]
 with open(plan["journal"], "a") as journal:
-    journal.write(
-        json.dumps({"pid": os.getpid(), "from": start, "database": "BIRESNERF_DATABASE_URL" in os.environ})
-    )
-    journal.write("\n")
+    knows_database = "BIRESNERF_DATABASE_URL" in os.environ
+    said = {"pid": os.getpid(), "from": start, "database": knows_database, "at": time.time()}
+    journal.write(json.dumps(said) + "\n")
 sys.stderr.write(f"counting from {start}\n")
 sys.stdout.write("a line of a library that is no report\n")
 if plan.get("outdated") and state.exists():
@@ -70,6 +71,8 @@ if plan.get("refuse"):
 tell(start, "preparing")
 for step in range(start + 1, plan["steps"] + 1):
     time.sleep(plan["step_s"])
+    # Right at the end only if no step was lost, repeated or begun from another state.
+    chain = hashlib.sha256(f"{chain}{step}".encode()).hexdigest()
     tell(step)
     if step % plan.get("checkpoint_every", 5) == 0:
         save(step)
@@ -80,7 +83,7 @@ for step in range(start + 1, plan["steps"] + 1):
     if stopping and not plan.get("deaf"):
         save(step)
         sys.exit(143)
-(output / "report.json").write_text(json.dumps({"steps": plan["steps"], "from": start}))
+(output / "report.json").write_text(json.dumps({"steps": plan["steps"], "from": start, "chain": chain}))
 (output / "renders").mkdir()
 (output / "renders" / "one.png").write_bytes(b"\x89PNG counted")
 tell(plan["steps"], "exporting")

@@ -1,0 +1,96 @@
+"""The command: `python -m benchmarks.chaos --help`."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import random
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from benchmarks.chaos.clients import Clients
+from benchmarks.chaos.faults import Faults
+from benchmarks.chaos.installation import Installation
+from benchmarks.chaos.verdict import Claim, claims_about_jobs, claims_about_rest, told
+from workers.database import open_database
+
+
+async def storm(
+    folder: Path, *, jobs: int, workers: int, every_s: float, seed: int, at_once: int = 8
+) -> tuple[list[Claim], dict[str, Any]]:
+    """Run the jobs under faults; what has to hold, and what happened."""
+    began = time.monotonic()
+    installation = Installation(folder, replicas=2, workers=workers)
+    clients = Clients(installation.ports, folder, random.Random(seed))
+    over = asyncio.Event()
+    async with installation:
+        faults = Faults(installation, random.Random(seed + 1), every_s)
+        failing = asyncio.create_task(faults.run(over))
+        try:
+            await clients.run(jobs, at_once)
+        finally:
+            over.set()
+            await failing
+        seconds = time.monotonic() - began
+        claims = claims_about_jobs(clients)
+        async with open_database(installation.postgres.url, connections=2) as database:
+            claims += await claims_about_rest(installation, database, 20 + 4 * installation.settings.stall_s)
+    claims.append(Claim("no process is left", installation.left_over()))
+    states = Counter(f"{seen.kind}: {seen.job['state']}" for seen in clients.seen)
+    happened = {
+        "seconds": round(seconds, 1),
+        "faults": dict(faults.done),
+        "answers": {str(key): value for key, value in clients.answers.items()},
+        "states": dict(states),
+        "attempts": sum(sum(e["type"] == "started" for e in seen.events) for seen in clients.seen),
+        "restarts": {kept.name: kept.starts - 1 for kept in installation.replicas + installation.workers},
+    }
+    sys.stdout.write(told(claims, faults.done, clients.answers, seconds) + f"\n{dict(states)}\n")
+    return claims, happened
+
+
+def new_folder() -> Path:
+    """In memory where there is room: a database on a busy disk takes longer to start than workers to stall."""
+    memory = Path("/dev/shm")
+    roomy = memory.is_dir() and os.access(memory, os.W_OK) and shutil.disk_usage(memory).free > 2**30
+    folder = Path(tempfile.mkdtemp(prefix="biresnerf-chaos-", dir=memory if roomy else None))
+    folder.chmod(0o711)  # PostgreSQL's user must get through
+    return folder
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Jobs under random faults; exit status 0 where all held.")
+    parser.add_argument("--jobs", type=int, default=200)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--every", type=float, default=3.0, help="Seconds between two faults, on average.")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--output", type=Path, default=Path("chaos.json"))
+    parser.add_argument("--keep", action="store_true", help="Leave the folder with logs and files.")
+    asked = parser.parse_args()
+    folder = new_folder()
+    try:
+        claims, happened = asyncio.run(
+            storm(folder, jobs=asked.jobs, workers=asked.workers, every_s=asked.every, seed=asked.seed)
+        )
+    finally:
+        if asked.keep:
+            sys.stdout.write(f"all is in {folder}\n")
+        else:
+            shutil.rmtree(folder, ignore_errors=True)
+    passed = not any(claim.broken for claim in claims)
+    settings = {"jobs": asked.jobs, "workers": asked.workers, "every_s": asked.every, "seed": asked.seed}
+    verdict = {"passed": passed, **settings, **happened, "claims": {c.name: c.broken for c in claims}}
+    asked.output.write_text(json.dumps(verdict, indent=1) + "\n")
+    sys.stdout.write(f"{'passed' if passed else 'FAILED'}; written to {asked.output}\n")
+    return 0 if passed else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,175 @@
+"""Clients as a careful user writes them: each call again until it is answered, on any replica."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import json
+import random
+import time
+import uuid
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import httpx
+
+Kind = Literal["good", "refused", "poisoned", "cancelled"]
+FINAL = {"succeeded", "failed", "cancelled"}
+ANSWER_S = 8.0
+LONG_POLL_S = 4.0
+RESULT = {"log.txt", "renders/one.png", "report.json"}
+
+
+@dataclass
+class Seen:
+    """One job as its client saw it."""
+
+    kind: Kind
+    plan: dict[str, Any]
+    job: dict[str, Any] = field(default_factory=dict)
+    state_at_cancel: str | None = None
+    events: list[dict[str, Any]] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+
+    def expected(self) -> set[str]:
+        """States that would be right at the end."""
+        if self.kind == "cancelled":
+            if self.state_at_cancel in FINAL:
+                return {str(self.state_at_cancel)}
+            return {"cancelled"}
+        return {"good": {"succeeded"}, "refused": {"failed"}, "poisoned": {"failed"}}[self.kind]
+
+
+class Clients:
+    """Submit, follow and check ``count`` jobs, ``at_once`` at a time."""
+
+    def __init__(self, ports: list[int], folder: Path, chance: random.Random) -> None:
+        self._urls = [f"http://127.0.0.1:{port}" for port in ports]
+        self._folder, self._chance = folder, chance
+        self.answers: Counter[int | str] = Counter()
+        self.seen: list[Seen] = []
+        self._http = httpx.AsyncClient(timeout=ANSWER_S)
+
+    async def run(self, count: int, at_once: int) -> None:
+        """Until all jobs are final and looked through."""
+        turn = asyncio.Semaphore(at_once)
+        self.seen = [self._planned(n) for n in range(count)]
+
+        async def one(seen: Seen) -> None:
+            async with turn:
+                await self._whole_life(seen)
+
+        await asyncio.gather(*(one(seen) for seen in self.seen))
+        await self._http.aclose()
+
+    def _planned(self, n: int) -> Seen:
+        kinds: list[Kind] = ["good"] * 6 + ["cancelled"] * 3 + ["refused"]
+        kind: Kind = "poisoned" if n % 40 == 7 else kinds[n % 10]
+        plan = {
+            "steps": self._chance.randint(8, 40),
+            "step_s": 0.05,
+            "seed": f"{n}",
+            "journal": str(self._folder / f"journal-{n}"),
+            **({"refuse": True} if kind == "refused" else {}),
+            **({"die_at": 3} if kind == "poisoned" else {}),
+        }
+        return Seen(kind, plan)
+
+    async def _whole_life(self, seen: Seen) -> None:
+        await self._submit(seen)
+        live = asyncio.create_task(self._follow(seen.job["id"]))
+        if seen.kind == "cancelled":
+            await asyncio.sleep(self._chance.uniform(0, 4.0))
+            seen.state_at_cancel = (await self._json("POST", f"/v1/jobs/{seen.job['id']}/cancel"))["state"]
+        while seen.job["state"] not in FINAL:
+            seen.job = await self._json("GET", f"/v1/jobs/{seen.job['id']}?wait={LONG_POLL_S:g}")
+        seen.events = await self._follow(seen.job["id"])
+        if await live != seen.events:
+            seen.faults.append("who followed live saw another history than who came later")
+        await self._look_through(seen)
+
+    async def _submit(self, seen: Seen) -> None:
+        dataset = (await self._json("POST", "/v1/datasets", json={"name": "chaos"}))["id"]
+        content = json.dumps(seen.plan).encode()
+        await self._json("PUT", f"/v1/datasets/{dataset}/files/plan.json", content=content)
+        await self._json("POST", f"/v1/datasets/{dataset}/finalize")
+        seen.job = await self._json(
+            "POST",
+            "/v1/jobs",
+            json={"dataset_id": dataset, "options": {"preset": "fast"}},
+            headers={"Idempotency-Key": uuid.uuid4().hex},
+        )
+
+    async def _json(self, method: str, path: str, **request: Any) -> dict[str, Any]:
+        answer = await self._call(method, path, **request)
+        if answer.status_code >= 300:
+            raise RuntimeError(f"{method} {path}: {answer.status_code} {answer.text}")
+        found: dict[str, Any] = answer.json()
+        return found
+
+    async def _call(self, method: str, path: str, **request: Any) -> httpx.Response:
+        """The first answer that is not 'try again'."""
+        while True:
+            url = self._chance.choice(self._urls)
+            try:
+                answer = await self._http.request(method, url + path, **request)
+            except httpx.TransportError as error:
+                self.answers[type(error).__name__] += 1
+            else:
+                self.answers[answer.status_code] += 1
+                if answer.status_code < 500:
+                    return answer
+            await asyncio.sleep(self._chance.uniform(0.1, 0.5))
+
+    async def _follow(self, job_id: str) -> list[dict[str, Any]]:
+        """The whole history by server-sent events, resumed wherever the stream broke."""
+        events: list[dict[str, Any]] = []
+        while not events or events[-1]["type"] not in FINAL:
+            headers = {"Last-Event-ID": str(events[-1]["seq"])} if events else {}
+            url = f"{self._chance.choice(self._urls)}/v1/jobs/{job_id}/events"
+            with contextlib.suppress(httpx.TransportError):
+                async with self._http.stream("GET", url, headers=headers) as answer:
+                    await _collect(answer, events)
+            await asyncio.sleep(0.1)
+        return events
+
+    async def _look_through(self, seen: Seen) -> None:
+        path = f"/v1/jobs/{seen.job['id']}/artifacts"
+        listed = (await self._json("GET", path))["items"]
+        for item in listed:
+            answer = await self._call("GET", f"{path}/{item['name']}")
+            if hashlib.sha256(answer.content).hexdigest() != item["sha256"]:
+                seen.faults.append(f"{item['name']} has other bytes than its digest says")
+            if item["name"] == "report.json" and seen.job["state"] == "succeeded":
+                said = answer.json()
+                if said["chain"] != chain(seen.plan["seed"], seen.plan["steps"]):
+                    seen.faults.append(f"the result is wrong: {said}")
+            if item["name"] == "renders/one.png" and answer.content != b"\x89PNG counted":
+                seen.faults.append("the render is wrong")
+        names = sorted(item["name"] for item in listed)
+        if seen.job["state"] == "succeeded" and names != sorted(RESULT):
+            seen.faults.append(f"the result is not whole: {names}")
+
+
+def chain(seed: str, steps: int) -> str:
+    """What the counting program comes to, through however many attempts."""
+    for step in range(1, steps + 1):
+        seed = hashlib.sha256(f"{seed}{step}".encode()).hexdigest()
+    return seed
+
+
+async def _collect(answer: httpx.Response, events: list[dict[str, Any]]) -> None:
+    if answer.status_code != 200:
+        return
+    numbered, began = False, time.monotonic()
+    async for line in answer.aiter_lines():
+        if line.startswith("id:"):
+            numbered = True
+        elif line.startswith("data:") and numbered:
+            events.append(json.loads(line[5:]))
+            numbered = False
+        if time.monotonic() - began > 60:
+            return

@@ -1,0 +1,173 @@
+"""A whole installation as processes of this one: PostgreSQL, API replicas, workers; what ends is started again."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import psutil
+
+from workers.embedded_postgres import EmbeddedPostgres
+from workers.migrate import migrate
+from workers.settings import Settings
+from workers.tether import tethered
+
+ROOT = Path(__file__).parents[2]
+PROGRAM = ROOT / "tests" / "workers" / "counting_program.py"
+CHECK = 'print(\'{"report": {"images": 1}}\')'
+PAUSE_S = 0.3  # before what ended is started again, as a container's restart policy would
+
+
+def free_port() -> int:
+    """A port that nobody listens on just now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def quick_settings(data_dir: Path, database_url: str, **changes: object) -> Settings:
+    """Everything that production waits for, in tenths of a second; jobs count."""
+    values: dict[str, object] = {
+        "data_dir": data_dir,
+        "database_url": database_url,
+        "beat_s": 0.5,
+        "stall_s": 3.0,
+        "poll_s": 0.5,
+        "janitor_s": 0.5,
+        "stop_grace_s": 5.0,
+        # Innocent jobs are hit by faults again and again; those that die of themselves must still fail soon.
+        "max_attempts": 12,
+        "job_command": (sys.executable, str(PROGRAM)),
+        "check_command": (sys.executable, "-S", "-c", CHECK),
+    }
+    return Settings(**{**values, **changes})
+
+
+@dataclass
+class Kept:
+    """A process that is started again whenever it ends."""
+
+    name: str
+    command: Sequence[str]
+    variables: dict[str, str] = field(default_factory=dict)
+    process: asyncio.subprocess.Process | None = None
+    starts: int = 0
+
+    @property
+    def pid(self) -> int | None:
+        """Of the running process."""
+        alive = self.process is not None and self.process.returncode is None
+        return self.process.pid if alive and self.process is not None else None
+
+
+class Installation:
+    """Starts all in ``folder``; `ports` are those of the API replicas. Use as an async context manager."""
+
+    def __init__(self, folder: Path, replicas: int, workers: int, **settings: object) -> None:
+        self.folder = folder
+        self.postgres = EmbeddedPostgres(folder / "postgres")
+        self.settings = quick_settings(folder / "data", self.postgres.url, **settings)
+        self.ports = [free_port() for _ in range(replicas)]
+        self.replicas = [
+            Kept(f"api{n}", (sys.executable, "-m", "service.server"), {"BIRESNERF_PORT": str(port)})
+            for n, port in enumerate(self.ports)
+        ]
+        self.workers = [
+            Kept(f"worker{n}", (sys.executable, "-m", "workers.slot", "--slot", f"w{n}"))
+            for n in range(workers)
+        ]
+        self._keeping: list[asyncio.Task[None]] = []
+        self._closing = False
+
+    async def __aenter__(self) -> Installation:
+        self.postgres.start()
+        migrate(self.postgres.url)
+        for kept in self.replicas + self.workers:
+            self._keeping.append(asyncio.create_task(self._keep(kept)))
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._closing = True
+        for kept in self.replicas + self.workers:
+            if kept.pid is not None:
+                os.kill(kept.pid, signal.SIGCONT)
+                os.kill(kept.pid, signal.SIGTERM)
+        try:
+            async with asyncio.timeout(30):
+                await asyncio.gather(*self._keeping)
+        except TimeoutError:
+            for kept in self.replicas + self.workers:
+                if kept.pid is not None:
+                    os.kill(kept.pid, signal.SIGKILL)
+            await asyncio.gather(*self._keeping)
+        finally:
+            self.postgres.stop()
+
+    def add(self, worker: Kept) -> None:
+        """One more worker, from now on."""
+        self.workers.append(worker)
+        self._keeping.append(asyncio.create_task(self._keep(worker)))
+
+    async def _keep(self, kept: Kept) -> None:
+        log = self.folder / f"{kept.name}.log"
+        while not self._closing:
+            with log.open("ab") as output:
+                # Without a file for their standard input children would share the terminal.
+                kept.process = await asyncio.create_subprocess_exec(
+                    *tethered(list(kept.command), signal_number=signal.SIGKILL),
+                    stdin=asyncio.subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                    env=self._environment() | kept.variables,
+                    start_new_session=True,
+                    cwd=ROOT,
+                )
+            kept.starts += 1
+            await kept.process.wait()
+            await asyncio.sleep(PAUSE_S)
+
+    def _environment(self) -> dict[str, str]:
+        said = {
+            f"BIRESNERF_{name.upper()}": value if isinstance(value, str) else json.dumps(value)
+            for name, value in self.settings.model_dump(
+                mode="json", exclude_none=True, exclude_defaults=True
+            ).items()
+        }
+        return {**os.environ, **said, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+
+    def job_processes(self) -> list[int]:
+        """Pids of the processes that count."""
+        found = []
+        for kept in self.workers:
+            with contextlib.suppress(psutil.Error):
+                for child in psutil.Process(kept.pid).children(recursive=True) if kept.pid else ():
+                    if str(PROGRAM) in child.cmdline():
+                        found.append(child.pid)
+        return found
+
+    def database_processes(self) -> list[int]:
+        """Pids of the server and its backends."""
+        assert self.postgres.process is not None, "started"
+        with contextlib.suppress(psutil.NoSuchProcess):
+            server = psutil.Process(self.postgres.process.pid)
+            return [server.pid, *(child.pid for child in server.children())]
+        return []
+
+    def left_over(self) -> list[str]:
+        """Command lines of processes that still work in our folder."""
+        found = []
+        for process in psutil.process_iter(["pid", "cmdline", "cwd", "status"]):
+            words = " ".join(process.info["cmdline"] or ())
+            ours = str(self.folder) in words or (process.info["cwd"] or "").startswith(str(self.folder))
+            if ours and process.pid != os.getpid() and process.info["status"] != psutil.STATUS_ZOMBIE:
+                found.append(words)
+        return found
