@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
+from biresnerf.errors import Interrupted
 from biresnerf.output_folder import OutputFolder
 from biresnerf.progress import OnProgress, Progress
 from biresnerf.refine.evaluation import ViewScore, fit_held_out_poses, render_orbit, score_views
@@ -36,7 +37,11 @@ class Run:
     judgement: Judgement | None = None
 
     def evaluate(self) -> None:
-        """Fit the poses of held-out views, score and render views, film the orbit."""
+        """Fit the poses of held-out views, score and render views, film the orbit.
+
+        Raises:
+            Interrupted: ``stop`` said so; a continued run evaluates again.
+        """
         started = time.monotonic()
         optimiser, held_out = self.stages.optimiser, self.given.held_out
         self.report(Progress(stage="evaluating", fraction=LAST_FRACTION))
@@ -47,6 +52,8 @@ class Run:
         rendering_from = time.monotonic()
 
         def tell(done: int) -> None:
+            if self.stop():
+                raise Interrupted("stopped while the result was measured; run again to go on")
             share = done / max(1, work)
             spent = time.monotonic() - rendering_from
             self.report(
@@ -59,6 +66,7 @@ class Run:
                 )
             )
 
+        tell(0)
         scores = []
         for score in score_views(optimiser, self.given.images, views):
             self.folder.write_view(self.given.dataset.names, self.given.images, score)
@@ -91,12 +99,17 @@ class Run:
         self.stages.record.seconds["judging"] = time.monotonic() - started
 
     def write(self, state: Literal["complete", "partial"]) -> Report:
-        """Write all results; nothing is left of what only a run that goes on needs, once it is complete."""
+        """Write all results; nothing is left of what only a run that goes on needs, once it is complete.
+
+        Raises:
+            Interrupted: ``stop`` said so before the last pack of a complete result was written.
+        """
         if state == "complete":
             self.report(Progress(stage="exporting", fraction=EXPORTING_FRACTION))
         result = self.folder.write_result(
-            self.given, self.stages, self.scores, self.judgement, threads=self.threads, state=state
-        )
+            self.given, self.stages, self.scores, self.judgement,
+            threads=self.threads, state=state, should_stop=self.stop if state == "complete" else lambda: False,
+        )  # fmt: skip
         if state == "complete":
             self.folder.drop_traces()
             self.report(Progress(stage="exporting", fraction=1.0, eta_s=0.0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -15,9 +15,10 @@ from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.images import ImageSet
 from biresnerf.data.packs.input_form import forms_of_input, write_input_form
+from biresnerf.data.packs.poses_json import POSES, write_poses_json
 from biresnerf.data.packs.write_packs import write_packs
 from biresnerf.data.refined_points import with_points_of
-from biresnerf.data.refined_set import refined_set
+from biresnerf.data.refined_set import RefinedSet, refined_set
 from biresnerf.data.renders import picture_stems, write_orbit, write_view
 from biresnerf.data.write import transforms_notes, write_transforms
 from biresnerf.errors import InputError
@@ -104,10 +105,26 @@ class OutputFolder:
             depth=np.where(score.view.opacity > SOLID, score.view.depth, np.nan),
         )
 
-    def write_preview(self, dataset: Dataset, images: ImageSet, optimiser: JointOptimiser, view: int) -> None:
-        """How far the run is: poses so far, and one view at half the working size."""
-        world_from_cam, _ = poses_in_input_frame(dataset, optimiser)
-        write_transforms(optimiser.lenses.refined(dataset), world_from_cam, self.path / PREVIEW / TRANSFORMS)
+    def write_preview(self, given: RunInput, stages: TwoStages, threads: int) -> tuple[str, ...]:
+        """How far the run is: poses so far, the report on them, and one view at half the working size.
+
+        Returns the files, relative to the output folder.
+        """
+        dataset, optimiser = given.dataset, stages.optimiser
+        world_from_cam, similarity = poses_in_input_frame(dataset, optimiser)
+        report = run_report(
+            given, stages, [], None, world_from_cam, similarity, threads=threads, state="partial"
+        )
+        refined = optimiser.lenses.refined(dataset)
+        write_transforms(refined, world_from_cam, self.path / PREVIEW / TRANSFORMS)
+        write_poses_json(_described(refined, world_from_cam, report), self.path / PREVIEW / POSES)
+        self._write_text(f"{PREVIEW}/{REPORT}", report.model_dump_json(indent=2))
+        pictures = self._preview_pictures(given, optimiser)
+        texts = [f"{PREVIEW}/{name}" for name in (POSES, REPORT, TRANSFORMS)]
+        return (*texts, *(path.relative_to(self.path).as_posix() for path in pictures))
+
+    def _preview_pictures(self, given: RunInput, optimiser: JointOptimiser) -> list[Path]:
+        images, view = given.images, (given.held_out or [0])[0]
         halves = [
             camera.resized(max(1, camera.width // 2), max(1, camera.height // 2))
             for camera in optimiser.lenses.refined_working(images.cameras)
@@ -115,9 +132,9 @@ class OutputFolder:
         intrinsics = Intrinsics.from_cameras(halves).to(optimiser.device)
         pose = optimiser.poses.matrices()[view].detach()
         rendered = render_view(optimiser, pose, view, intrinsics, as_photo=True)
-        write_view(
+        return write_view(
             self.path / PREVIEW,
-            picture_stems(dataset.names)[view],
+            picture_stems(given.dataset.names)[view],
             render=rendered.colour,
             photo=area_resize(images.image(view), halves[view].width, halves[view].height) / 255,
             depth=np.where(rendered.opacity > SOLID, rendered.depth, np.nan),
@@ -141,10 +158,14 @@ class OutputFolder:
         *,
         threads: int,
         state: Literal["complete", "partial"],
+        should_stop: Callable[[], bool] = lambda: False,
     ) -> Report:
         """Poses in the input's frame, in the input's form and in others, the options, and the report, last.
 
         Where the verdict keeps the input's poses, those are written, and the refined ones beside them in refined/.
+
+        Raises:
+            Interrupted: ``should_stop`` said so while packs were written.
         """
         dataset, optimiser = given.dataset, stages.optimiser
         self._write_text(CONFIG, optimiser.options.model_dump_json(indent=2))
@@ -160,7 +181,7 @@ class OutputFolder:
                 self._write_poses(self.path / REFINED, given, refined_dataset, refined, report, ())
         # On the way to the end nobody waits for large packs.
         packs = optimiser.options.packs if state == "complete" else ()
-        report = self._write_poses(self.path, given, returned_dataset, returned, report, packs)
+        report = self._write_poses(self.path, given, returned_dataset, returned, report, packs, should_stop)
         self._write_text(REPORT, report.model_dump_json(indent=2))
         return report
 
@@ -172,23 +193,17 @@ class OutputFolder:
         world_from_cam: np.ndarray,
         report: Report,
         packs: Sequence[PackName],
+        should_stop: Callable[[], bool] = lambda: False,
     ) -> Report:
         """Poses [n, 4, 4] of ``dataset``, the input with other lenses or none, in the input's form, and the packs.
 
         Returns the report with notes on them.
         """
         write_transforms(dataset, world_from_cam, folder / TRANSFORMS)
-        tie = report.input_from_optimised
-        refined = refined_set(
-            dataset,
-            world_from_cam,
-            similarity=Similarity(tie.scale, np.array(tie.rotation), np.array(tie.translation)),
-            pose_sources=[image.pose_source for image in report.images],
-            flags=[image.flags for image in report.images],
-        )
+        refined = _described(dataset, world_from_cam, report)
         refined = with_points_of(refined, dataset.source.colmap, given.matches, given.images)
         asked = dict.fromkeys((*forms_of_input(dataset), *packs))
-        notes = write_packs(refined, folder, asked) + transforms_notes(dataset, world_from_cam)
+        notes = write_packs(refined, folder, asked, should_stop) + transforms_notes(dataset, world_from_cam)
         write_input_form(dataset, refined, folder)
         points = PointsReport(source=refined.points_source, count=len(refined.model.points))
         return report.model_copy(update={"points": points, "warnings": report.warnings + notes})
@@ -196,3 +211,15 @@ class OutputFolder:
     def _write_text(self, name: str, text: str) -> None:
         with whole_file(self.path / name) as temporary:
             temporary.write_text(text + "\n", "utf-8")
+
+
+def _described(dataset: Dataset, world_from_cam: np.ndarray, report: Report) -> RefinedSet:
+    """The set at poses [n, 4, 4], with what the report says of each image."""
+    tie = report.input_from_optimised
+    return refined_set(
+        dataset,
+        world_from_cam,
+        similarity=Similarity(tie.scale, np.array(tie.rotation), np.array(tie.translation)),
+        pose_sources=[image.pose_source for image in report.images],
+        flags=[image.flags for image in report.images],
+    )

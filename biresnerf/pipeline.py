@@ -73,7 +73,8 @@ def refine_poses(
         input: a folder of images (with or without a transforms file), a transforms file, or a set already read.
         output: a folder that is empty, new, or holds an unfinished run of the same input and options.
         on_progress: called with a `Progress` a few times a second.
-        should_stop: asked after every step; once true, checkpoint and partial result are written.
+        should_stop: asked after every step, view, frame and photo; once true, checkpoint and partial result are
+            written.
         observer: looks into the run, for comparisons with the truth.
 
     Raises:
@@ -88,15 +89,15 @@ def refine_poses(
     if not stages.run():
         run.write("partial")
         raise Interrupted(f"stopped at step {stages.optimiser.step_index}; run again to go on")
-    run.evaluate()
-    if observer is not None:
-        observer.at_end(stages.optimiser)
     try:
+        run.evaluate()
+        if observer is not None:
+            observer.at_end(stages.optimiser)
         run.judge()
+        return run.write("complete")
     except Interrupted:
         run.write("partial")
         raise
-    return run.write("complete")
 
 
 def _begin(
@@ -137,7 +138,7 @@ def _begin(
     optimiser = _optimiser(given, options, device, threads)
     stages = TwoStages(
         optimiser, folder.path, prepared.fingerprint, report, stop, prepared.seeding, start.as_json(), observer,
-        lambda: folder.write_preview(given.dataset, given.images, optimiser, (given.held_out or [0])[0]),
+        lambda: folder.write_preview(given, stages, threads),
         _carried(given.matches),
     )  # fmt: skip
     if checkpoint is not None:

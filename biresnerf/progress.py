@@ -26,6 +26,9 @@ class Progress(BaseModel):
     checkpoint: str | None = Field(
         None, description="File name of a checkpoint just completed, relative to the output folder."
     )
+    preview: tuple[str, ...] = Field(
+        (), description="Files just written that show how far the run is, relative to the output folder."
+    )
 
 
 OnProgress = Callable[[Progress], None]

@@ -36,5 +36,5 @@ def export_command(
 
     refined = read_result(result, photos)
     for form in forms:
-        ON_REQUEST[form](refined, output or result)
+        ON_REQUEST[form](refined, output or result, lambda: False)
         click.echo(f"{form} written to {output or result}")

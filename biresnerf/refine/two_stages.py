@@ -21,6 +21,7 @@ from biresnerf.refine.history import History, Observer
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.late_figures import StepResult
 from biresnerf.refine.lost_cameras import LostCameraRepair
+from biresnerf.refine.previews import Previews
 from biresnerf.refine.stability import StabilityDetector
 from biresnerf.report import SwitchReason
 
@@ -55,7 +56,7 @@ class TwoStages:
         seeding: COLMAP's answer, where poses come from it; goes into every checkpoint.
         start: the poses started from; goes into every checkpoint.
         observer: looks in at every check.
-        after_checkpoint: called after each checkpoint on the way.
+        show: writes a preview and returns its files, relative to `folder`; called on the way and at the end.
         carried: tensors that go into every checkpoint as they are.
     """
 
@@ -69,13 +70,13 @@ class TwoStages:
         seeding: str | None = None,
         start: dict[str, Any] | None = None,
         observer: Observer | None = None,
-        after_checkpoint: Callable[[], None] = lambda: None,
+        show: Callable[[], tuple[str, ...]] = lambda: (),
         carried: dict[str, Tensor] | None = None,
     ) -> None:
         self.optimiser, self.folder = optimiser, folder
         self.history, self.observer = History(folder), observer or Observer()
         self.on_progress, self.should_stop = on_progress, should_stop
-        self.after_checkpoint, self.carried = after_checkpoint, carried or {}
+        self.previews, self.carried = Previews(show, optimiser.options.checkpoint_every_s), carried or {}
         self.record = RunRecord(fingerprint, seeding=seeding, start=start or {})
         self.repair = LostCameraRepair(optimiser)
         options = optimiser.options
@@ -105,6 +106,7 @@ class TwoStages:
         """
         optimiser, options = self.optimiser, self.optimiser.options
         reported = saved = time.monotonic()
+        self.previews.begin()
         self.history.cut(optimiser.step_index)
         while optimiser.step_index < self.optimiser.schedule.steps:
             if self.should_stop():
@@ -131,13 +133,14 @@ class TwoStages:
             checkpoint = None
             if now - saved >= options.checkpoint_every_s:
                 self._save()
-                self.after_checkpoint()
                 saved, checkpoint = time.monotonic(), CHECKPOINT.as_posix()
-            if checkpoint or now - reported >= REPORT_PERIOD_S:
+            preview = self.previews.if_due()
+            if checkpoint or preview or now - reported >= REPORT_PERIOD_S:
                 reported = now
-                self.on_progress(self._progress(checkpoint))
+                self.on_progress(self._progress(checkpoint, preview))
         self._save()
-        self.on_progress(self._progress(CHECKPOINT.as_posix()))
+        # Evaluation may take long; whoever looks, or stops it, finds the final poses.
+        self.on_progress(self._progress(CHECKPOINT.as_posix(), self.previews.take()))
         return True
 
     def _check(self, last: StepResult) -> None:
@@ -212,7 +215,7 @@ class TwoStages:
         self.detector.clear()
         self._poses_at_check = self.optimiser.poses.poses()
 
-    def _progress(self, checkpoint: str | None) -> Progress:
+    def _progress(self, checkpoint: str | None, preview: tuple[str, ...] = ()) -> Progress:
         optimiser, options = self.optimiser, self.optimiser.options
         done, total = optimiser.step_index, optimiser.schedule.steps
         coarse = self._step_seconds["coarse"] or self._step_seconds["fine"] / FINE_COST
@@ -237,6 +240,7 @@ class TwoStages:
             eta_s=left * (1 - FIRST_FRACTION) / (LAST_FRACTION - FIRST_FRACTION),
             metrics=metrics,
             checkpoint=checkpoint,
+            preview=preview,
         )
 
     def _save(self) -> None:

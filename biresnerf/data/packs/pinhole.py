@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -27,7 +28,7 @@ from biresnerf.data.packs.bundler import write_bundler
 from biresnerf.data.packs.colmap_binary import write_colmap_binary
 from biresnerf.data.refined_set import RefinedImage, RefinedSet
 from biresnerf.data.renders import picture_stems
-from biresnerf.errors import InputError
+from biresnerf.errors import InputError, Interrupted
 from biresnerf.geometry.pixel_rays import pixels_of_points, rays_of_pixels
 
 PINHOLE = "pinhole"
@@ -78,7 +79,7 @@ def _tangents(rays: NDArray[np.float64], axis: int, sign: int) -> NDArray[np.flo
     return np.where(ahead, sign * rays[:, axis] / np.where(ahead, rays[:, 2], 1.0), np.inf)
 
 
-def write_pinhole(refined: RefinedSet, folder: Path) -> None:
+def write_pinhole(refined: RefinedSet, folder: Path, should_stop: Callable[[], bool] = lambda: False) -> None:
     """Writes images/, sparse/0/, bundle.out, list.txt and names.json (pack's name: caller's name) into ``folder``.
 
     Photos keep their names without folders, where those differ; JPEG stays JPEG, all else becomes PNG. EXIF data are
@@ -86,16 +87,25 @@ def write_pinhole(refined: RefinedSet, folder: Path) -> None:
 
     Raises:
         InputError: ``pack_not_possible``, or a code of `decode` for a photo that cannot be read.
+        Interrupted: ``should_stop``, asked before each photo, said so; a folder that was new is gone again.
     """
+    new = not folder.exists()
     names = _names(refined)
     cameras = tuple(pinhole_camera(camera) for camera in refined.cameras)
 
     def convert(index: int) -> None:
+        if should_stop():
+            raise Interrupted("stopped while photos were written; run again to go on")
         _write_photo(refined.images[index], refined.camera_of(index), cameras[refined.images[index].camera],
                      folder / "images" / names[index])  # fmt: skip
 
-    with quiet_pillow(), ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
-        list(pool.map(convert, range(len(refined))))
+    try:
+        with quiet_pillow(), ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+            list(pool.map(convert, range(len(refined))))
+    except Interrupted:
+        if new:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
     pack = _as_pinhole(refined, cameras, names)
     write_colmap_binary(pack.model, folder / "sparse" / "0")
     write_bundler(pack, folder)

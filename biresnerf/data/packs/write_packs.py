@@ -26,27 +26,36 @@ ALWAYS: dict[str, Callable[[RefinedSet, Path], None]] = {
     "scene": lambda refined, folder: write_scene(refined, folder / SCENE),
     "poses": lambda refined, folder: write_poses_json(refined, folder / POSES),
 }
-ON_REQUEST: dict[PackName, Callable[[RefinedSet, Path], None]] = {
-    "colmap-text": lambda refined, folder: write_colmap_text(refined.model, folder / COLMAP_TEXT),
-    "instant-ngp": lambda refined, folder: write_transforms_ngp(refined, folder / TRANSFORMS_NGP),
-    "kitti": lambda refined, folder: write_kitti(refined, folder / "kitti.txt"),
-    "bundler": lambda refined, folder: write_bundler(refined, folder / "bundler"),
-    "pinhole": lambda refined, folder: write_pinhole(refined, folder / PINHOLE),
+# Those that take long ask whether to stop, and raise `Interrupted`.
+ON_REQUEST: dict[PackName, Callable[[RefinedSet, Path, Callable[[], bool]], None]] = {
+    "colmap-text": lambda refined, folder, _: write_colmap_text(refined.model, folder / COLMAP_TEXT),
+    "instant-ngp": lambda refined, folder, _: write_transforms_ngp(refined, folder / TRANSFORMS_NGP),
+    "kitti": lambda refined, folder, _: write_kitti(refined, folder / "kitti.txt"),
+    "bundler": lambda refined, folder, _: write_bundler(refined, folder / "bundler"),
+    "pinhole": lambda refined, folder, stop: write_pinhole(refined, folder / PINHOLE, stop),
 }
 
 
-def write_packs(refined: RefinedSet, folder: Path, more: Iterable[PackName] = ()) -> tuple[str, ...]:
+def write_packs(
+    refined: RefinedSet,
+    folder: Path,
+    more: Iterable[PackName] = (),
+    should_stop: Callable[[], bool] = lambda: False,
+) -> tuple[str, ...]:
     """Writes what belongs to every result and ``more`` into ``folder``.
 
     Returns:
         a sentence for each pack asked for that this set cannot be written as.
+
+    Raises:
+        Interrupted: ``should_stop`` said so.
     """
     for write in ALWAYS.values():
         write(refined, folder)
     notes = []
     for name in more:
         try:
-            ON_REQUEST[name](refined, folder)
+            ON_REQUEST[name](refined, folder, should_stop)
         except InputError as error:
             notes.append(f"{name} was not written: {error}")
     return tuple(notes)
