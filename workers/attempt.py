@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import mimetypes
 import shutil
-from collections.abc import Mapping
+import signal
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -16,11 +16,14 @@ from pydantic import ValidationError
 from biresnerf.progress import Progress
 from biresnerf.report import Verdict, VerdictName
 from workers.child import Child, log_tail
+from workers.claim import Claim, crashed_too_often
 from workers.courier import Courier
 from workers.database import Database
 from workers.files import FileStore
-from workers.ledger import Claim, Ledger, crashed_too_often
-from workers.records import Artifact, JobError
+from workers.ledger import Ledger
+from workers.memory import OomKills, out_of_memory, smaller_options
+from workers.records import LOG_NAME, Artifact, JobError
+from workers.results import store_result
 from workers.settings import Settings
 from workers.waiting import first_done
 
@@ -28,9 +31,12 @@ log = logging.getLogger(__name__)
 
 StopReason = Literal["cancel", "shutdown"]
 EXIT_ERRORS = {2: "InputError", 3: "RefinementError"}  # deterministic: another attempt would end the same
+EXIT_MEMORY = 4
+# Of a process that the kernel may have killed for want of memory; the second where it was a process of its own.
+KILLED, CHILD_KILLED = -signal.SIGKILL, "seeding_crashed"
 # Ours to mend, not the user's: a checkpoint of an older version, for example. The job starts over.
 STALE_CHECKPOINT = {"output_not_resumable", "checkpoint_invalid"}
-LOG_NAME = "log.txt"
+DISCARDED_GRACE_S = 2.0  # for a cancelled job whose result nobody wants
 
 
 class Attempt:
@@ -52,6 +58,8 @@ class Attempt:
         self._stop_reason: StopReason | None = None
         self._stop = asyncio.Event()
         self._timed_out = False
+        self._oom_kills = OomKills()
+        self._oom_kills_before: int | None = None
 
     def ask_stop(self, reason: StopReason) -> None:
         """End soon: the process writes a checkpoint and exits. A cancellation outweighs a shutdown."""
@@ -81,9 +89,11 @@ class Attempt:
             staging.cancel()
             return None
         await staging
-        command, variables = self._settings.job_command, self._variables
-        child = await Child.start(command, self._folder, self._log, variables)
-        courier = Courier(self._ledger, self._files, self._output)
+        self._oom_kills_before = self._oom_kills.count()
+        # What a job that is killed leaves behind goes with its folder.
+        variables = {**self._variables, "TMPDIR": str(self._folder / "tmp")}
+        child = await Child.start(self._settings.job_command, self._folder, self._log, variables)
+        courier = Courier(self._ledger, self._files, self._output, self._log)
         carrying = asyncio.create_task(courier.run())
         pumping = asyncio.create_task(self._pump(child, courier))
         ended = asyncio.create_task(child.wait())
@@ -96,16 +106,24 @@ class Attempt:
             if carrying.done():
                 await carrying  # Fenced
             if not ended.done():
-                await child.stop(self._settings.stop_grace_s)
+                await child.stop(await self._grace_s())
             status = await ended
             await pumping
-            courier.close()
+            courier.close(last_checkpoint=self._stop_reason != "cancel")
             await carrying
             return status
         finally:
             child.kill()
             for task in (carrying, pumping, ended):
                 task.cancel()
+
+    async def _grace_s(self) -> float:
+        """How long the process may take to end."""
+        grace_s = self._settings.stop_grace_s
+        if self._stop_reason != "cancel":
+            return grace_s
+        wanted = await self._ledger.wants_partial()
+        return min(grace_s, self._settings.cancel_grace_s if wanted else DISCARDED_GRACE_S)
 
     async def _stage(self) -> None:
         """The dataset to ``input``, the last checkpoint to ``output``, the order to ``job.json``."""
@@ -115,12 +133,14 @@ class Attempt:
         shutil.rmtree(self._folder, ignore_errors=True)
         (self._folder / "input").mkdir(parents=True)
         self._output.mkdir()
+        (self._folder / "tmp").mkdir()
         await self._files.stage(((row["key"], row["path"]) for row in rows), self._folder / "input")
         if self._claim.checkpoint is not None:
             prefix, names = self._claim.checkpoint["prefix"], self._claim.checkpoint["files"]
             await self._files.stage(((f"{prefix}/{name}", name) for name in names), self._output)
         # Relative, so that an attempt elsewhere is the same job to the process.
-        order = {"input": "input", "output": "output", "options": self._claim.options}
+        options = {**self._claim.options, **self._claim.smaller}
+        order = {"input": "input", "output": "output", "options": options}
         (self._folder / "job.json").write_text(json.dumps(order, indent=1))
 
     async def _pump(self, child: Child, courier: Courier) -> None:
@@ -134,18 +154,21 @@ class Attempt:
     async def _conclude(self, status: int | None) -> bool:
         keep = (self._claim.name, self._settings.stall_s)
         if status == 0:
-            artifacts = await self._upload_result()
+            artifacts = await self._store(enough=lambda: self._stop_reason == "cancel")
             if not await self._ledger.publish(artifacts, self._verdict(), *keep):
                 await self._ledger.cancelled(artifacts, *keep)
             return False
+        if status == EXIT_MEMORY or (status in (KILLED, *EXIT_ERRORS) and self._killed_for_memory(status)):
+            return await self._ran_out_of_memory()
         if status in EXIT_ERRORS:
             error = self._reported_error()
             if error.code in STALE_CHECKPOINT and self._claim.checkpoint is not None:
                 return await self._crashed(error.detail, forget_checkpoint=True)
-            await self._ledger.fail(error, await self._upload_result(log_only=True), *keep)
+            await self._ledger.fail(error, await self._store(log_only=True), *keep)
             return False
         if self._stop_reason == "cancel":
-            await self._ledger.cancelled(await self._upload_result(), *keep)
+            unwanted = not await self._ledger.wants_partial()
+            await self._ledger.cancelled(await self._store(log_only=unwanted), *keep)
             return False
         if self._stop_reason == "shutdown":
             return await self._ledger.give_back("requeued", {"why": "shutdown"}, counted=False)
@@ -156,7 +179,7 @@ class Attempt:
                 mend="Ask for fewer steps or smaller images, or raise BIRESNERF_JOB_TIMEOUT_S.",
                 log_tail=log_tail(self._log),
             )
-            await self._ledger.fail(error, await self._upload_result(), *keep)
+            await self._ledger.fail(error, await self._store(), *keep)
             return False
         return await self._crashed(f"exit status {status}")
 
@@ -169,8 +192,31 @@ class Attempt:
             )
         error = crashed_too_often(self._claim.attempt, tail)
         error = error.model_copy(update={"detail": f"{error.detail} The last time: {how}."})
-        artifacts = await self._upload_result(log_only=True)
+        artifacts = await self._store(log_only=True)
         await self._ledger.fail(error, artifacts, self._claim.name, self._settings.stall_s)
+        return False
+
+    def _killed_for_memory(self, status: int) -> bool:
+        """Whether the kernel killed a process meanwhile, and this one's end looks like it."""
+        if self._stop_reason is not None or self._timed_out:
+            return False
+        if status != KILLED and self._reported_error().code != CHILD_KILLED:
+            return False
+        now = self._oom_kills.count()
+        return now is not None and now > (self._oom_kills_before or 0)
+
+    async def _ran_out_of_memory(self) -> bool:
+        """Once more with less, from the start: a checkpoint is of the sizes that were too large."""
+        tail, keep = log_tail(self._log), (self._claim.name, self._settings.stall_s)
+        smaller = smaller_options(self._claim.options)
+        if smaller and not self._claim.smaller and self._claim.attempt < self._settings.max_attempts:
+            said = {"why": "out_of_memory", "options": smaller, "log_tail": tail}
+            return await self._ledger.give_back(
+                "retried_smaller", said, counted=True, forget_checkpoint=True, smaller=smaller
+            )
+        await self._ledger.fail(
+            out_of_memory(self._claim.smaller, tail), await self._store(log_only=True), *keep
+        )
         return False
 
     def _verdict(self) -> VerdictName | None:
@@ -192,24 +238,11 @@ class Attempt:
             detail = f"The job failed and its error report could not be read ({error})."
             return JobError(code="engine_error", detail=detail, log_tail=tail)
 
-    async def _upload_result(self, *, log_only: bool = False) -> list[Artifact]:
-        """Store the output (all but the checkpoint) and the log under this attempt's own prefix."""
+    async def _store(
+        self, *, log_only: bool = False, enough: Callable[[], bool] = lambda: False
+    ) -> list[Artifact]:
+        """The output and the log, under this attempt's own prefix."""
         prefix = f"jobs/{self._claim.job_id}/results/{self._claim.name}"
-        names = {LOG_NAME: self._log} if self._log.exists() else {}
-        for path in () if log_only else sorted(self._output.rglob("*")):
-            relative = path.relative_to(self._output)
-            if path.is_file() and not path.is_symlink() and relative.parts[0] != "checkpoint":
-                names[relative.as_posix()] = path
-        artifacts = []
-        for name, path in sorted(names.items()):
-            stored = await self._files.put_path(f"{prefix}/{name}", path)
-            artifacts.append(
-                Artifact(
-                    name=name,
-                    key=stored.key,
-                    size=stored.size,
-                    sha256=stored.sha256 or "",
-                    media_type=mimetypes.guess_type(name)[0] or "application/octet-stream",
-                )
-            )
-        return artifacts
+        return await store_result(
+            self._files, prefix, self._output, self._log, log_only=log_only, enough=enough
+        )

@@ -19,10 +19,10 @@ from typing import Any
 from psycopg.types.json import Jsonb
 
 from workers.child import Child, log_tail
+from workers.claim import insist
 from workers.database import Database
 from workers.errors import Unavailable
 from workers.files import FileStore
-from workers.ledger import insist
 from workers.records import JobError
 from workers.settings import Settings
 

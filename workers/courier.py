@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from pathlib import Path, PurePosixPath
+from collections.abc import Awaitable, Callable
+from pathlib import Path
 
 from obstore.exceptions import BaseError as StoreError
 
@@ -13,26 +14,28 @@ from biresnerf.progress import Progress
 from workers.errors import EngineError
 from workers.files import FileStore
 from workers.ledger import Ledger
+from workers.log_lines import LogLines
+from workers.results import files_inside, store_artifact
 
 log = logging.getLogger(__name__)
 
-PROGRESS_PERIOD_S = 1.0
+PERIOD_S = 1.0
 
 
 class Courier:
-    """Delivers every stage change, the latest progress once a second, and the latest checkpoint.
+    """Delivers every stage change, once a second the latest progress and the log, the latest checkpoint and preview.
 
     `offer` never waits; `run` delivers until `close` and the last delivery. `run` raises `Fenced`.
     """
 
-    def __init__(self, ledger: Ledger, files: FileStore, output: Path) -> None:
+    def __init__(self, ledger: Ledger, files: FileStore, output: Path, log_file: Path) -> None:
         self._ledger, self._files, self._output = ledger, files, output
         self._stages: deque[Progress] = deque()
         self._latest: Progress | None = None
-        self._checkpoint: Progress | None = None
-        self._checkpoints = 0
+        self._log = LogLines(log_file)
+        self._checkpoints, self._previews = _Box(), _Box()
+        self._stored = 0
         self._progress_due = asyncio.Event()
-        self._checkpoint_due = asyncio.Event()
         self._closed = asyncio.Event()
 
     def offer(self, progress: Progress) -> None:
@@ -42,20 +45,26 @@ class Courier:
         self._latest = progress
         self._progress_due.set()
         if progress.checkpoint is not None:
-            self._checkpoint = progress
-            self._checkpoint_due.set()
+            self._checkpoints.put(progress)
+        if progress.preview:
+            self._previews.put(progress)
 
-    def close(self) -> None:
-        """No more reports will come."""
+    def close(self, *, last_checkpoint: bool = True) -> None:
+        """No more reports will come; nobody goes on from the job's ``last_checkpoint`` where it is cancelled."""
+        if not last_checkpoint:
+            self._checkpoints.latest = None
         self._closed.set()
         self._progress_due.set()
-        self._checkpoint_due.set()
+        self._checkpoints.due.set()
+        self._previews.due.set()
 
     async def run(self) -> None:
         """Deliver until closed and all is delivered."""
         deliveries = [
             asyncio.create_task(self._carry_progress()),
-            asyncio.create_task(self._carry_checkpoints()),
+            asyncio.create_task(self._carry_log()),
+            asyncio.create_task(self._carry(self._checkpoints, self._store_checkpoint)),
+            asyncio.create_task(self._carry(self._previews, self._store_preview)),
         ]
         try:
             await asyncio.gather(*deliveries)
@@ -77,35 +86,68 @@ class Courier:
                 await self._ledger.progress(delivered)
             if closed:
                 return
-            # Wakes early for the end only: everything else can wait for the period.
-            try:
-                await asyncio.wait_for(self._closed.wait(), PROGRESS_PERIOD_S)
-            except TimeoutError:
-                continue
+            await self._pause()
 
-    async def _carry_checkpoints(self) -> None:
+    async def _carry_log(self) -> None:
         while True:
-            await self._checkpoint_due.wait()
-            self._checkpoint_due.clear()
             closed = self._closed.is_set()
-            progress, self._checkpoint = self._checkpoint, None
-            if progress is not None and progress.checkpoint is not None:
-                await self._upload(progress.checkpoint, progress.step)
+            while lines := await asyncio.to_thread(self._log.fresh, last=closed):
+                await self._ledger.log(lines)
+            if closed:
+                return
+            await self._pause()
+
+    async def _pause(self) -> None:
+        """Wakes early for the end only: everything else can wait for the period."""
+        try:
+            await asyncio.wait_for(self._closed.wait(), PERIOD_S)
+        except TimeoutError:
+            return
+
+    async def _carry(self, box: _Box, store: Callable[[Progress], Awaitable[None]]) -> None:
+        while True:
+            await box.due.wait()
+            box.due.clear()
+            closed = self._closed.is_set()
+            progress, box.latest = box.latest, None
+            if progress is not None:
+                try:
+                    await store(progress)
+                except (OSError, ValueError, StoreError, EngineError) as error:
+                    # The job can go on without: another one will come, or the one before will do.
+                    log.error("a file of %s was not stored: %s", self._ledger.claim.job_id, error)
             if closed:
                 return
 
-    async def _upload(self, name: str, step: int) -> None:
+    async def _store_checkpoint(self, progress: Progress) -> None:
         """A new object each time, then the pointer: a checkpoint is never overwritten."""
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            log.error("checkpoint %r lies outside the output folder", name)
-            return
-        self._checkpoints += 1
+        prefix = self._new_prefix("checkpoints")
+        for name, path in files_inside(self._output, [str(progress.checkpoint)]).items():
+            await self._files.put_path(f"{prefix}/{name}", path)
+            await self._ledger.checkpoint(prefix, [name], progress.step)
+
+    async def _store_preview(self, progress: Progress) -> None:
+        """The same for the files that show how far the job is."""
+        prefix = self._new_prefix("previews")
+        found = files_inside(self._output, progress.preview)
+        artifacts = [
+            await store_artifact(self._files, prefix, name, path) for name, path in sorted(found.items())
+        ]
+        await self._ledger.preview(prefix, artifacts, progress)
+
+    def _new_prefix(self, kind: str) -> str:
+        self._stored += 1
         claim = self._ledger.claim
-        prefix = f"jobs/{claim.job_id}/checkpoints/{claim.name}-{self._checkpoints}"
-        try:
-            await self._files.put_path(f"{prefix}/{name}", self._output / name)
-        except (OSError, ValueError, StoreError, EngineError) as error:
-            # The job can go on without: a later checkpoint, or a resume from an earlier one, will do.
-            log.error("checkpoint %s of %s not stored: %s", name, claim.job_id, error)
-            return
-        await self._ledger.checkpoint(prefix, [name], step)
+        return f"jobs/{claim.job_id}/{kind}/{claim.name}-{self._stored}"
+
+
+class _Box:
+    """The latest report that has something to be stored; one that was not fetched in time is dropped."""
+
+    def __init__(self) -> None:
+        self.latest: Progress | None = None
+        self.due = asyncio.Event()
+
+    def put(self, progress: Progress) -> None:
+        self.latest = progress
+        self.due.set()

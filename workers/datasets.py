@@ -10,11 +10,11 @@ from psycopg.types.json import Jsonb
 
 from biresnerf.errors import InputError
 from workers.checking import Checker
+from workers.claim import insist
 from workers.database import Connection, Database
 from workers.errors import Conflict, LimitReached, NotFound
 from workers.files import FileStore, StoredFile
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
-from workers.ledger import insist
 from workers.records import DatasetFile, DatasetRecord, DatasetState, ManifestEntry, Page
 from workers.settings import Settings
 

@@ -16,6 +16,7 @@ from procrastinate.exceptions import ConnectorException
 from psycopg.types.json import Jsonb
 
 from workers.database import QUEUE, Connection, Database
+from workers.endings import finish_cancelled
 from workers.errors import Unavailable
 from workers.files import FileStore
 from workers.receipts import offer_again
@@ -187,12 +188,8 @@ async def release(connection: Connection, queue_id: int, why: str) -> None:
         return
     log.warning("taking job %s back (%s)", job["id"], why)
     if job["cancel_requested"]:
-        await connection.execute(
-            "UPDATE jobs SET state = 'cancelled', run_token = NULL, finished_at = clock_timestamp()"
-            " WHERE id = %s",
-            (job["id"],),
-        )
-        await connection.execute("SELECT add_job_event(%s, 'cancelled', '{}')", (job["id"],))
+        await connection.execute("UPDATE jobs SET run_token = NULL WHERE id = %s", (job["id"],))
+        await finish_cancelled(connection, job["id"])
         await connection.execute("SELECT procrastinate_finish_job_v1(%s, 'aborted', false)", (queue_id,))
         return
     await connection.execute(

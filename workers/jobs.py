@@ -13,10 +13,11 @@ from psycopg.types.json import Jsonb
 
 from biresnerf.config import RefineOptions
 from workers.database import Connection, Database
+from workers.endings import finish_cancelled
 from workers.errors import Conflict, LimitReached, NotFound
 from workers.follow import Listener, follow
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
-from workers.records import Artifact, Job, JobError, JobEvent, JobProgress, JobState, JobUpdate, Page
+from workers.records import Artifact, Job, JobError, JobEvent, JobProgress, JobState, JobUpdate, LogLine, Page
 from workers.settings import Settings
 
 # Two submits at once must not both take the last place.
@@ -134,27 +135,29 @@ class JobStore:
             items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
         )
 
-    async def cancel(self, job_id: str) -> Job:
+    async def cancel(self, job_id: str, *, keep_partial: bool = False) -> Job:
         """Ask for the end of a job: a queued one is cancelled at once, a running one within seconds.
 
-        A job already final is returned as it is. Raises `NotFound`.
+        With ``keep_partial`` the best poses so far are published, with a report that says that they are
+        partial. The first request decides. A job already final is returned as it is. Raises `NotFound`.
         """
         async with self._database.transaction() as connection:
             changed = await _one(
                 connection,
-                "UPDATE jobs SET cancel_requested = true,"
-                " finished_at = CASE WHEN state = 'queued' THEN clock_timestamp() END,"
-                " state = CASE WHEN state = 'queued' THEN 'cancelled' ELSE state END"
+                "UPDATE jobs SET cancel_requested = true, keep_partial = %s"
                 " WHERE id = %s AND state IN ('queued', 'running') AND NOT cancel_requested"
                 " RETURNING queue_id, state",
+                keep_partial,
                 job_id,
             )
             if changed is not None:
                 await connection.execute(
                     "SELECT procrastinate_cancel_job_v1(%s, true, false)", (changed["queue_id"],)
                 )
-                event = "cancelled" if changed["state"] == "cancelled" else "cancel_requested"
-                await connection.execute("SELECT add_job_event(%s, %s, '{}')", (job_id, event))
+                if changed["state"] == "queued":  # perhaps after an attempt that has shown something
+                    await finish_cancelled(connection, job_id, stall_s=self._settings.stall_s)
+                else:
+                    await connection.execute("SELECT add_job_event(%s, 'cancel_requested', '{}')", (job_id,))
             return job_from_row(await _required(connection, job_id))
 
     async def delete(self, job_id: str) -> None:
@@ -165,8 +168,8 @@ class JobStore:
                 raise NotFound(f"No job {job_id}.")
             if row["state"] in ("queued", "running"):
                 raise Conflict("state_conflict", f"Job {job_id} is {row['state']}; cancel it first.")
+            # Its files, and its exports with theirs, go with it.
             await connection.execute("DELETE FROM jobs WHERE id = %s", (job_id,))
-            await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (f"jobs/{job_id}",))
             await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job_id,))
 
     async def events(self, job_id: str, *, after: int = 0, limit: int = 1000) -> tuple[JobEvent, ...]:
@@ -176,11 +179,22 @@ class JobStore:
             return await _events(connection, job_id, after, limit)
 
     async def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
-        """The published files, by name; empty while there is no result. Raises `NotFound`."""
-        rows = await self._database.fetch("SELECT artifacts FROM jobs WHERE id = %s", job_id)
+        """The published files, by name, while the job runs its previews; raises `NotFound`."""
+        rows = await self._database.fetch("SELECT artifacts, previews FROM jobs WHERE id = %s", job_id)
         if not rows:
             raise NotFound(f"No job {job_id}.")
-        return tuple(Artifact.model_validate(item) for item in rows[0]["artifacts"])
+        previews = (rows[0]["previews"] or {}).get("artifacts", [])
+        return tuple(Artifact.model_validate(item) for item in [*rows[0]["artifacts"], *previews])
+
+    async def log(self, job_id: str, *, after: int = 0, limit: int = 1000) -> tuple[LogLine, ...]:
+        """What the job's process wrote to standard error, after line ``after``; raises `NotFound`."""
+        async with self._database.transaction() as connection:
+            await _required(connection, job_id)
+            cursor = await connection.execute(
+                "SELECT n, at, attempt, text FROM job_log WHERE job_id = %s AND n > %s ORDER BY n LIMIT %s",
+                (job_id, after, limit),
+            )
+            return tuple(LogLine.model_validate(row) for row in await cursor.fetchall())
 
     async def update(self, job_id: str, after: int = 0) -> JobUpdate:
         """The job and the events after ``after``, seen in one snapshot; raises `NotFound`."""
@@ -265,6 +279,7 @@ def job_from_row(row: dict[str, Any]) -> Job:
         "created_at",
     )
     also = ("started_at", "finished_at", "options", "metrics", "message", "verdict", "labels", "revision")
+    life = ("kind", "parent", "forked_from", "forked_stage", "smaller", "partial")
     progress = JobProgress(**{key: row[key] for key in ("fraction", "step", "steps_total", "eta_s")})
     error = JobError.model_validate(row["error"]) if row["error"] else None
-    return Job(**{key: row[key] for key in same + also}, progress=progress, error=error)
+    return Job(**{key: row[key] for key in same + also + life}, progress=progress, error=error)

@@ -6,90 +6,21 @@ last can write. The other gets `Fenced` and must leave without touching the queu
 
 from __future__ import annotations
 
-import asyncio
-import logging
-import uuid
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from psycopg.types.json import Jsonb
 
 from biresnerf.progress import Progress
 from biresnerf.report import VerdictName
+from workers.claim import Claim, Fenced, insist
 from workers.database import Connection, Database
-from workers.errors import Unavailable
-from workers.records import Artifact, EventType, JobError
+from workers.endings import finish, finish_cancelled, trash_attempts
+from workers.records import LOG_NAME, Artifact, EventType, JobError
 
-log = logging.getLogger(__name__)
-
-RETRY_S = 0.5
-End = Literal["succeeded", "failed", "cancelled", "queued"]
+PREVIEW_KEPT_S = 60.0  # after another one took its place: it may be on its way to somebody
+LOG_LINES_MAX = 20_000  # of one job
 T = TypeVar("T")
-
-
-class Fenced(BaseException):
-    """Somebody else has claimed the job since. Not an `Exception`: nothing may swallow it."""
-
-
-@dataclass(frozen=True)
-class Claim:
-    """One attempt of one job, owned by whoever holds ``token``."""
-
-    job_id: str
-    dataset_id: str
-    attempt: int
-    token: uuid.UUID
-    options: dict[str, Any]
-    checkpoint: dict[str, Any] | None
-
-    @property
-    def name(self) -> str:
-        """Folder name of this attempt, never used by another one."""
-        return f"{self.attempt}-{self.token.hex[:8]}"
-
-
-async def claim_job(database: Database, job_id: str, max_attempts: int) -> Claim | None:
-    """Take a job over with a fresh token; none where there is nothing to run.
-
-    A job whose cancellation was asked for ends ``cancelled``, one that had its attempts ends ``failed``.
-    """
-    token = uuid.uuid4()
-    return await insist(lambda: _claim(database, job_id, max_attempts, token))
-
-
-async def _claim(database: Database, job_id: str, max_attempts: int, token: uuid.UUID) -> Claim | None:
-    async with database.transaction() as connection:
-        cursor = await connection.execute(
-            "SELECT state, attempt, cancel_requested, run_token, dataset_id, options, checkpoint"
-            " FROM jobs WHERE id = %s FOR UPDATE",
-            (job_id,),
-        )
-        row = await cursor.fetchone()
-        if row is not None and row["run_token"] == token:
-            # An earlier try got through, though its acknowledgement was lost: the attempt counts once.
-            same = {key: row[key] for key in ("dataset_id", "attempt", "options", "checkpoint")}
-            return Claim(job_id, token=token, **same)
-        if row is None or row["state"] not in ("queued", "running"):
-            return None
-        if row["cancel_requested"]:
-            await _finish(connection, job_id, "cancelled", None)
-            return None
-        if row["attempt"] >= max_attempts:
-            await _finish(connection, job_id, "failed", crashed_too_often(row["attempt"]))
-            return None
-        cursor = await connection.execute(
-            "UPDATE jobs SET state = 'running', attempt = attempt + 1, run_token = %s, fraction = 0,"
-            " step = 0, stage = NULL, eta_s = NULL, message = '',"
-            " started_at = coalesce(started_at, clock_timestamp())"
-            " WHERE id = %s RETURNING dataset_id, attempt, options, checkpoint",
-            (token, job_id),
-        )
-        claimed = await cursor.fetchone()
-        assert claimed is not None, "the row is locked"
-        resumed = Jsonb({"resumed": claimed["checkpoint"] is not None})
-        await connection.execute("SELECT add_job_event(%s, 'started', %s)", (job_id, resumed))
-        return Claim(job_id, token=token, **claimed)
 
 
 class Ledger:
@@ -138,6 +69,68 @@ class Ledger:
 
         await self._fenced(write)
 
+    async def preview(self, prefix: str, artifacts: Sequence[Artifact], now: Progress) -> None:
+        """Let the job show these files, in the place of those before."""
+
+        async def write(connection: Connection) -> None:
+            await connection.execute(
+                "INSERT INTO trash (prefix, not_before)"
+                " SELECT previews ->> 'prefix', clock_timestamp() + make_interval(secs => %s) FROM jobs"
+                " WHERE id = %s AND previews ->> 'prefix' <> %s",
+                (PREVIEW_KEPT_S, self.claim.job_id, prefix),
+            )
+            shown = {"prefix": prefix, "artifacts": [item.model_dump() for item in artifacts]}
+            await connection.execute(
+                "UPDATE jobs SET previews = %s WHERE id = %s", (Jsonb(shown), self.claim.job_id)
+            )
+            data = {"stage": now.stage, "step": now.step, "files": [item.name for item in artifacts]}
+            await _add_event(connection, self.claim.job_id, "preview", data)
+
+        await self._fenced(write)
+
+    async def log(self, lines: Sequence[str]) -> None:
+        """Append lines to the job's log; what is more than `LOG_LINES_MAX` is in its log file alone."""
+        before: int | None = None
+
+        async def write(connection: Connection) -> None:
+            nonlocal before
+            cursor = await connection.execute(
+                "SELECT log_lines FROM jobs WHERE id = %s", (self.claim.job_id,)
+            )
+            row = await cursor.fetchone()
+            assert row is not None, "the row is locked"
+            if before is not None and row["log_lines"] != before:
+                return  # an earlier try got through, though its acknowledgement was lost
+            before = row["log_lines"]
+            room = LOG_LINES_MAX - before
+            kept = list(lines[: max(0, room)])
+            if kept and len(kept) == room:
+                kept[-1] = f"(the rest is in {LOG_NAME} alone)"
+            if not kept:
+                return
+            await connection.execute(
+                "INSERT INTO job_log (job_id, n, attempt, text)"
+                " SELECT %s, %s + place, %s, text FROM unnest(%s::text[]) WITH ORDINALITY AS fresh (text, place)",
+                (self.claim.job_id, before, self.claim.attempt, kept),
+            )
+            await connection.execute(
+                "UPDATE jobs SET log_lines = log_lines + %s WHERE id = %s", (len(kept), self.claim.job_id)
+            )
+
+        await self._fenced(write)
+
+    async def wants_partial(self) -> bool:
+        """Whether who cancelled the job wants what there is of its result."""
+
+        async def read(connection: Connection) -> bool:
+            cursor = await connection.execute(
+                "SELECT keep_partial FROM jobs WHERE id = %s", (self.claim.job_id,)
+            )
+            row = await cursor.fetchone()
+            return bool(row and row["keep_partial"])
+
+        return await self._fenced(read, done=False)
+
     async def publish(
         self, artifacts: Sequence[Artifact], verdict: VerdictName | None, keep: str, stall_s: float
     ) -> bool:
@@ -152,8 +145,8 @@ class Ledger:
             await connection.execute(
                 "UPDATE jobs SET verdict = %s WHERE id = %s", (verdict, self.claim.job_id)
             )
-            await _finish(connection, self.claim.job_id, "succeeded", None, artifacts)
-            await _trash_attempts(connection, self.claim.job_id, keep, stall_s)
+            await finish(connection, self.claim.job_id, "succeeded", None, artifacts)
+            await trash_attempts(connection, self.claim.job_id, keep, stall_s)
             return True
 
         return await self._fenced(write, done=True)
@@ -163,35 +156,43 @@ class Ledger:
 
         async def write(connection: Connection) -> None:
             if await _cancel_requested(connection, self.claim.job_id):
-                await _finish(connection, self.claim.job_id, "cancelled", None, artifacts)
-            else:
-                await _finish(connection, self.claim.job_id, "failed", error, artifacts)
-            await _trash_attempts(connection, self.claim.job_id, keep, stall_s)
+                await finish_cancelled(connection, self.claim.job_id, artifacts, keep, stall_s)
+                return
+            await finish(connection, self.claim.job_id, "failed", error, artifacts)
+            await trash_attempts(connection, self.claim.job_id, keep, stall_s)
 
         await self._fenced(write, done=None)
 
     async def cancelled(self, artifacts: Sequence[Artifact], keep: str, stall_s: float) -> None:
-        """End the job as cancelled."""
+        """End the job as cancelled, with what is wanted of the files."""
 
         async def write(connection: Connection) -> None:
-            await _finish(connection, self.claim.job_id, "cancelled", None, artifacts)
-            await _trash_attempts(connection, self.claim.job_id, keep, stall_s)
+            await finish_cancelled(connection, self.claim.job_id, artifacts, keep, stall_s)
 
         await self._fenced(write, done=None)
 
     async def give_back(
-        self, event: EventType, data: dict[str, Any], *, counted: bool, forget_checkpoint: bool = False
+        self,
+        event: EventType,
+        data: dict[str, Any],
+        *,
+        counted: bool,
+        forget_checkpoint: bool = False,
+        smaller: dict[str, Any] | None = None,
     ) -> bool:
-        """Back to the queue, the attempt counted or not; False if the job was cancelled instead."""
+        """Back to the queue, the attempt counted or not; False if the job was cancelled instead.
+
+        ``smaller``: options that attempts to come use in the place of those asked for.
+        """
 
         async def write(connection: Connection) -> bool:
             if await _cancel_requested(connection, self.claim.job_id):
-                await _finish(connection, self.claim.job_id, "cancelled", None)
+                await finish_cancelled(connection, self.claim.job_id)
                 return False
             await connection.execute(
                 "UPDATE jobs SET state = 'queued', attempt = attempt - %s, eta_s = NULL,"
-                " checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END WHERE id = %s",
-                (0 if counted else 1, forget_checkpoint, self.claim.job_id),
+                " checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END, smaller = smaller || %s WHERE id = %s",
+                (0 if counted else 1, forget_checkpoint, Jsonb(smaller or {}), self.claim.job_id),
             )
             await _add_event(connection, self.claim.job_id, event, data)
             return True
@@ -219,45 +220,6 @@ class Ledger:
         return await insist(once)
 
 
-def crashed_too_often(attempts: int, log_tail: str = "") -> JobError:
-    """The error of a job whose every attempt died."""
-    return JobError(
-        code="too_many_crashes",
-        detail=f"The job's process died in each of {attempts} attempts.",
-        mend="Try smaller options (preset fast, a smaller max_image_size) or a machine with more memory.",
-        log_tail=log_tail,
-    )
-
-
-async def insist(write: Callable[[], Awaitable[T]]) -> T:
-    """The answer of ``write``, tried again for as long as the database is away."""
-    while True:
-        try:
-            return await write()
-        except Unavailable as error:
-            log.warning("%s; trying again", error)
-            await asyncio.sleep(RETRY_S)
-
-
-async def _finish(
-    connection: Connection,
-    job_id: str,
-    state: End,
-    error: JobError | None,
-    artifacts: Sequence[Artifact] = (),
-) -> None:
-    await connection.execute(
-        "UPDATE jobs SET state = %s, error = %s, artifacts = %s, finished_at = clock_timestamp(),"
-        " eta_s = NULL, fraction = CASE WHEN %s = 'succeeded' THEN 1 ELSE fraction END WHERE id = %s",
-        (
-            *(state, Jsonb(error.model_dump()) if error else None),
-            *(Jsonb([item.model_dump() for item in artifacts]), state, job_id),
-        ),
-    )
-    data = {"code": error.code, "detail": error.detail} if error else {}
-    await _add_event(connection, job_id, state, data)
-
-
 async def _add_event(connection: Connection, job_id: str, event: str, data: dict[str, Any]) -> None:
     await connection.execute("SELECT add_job_event(%s, %s, %s)", (job_id, event, Jsonb(data)))
 
@@ -266,13 +228,3 @@ async def _cancel_requested(connection: Connection, job_id: str) -> bool:
     cursor = await connection.execute("SELECT cancel_requested FROM jobs WHERE id = %s", (job_id,))
     row = await cursor.fetchone()
     return bool(row and row["cancel_requested"])
-
-
-async def _trash_attempts(connection: Connection, job_id: str, keep: str, stall_s: float) -> None:
-    # Twice the stall time: a frozen owner that wakes up later finds itself fenced at its first write.
-    await connection.execute(
-        "INSERT INTO trash (prefix, keep, not_before)"
-        " SELECT prefix, keep, clock_timestamp() + make_interval(secs => %s)"
-        " FROM (VALUES (%s, NULL), (%s, %s)) AS garbage (prefix, keep)",
-        (2 * stall_s, f"jobs/{job_id}/checkpoints", f"jobs/{job_id}/results", keep),
-    )

@@ -12,8 +12,8 @@ from procrastinate.jobs import Job, Status
 from procrastinate.retry import RetryDecision
 from procrastinate.worker import Worker
 
+from workers.claim import insist
 from workers.database import QUEUE, Connection, Database
-from workers.ledger import insist
 
 log = logging.getLogger(__name__)
 

@@ -14,13 +14,19 @@ JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 DatasetState = Literal["open", "finalizing", "ready", "rejected"]
 FINAL_JOB_STATES: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled"})
 
-# queued started stage checkpoint attempt_crashed requeued cancel_requested succeeded failed cancelled
+LOG_NAME, POSES_NAME = "log.txt", "poses.json"  # files of a result that the engine knows
+PREVIEW_FOLDER = "preview"  # of files that show how far a job is
+
+ReusableStage = Literal["seeding", "coarse"]
+JobKind = Literal["refine", "export"]
 EventType = Literal[
     "queued",
     "started",
     "stage",
     "checkpoint",
+    "preview",
     "attempt_crashed",
+    "retried_smaller",
     "requeued",
     "cancel_requested",
     "succeeded",
@@ -49,7 +55,7 @@ class JobError(Record):
     """Why a job failed.
 
     ``code`` is the pipeline's own (InputError, RefinementError) or one of the engine's: ``timeout``,
-    ``too_many_crashes``, ``engine_error``. ``log_tail`` is the end of what the job wrote to stderr.
+    ``out_of_memory``, ``too_many_crashes``, ``engine_error``. ``log_tail`` is the end of what the job wrote to stderr.
     """
 
     code: str
@@ -64,6 +70,10 @@ class Job(Record):
     """A job as clients see it. ``revision`` grows with every change (use it as a weak ETag)."""
 
     id: str
+    kind: JobKind = Field("refine", description="`export` writes the result of `parent` in further forms.")
+    parent: str | None = Field(None, description="Of an export: the job whose result it writes.")
+    forked_from: str | None = Field(None, description="The job that this one started from.")
+    forked_stage: ReusableStage | None = Field(None, description="Whose work of that job it took over.")
     dataset_id: str
     state: JobState
     stage: Stage | None = None
@@ -74,7 +84,13 @@ class Job(Record):
     created_at: datetime
     started_at: datetime | None = None
     finished_at: datetime | None = None
-    options: dict[str, Any] = Field(description="Resolved RefineOptions.")
+    options: dict[str, Any] = Field(description="Resolved RefineOptions; of an export, its formats.")
+    smaller: dict[str, Any] = Field(
+        {}, description="Options that a second try uses instead, after the first ran out of memory."
+    )
+    partial: bool = Field(
+        False, description="The files are those of a job that was stopped: its best poses until then."
+    )
     metrics: dict[str, float] = {}
     message: str = ""
     verdict: VerdictName | None = Field(
@@ -116,6 +132,20 @@ class Artifact(Record):
     size: int
     sha256: str
     media_type: str
+
+    @property
+    def preview(self) -> bool:
+        """Whether it shows a job that is not over yet; another one will take its place."""
+        return self.name.startswith(f"{PREVIEW_FOLDER}/")
+
+
+class LogLine(Record):
+    """One line that a job's process wrote to standard error; ``n`` starts at 1 and has no gaps."""
+
+    n: int
+    at: datetime
+    attempt: int
+    text: str
 
 
 class ManifestEntry(Record):

@@ -1,12 +1,13 @@
 """The program of one job's child process: `python -m workers.run JOB_FOLDER`.
 
 Reads ``job.json``, writes one line of JSON per report to standard output, everything else to standard error.
-Exit status: 0 done; 2 the user's mistake, 3 the refinement failed (both told in ``error.json``); 143 stopped
-by SIGTERM after writing a checkpoint; 1 anything else.
+Exit status: 0 done; 2 the user's mistake, 3 the refinement failed (both told in ``error.json``); 4 out of
+memory; 143 stopped by SIGTERM after writing a checkpoint, if there was anything to keep; 1 anything else.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -21,11 +22,12 @@ from pydantic import BaseModel, ConfigDict
 
 from biresnerf.config import RefineOptions, parse_options
 from biresnerf.errors import InputError, Interrupted, RefinementError
-from biresnerf.progress import Progress
+from biresnerf.progress import Progress, Stage
 
 EXIT_BUG = 1
 EXIT_INPUT = 2
 EXIT_REFINEMENT = 3
+EXIT_MEMORY = 4
 EXIT_STOPPED = 128 + signal.SIGTERM
 
 
@@ -43,8 +45,8 @@ def main(folder: Path) -> int:
     """Run the job in ``folder``; returns the exit status."""
     protocol = _protocol_only()
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s %(message)s")
-    stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    stop = _Stop()
+    signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         os.chdir(folder)
@@ -58,20 +60,44 @@ def main(folder: Path) -> int:
     except RefinementError as error:
         _report(error.code, error.what, "", "")
         return EXIT_REFINEMENT
-    except Exception:  # noqa: BLE001 - the last line of defence: a bug ends in the log and in the status
+    except Exception as error:  # noqa: BLE001 - the last line of defence: a bug ends in the log and in the status
         traceback.print_exc()
-        return EXIT_BUG
+        return EXIT_MEMORY if _is_want_of_memory(error) else EXIT_BUG
     return 0
 
 
-def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: threading.Event) -> None:
-    from biresnerf.pipeline import refine_poses  # loads torch; SIGTERM during that is seen at the first step
+class _Stop:
+    """What SIGTERM means: stop soon and keep what there is, or end at once where there is nothing to keep."""
+
+    def __init__(self) -> None:
+        self.asked = threading.Event()
+        self.stage: Stage = "preparing"
+
+    def ask(self) -> None:
+        if self.stage == "preparing":
+            os._exit(
+                EXIT_STOPPED
+            )  # loading torch, compiling kernels and reading images take long to come to an end
+        self.asked.set()
+
+
+def _is_want_of_memory(error: Exception) -> bool:
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return True
+    # torch's own, of the GPU (a class) and of the CPU (a text); not imported here, as most jobs never fail.
+    said = type(error).__name__ == "OutOfMemoryError" or "DefaultCPUAllocator" in str(error)
+    return isinstance(error, RuntimeError) and said
+
+
+def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop) -> None:
+    from biresnerf.pipeline import refine_poses  # loads torch
 
     def tell(progress: Progress) -> None:
+        stop.stage = progress.stage
         protocol.write(progress.model_dump_json() + "\n")
         protocol.flush()
 
-    refine_poses(order.input, order.output, options, on_progress=tell, should_stop=stop.is_set)
+    refine_poses(order.input, order.output, options, on_progress=tell, should_stop=stop.asked.is_set)
 
 
 def _protocol_only() -> TextIO:

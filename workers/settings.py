@@ -78,6 +78,11 @@ class Settings(BaseSettings):
     stop_grace_s: float = Field(
         20.0, gt=0, description="Seconds a job may take to write a checkpoint and exit."
     )
+    cancel_grace_s: float = Field(
+        6.0,
+        gt=0,
+        description="Seconds a cancelled job may take to write the partial result that was asked for.",
+    )
     job_timeout_s: float = Field(2 * 3600, gt=0, description="Longest run of one attempt.")
     check_timeout_s: float = Field(900, gt=0, description="Longest validation of one dataset.")
     max_attempts: int = Field(3, ge=1, description="Attempts of a job that crashes.")

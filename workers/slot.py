@@ -23,11 +23,11 @@ from procrastinate.jobs import Job
 
 from workers.attempt import Attempt
 from workers.beat import Beat
+from workers.claim import Fenced, claim_job, insist
 from workers.database import QUEUE, TASK, Database, first_line, open_database
 from workers.errors import LimitReached, SetupError
 from workers.files import open_files
 from workers.janitor import Janitor, release_worker
-from workers.ledger import Fenced, claim_job, insist
 from workers.logs import about, set_up_logging
 from workers.one_store import require_same_store
 from workers.receipts import FencedWorker

@@ -24,11 +24,13 @@ stopping = []
 signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
 
 
-def tell(step: int, stage: str = "coarse", checkpoint: str | None = None) -> None:
+def tell(
+    step: int, stage: str = "coarse", checkpoint: str | None = None, preview: tuple[str, ...] = ()
+) -> None:
     total = plan["steps"]
     progress = Progress(
         stage=stage, step=step, steps_total=total, fraction=step / total, metrics={"loss": 1.0 / (step + 1)},
-        checkpoint=checkpoint,
+        checkpoint=checkpoint, preview=preview,
     )  # fmt: skip
     sys.stdout.write(progress.model_dump_json() + "\n")
     sys.stdout.flush()
@@ -40,6 +42,14 @@ def save(step: int) -> None:
     fresh.write_text(json.dumps({"step": step, "chain": chain}))
     fresh.rename(state)
     tell(step, checkpoint="checkpoint/latest.json")
+
+
+def show(step: int) -> None:
+    """A preview, as the refinement shows how far it is."""
+    (output / "preview").mkdir(exist_ok=True)
+    (output / "preview" / "poses.json").write_text(json.dumps({"step": step}))
+    (output / "preview" / "report.json").write_text(json.dumps({"state": "partial", "steps": step}))
+    tell(step, preview=("preview/poses.json", "preview/report.json", "../outside"))
 
 
 begun = json.loads(state.read_text()) if state.exists() else {"step": 0, "chain": plan.get("seed", "")}
@@ -79,9 +89,18 @@ for step in range(start + 1, plan["steps"] + 1):
     if plan.get("die_at") == step:
         sys.stderr.write("dying now\n")
         sys.stderr.flush()
+        if "oom_counter" in plan:
+            said, count = Path(plan["oom_counter"]).read_text().split()
+            Path(plan["oom_counter"]).write_text(f"{said} {int(count) + 1}\n")
         os.kill(os.getpid(), signal.SIGKILL)
+    if step % plan.get("preview_every", 10**9) == 0:
+        show(step)
+    if plan.get("hungry", 0) and step == 3 and order["options"]["max_image_size"] > plan["hungry"]:
+        sys.exit(4)  # as `workers.run` says that memory ran out
     if stopping and not plan.get("deaf"):
         save(step)
+        (output / "poses.json").write_text(json.dumps({"step": step}))
+        (output / "report.json").write_text(json.dumps({"state": "partial", "steps": step}))
         sys.exit(143)
 (output / "report.json").write_text(json.dumps({"steps": plan["steps"], "from": start, "chain": chain}))
 (output / "renders").mkdir()

@@ -15,12 +15,12 @@ from procrastinate.utils import utcnow
 from biresnerf.config import RefineOptions
 from tests.workers.conftest import ready_dataset
 from workers import ledger
+from workers.claim import claim_job
 from workers.database import QUEUE, Database, open_database
 from workers.errors import Unavailable
 from workers.file_places import LocalPlace
 from workers.files import FileStore
 from workers.janitor import Janitor
-from workers.ledger import claim_job
 from workers.receipts import FencedWorker
 from workers.settings import Settings
 from workers.stores import Stores

@@ -32,7 +32,7 @@ DECLARE
     _before record;
 BEGIN
     INSERT INTO tally_log (name, label) VALUES ('job_events', NEW.type);
-    IF NEW.type IN ('checkpoint', 'cancel_requested') THEN
+    IF NEW.type IN ('checkpoint', 'preview', 'cancel_requested') THEN
         RETURN NULL;
     END IF;
     IF NEW.type = 'failed' THEN
@@ -42,7 +42,7 @@ BEGIN
     END IF;
     -- Whatever comes after a stage ends it.
     SELECT type, data ->> 'stage' AS stage, at INTO _before FROM job_events
-        WHERE job_id = NEW.job_id AND seq < NEW.seq AND type NOT IN ('checkpoint', 'cancel_requested')
+        WHERE job_id = NEW.job_id AND seq < NEW.seq AND type NOT IN ('checkpoint', 'preview', 'cancel_requested')
         ORDER BY seq DESC LIMIT 1;
     IF FOUND AND _before.type = 'stage' THEN
         PERFORM tally_seconds('stage_seconds', _before.stage, extract(epoch FROM NEW.at - _before.at));
