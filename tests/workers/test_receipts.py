@@ -14,7 +14,7 @@ from procrastinate.utils import utcnow
 
 from biresnerf.config import RefineOptions
 from tests.workers.conftest import ready_dataset
-from workers import ledger
+from workers import claim as claims
 from workers.claim import claim_job
 from workers.database import QUEUE, Database, open_database
 from workers.errors import Unavailable
@@ -79,7 +79,7 @@ async def test_a_claim_whose_acknowledgement_was_lost_counts_once(
     stores: Stores, database: Database, monkeypatch: pytest.MonkeyPatch
 ):
     job_id = await queued(stores)
-    claim, lost = ledger._claim, []
+    claim, lost = claims._claim, []
 
     async def loses_the_first_answer(*arguments):
         answer = await claim(*arguments)
@@ -88,7 +88,7 @@ async def test_a_claim_whose_acknowledgement_was_lost_counts_once(
             raise Unavailable("database_unavailable", "the connection broke after the commit")
         return answer
 
-    monkeypatch.setattr(ledger, "_claim", loses_the_first_answer)
+    monkeypatch.setattr(claims, "_claim", loses_the_first_answer)
     assert await claim_job(database, job_id, 3) == lost[0]
     assert (await stores.jobs.get(job_id)).attempt == 1
     assert [event.type for event in await stores.jobs.events(job_id)] == ["queued", "started"]
