@@ -30,6 +30,15 @@ PackName = Literal["colmap-text", "instant-ngp", "kitti", "bundler", "pinhole"]
 StartPoses = Literal["auto", "given", "colmap", "none"]
 RefineIntrinsics = Literal["auto", "none", "focal", "all"]
 
+# Options that have no say before stage 2 begins: runs that differ in these alone can share stage 1.
+STAGE_2_OPTIONS = frozenset(
+    {
+        *("reconstruction_levels", "reconstruction_resolution_min", "reconstruction_resolution_max"),
+        *("table_size_log2", "wiring", "warmup_steps", "verdict", "trial_steps"),
+        *("threads", "checkpoint_every_s", "orbit_frames", "packs"),
+    }
+)
+
 
 class RefineOptions(BaseModel):
     """Options of one refinement. Unknown keys are refused."""

@@ -24,6 +24,7 @@ from biresnerf.data.write import transforms_notes, write_transforms
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera import Intrinsics
 from biresnerf.geometry.similarity import Similarity
+from biresnerf.progress import ReusableStage
 from biresnerf.refine.checkpoint import CHECKPOINT, MATCHES, SEEDING
 from biresnerf.refine.evaluation import ViewScore, render_view
 from biresnerf.refine.history import HISTORY
@@ -45,8 +46,8 @@ _ANOTHER = "Choose another output folder, or remove this one."
 class OutputFolder:
     """Refuses folders that hold something else; creates nothing before `claim` but what COLMAP answered."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = Path(path)
+    def __init__(self, path: Path, *, keep_reusable: bool = False) -> None:
+        self.path, self._keep_reusable = Path(path), keep_reusable
 
     def refuse_finished(self) -> None:
         """Raise `InputError` unless the folder is new, empty, or holds an unfinished run."""
@@ -77,6 +78,11 @@ class OutputFolder:
     def matches(self) -> Path:
         """The file that keeps the feature matches COLMAP found, until the run is complete."""
         return self.path / MATCHES
+
+    def seeding_files(self) -> dict[ReusableStage, tuple[str, ...]]:
+        """What another run can take over of it; nothing where COLMAP was not asked."""
+        kept = tuple(path.as_posix() for path in (SEEDING, MATCHES) if (self.path / path).is_file())
+        return {"seeding": kept} if SEEDING.as_posix() in kept else {}
 
     def restore_seeding(self, seeding: str | None) -> None:
         """Put back the answer that a checkpoint carried: it may have come here without its folder."""
@@ -141,9 +147,12 @@ class OutputFolder:
         )
 
     def drop_traces(self) -> None:
-        """Remove what only a run that goes on needs."""
-        for name in (CHECKPOINT.parent, PREVIEW):
-            shutil.rmtree(self.path / name, ignore_errors=True)
+        """Remove what only a run that goes on needs, and what others could start from unless that is to be kept."""
+        shutil.rmtree(self.path / PREVIEW, ignore_errors=True)
+        if self._keep_reusable:
+            (self.path / CHECKPOINT).unlink(missing_ok=True)
+        else:
+            shutil.rmtree(self.path / CHECKPOINT.parent, ignore_errors=True)
 
     def write_orbit(self, frames: Iterator[np.ndarray]) -> None:
         """renders/orbit.mp4."""

@@ -16,18 +16,18 @@ import torch
 from torch import Tensor
 
 from biresnerf.conclude import Run
-from biresnerf.config import RefineOptions
+from biresnerf.config import STAGE_2_OPTIONS, RefineOptions
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.data.images import ImageSet, load_images
 from biresnerf.data.read import read_dataset
 from biresnerf.data.seed_poses import PoseCandidate, seed_poses
-from biresnerf.errors import Interrupted
+from biresnerf.errors import InputError, Interrupted
 from biresnerf.field.backends import choose_device, use_threads
 from biresnerf.field.compile_kernels import compile_kernels
 from biresnerf.output_folder import OutputFolder
 from biresnerf.progress import OnProgress, Progress
-from biresnerf.refine.checkpoint import load_checkpoint
+from biresnerf.refine.checkpoint import COARSE, load_checkpoint
 from biresnerf.refine.forward_facing import find_forward_facing
 from biresnerf.refine.history import Observer
 from biresnerf.refine.intrinsics_parameters import lenses_of
@@ -53,6 +53,7 @@ class Prepared:
     dataset: Dataset
     images: ImageSet
     fingerprint: str
+    stage_1_fingerprint: str
     candidates: tuple[PoseCandidate, ...]
     seeding: str | None  # what COLMAP answered, where it was asked
 
@@ -64,10 +65,13 @@ def refine_poses(
     on_progress: OnProgress | None = None,
     should_stop: Callable[[], bool] | None = None,
     observer: Observer | None = None,
+    *,
+    keep_reusable: bool = False,
 ) -> Report:
     """Refine the poses of an image set; all results go to the folder `output`.
 
-    Goes on by itself where a run of the same input and options left a checkpoint in `output`.
+    Goes on by itself where a run of the same input and options left a checkpoint in `output`, and begins with stage 2
+    where one that differs in options of stage 2 alone left the end of its stage 1 there.
 
     Args:
         input: a folder of images (with or without a transforms file), a transforms file, or a set already read.
@@ -76,6 +80,7 @@ def refine_poses(
         should_stop: asked after every step, view, frame and photo; once true, checkpoint and partial result are
             written.
         observer: looks into the run, for comparisons with the truth.
+        keep_reusable: leave in `output`/checkpoint what other runs of the set can start from.
 
     Raises:
         InputError: the user can mend it.
@@ -84,7 +89,8 @@ def refine_poses(
             yet where poses to start from were still being looked for.
     """
     report = on_progress or (lambda _progress: None)
-    run = _begin(input, OutputFolder(output), options, report, should_stop or (lambda: False), observer)
+    folder = OutputFolder(output, keep_reusable=keep_reusable)
+    run = _begin(input, folder, options, report, should_stop or (lambda: False), observer)
     stages = run.stages
     if not stages.run():
         run.write("partial")
@@ -112,38 +118,51 @@ def _begin(
     started = time.monotonic()
     folder.refuse_finished()
     checkpoint = load_checkpoint(folder.path)
+    stage_1 = load_checkpoint(folder.path, COARSE) if checkpoint is None else None
     report(Progress(stage="preparing"))
     options, device, threads = _choose_backend(asked, report)
     unstarted: dict[str, Any] = {"fingerprint": None, "seeding": None}
-    notes = checkpoint[1] if checkpoint is not None else unstarted
+    begun = checkpoint or stage_1
+    notes = begun[1] if begun is not None else unstarted
     folder.restore_seeding(notes["seeding"])
     prepared = _prepare(input, options, folder.seeding, report, stop)
-    folder.claim(prepared.fingerprint, notes["fingerprint"])
-    if checkpoint is not None:
+    folder.claim(prepared.fingerprint, notes["fingerprint"] if stage_1 is None else None)
+    if stage_1 is not None and notes["stage_1_fingerprint"] != prepared.stage_1_fingerprint:
+        raise InputError(
+            "stage_1_not_usable",
+            "is of other images, poses or options, or of another kind of device.",
+            where=COARSE.as_posix(),
+            mend="Start from its seeding, or from the beginning.",
+        )
+    if begun is not None:
         start = Start.from_json(notes["start"])
     else:
         start = _find_start(prepared, options, device, threads, report, stop)
     message = f"{len(prepared.dataset)} images read"
     stage: Literal["seeding", "preparing"] = "seeding" if prepared.seeding is not None else "preparing"
-    report(Progress(stage=stage, fraction=0.02, message=message))
+    reusable = folder.seeding_files() if begun is None else {}
+    report(Progress(stage=stage, fraction=0.02, message=message, reusable=reusable))
 
     given = RunInput(
         prepared.dataset,
         prepared.images,
         start,
         held_out_views(len(prepared.dataset), options.holdout, start.sound),
-        _matches(folder, prepared.dataset, checkpoint),
+        _matches(folder, prepared.dataset, begun),
     )
     options = start.stage_lengths(asked, options)
     optimiser = _optimiser(given, options, device, threads)
     stages = TwoStages(
         optimiser, folder.path, prepared.fingerprint, report, stop, prepared.seeding, start.as_json(), observer,
         lambda: folder.write_preview(given, stages, threads),
-        _carried(given.matches),
+        _carried(given.matches), prepared.stage_1_fingerprint,
     )  # fmt: skip
     if checkpoint is not None:
         stages.resume(*checkpoint)
         logger.info("going on from step %d", optimiser.step_index)
+    elif stage_1 is not None:
+        stages.begin_stage_2(*stage_1)
+        logger.info("stage 2 begins at step %d of another run", optimiser.step_index)
     stages.record.seconds["preparing"] = time.monotonic() - started
     return Run(given, stages, folder, threads, report, stop)
 
@@ -260,11 +279,19 @@ def _prepare(
         digest.update(images.counts.tobytes())
     # What changes neither result nor effort may differ between a run and its continuation.
     asked = options.model_dump(exclude={"threads", "checkpoint_every_s", "orbit_frames", "packs"})
-    digest.update(json.dumps([asked, dataset.names, given_poses], sort_keys=True).encode())
+    stage_1 = options.model_dump(exclude=set(STAGE_2_OPTIONS))
     return Prepared(
         dataset,
         images,
-        digest.hexdigest(),
+        _fingerprint(digest, asked, dataset.names, given_poses),
+        _fingerprint(digest, stage_1, dataset.names, given_poses),
         found.candidates,
         seeding.read_text("utf-8") if seeding.is_file() else None,
     )
+
+
+def _fingerprint(photos: hashlib._Hash, *said: Any) -> str:
+    """Of a set's photos and what is asked for of them."""
+    digest = photos.copy()
+    digest.update(json.dumps(said, sort_keys=True).encode())
+    return digest.hexdigest()

@@ -9,6 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 Stage = Literal["preparing", "seeding", "coarse", "fine", "evaluating", "exporting"]
 STAGES: tuple[Stage, ...] = ("preparing", "seeding", "coarse", "fine", "evaluating", "exporting")
+# Stages whose work another run of the same set can take over.
+ReusableStage = Literal["seeding", "coarse"]
 
 
 class Progress(BaseModel):
@@ -28,6 +30,10 @@ class Progress(BaseModel):
     )
     preview: tuple[str, ...] = Field(
         (), description="Files just written that show how far the run is, relative to the output folder."
+    )
+    reusable: dict[ReusableStage, tuple[str, ...]] = Field(
+        default_factory=dict,
+        description="Files just completed that another run can start from, by the stage whose work they hold.",
     )
 
 

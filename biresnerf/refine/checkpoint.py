@@ -18,12 +18,15 @@ from biresnerf.errors import InputError
 CHECKPOINT = Path("checkpoint") / "latest.safetensors"
 SEEDING = CHECKPOINT.with_name("seeding.json")  # what COLMAP answered; every checkpoint carries a copy
 MATCHES = CHECKPOINT.with_name(KEPT)  # feature matches; every checkpoint carries them, too
+COARSE = CHECKPOINT.with_name("coarse.safetensors")  # the state as stage 1 ended, for runs that share it
 FORMAT = "3"
 
 
-def save_checkpoint(folder: Path, tensors: dict[str, Tensor], notes: dict[str, Any]) -> Path:
+def save_checkpoint(
+    folder: Path, tensors: dict[str, Tensor], notes: dict[str, Any], name: Path = CHECKPOINT
+) -> Path:
     """Write `folder`/checkpoint/latest.safetensors; `notes` is JSON data kept beside the tensors."""
-    path = folder / CHECKPOINT
+    path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     with whole_file(path) as temporary:
@@ -31,13 +34,13 @@ def save_checkpoint(folder: Path, tensors: dict[str, Tensor], notes: dict[str, A
     return path
 
 
-def load_checkpoint(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+def load_checkpoint(folder: Path, name: Path = CHECKPOINT) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
     """Tensors and notes of the checkpoint in `folder`, None where there is none.
 
     Raises:
         InputError: ``checkpoint_invalid`` if the file is damaged or of another version.
     """
-    path = folder / CHECKPOINT
+    path = folder / name
     if not path.is_file():
         return None
     try:

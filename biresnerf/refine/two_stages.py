@@ -6,7 +6,6 @@ import logging
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,15 @@ from torch import Tensor
 
 from biresnerf.errors import RefinementError
 from biresnerf.geometry.pose_error import rotation_angle_deg
-from biresnerf.progress import OnProgress, Progress
-from biresnerf.refine.checkpoint import CHECKPOINT, save_checkpoint
+from biresnerf.progress import OnProgress, Progress, ReusableStage
+from biresnerf.refine.checkpoint import CHECKPOINT, COARSE, save_checkpoint
 from biresnerf.refine.history import History, Observer
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.late_figures import StepResult
 from biresnerf.refine.lost_cameras import LostCameraRepair
 from biresnerf.refine.previews import Previews
+from biresnerf.refine.run_record import RunRecord
 from biresnerf.refine.stability import StabilityDetector
-from biresnerf.report import SwitchReason
 
 logger = logging.getLogger(__name__)
 
@@ -32,19 +31,6 @@ SNAPSHOT = "snapshot."  # before the names of its tensors in a checkpoint
 REPORT_PERIOD_S = 0.5
 FIRST_FRACTION, LAST_FRACTION = 0.03, 0.88  # of the whole run's progress: reading before, evaluation after
 FINE_COST = 2.0  # a fine step against a coarse one, until measured
-
-
-@dataclass
-class RunRecord:
-    """What has happened so far, as kept in checkpoints."""
-
-    fingerprint: str
-    resumed: int = 0
-    rollbacks: int = 0
-    switch_reason: SwitchReason | None = None
-    seeding: str | None = None  # COLMAP's answer where poses come from it: another run would find others
-    start: dict[str, Any] = field(default_factory=dict)  # the poses started from, as `Start.as_json`
-    seconds: dict[str, float] = field(default_factory=lambda: {"coarse": 0.0, "fine": 0.0})
 
 
 class TwoStages:
@@ -58,6 +44,7 @@ class TwoStages:
         observer: looks in at every check.
         show: writes a preview and returns its files, relative to `folder`; called on the way and at the end.
         carried: tensors that go into every checkpoint as they are.
+        stage_1_fingerprint: the fingerprint without the options that have no say in stage 1.
     """
 
     def __init__(
@@ -72,12 +59,13 @@ class TwoStages:
         observer: Observer | None = None,
         show: Callable[[], tuple[str, ...]] = lambda: (),
         carried: dict[str, Tensor] | None = None,
+        stage_1_fingerprint: str = "",
     ) -> None:
         self.optimiser, self.folder = optimiser, folder
         self.history, self.observer = History(folder), observer or Observer()
         self.on_progress, self.should_stop = on_progress, should_stop
         self.previews, self.carried = Previews(show, optimiser.options.checkpoint_every_s), carried or {}
-        self.record = RunRecord(fingerprint, seeding=seeding, start=start or {})
+        self.record = RunRecord(fingerprint, stage_1_fingerprint, seeding=seeding, start=start or {})
         self.repair = LostCameraRepair(optimiser)
         options = optimiser.options
         self.detector = StabilityDetector(
@@ -91,6 +79,7 @@ class TwoStages:
         self._moved_deg = 0.0
         self._poses_at_check = optimiser.poses.poses()
         self._snapshot: tuple[float, dict[str, Tensor]] | None = None
+        self._reusable: dict[ReusableStage, tuple[str, ...]] = {}
         self._step_seconds = {"coarse": 0.0, "fine": 0.0}
         self._fraction = FIRST_FRACTION
 
@@ -169,6 +158,8 @@ class TwoStages:
             self.record.switch_reason = "stable" if verdict == "stable" else "cap"
             logger.info("stage 2 begins at step %d (%s)", optimiser.step_index, verdict)
             self._snapshot = None
+            self._save(COARSE)
+            self._reusable = {"coarse": (COARSE.as_posix(),)}
             optimiser.start_reconstruction()
         else:
             self._repair_if_due()
@@ -227,6 +218,7 @@ class TwoStages:
         # An early switch makes what is left dearer; the fraction told never falls all the same.
         self._fraction = max(self._fraction, FIRST_FRACTION + (LAST_FRACTION - FIRST_FRACTION) * share)
         losses, self._losses = self._losses, []
+        reusable, self._reusable = self._reusable, {}
         metrics = {"moved_deg": self._moved_deg}
         if losses:
             metrics["loss"] = float(np.mean(losses))
@@ -241,18 +233,13 @@ class TwoStages:
             metrics=metrics,
             checkpoint=checkpoint,
             preview=preview,
+            reusable=reusable,
         )
 
-    def _save(self) -> None:
+    def _save(self, name: Path = CHECKPOINT) -> None:
         record, detector = self.record, self.detector
         notes: dict[str, Any] = {
-            "fingerprint": record.fingerprint,
-            "resumed": record.resumed,
-            "rollbacks": record.rollbacks,
-            "switch_reason": record.switch_reason,
-            "seeding": record.seeding,
-            "start": record.start,
-            "seconds": record.seconds,
+            **record.notes(),
             "detector": {
                 "decibels": detector.decibels,
                 "confirmed": detector.confirmed,
@@ -262,11 +249,12 @@ class TwoStages:
             "repair": self.repair.notes(),
             "optimiser": self.optimiser.notes(),
         }
-        tensors = {**self.carried, **self.optimiser.state(), "poses_at_check": self._poses_at_check}
+        state = self.optimiser.state() if name == CHECKPOINT else self.optimiser.coarse_state()
+        tensors = {**self.carried, **state, "poses_at_check": self._poses_at_check}
         if self._snapshot is not None:
             notes["snapshot_error"] = self._snapshot[0]
             tensors.update({SNAPSHOT + name: tensor for name, tensor in self._snapshot[1].items()})
-        save_checkpoint(self.folder, tensors, notes)
+        save_checkpoint(self.folder, tensors, notes, name)
 
     def resume(self, tensors: dict[str, Tensor], notes: dict[str, Any]) -> None:
         """Go on where a checkpoint left off."""
@@ -276,17 +264,19 @@ class TwoStages:
         self.optimiser.load_state(
             {k: v for k, v in tensors.items() if not k.startswith(SNAPSHOT)}, notes["optimiser"]
         )
+        self._take_up(tensors, notes)
+        self.record.resumed += 1
+        for key, value in notes["detector"].items():
+            setattr(self.detector, key, value)
+
+    def begin_stage_2(self, tensors: dict[str, Tensor], notes: dict[str, Any]) -> None:
+        """Begin where stage 1 of another run ended, which differs in options of stage 2 alone."""
+        self.optimiser.load_state({**self.optimiser.state(), **tensors}, notes["optimiser"])
+        self._take_up(tensors, notes)
+        self.optimiser.start_reconstruction()
+
+    def _take_up(self, tensors: dict[str, Tensor], notes: dict[str, Any]) -> None:
         self._poses_at_check = tensors["poses_at_check"]
         self._errors = notes["errors"]
         self.repair.load_notes(notes["repair"])
-        self.record = RunRecord(
-            notes["fingerprint"],
-            notes["resumed"] + 1,
-            notes["rollbacks"],
-            notes["switch_reason"],
-            notes["seeding"],
-            notes["start"],
-            notes["seconds"],
-        )
-        for key, value in notes["detector"].items():
-            setattr(self.detector, key, value)
+        self.record.take(notes)
