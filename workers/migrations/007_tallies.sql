@@ -45,7 +45,7 @@ BEGIN
         WHERE job_id = NEW.job_id AND seq < NEW.seq AND type NOT IN ('checkpoint', 'preview', 'cancel_requested')
         ORDER BY seq DESC LIMIT 1;
     IF FOUND AND _before.type = 'stage' THEN
-        PERFORM tally_seconds('stage_seconds', _before.stage, extract(epoch FROM NEW.at - _before.at));
+        PERFORM tally_seconds('stage_seconds', coalesce(_before.stage, ''), extract(epoch FROM NEW.at - _before.at));
     END IF;
     IF NEW.type IN ('started', 'succeeded', 'failed', 'cancelled') THEN
         SELECT created_at INTO _created FROM jobs WHERE id = NEW.job_id;
