@@ -25,6 +25,7 @@ from workers.memory import OomKills, out_of_memory, smaller_options
 from workers.records import LOG_NAME, Artifact, JobError
 from workers.results import store_result
 from workers.settings import Settings
+from workers.staging import stage_job
 from workers.waiting import first_done
 
 log = logging.getLogger(__name__)
@@ -83,7 +84,7 @@ class Attempt:
 
     async def _run_process(self) -> int | None:
         """Exit status of the process; none where a stop came before it was started."""
-        staging = asyncio.create_task(self._stage())
+        staging = asyncio.create_task(stage_job(self._database, self._files, self._claim, self._folder))
         await first_done(staging, self._stop.wait())
         if not staging.done():
             staging.cancel()
@@ -124,24 +125,6 @@ class Attempt:
             return grace_s
         wanted = await self._ledger.wants_partial()
         return min(grace_s, self._settings.cancel_grace_s if wanted else DISCARDED_GRACE_S)
-
-    async def _stage(self) -> None:
-        """The dataset to ``input``, the last checkpoint to ``output``, the order to ``job.json``."""
-        rows = await self._database.fetch(
-            "SELECT key, path FROM dataset_files WHERE dataset_id = %s", self._claim.dataset_id
-        )
-        shutil.rmtree(self._folder, ignore_errors=True)
-        (self._folder / "input").mkdir(parents=True)
-        self._output.mkdir()
-        (self._folder / "tmp").mkdir()
-        await self._files.stage(((row["key"], row["path"]) for row in rows), self._folder / "input")
-        if self._claim.checkpoint is not None:
-            prefix, names = self._claim.checkpoint["prefix"], self._claim.checkpoint["files"]
-            await self._files.stage(((f"{prefix}/{name}", name) for name in names), self._output)
-        # Relative, so that an attempt elsewhere is the same job to the process.
-        options = {**self._claim.options, **self._claim.smaller}
-        order = {"input": "input", "output": "output", "options": options}
-        (self._folder / "job.json").write_text(json.dumps(order, indent=1))
 
     async def _pump(self, child: Child, courier: Courier) -> None:
         async for line in child.lines():
@@ -208,7 +191,7 @@ class Attempt:
     async def _ran_out_of_memory(self) -> bool:
         """Once more with less, from the start: a checkpoint is of the sizes that were too large."""
         tail, keep = log_tail(self._log), (self._claim.name, self._settings.stall_s)
-        smaller = smaller_options(self._claim.options)
+        smaller = smaller_options(self._claim.options) if self._claim.kind == "refine" else {}
         if smaller and not self._claim.smaller and self._claim.attempt < self._settings.max_attempts:
             said = {"why": "out_of_memory", "options": smaller, "log_tail": tail}
             return await self._ledger.give_back(
@@ -221,6 +204,8 @@ class Attempt:
 
     def _verdict(self) -> VerdictName | None:
         """What the report says of the result; None where it passes no verdict."""
+        if self._claim.kind != "refine":
+            return None
         try:
             passed = json.loads((self._output / "report.json").read_bytes()).get("verdict")
             return None if passed is None else Verdict.model_validate(passed).verdict

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from psycopg.types.json import Jsonb
 
+from biresnerf.progress import ReusableStage
 from workers.database import Database
 from workers.endings import finish, finish_cancelled
 from workers.errors import Unavailable
@@ -40,6 +41,7 @@ class Claim:
     smaller: dict[str, Any]
     checkpoint: dict[str, Any] | None
     reusable: dict[str, Any]
+    forked_stage: ReusableStage | None
 
     @property
     def name(self) -> str:
@@ -86,7 +88,9 @@ async def _claim(database: Database, job_id: str, max_attempts: int, token: uuid
 
 def _claimed(row: dict[str, Any], token: uuid.UUID) -> Claim:
     same = ("dataset_id", "attempt", "kind", "parent", "options", "smaller", "checkpoint", "reusable")
-    return Claim(row["id"], token=token, **{name: row[name] for name in same})
+    return Claim(
+        row["id"], token=token, forked_stage=row["forked_stage"], **{name: row[name] for name in same}
+    )
 
 
 def crashed_too_often(attempts: int, log_tail: str = "") -> JobError:

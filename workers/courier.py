@@ -6,11 +6,12 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 
 from obstore.exceptions import BaseError as StoreError
 
-from biresnerf.progress import Progress
+from biresnerf.progress import Progress, ReusableStage
 from workers.errors import EngineError
 from workers.files import FileStore
 from workers.ledger import Ledger
@@ -34,6 +35,7 @@ class Courier:
         self._latest: Progress | None = None
         self._log = LogLines(log_file)
         self._checkpoints, self._previews = _Box(), _Box()
+        self._reusable: dict[ReusableStage, _Box] = {"seeding": _Box(), "coarse": _Box()}
         self._stored = 0
         self._progress_due = asyncio.Event()
         self._closed = asyncio.Event()
@@ -48,6 +50,8 @@ class Courier:
             self._checkpoints.put(progress)
         if progress.preview:
             self._previews.put(progress)
+        for stage in progress.reusable:
+            self._reusable[stage].put(progress)
 
     def close(self, *, last_checkpoint: bool = True) -> None:
         """No more reports will come; nobody goes on from the job's ``last_checkpoint`` where it is cancelled."""
@@ -55,8 +59,8 @@ class Courier:
             self._checkpoints.latest = None
         self._closed.set()
         self._progress_due.set()
-        self._checkpoints.due.set()
-        self._previews.due.set()
+        for box in (self._checkpoints, self._previews, *self._reusable.values()):
+            box.due.set()
 
     async def run(self) -> None:
         """Deliver until closed and all is delivered."""
@@ -65,6 +69,10 @@ class Courier:
             asyncio.create_task(self._carry_log()),
             asyncio.create_task(self._carry(self._checkpoints, self._store_checkpoint)),
             asyncio.create_task(self._carry(self._previews, self._store_preview)),
+            *(
+                asyncio.create_task(self._carry(box, partial(self._store_reusable, stage)))
+                for stage, box in self._reusable.items()
+            ),
         ]
         try:
             await asyncio.gather(*deliveries)
@@ -133,7 +141,17 @@ class Courier:
         artifacts = [
             await store_artifact(self._files, prefix, name, path) for name, path in sorted(found.items())
         ]
-        await self._ledger.preview(prefix, artifacts, progress)
+        if artifacts:  # the job may have ended meanwhile, and have cleaned up
+            await self._ledger.preview(prefix, artifacts, progress)
+
+    async def _store_reusable(self, stage: ReusableStage, progress: Progress) -> None:
+        """The same for the work of a stage."""
+        prefix = self._new_prefix("stages")
+        found = files_inside(self._output, progress.reusable[stage])
+        for name, path in found.items():
+            await self._files.put_path(f"{prefix}/{name}", path)
+        if len(found) == len(progress.reusable[stage]):
+            await self._ledger.reusable(stage, prefix, list(found))
 
     def _new_prefix(self, kind: str) -> str:
         self._stored += 1

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from psycopg.types.json import Jsonb
 
-from biresnerf.progress import Progress
+from biresnerf.progress import Progress, ReusableStage
 from biresnerf.report import VerdictName
 from workers.claim import Claim, Fenced, insist
 from workers.database import Connection, Database
@@ -66,6 +66,22 @@ class Ledger:
                 (Jsonb({"prefix": prefix, "files": list(files)}), self.claim.job_id),
             )
             await _add_event(connection, self.claim.job_id, "checkpoint", {"step": step})
+
+        await self._fenced(write)
+
+    async def reusable(self, stage: ReusableStage, prefix: str, files: Sequence[str]) -> None:
+        """Keep the work of a stage for other jobs to start from, in the place of an earlier attempt's."""
+
+        async def write(connection: Connection) -> None:
+            await connection.execute(
+                "INSERT INTO trash (prefix) SELECT reusable -> %s ->> 'prefix' FROM jobs"
+                " WHERE id = %s AND reusable -> %s ->> 'prefix' <> %s",
+                (stage, self.claim.job_id, stage, prefix),
+            )
+            await connection.execute(
+                "UPDATE jobs SET reusable = reusable || %s WHERE id = %s",
+                (Jsonb({stage: {"prefix": prefix, "files": list(files)}}), self.claim.job_id),
+            )
 
         await self._fenced(write)
 

@@ -7,7 +7,7 @@ from typing import Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from biresnerf.progress import Stage
+from biresnerf.progress import ReusableStage, Stage
 from biresnerf.report import VerdictName
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
@@ -17,7 +17,6 @@ FINAL_JOB_STATES: frozenset[JobState] = frozenset({"succeeded", "failed", "cance
 LOG_NAME, POSES_NAME = "log.txt", "poses.json"  # files of a result that the engine knows
 PREVIEW_FOLDER = "preview"  # of files that show how far a job is
 
-ReusableStage = Literal["seeding", "coarse"]
 JobKind = Literal["refine", "export"]
 EventType = Literal[
     "queued",

@@ -57,10 +57,10 @@ def files_inside(output: Path, names: Iterable[str]) -> dict[str, Path]:
     found = {}
     for name in names:
         pure = PurePosixPath(name)
-        if pure.is_absolute() or ".." in pure.parts or not _is_plain(output / name):
-            log.error("%r is no file of the output folder", name)
-            continue
-        found[name] = output / name
+        if pure.is_absolute() or ".." in pure.parts:
+            log.error("%r lies outside the output folder", name)
+        elif _is_plain(output / name):
+            found[name] = output / name
     return found
 
 

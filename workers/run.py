@@ -16,11 +16,11 @@ import sys
 import threading
 import traceback
 from pathlib import Path
-from typing import TextIO
+from typing import Literal, TextIO
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, TypeAdapter
 
-from biresnerf.config import RefineOptions, parse_options
+from biresnerf.config import PackName, RefineOptions, parse_options
 from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.progress import Progress, Stage
 
@@ -36,9 +36,11 @@ class Order(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    task: Literal["refine", "export"] = "refine"
     input: Path
     output: Path
     options: dict[str, object]
+    result: Path | None = None
 
 
 def main(folder: Path) -> int:
@@ -51,7 +53,10 @@ def main(folder: Path) -> int:
     try:
         os.chdir(folder)
         order = Order.model_validate_json(Path("job.json").read_bytes())
-        _refine(order, parse_options(order.options), protocol, stop)
+        if order.task == "export":
+            _export(order, stop)
+        else:
+            _refine(order, parse_options(order.options), protocol, stop)
     except Interrupted:
         return EXIT_STOPPED
     except InputError as error:
@@ -97,7 +102,28 @@ def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop)
         protocol.write(progress.model_dump_json() + "\n")
         protocol.flush()
 
-    refine_poses(order.input, order.output, options, on_progress=tell, should_stop=stop.asked.is_set)
+    refine_poses(
+        order.input,
+        order.output,
+        options,
+        on_progress=tell,
+        should_stop=stop.asked.is_set,
+        keep_reusable=True,
+    )
+
+
+def _export(order: Order, stop: _Stop) -> None:
+    """The result in further forms; the photos lie in the input where a form needs them."""
+    from biresnerf.data.packs.read_result import read_result
+    from biresnerf.data.packs.write_packs import ON_REQUEST
+
+    assert order.result is not None, "said with every export"
+    forms = TypeAdapter(tuple[PackName, ...]).validate_python(order.options["formats"])
+    photos = order.input if any(order.input.iterdir()) else None
+    refined = read_result(order.result, photos)
+    for form in forms:
+        # Nothing of it is kept when it is stopped, so it need not be asked.
+        ON_REQUEST[form](refined, order.output, stop.asked.is_set)
 
 
 def _protocol_only() -> TextIO:
