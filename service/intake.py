@@ -16,8 +16,8 @@ from service.dependencies import Service
 from service.problems import ProblemError
 from service.unpack import UnpackRequest
 from service.uploads import staging_folder, write_stream
+from workers.claim import insist
 from workers.errors import Conflict, EngineError, LimitReached, NotFound, Unavailable
-from workers.ledger import insist
 from workers.records import DatasetRecord, JobError, Upload
 
 logger = logging.getLogger(__name__)
