@@ -5,16 +5,17 @@ VENV ?= .venv
 EXTRAS ?= service,colmap,compare,dev
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+TOOLS := $(VENV)/tools
 # Pins for what is installed and, under the names that older and newer pips know, for what builds it.
 export PIP_CONSTRAINT := constraints.txt
 export PIP_BUILD_CONSTRAINT := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test lint format demo serve bench openapi fuzz
+.PHONY: help setup test lint format demo serve bench openapi fuzz audit sbom
 .DELETE_ON_ERROR:
 
 help:  ## what there is
-	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' Makefile | expand -t 8
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' Makefile | expand -t 16
 
 setup: $(INSTALLED)  ## the environment in .venv, with everything installed
 
@@ -42,6 +43,20 @@ openapi: setup  ## write docs/openapi.json anew, after a change of the HTTP inte
 
 fuzz: setup  ## thousands of made-up requests against a real service; FUZZ="arguments"
 	$(BIN)/python -m tests.service.fuzzing $(FUZZ)
+
+audit: $(TOOLS)  ## known faults of the pinned libraries; AUDIT="-s osv" asks another database
+	$(TOOLS)/bin/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict $(AUDIT)
+
+sbom: setup $(TOOLS)  ## what is installed, as CycloneDX, in build/sbom.json
+	@mkdir -p build
+	$(TOOLS)/bin/cyclonedx-py environment --pyproject pyproject.toml --gather-license-texts \
+	  --output-reproducible --output-file build/sbom.json $(BIN)/python
+
+# Tools that need libraries of their own stay out of the environment that they look at.
+$(TOOLS): constraints.txt
+	$(PYTHON) -m venv --clear $(TOOLS)
+	$(TOOLS)/bin/python -m pip install --quiet -c constraints.txt pip-audit cyclonedx-bom
+	@touch $@
 
 # Without ensurepip the venv module leaves half an environment behind, so it is looked for first.
 $(BIN)/python:
