@@ -45,7 +45,37 @@ QUIET_S = 60.0  # between two warnings of the same outage
 
 
 class PatientConnector(PsycopgConnector):
-    """The queue's connector, except that its listener outlives a restart of the database."""
+    """The queue's connector, except that its listener outlives a restart of the database.
+
+    And that a query is given up where no answer comes: the line may be dead with both its ends alive.
+    """
+
+    def __init__(self, answer_s: float, **options: Any) -> None:
+        super().__init__(**options)
+        self._answer_s = answer_s
+
+    async def execute_query_async(self, query: LiteralString, **arguments: Any) -> None:
+        """As the engine's."""
+        async with self._in_time():
+            await super().execute_query_async(query, **arguments)
+
+    async def execute_query_one_async(self, query: LiteralString, **arguments: Any) -> dict[str, Any]:
+        """As the engine's."""
+        async with self._in_time():
+            return await super().execute_query_one_async(query, **arguments)
+
+    async def execute_query_all_async(self, query: LiteralString, **arguments: Any) -> list[dict[str, Any]]:
+        """As the engine's."""
+        async with self._in_time():
+            return await super().execute_query_all_async(query, **arguments)
+
+    @asynccontextmanager
+    async def _in_time(self) -> AsyncIterator[None]:
+        try:
+            async with asyncio.timeout(self._answer_s):
+                yield
+        except TimeoutError as error:
+            raise ConnectorException(f"no answer within {self._answer_s:g} s") from error
 
     async def listen_notify(self, on_notification: Notify, channels: Iterable[str]) -> None:
         """Listen for ever; while the database is away, try again each second (polling fills the gap)."""
@@ -63,15 +93,23 @@ class PatientConnector(PsycopgConnector):
 class Database:
     """One process's pool and queue app. Use `open_database`."""
 
-    def __init__(self, url: str, pool: AsyncConnectionPool[Connection], app: App) -> None:
-        self.url, self.pool, self.app = url, pool, app
+    def __init__(self, url: str, pool: AsyncConnectionPool[Connection], app: App, answer_s: float) -> None:
+        self.url, self.pool, self.app, self._answer_s = url, pool, app, answer_s
 
     @asynccontextmanager
     async def transaction(self) -> AsyncIterator[Connection]:
-        """A connection inside one transaction; raises `Unavailable` where the database is away."""
+        """A connection inside one transaction; raises `Unavailable` where the database is away.
+
+        Also where it takes longer than it may: a connection can fall silent without an end.
+        """
         try:
-            async with self.pool.connection() as connection:
+            async with asyncio.timeout(self._answer_s), self.pool.connection() as connection:
                 yield connection
+        except TimeoutError as error:
+            await self.pool.drain()  # where one line is dead the others are, and each would cost as long
+            raise Unavailable(
+                "database_unavailable", f"The database did not answer within {self._answer_s:g} s."
+            ) from error
         except AWAY as error:
             raise Unavailable(
                 "database_unavailable", f"The database does not answer: {first_line(error)}"
@@ -102,6 +140,7 @@ async def open_database(
     patience_s: float = 10.0,
     opening_s: float = 30.0,
     silence_s: float = 60.0,
+    answer_s: float = 20.0,
 ) -> AsyncIterator[Database]:
     """Pool and queue app, closed at the end.
 
@@ -110,6 +149,7 @@ async def open_database(
         patience_s: how long a caller waits for a free and living connection.
         opening_s: how long to wait for the database at the start.
         silence_s: a transaction in which nothing is asked for so long is rolled back by the database.
+        answer_s: how long a transaction may take; a database that does not answer for so long is away.
 
     Raises `SetupError` if the database does not answer in time or is not migrated.
     """
@@ -145,9 +185,9 @@ async def open_database(
             "database_unreachable", f"The database at {without_password(url)} does not answer."
         ) from None
     try:
-        app = App(connector=PatientConnector(conninfo=url, kwargs=CONNECT))
+        app = App(connector=PatientConnector(answer_s, conninfo=url, kwargs=CONNECT))
         async with app.open_async(pool):
-            database = Database(url, pool, app)
+            database = Database(url, pool, app, answer_s)
             await _require_schema(database)
             yield database
     finally:

@@ -9,10 +9,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Awaitable, Callable, Collection
 
-import psycopg
-from procrastinate.exceptions import ConnectorException
 from psycopg.types.json import Jsonb
 
 from workers.database import QUEUE, Connection, Database
@@ -57,14 +55,19 @@ class Janitor:
 
     async def run(self) -> None:
         """Rounds until cancelled."""
+        # Apart, for it can take long, and the pauses between two rounds tell something.
+        await asyncio.gather(self._again_and_again(self._round), self._again_and_again(self._take_trash_out))
+
+    async def _again_and_again(self, duty: Callable[[], Awaitable[None]]) -> None:
         while True:
             await asyncio.sleep(self._settings.janitor_s)
             try:
-                await self._round()
+                await duty()
             except Unavailable as error:
                 log.warning("janitor: %s", error)
-                self._healthy_since, self._saw_outage = None, True
-            except (psycopg.Error, ConnectorException, OSError):
+                if error.code == "database_unavailable":
+                    self._healthy_since, self._saw_outage = None, True
+            except Exception:  # it must not end: nobody would take its place here
                 log.exception("janitor: this round failed")
 
     async def _round(self) -> None:
@@ -86,7 +89,6 @@ class Janitor:
                     await self._release_stalled(connection)
                 await self._requeue_lost(connection)
                 await fold_tallies(connection)
-        await self._take_trash_out()
         if time.monotonic() >= self._upkeep_at:
             self._upkeep_at = time.monotonic() + UPKEEP_S
             await self._database.app.job_manager.delete_old_jobs(
@@ -158,14 +160,12 @@ class Janitor:
             )
 
     async def _take_trash_out(self) -> None:
-        async with self._database.transaction() as connection:
-            cursor = await connection.execute(
-                "SELECT id, prefix, keep FROM trash WHERE not_before <= clock_timestamp()"
-                " ORDER BY id LIMIT 20 FOR UPDATE SKIP LOCKED"
-            )
-            for row in await cursor.fetchall():
-                await self._files.delete_prefix(row["prefix"], keep=row["keep"])
-                await connection.execute("DELETE FROM trash WHERE id = %s", (row["id"],))
+        # Outside of a transaction: a thousand files in a bucket take their time. Two of us do no harm.
+        for row in await self._database.fetch(
+            "SELECT id, prefix, keep FROM trash WHERE not_before <= clock_timestamp() ORDER BY id LIMIT 20"
+        ):
+            await self._files.delete_prefix(row["prefix"], keep=row["keep"])
+            await self._database.fetch("DELETE FROM trash WHERE id = %s", row["id"])
 
 
 async def release(connection: Connection, queue_id: int, why: str) -> None:

@@ -73,6 +73,9 @@ class Settings(BaseSettings):
     slots: int = Field(1, ge=0, le=64, description="Jobs that run at the same time on this machine.")
     beat_s: float = Field(10.0, gt=0, description="Seconds between two signs of life of a worker.")
     stall_s: float = Field(60.0, gt=0, description="A worker silent for so long is taken for dead.")
+    answer_s: float = Field(
+        20.0, gt=0, description="A database that does not answer for so long is taken for away."
+    )
     poll_s: float = Field(2.0, gt=0, description="Seconds between two looks where a notification was lost.")
     janitor_s: float = Field(5.0, gt=0, description="Seconds between two rounds of the janitor.")
     stop_grace_s: float = Field(

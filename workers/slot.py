@@ -104,7 +104,10 @@ class Slot:
         shutil.rmtree(self._scratch, ignore_errors=True)  # a predecessor's; the lock says it is gone
         self._scratch.mkdir(parents=True)
         async with open_database(
-            self._settings.require_database_url(), connections=5, silence_s=self._settings.stall_s
+            self._settings.require_database_url(),
+            connections=5,
+            silence_s=self._settings.stall_s,
+            answer_s=self._settings.answer_s,
         ) as database:
             if (predecessor := self._lock.predecessor) is not None:
                 await insist(lambda: release_worker(database, predecessor))
@@ -122,7 +125,9 @@ class Slot:
                 fetch_job_polling_interval=self._settings.poll_s,
                 abort_job_polling_interval=self._settings.poll_s,
             )
-            beat = Beat(database.url, self._settings.beat_s, self._worker_id)
+            # Time for a second try, on another connection, before anybody takes us for dead.
+            in_time_s = self._settings.stall_s / 3
+            beat = Beat(database.url, self._settings.beat_s, self._worker_id, answer_s=in_time_s)
             beat.start()
             janitor = Janitor(database, self._files, self._settings, self._worker_id, self._running)
             side = [asyncio.create_task(janitor.run()), asyncio.create_task(self._remember(database))]

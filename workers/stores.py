@@ -38,7 +38,9 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
     Raises `SetupError`. Opening waits up to 30 s for the database.
     """
     files = open_files(settings)
-    async with open_database(settings.require_database_url(), silence_s=settings.stall_s) as database:
+    async with open_database(
+        settings.require_database_url(), silence_s=settings.stall_s, answer_s=settings.answer_s
+    ) as database:
         await require_same_store(database, files)
         listener = Listener(database, FOLLOW_POLL_S)
         listening = asyncio.create_task(listener.run())

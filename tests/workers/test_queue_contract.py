@@ -21,7 +21,6 @@ from workers.janitor import Janitor, release, release_worker
 from workers.settings import Settings
 
 FUNCTIONS = {
-    "procrastinate_update_heartbeat_v1": "bigint",
     "procrastinate_cancel_job_v1": "bigint, boolean, boolean",
     "procrastinate_finish_job_v1": "bigint, procrastinate_job_status, boolean",
     "procrastinate_retry_job_v2": "bigint, timestamp with time zone, integer, character varying, character varying",
