@@ -17,6 +17,7 @@ from starlette.routing import Route
 from biresnerf import __version__
 from biresnerf.errors import InputError
 from service import docs_page
+from service.access import Access, say_who_is_let_in
 from service.dependencies import Service
 from service.intake import take_upload
 from service.json_body import validation_problem
@@ -63,6 +64,7 @@ def create_app(settings: Settings) -> FastAPI:
                 logger.info("removed %d unfinished uploads", swept)
             service.keep_running(asyncio.create_task(_check_unfinished(service)))
             service.keep_running(asyncio.create_task(_tend_uploads(service)))
+            await say_who_is_let_in(service)
             try:
                 yield
             finally:
@@ -82,7 +84,8 @@ def create_app(settings: Settings) -> FastAPI:
         redoc_url=None,
         redirect_slashes=False,
     )
-    app.add_middleware(RequestContext)
+    app.add_middleware(Access)
+    app.add_middleware(RequestContext)  # it tells what Access refuses
     app.add_middleware(Observed, metrics=metrics)
     _answer_with_problems(app)
     for router in _ROUTERS:

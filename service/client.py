@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, TypeVar
@@ -46,18 +46,36 @@ class Happening(NamedTuple):
     data: dict[str, Any]
 
 
+class _Bearer(httpx.Auth):
+    """Shows the key to its own service alone, wherever a link or a redirection leads."""
+
+    def __init__(self, home: httpx.URL, api_key: str) -> None:
+        self._home, self._header = home, f"Bearer {api_key}"
+
+    def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response]:
+        url, home = request.url, self._home
+        if (url.scheme, url.host, url.port) == (home.scheme, home.host, home.port):
+            request.headers["Authorization"] = self._header
+        yield request
+
+
 class Client:
     """Talks to one service. Use as a context manager.
 
     Every method raises `ServiceError`.
     """
 
-    def __init__(self, url: str, *, patience_s: float = 60.0) -> None:
+    def __init__(self, url: str, *, api_key: str | None = None, patience_s: float = 60.0) -> None:
         """``patience_s``: how long a service that cannot be reached is tried again while following a job."""
         self.url = url.rstrip("/")
         self._patience_s = patience_s
         timeout = httpx.Timeout(30.0, read=120.0, write=120.0)
-        self._http = httpx.Client(base_url=self.url, timeout=timeout, headers={"Accept": "application/json"})
+        self._http = httpx.Client(
+            base_url=self.url,
+            timeout=timeout,
+            headers={"Accept": "application/json"},
+            auth=_Bearer(httpx.URL(self.url), api_key) if api_key else None,
+        )
 
     def __enter__(self) -> Client:
         return self

@@ -151,8 +151,17 @@ def migrate_command() -> None:
 @click.option(
     "--url", envvar="BIRESNERF_URL", default=DEFAULT_URL, show_default=True, help="Where the service is."
 )
+@click.option(
+    "--api-key", envvar="BIRESNERF_API_KEY", help="Better in BIRESNERF_API_KEY: others see command lines."
+)
 def submit_command(
-    path: Path, preset: str | None, settings: dict[str, Any], wait: bool, output: Path | None, url: str
+    path: Path,
+    preset: str | None,
+    settings: dict[str, Any],
+    wait: bool,
+    output: Path | None,
+    url: str,
+    api_key: str | None,
 ) -> None:
     """Send PATH (a folder, or a file with poses in a folder of images) to a service.
 
@@ -163,7 +172,7 @@ def submit_command(
     from service.submit import run_submit
 
     options = parse_options({**settings, **({"preset": preset} if preset else {})})
-    run_submit(path, options, wait=wait, output=output, url=url)
+    run_submit(path, options, wait=wait, output=output, url=url, api_key=api_key)
 
 
 @click.command("demo")

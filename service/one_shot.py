@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fastapi import Request
 
-from service.dependencies import Service
+from service.access import Caller
 from service.intake import file_sha256, take_archive
 from service.json_body import fit, load_json
 from service.problems import FieldProblem, ProblemError
@@ -22,17 +22,18 @@ from workers.records import Job
 _FORM_BYTES = 2**20
 
 
-async def submit_form(service: Service, request: Request, idempotency_key: str | None) -> tuple[Job, bool]:
+async def submit_form(caller: Caller, request: Request, idempotency_key: str | None) -> tuple[Job, bool]:
     """Takes the form (`archive`, JSON texts `options`, `labels`); returns the job and whether it is new.
 
     A repeated request with the same key is known by the archive's digest, before anything is unpacked.
-    Where anything is wrong, the dataset made for it is deleted again.
+    Where anything is wrong, the dataset made for it is deleted again. Needs the scope ``datasets:write``.
     """
-    limit = service.settings.max_archive_bytes + _FORM_BYTES
-    refuse_announced_excess(request.headers.get("content-length"), limit, service.room)
-    async with staging_folder(service.staging_dir) as folder:
+    caller.require("datasets:write")
+    limit = caller.service.settings.max_archive_bytes + _FORM_BYTES
+    refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.room)
+    async with staging_folder(caller.service.staging_dir) as folder:
         archive = folder / "archive"
-        form = Form("archive", {"options", "labels"}, archive, limit, service.room)
+        form = Form("archive", {"options", "labels"}, archive, limit, caller.service.room)
         await form.read(request.headers["content-type"], request.stream())
         if not form.has_file:
             detail = "The form has no file field `archive`."
@@ -42,25 +43,25 @@ async def submit_form(service: Service, request: Request, idempotency_key: str |
         texts = _texts(form)
         digest = await asyncio.to_thread(file_sha256, archive)
         if idempotency_key is not None:
-            known = await service.stores.jobs.repeated(digest, texts.options, texts.labels, idempotency_key)
+            known = await caller.jobs.repeated(digest, texts.options, texts.labels, idempotency_key)
             if known is not None:
                 return known, False
         into = folder / "content"
         into.mkdir()
-        return await _make_job(service, archive, into, texts, digest, idempotency_key)
+        return await _make_job(caller, archive, into, texts, digest, idempotency_key)
 
 
 async def _make_job(
-    service: Service, archive: Path, into: Path, texts: JobTexts, digest: str, idempotency_key: str | None
+    caller: Caller, archive: Path, into: Path, texts: JobTexts, digest: str, idempotency_key: str | None
 ) -> tuple[Job, bool]:
-    datasets = service.stores.datasets
+    datasets = caller.datasets
     dataset = await datasets.create("one-shot")
     used = False
     try:
-        await take_archive(service, dataset.id, archive, into)
-        await begin_check(service, dataset.id)
-        await finish_check(service, dataset.id)
-        job, used = await service.stores.jobs.submit(
+        await take_archive(caller.service, dataset.id, archive, into)
+        await begin_check(caller, dataset.id)
+        await finish_check(caller, dataset.id)
+        job, used = await caller.jobs.submit(
             dataset.id,
             texts.options,
             labels=texts.labels,

@@ -10,6 +10,7 @@ from typing import Any
 
 from fastapi import FastAPI
 
+from service.access import REFUSALS
 from service.examples import EXAMPLES
 from service.problems import MEDIA_TYPE, declared
 
@@ -40,7 +41,8 @@ _LINKS: dict[str, tuple[str, dict[str, Any]]] = {
     "submitJob": ("202", {**_by_path("getJob", "job_id"), **_by_path("cancelJob", "job_id")}),
 }
 # What a request may be answered with before it reaches its operation.
-_ANYWHERE = declared("malformed_request", "head_timeout", "headers_too_large", "internal_error")
+_ANY = ("malformed_request", "head_timeout", "headers_too_large", "internal_error")
+_ANYWHERE, _GUARDED = declared(*_ANY), declared(*_ANY, *REFUSALS)
 # FastAPI's own form of a 422, which this service never answers with.
 _UNUSED = ("HTTPValidationError", "ValidationError")
 
@@ -55,7 +57,8 @@ def describe(app: FastAPI) -> None:
         document = generate()
         for path in document["paths"].values():
             for method, operation in path.items():
-                operation["responses"] = _answers(operation["responses"])
+                early = _GUARDED if operation.get("security") else _ANYWHERE
+                operation["responses"] = _answers(operation["responses"], early)
                 if method == "head":
                     operation["responses"]["200"].pop("content", None)
                 status, links = _LINKS.get(operation["operationId"], ("", {}))
@@ -72,17 +75,17 @@ def describe(app: FastAPI) -> None:
     app.openapi = openapi  # type: ignore[method-assign]
 
 
-def _answers(responses: dict[str, Any]) -> dict[str, Any]:
-    """The answers in order of status, problems as problems, with those that any request may get."""
+def _answers(responses: dict[str, Any], early: dict[int | str, dict[str, Any]]) -> dict[str, Any]:
+    """The answers in order of status, problems as problems, with those that come before the operation."""
     told: dict[str, Any] = {}
-    for status, response in sorted({**{str(key): {} for key in _ANYWHERE}, **responses}.items()):
+    for status, response in sorted({**{str(key): {} for key in early}, **responses}.items()):
         if int(status) < 400:
             told[status] = response
             continue
         # Without examples it is FastAPI's own 422, which it declares wherever there are parameters.
         examples = dict(response.get("content", {}).get(MEDIA_TYPE, {}).get("examples", {}))
-        if int(status) in _ANYWHERE:
-            examples |= _ANYWHERE[int(status)]["content"][MEDIA_TYPE]["examples"]
+        if int(status) in early:
+            examples |= early[int(status)]["content"][MEDIA_TYPE]["examples"]
         if examples:
             told[status] = {
                 "description": f"{HTTPStatus(int(status)).phrase}: `{'`, `'.join(examples)}`",

@@ -58,13 +58,21 @@ def download_all(client: Client, job: JobView, output: Path) -> list[Path]:
     return written
 
 
-def run_submit(path: Path, options: RefineOptions, *, wait: bool, output: Path | None, url: str) -> None:
+def run_submit(
+    path: Path,
+    options: RefineOptions,
+    *,
+    wait: bool,
+    output: Path | None,
+    url: str,
+    api_key: str | None = None,
+) -> None:
     """The command's work; raises `InputError` (the user's to mend) or another `BiresnerfError`."""
     if output is not None:
         require_empty(output)
     scene = look_at(path)
     try:
-        with Client(url) as client:
+        with Client(url, api_key=api_key) as client:
             click.echo(f"sending {len(scene.files)} files, {scene.total_bytes / 1e6:.1f} MB", err=True)
             job = submit_scene(client, scene, path.resolve().name, options)
             click.echo(f"{client.url}{job.links.self}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import AsyncIterable, Sequence
+from copy import copy
 from typing import Any
 
 from psycopg.types.json import Jsonb
@@ -17,6 +18,7 @@ from workers.files import FileStore, StoredFile
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
 from workers.records import DatasetFile, DatasetRecord, DatasetState, ManifestEntry, Page
 from workers.settings import Settings
+from workers.tenants import LOCAL_TENANT
 
 # The file store keeps such names for uploads under way.
 RESERVED_NAME = re.compile(r"#\d+$")
@@ -27,6 +29,8 @@ DATASET = """
             AND file.path = entry ->> 'path')) AS missing
     FROM datasets LEFT JOIN LATERAL (SELECT count(*) AS files, sum(size) AS bytes
         FROM dataset_files WHERE dataset_id = datasets.id) AS total ON true"""
+# With the store's tenant as parameter; none for everybody's.
+MINE = "datasets.tenant = coalesce(%s, datasets.tenant)"
 
 FILE = "SELECT path, key, size, sha256, created_at FROM dataset_files"
 
@@ -34,12 +38,21 @@ FILE = "SELECT path, key, size, sha256, created_at FROM dataset_files"
 class DatasetStore:
     """Datasets in the database and the file store. Get one from `workers.stores.open_stores`.
 
-    Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
+    As opened it sees everybody's datasets; `of` gives it as one tenant sees it, to whom a dataset of another
+    is as unknown as one that never was. Every method raises `Unavailable` (``database_unavailable``) where
+    the database does not answer.
     """
 
     def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:
         self._database, self._files, self._settings = database, files, settings
         self._checker = Checker(database, files, settings)
+        self._tenant: str | None = None
+
+    def of(self, tenant: str | None) -> DatasetStore:
+        """The store as this tenant sees it; none: as the operator does."""
+        bound = copy(self)
+        bound._tenant = tenant
+        return bound
 
     async def create(self, name: str, manifest: Sequence[ManifestEntry] = ()) -> DatasetRecord:
         """An empty dataset in state ``open``; raises `LimitReached` (``too_many_files``)."""
@@ -50,15 +63,18 @@ class DatasetStore:
         dataset_id = new_id("ds")
         async with self._database.transaction() as connection:
             await connection.execute(
-                "INSERT INTO datasets (id, name, manifest) VALUES (%s, %s, %s)",
-                (dataset_id, name, Jsonb([entry.model_dump() for entry in manifest])),
+                "INSERT INTO datasets (id, tenant, name, manifest) VALUES (%s, %s, %s, %s)",
+                (
+                    *(dataset_id, self._tenant or LOCAL_TENANT, name),
+                    Jsonb([entry.model_dump() for entry in manifest]),
+                ),
             )
-            return await _required(connection, dataset_id)
+            return await self._required(connection, dataset_id)
 
     async def get(self, dataset_id: str) -> DatasetRecord:
         """The dataset; raises `NotFound`."""
         async with self._database.transaction() as connection:
-            return await _required(connection, dataset_id)
+            return await self._required(connection, dataset_id)
 
     async def list(
         self, *, state: DatasetState | None = None, limit: int = 50, cursor: str | None = None
@@ -66,10 +82,10 @@ class DatasetStore:
         """Datasets, newest first; raises `InputError` (``bad_cursor``)."""
         created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
         rows = await self._database.fetch(
-            DATASET + " WHERE (%s::text IS NULL OR state = %s)"
+            DATASET + f" WHERE {MINE} AND (%s::text IS NULL OR state = %s)"
             " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
             " ORDER BY created_at DESC, id DESC LIMIT %s",
-            *(state, state),
+            *(self._tenant, state, state),
             *((cursor_time(created),) * 2 if created else (None, None)),
             *(last_id, limit + 1),
         )
@@ -113,7 +129,7 @@ class DatasetStore:
         self, connection: Connection, dataset_id: str, path: str, *, overwrite: bool, size: int = 0
     ) -> dict[str, Any]:
         """The dataset's row, locked, with the bytes and files it would have besides ``path``."""
-        await require_open(connection, dataset_id)
+        await require_open(connection, dataset_id, self._tenant)
         cursor = await connection.execute(
             "SELECT count(*) FILTER (WHERE path <> %s) AS files, count(*) FILTER (WHERE path = %s) AS same,"
             " coalesce(sum(size) FILTER (WHERE path <> %s), 0)::bigint AS bytes"
@@ -134,7 +150,11 @@ class DatasetStore:
 
     async def file(self, dataset_id: str, path: str) -> DatasetFile:
         """One file; raises `NotFound`."""
-        rows = await self._database.fetch(FILE + " WHERE dataset_id = %s AND path = %s", dataset_id, path)
+        rows = await self._database.fetch(
+            FILE + " WHERE dataset_id = %s AND path = %s"
+            f" AND EXISTS (SELECT 1 FROM datasets WHERE id = dataset_files.dataset_id AND {MINE})",
+            *(dataset_id, path, self._tenant),
+        )
         if not rows:
             raise NotFound(f"Dataset {dataset_id} has no file {path}.")
         return DatasetFile.model_validate(rows[0])
@@ -145,7 +165,7 @@ class DatasetStore:
         """The files, by path; raises `NotFound`, `InputError` (``bad_cursor``)."""
         after = cursor_place(cursor, 1)[0] if cursor else ""
         async with self._database.transaction() as connection:
-            await _required(connection, dataset_id)
+            await self._required(connection, dataset_id)
             found = await connection.execute(
                 FILE + " WHERE dataset_id = %s AND path > %s ORDER BY path LIMIT %s",
                 (dataset_id, after, limit + 1),
@@ -161,8 +181,8 @@ class DatasetStore:
         Then call `check` (in a background task, or awaited), which leads to ``ready`` or ``rejected``.
         """
         async with self._database.transaction() as connection:
-            await connection.execute("SELECT 1 FROM datasets WHERE id = %s FOR UPDATE", (dataset_id,))
-            dataset = await _required(connection, dataset_id)
+            await _locked(connection, dataset_id, self._tenant)
+            dataset = await self._required(connection, dataset_id)
             if dataset.state != "open":
                 return dataset
             if dataset.missing or not dataset.files:
@@ -172,7 +192,7 @@ class DatasetStore:
                 "UPDATE datasets SET state = 'finalizing', revision = revision + 1 WHERE id = %s",
                 (dataset_id,),
             )
-            return await _required(connection, dataset_id)
+            return await self._required(connection, dataset_id)
 
     async def check(self, dataset_id: str) -> DatasetRecord:
         """Validate a ``finalizing`` dataset in a child process and write the outcome; idempotent.
@@ -190,8 +210,8 @@ class DatasetStore:
     async def delete(self, dataset_id: str) -> None:
         """Delete a dataset with its files; raises `NotFound`, `Conflict` (``dataset_in_use`` by jobs)."""
         async with self._database.transaction() as connection:
-            await connection.execute("SELECT 1 FROM datasets WHERE id = %s FOR UPDATE", (dataset_id,))
-            await _required(connection, dataset_id)
+            await _locked(connection, dataset_id, self._tenant)
+            await self._required(connection, dataset_id)
             cursor = await connection.execute(
                 "SELECT id, state FROM jobs WHERE dataset_id = %s", (dataset_id,)
             )
@@ -202,6 +222,13 @@ class DatasetStore:
                 )
             await connection.execute("DELETE FROM datasets WHERE id = %s", (dataset_id,))
             await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (f"datasets/{dataset_id}",))
+
+    async def _required(self, connection: Connection, dataset_id: str) -> DatasetRecord:
+        sql = DATASET + f" WHERE datasets.id = %s AND {MINE}"
+        row = await (await connection.execute(sql, (dataset_id, self._tenant))).fetchone()
+        if row is None:
+            raise NotFound(f"No dataset {dataset_id}.")
+        return _record(row)
 
 
 async def _record_file(
@@ -225,16 +252,21 @@ async def _record_file(
     return DatasetFile.model_validate(await cursor.fetchone()), before is None
 
 
-async def require_open(connection: Connection, dataset_id: str) -> None:
+async def require_open(connection: Connection, dataset_id: str, tenant: str | None) -> None:
     """Locks the dataset's row; raises `NotFound`, `Conflict` (``dataset_not_open``)."""
-    cursor = await connection.execute("SELECT state FROM datasets WHERE id = %s FOR UPDATE", (dataset_id,))
-    dataset = await cursor.fetchone()
-    if dataset is None:
+    state = await _locked(connection, dataset_id, tenant)
+    if state != "open":
+        raise Conflict("dataset_not_open", f"Dataset {dataset_id} is {state}; it takes no more files.")
+
+
+async def _locked(connection: Connection, dataset_id: str, tenant: str | None) -> DatasetState:
+    """The state of the dataset, which stays as it is until the transaction ends; raises `NotFound`."""
+    sql = f"SELECT state FROM datasets WHERE id = %s AND {MINE} FOR UPDATE"
+    row = await (await connection.execute(sql, (dataset_id, tenant))).fetchone()
+    if row is None:
         raise NotFound(f"No dataset {dataset_id}.")
-    if dataset["state"] != "open":
-        raise Conflict(
-            "dataset_not_open", f"Dataset {dataset_id} is {dataset['state']}; it takes no more files."
-        )
+    state: DatasetState = row["state"]
+    return state
 
 
 def file_key(folder: str, path: str) -> str:
@@ -246,13 +278,5 @@ def file_key(folder: str, path: str) -> str:
     return f"{folder}/{path}"
 
 
-async def _required(connection: Connection, dataset_id: str) -> DatasetRecord:
-    row = await (await connection.execute(DATASET + " WHERE datasets.id = %s", (dataset_id,))).fetchone()
-    if row is None:
-        raise NotFound(f"No dataset {dataset_id}.")
-    return _record(row)
-
-
 def _record(row: dict[str, Any]) -> DatasetRecord:
-    same = ("id", "name", "state", "files", "bytes", "missing", "report", "error", "created_at", "revision")
-    return DatasetRecord.model_validate({key: row[key] for key in same})
+    return DatasetRecord.model_validate({key: row[key] for key in DatasetRecord.model_fields})

@@ -17,26 +17,32 @@ from workers.endings import finish_cancelled
 from workers.errors import Conflict, LimitReached, NotFound
 from workers.follow import Listener, follow
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
-from workers.records import Artifact, Job, JobError, JobEvent, JobProgress, JobState, JobUpdate, LogLine, Page
+from workers.job_rows import JOB, MINE, job_from_row
+from workers.records import Artifact, Job, JobEvent, JobState, JobUpdate, LogLine, Page
 from workers.settings import Settings
+from workers.tenants import LOCAL_TENANT
 
 # Two submits at once must not both take the last place.
 QUEUE_LIMIT_LOCK = 7_201_604
-JOB = """
-    SELECT jobs.*, CASE WHEN jobs.state = 'queued' THEN
-        (SELECT count(*) FROM jobs AS ahead WHERE ahead.state = 'queued' AND ahead.queue_id <= jobs.queue_id)
-        END AS queue_position
-    FROM jobs"""
 
 
 class JobStore:
     """Jobs in the database. Get one from `workers.stores.open_stores`.
 
-    Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
+    As opened it sees everybody's jobs; `of` gives it as one tenant sees it, to whom a job of another is as
+    unknown as one that never was. Every method raises `Unavailable` (``database_unavailable``) where the
+    database does not answer.
     """
 
-    def __init__(self, database: Database, listener: Listener, settings: Settings) -> None:
+    def __init__(
+        self, database: Database, listener: Listener, settings: Settings, tenant: str | None = None
+    ) -> None:
         self._database, self._listener, self._settings = database, listener, settings
+        self._tenant = tenant
+
+    def of(self, tenant: str | None) -> JobStore:
+        """The store as this tenant sees it; none: as the operator does."""
+        return JobStore(self._database, self._listener, self._settings, tenant)
 
     async def submit(
         self,
@@ -60,18 +66,20 @@ class JobStore:
         async with self._database.transaction() as connection:
             # Serialises submits (a millisecond each): the queue limit and repeated keys need no more thought.
             await connection.execute("SELECT pg_advisory_xact_lock(%s)", (QUEUE_LIMIT_LOCK,))
+            tenant = await self._tenant_of(connection, dataset_id)
             if idempotency_key is not None:
-                known = await _known(connection, idempotency_key, fingerprint)
+                known = await _known(connection, tenant, idempotency_key, fingerprint)
                 if known is not None:
                     return known, False
             await self._require_room(connection, dataset_id)
             job_id = new_id("job")
             await connection.execute(
-                "INSERT INTO jobs (id, dataset_id, options, labels, idempotency_key, fingerprint)"
-                " VALUES (%s, %s, %s, %s, %s, %s)",
+                "INSERT INTO jobs (id, dataset_id, tenant, options, labels, idempotency_key, fingerprint)"
+                " VALUES (%s, %s, %s, %s, %s, %s, %s)",
                 (
                     job_id,
                     dataset_id,
+                    tenant,
                     Jsonb(resolved),
                     Jsonb(dict(labels or {})),
                     idempotency_key,
@@ -81,11 +89,23 @@ class JobStore:
             queue_id = await self._database.enqueue(connection, job_id)
             await connection.execute("UPDATE jobs SET queue_id = %s WHERE id = %s", (queue_id, job_id))
             await connection.execute("SELECT add_job_event(%s, 'queued', '{}')", (job_id,))
-            return job_from_row(await _required(connection, job_id)), True
+            return job_from_row(await self._required(connection, job_id)), True
+
+    async def _tenant_of(self, connection: Connection, dataset_id: str) -> str:
+        """A job belongs to whom its dataset belongs to; raises `NotFound`."""
+        dataset = await _one(
+            connection,
+            "SELECT tenant FROM datasets WHERE id = %s AND tenant = coalesce(%s, tenant)",
+            *(dataset_id, self._tenant),
+        )
+        if dataset is None:
+            raise NotFound(f"No dataset {dataset_id}.")
+        tenant: str = dataset["tenant"]
+        return tenant
 
     async def _require_room(self, connection: Connection, dataset_id: str) -> None:
         dataset = await _one(connection, "SELECT state FROM datasets WHERE id = %s FOR SHARE", dataset_id)
-        if dataset is None:
+        if dataset is None:  # deleted a moment ago
             raise NotFound(f"No dataset {dataset_id}.")
         if dataset["state"] != "ready":
             raise Conflict("dataset_not_ready", f"Dataset {dataset_id} is {dataset['state']}, not ready.")
@@ -102,12 +122,13 @@ class JobStore:
         """
         resolved = options.resolved().model_dump(mode="json")
         async with self._database.transaction() as connection:
-            return await _known(connection, idempotency_key, _fingerprint(request_digest, resolved, labels))
+            fingerprint = _fingerprint(request_digest, resolved, labels)
+            return await _known(connection, self._tenant or LOCAL_TENANT, idempotency_key, fingerprint)
 
     async def get(self, job_id: str) -> Job:
         """The job now; raises `NotFound`."""
         async with self._database.transaction() as connection:
-            return job_from_row(await _required(connection, job_id))
+            return job_from_row(await self._required(connection, job_id))
 
     async def list(
         self,
@@ -120,10 +141,11 @@ class JobStore:
         """Jobs, newest first; raises `InputError` (``bad_cursor``)."""
         created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
         rows = await self._database.fetch(
-            JOB + " WHERE (%s::text IS NULL OR state = %s) AND (%s::jsonb IS NULL OR labels @> %s)"
+            JOB + f" WHERE {MINE}"
+            " AND (%s::text IS NULL OR state = %s) AND (%s::jsonb IS NULL OR labels @> %s)"
             " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
             " ORDER BY created_at DESC, id DESC LIMIT %s",
-            *(state, state),
+            *(self._tenant, state, state),
             *((Jsonb({label[0]: label[1]}),) * 2 if label else (None, None)),
             *((cursor_time(created),) * 2 if created else (None, None)),
             last_id,
@@ -145,10 +167,9 @@ class JobStore:
             changed = await _one(
                 connection,
                 "UPDATE jobs SET cancel_requested = true, keep_partial = %s"
-                " WHERE id = %s AND state IN ('queued', 'running') AND NOT cancel_requested"
+                f" WHERE id = %s AND {MINE} AND state IN ('queued', 'running') AND NOT cancel_requested"
                 " RETURNING queue_id, state",
-                keep_partial,
-                job_id,
+                *(keep_partial, job_id, self._tenant),
             )
             if changed is not None:
                 await connection.execute(
@@ -158,12 +179,16 @@ class JobStore:
                     await finish_cancelled(connection, job_id, stall_s=self._settings.stall_s)
                 else:
                     await connection.execute("SELECT add_job_event(%s, 'cancel_requested', '{}')", (job_id,))
-            return job_from_row(await _required(connection, job_id))
+            return job_from_row(await self._required(connection, job_id))
 
     async def delete(self, job_id: str) -> None:
         """Delete a final job with its files; raises `NotFound`, `Conflict` (``state_conflict``)."""
         async with self._database.transaction() as connection:
-            row = await _one(connection, "SELECT state FROM jobs WHERE id = %s FOR UPDATE", job_id)
+            row = await _one(
+                connection,
+                f"SELECT state FROM jobs WHERE id = %s AND {MINE} FOR UPDATE",
+                *(job_id, self._tenant),
+            )
             if row is None:
                 raise NotFound(f"No job {job_id}.")
             if row["state"] in ("queued", "running"):
@@ -175,12 +200,14 @@ class JobStore:
     async def events(self, job_id: str, *, after: int = 0, limit: int = 1000) -> tuple[JobEvent, ...]:
         """The history after ``seq == after``, gapless and in order; raises `NotFound`."""
         async with self._database.transaction() as connection:
-            await _required(connection, job_id)
+            await self._required(connection, job_id)
             return await _events(connection, job_id, after, limit)
 
     async def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
         """The published files, by name, while the job runs its previews; raises `NotFound`."""
-        rows = await self._database.fetch("SELECT artifacts, previews FROM jobs WHERE id = %s", job_id)
+        rows = await self._database.fetch(
+            f"SELECT artifacts, previews FROM jobs WHERE id = %s AND {MINE}", *(job_id, self._tenant)
+        )
         if not rows:
             raise NotFound(f"No job {job_id}.")
         previews = (rows[0]["previews"] or {}).get("artifacts", [])
@@ -189,7 +216,7 @@ class JobStore:
     async def log(self, job_id: str, *, after: int = 0, limit: int = 1000) -> tuple[LogLine, ...]:
         """What the job's process wrote to standard error, after line ``after``; raises `NotFound`."""
         async with self._database.transaction() as connection:
-            await _required(connection, job_id)
+            await self._required(connection, job_id)
             cursor = await connection.execute(
                 "SELECT n, at, attempt, text FROM job_log WHERE job_id = %s AND n > %s ORDER BY n LIMIT %s",
                 (job_id, after, limit),
@@ -200,7 +227,7 @@ class JobStore:
         """The job and the events after ``after``, seen in one snapshot; raises `NotFound`."""
         async with self._database.transaction() as connection:
             await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
-            job = job_from_row(await _required(connection, job_id))
+            job = job_from_row(await self._required(connection, job_id))
             return JobUpdate(job=job, events=await _events(connection, job_id, after, 10_000))
 
     def subscribe(
@@ -226,12 +253,20 @@ class JobStore:
 
     async def counts(self) -> dict[JobState, int]:
         """How many jobs are in each state."""
-        rows = await self._database.fetch("SELECT state, count(*) AS n FROM jobs GROUP BY state")
+        rows = await self._database.fetch(
+            f"SELECT state, count(*) AS n FROM jobs WHERE {MINE} GROUP BY state", self._tenant
+        )
         return {row["state"]: row["n"] for row in rows}
 
     async def healthy(self) -> bool:
         """Whether the database answers within two seconds."""
         return await self._listener.database_answers(2.0)
+
+    async def _required(self, connection: Connection, job_id: str) -> dict[str, Any]:
+        row = await _one(connection, JOB + f" WHERE id = %s AND {MINE}", *(job_id, self._tenant))
+        if row is None:
+            raise NotFound(f"No job {job_id}.")
+        return row
 
 
 async def _one(connection: Connection, sql: Any, *parameters: Any) -> dict[str, Any] | None:
@@ -243,18 +278,13 @@ def _fingerprint(subject: str, options: dict[str, Any], labels: Mapping[str, str
     return hashlib.sha256(request.encode()).hexdigest()
 
 
-async def _known(connection: Connection, idempotency_key: str, fingerprint: str) -> Job | None:
-    row = await _one(connection, JOB + " WHERE idempotency_key = %s", idempotency_key)
+async def _known(connection: Connection, tenant: str, idempotency_key: str, fingerprint: str) -> Job | None:
+    row = await _one(
+        connection, JOB + " WHERE tenant = %s AND idempotency_key = %s", *(tenant, idempotency_key)
+    )
     if row is not None and row["fingerprint"] != fingerprint:
         raise Conflict("idempotency_key_reused", f"The key was used for another request ({row['id']}).")
     return None if row is None else job_from_row(row)
-
-
-async def _required(connection: Connection, job_id: str) -> dict[str, Any]:
-    row = await _one(connection, JOB + " WHERE id = %s", job_id)
-    if row is None:
-        raise NotFound(f"No job {job_id}.")
-    return row
 
 
 async def _events(connection: Connection, job_id: str, after: int, limit: int) -> tuple[JobEvent, ...]:
@@ -264,22 +294,3 @@ async def _events(connection: Connection, job_id: str, after: int, limit: int) -
         (job_id, after, limit),
     )
     return tuple(JobEvent.model_validate(row) for row in await cursor.fetchall())
-
-
-def job_from_row(row: dict[str, Any]) -> Job:
-    """The public record of a row of `JOB`."""
-    same = (
-        "id",
-        "dataset_id",
-        "state",
-        "stage",
-        "queue_position",
-        "attempt",
-        "cancel_requested",
-        "created_at",
-    )
-    also = ("started_at", "finished_at", "options", "metrics", "message", "verdict", "labels", "revision")
-    life = ("kind", "parent", "forked_from", "forked_stage", "smaller", "partial")
-    progress = JobProgress(**{key: row[key] for key in ("fraction", "step", "steps_total", "eta_s")})
-    error = JobError.model_validate(row["error"]) if row["error"] else None
-    return Job(**{key: row[key] for key in same + also + life}, progress=progress, error=error)

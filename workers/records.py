@@ -69,6 +69,7 @@ class Job(Record):
     """A job as clients see it. ``revision`` grows with every change (use it as a weak ETag)."""
 
     id: str
+    tenant: str = Field("local", description="Whose it is.")
     kind: JobKind = Field("refine", description="`export` writes the result of `parent` in further forms.")
     parent: str | None = Field(None, description="Of an export: the job whose result it writes.")
     forked_from: str | None = Field(None, description="The job that this one started from.")
@@ -159,6 +160,7 @@ class DatasetRecord(Record):
     """A set of uploaded files. ``report`` is what the validation found (or why it was rejected)."""
 
     id: str
+    tenant: str = Field("local", description="Whose it is.")
     name: str
     state: DatasetState
     files: int = 0

@@ -37,6 +37,11 @@ class Settings(BaseSettings):
     pg_bin: Path | None = Field(None, description="Folder with initdb and postgres for the private database.")
     host: str = "127.0.0.1"
     port: int = Field(8000, ge=0, le=65535)
+    auth: Literal["auto", "required", "off"] = Field(
+        "auto",
+        description="Who needs an API key: auto lets everybody in while the service listens on loopback only "
+        "and no key was ever made; required: every caller; off: nobody, on whatever address.",
+    )
 
     log_format: Literal["plain", "json"] = Field("plain", description="Lines for people, or JSON lines.")
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"

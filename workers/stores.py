@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
+from workers.api_keys import KeyStore
 from workers.database import open_database
 from workers.datasets import DatasetStore
 from workers.files import FileStore, open_files
@@ -28,6 +29,7 @@ class Stores:
     datasets: DatasetStore
     files: FileStore
     uploads: UploadStore
+    keys: KeyStore
     monitor: Monitor
 
 
@@ -48,6 +50,7 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
             jobs = JobStore(database, listener, settings)
             monitor = Monitor(database, files, settings.stall_s)
             uploads = UploadStore(database, files, settings)
-            yield Stores(jobs, DatasetStore(database, files, settings), files, uploads, monitor)
+            datasets = DatasetStore(database, files, settings)
+            yield Stores(jobs, datasets, files, uploads, KeyStore(database), monitor)
         finally:
             listening.cancel()

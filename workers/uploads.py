@@ -10,12 +10,12 @@ import contextlib
 import secrets
 import uuid
 from collections.abc import AsyncIterable, AsyncIterator, Iterator
-from typing import Any
+from copy import copy
 
 from psycopg.types.json import Jsonb
 
 from workers.database import Connection, Database
-from workers.datasets import file_key, require_open
+from workers.datasets import MINE, file_key, require_open
 from workers.errors import Conflict, LimitReached, NotFound
 from workers.files import FileStore
 from workers.idents import new_id
@@ -39,12 +39,20 @@ _UPLOAD = (
 class UploadStore:
     """Uploads in the database, their pieces in the file store. Get one from `workers.stores.open_stores`.
 
-    Every method raises `Unavailable` where database or store does not answer.
+    As opened it sees everybody's uploads; `of` gives it as one tenant sees it. Every method raises
+    `Unavailable` where database or store does not answer.
     """
 
     def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:
         self._database, self._files, self._settings = database, files, settings
-        self._appending = 0
+        self._appending = [0]  # shared by the views of all tenants
+        self._tenant: str | None = None
+
+    def of(self, tenant: str | None) -> UploadStore:
+        """The store as this tenant sees it; none: as the operator does."""
+        bound = copy(self)
+        bound._tenant = tenant
+        return bound
 
     async def create(
         self,
@@ -68,7 +76,7 @@ class UploadStore:
         if path is not None:
             file_key(folder, path)
         async with self._database.transaction() as connection:
-            await require_open(connection, dataset_id)
+            await require_open(connection, dataset_id, self._tenant)
             cursor = await connection.execute(
                 "SELECT count(*) AS n FROM uploads WHERE dataset_id = %s", (dataset_id,)
             )
@@ -86,17 +94,18 @@ class UploadStore:
                     ),
                 ),
             )
-            return await _required(connection, upload_id)
+            return await self._required(connection, upload_id)
 
     async def get(self, upload_id: str) -> Upload:
         """The upload; raises `NotFound` (also where it expired)."""
         async with self._database.transaction() as connection:
-            return await _required(connection, upload_id)
+            return await self._required(connection, upload_id)
 
     async def of_dataset(self, dataset_id: str) -> tuple[Upload, ...]:
         """The dataset's uploads that are not stored yet, oldest first."""
         rows = await self._database.fetch(
-            _UPLOAD + " WHERE dataset_id = %s AND uploads.state <> 'stored' ORDER BY uploads.id", dataset_id
+            _UPLOAD + f" WHERE dataset_id = %s AND {MINE} AND uploads.state <> 'stored' ORDER BY uploads.id",
+            *(dataset_id, self._tenant),
         )
         return tuple(Upload.model_validate(row) for row in rows)
 
@@ -129,14 +138,14 @@ class UploadStore:
 
     @contextlib.contextmanager
     def _sharing(self) -> Iterator[None]:
-        self._appending += 1
+        self._appending[0] += 1
         try:
             yield
         finally:
-            self._appending -= 1
+            self._appending[0] -= 1
 
     def _piece_bytes(self) -> int:
-        return min(PIECE_MAX_BYTES, max(PIECE_MIN_BYTES, PIECES_BYTES // self._appending))
+        return min(PIECE_MAX_BYTES, max(PIECE_MIN_BYTES, PIECES_BYTES // self._appending[0]))
 
     async def _add_piece(self, upload: Upload, piece: bytes) -> Upload:
         start, end = upload.received, upload.received + len(piece)
@@ -155,7 +164,7 @@ class UploadStore:
                     "INSERT INTO upload_pieces (upload_id, start, size, key) VALUES (%s, %s, %s, %s)",
                     (upload.id, start, len(piece), key),
                 )
-                return await _required(connection, upload.id)
+                return await self._required(connection, upload.id)
         await self._files.delete(key)
         raise _elsewhere(await self.get(upload.id))
 
@@ -205,7 +214,7 @@ class UploadStore:
     async def delete(self, upload_id: str) -> None:
         """Give an upload up, in any state; raises `NotFound`. What it brought into the dataset stays."""
         async with self._database.transaction() as connection:
-            await _required(connection, upload_id)
+            await self._required(connection, upload_id)
             await connection.execute(
                 "WITH gone AS (DELETE FROM uploads WHERE id = %s RETURNING folder)"
                 " INSERT INTO trash (prefix) SELECT folder FROM gone",
@@ -223,6 +232,13 @@ class UploadStore:
         )
         return len(rows)
 
+    async def _required(self, connection: Connection, upload_id: str) -> Upload:
+        sql = _UPLOAD + f" WHERE uploads.id = %s AND {MINE}"
+        row = await (await connection.execute(sql, (upload_id, self._tenant))).fetchone()
+        if row is None:
+            raise NotFound(f"No upload {upload_id}.")
+        return Upload.model_validate(row)
+
 
 def _elsewhere(upload: Upload) -> Conflict:
     return Conflict("offset_mismatch", f"The upload goes on at byte {upload.received}, state {upload.state}.")
@@ -230,12 +246,3 @@ def _elsewhere(upload: Upload) -> Conflict:
 
 async def _once(content: bytes) -> AsyncIterator[bytes]:
     yield content
-
-
-async def _required(connection: Connection, upload_id: str) -> Upload:
-    row: dict[str, Any] | None = await (
-        await connection.execute(_UPLOAD + " WHERE uploads.id = %s", (upload_id,))
-    ).fetchone()
-    if row is None:
-        raise NotFound(f"No upload {upload_id}.")
-    return Upload.model_validate(row)

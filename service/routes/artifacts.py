@@ -11,8 +11,9 @@ from fastapi import APIRouter, Header, Request
 from fastapi.responses import Response, StreamingResponse
 
 from biresnerf.report import Report
+from service.access import Caller, CallerHere
 from service.conditions import byte_range, none_match
-from service.dependencies import JobId, Service, ServiceHere
+from service.dependencies import JobId
 from service.problems import ProblemError, declared
 from service.schemas import ArtifactList, ArtifactView
 from workers.records import Artifact
@@ -35,9 +36,9 @@ _ANSWERS: dict[int | str, dict[str, Any]] = {
     operation_id="listArtifacts",
     responses=declared("not_found", "database_unavailable", "internal_error"),
 )
-async def list_artifacts(job_id: JobId, service: ServiceHere) -> ArtifactList:
+async def list_artifacts(job_id: JobId, caller: CallerHere) -> ArtifactList:
     """All files of the result; none while the job has no result. A failed job may have `log.txt`."""
-    found = await service.stores.jobs.artifacts(job_id)
+    found = await caller.jobs.artifacts(job_id)
     return ArtifactList(items=[ArtifactView.of(job_id, artifact) for artifact in found])
 
 
@@ -62,13 +63,13 @@ async def get_artifact(
     job_id: JobId,
     name: str,
     request: Request,
-    service: ServiceHere,
+    caller: CallerHere,
     range_: Annotated[str | None, Header(alias="Range", description="`bytes=first-last`")] = None,
     if_range: Annotated[str | None, Header()] = None,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
     """One file. Its strong ETag is the SHA-256 of its bytes."""
-    artifact = await _find(service, job_id, name)
+    artifact = await _find(caller, job_id, name)
     etag = f'"{artifact.sha256}"'
     headers = _headers(artifact, etag)
     if not none_match(if_none_match, etag):
@@ -81,7 +82,7 @@ async def get_artifact(
     status = 206 if part else 200
     if request.method == "HEAD":
         return Response(status_code=status, headers=headers, media_type=artifact.media_type)
-    content = await _opened(service, artifact, first, last + 1)
+    content = await _opened(caller, artifact, first, last + 1)
     return StreamingResponse(content, status_code=status, headers=headers, media_type=artifact.media_type)
 
 
@@ -91,32 +92,32 @@ async def get_artifact(
     response_model=Report,
     responses=declared("not_found", "result_not_ready", "database_unavailable", "internal_error"),
 )
-async def get_report(job_id: JobId, service: ServiceHere) -> Response:
+async def get_report(job_id: JobId, caller: CallerHere) -> Response:
     """The machine-readable account of a finished job (the artifact `report.json`)."""
     try:
-        artifact = await _find(service, job_id, REPORT)
+        artifact = await _find(caller, job_id, REPORT)
     except ProblemError:
-        job = await service.stores.jobs.get(job_id)
+        job = await caller.jobs.get(job_id)
         if job.final:
             raise ProblemError("not_found", f"The job {job.state} without a report.") from None
         raise ProblemError(
             "result_not_ready", f"The job is {job.state}.", headers={"Retry-After": "5"}
         ) from None
-    content = b"".join([chunk async for chunk in service.stores.files.read(artifact.key)])
+    content = b"".join([chunk async for chunk in caller.service.stores.files.read(artifact.key)])
     return Response(content, media_type="application/json", headers={"ETag": f'"{artifact.sha256}"'})
 
 
-async def _find(service: Service, job_id: str, name: str) -> Artifact:
-    for artifact in await service.stores.jobs.artifacts(job_id):
+async def _find(caller: Caller, job_id: str, name: str) -> Artifact:
+    for artifact in await caller.jobs.artifacts(job_id):
         if artifact.name == name:
             return artifact
     raise ProblemError("not_found", f"The job has no file {name[:200]!r}.")
 
 
-async def _opened(service: Service, artifact: Artifact, start: int, end: int) -> AsyncIterator[bytes]:
+async def _opened(caller: Caller, artifact: Artifact, start: int, end: int) -> AsyncIterator[bytes]:
     """The byte stream, begun: a file that is gone makes a 404, not a broken answer."""
-    await service.stores.files.head(artifact.key)
-    return service.stores.files.read(artifact.key, start, end)
+    await caller.service.stores.files.head(artifact.key)
+    return caller.service.stores.files.read(artifact.key, start, end)
 
 
 def _headers(artifact: Artifact, etag: str) -> dict[str, str]:

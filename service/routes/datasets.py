@@ -12,7 +12,8 @@ from fastapi import APIRouter, Depends, Header, Query, Request
 from fastapi.responses import JSONResponse, Response
 
 from biresnerf.errors import InputError
-from service.dependencies import DatasetId, Service, ServiceHere, next_link
+from service.access import Caller, CallerHere, DatasetWriterHere
+from service.dependencies import DatasetId, next_link
 from service.intake import settle_uploads, take_archive
 from service.json_body import json_content, read_json
 from service.problems import ProblemError, declared
@@ -53,12 +54,12 @@ async def _new_dataset(request: Request) -> NewDataset:
     },
 )
 async def create_dataset(
-    body: Annotated[NewDataset, Depends(_new_dataset)], response: Response, service: ServiceHere
+    caller: DatasetWriterHere, body: Annotated[NewDataset, Depends(_new_dataset)], response: Response
 ) -> DatasetView:
     """An empty dataset, to be filled."""
     for entry in body.manifest:
         checked_path(entry.path)
-    dataset = await service.stores.datasets.create(body.name, body.manifest)
+    dataset = await caller.datasets.create(body.name, body.manifest)
     response.headers["Location"] = dataset_url(dataset.id)
     return DatasetView.of(dataset)
 
@@ -67,21 +68,21 @@ async def create_dataset(
 async def list_datasets(
     request: Request,
     response: Response,
-    service: ServiceHere,
+    caller: CallerHere,
     state: DatasetState | None = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     cursor: Annotated[str | None, Query(max_length=500)] = None,
 ) -> DatasetList:
     """Datasets, newest first."""
-    page = await service.stores.datasets.list(state=state, limit=limit, cursor=cursor)
+    page = await caller.datasets.list(state=state, limit=limit, cursor=cursor)
     response.headers.update(next_link(request, page.next_cursor))
     return DatasetList(items=[DatasetView.of(item) for item in page.items], next_cursor=page.next_cursor)
 
 
 @router.get("/{dataset_id}", operation_id="getDataset", responses=declared("not_found", *_ALWAYS))
-async def get_dataset(dataset_id: DatasetId, service: ServiceHere) -> DatasetView:
+async def get_dataset(dataset_id: DatasetId, caller: CallerHere) -> DatasetView:
     """The dataset, with what the check found in it once it is final."""
-    return DatasetView.of(await service.stores.datasets.get(dataset_id))
+    return DatasetView.of(await caller.datasets.get(dataset_id))
 
 
 @router.delete(
@@ -90,9 +91,9 @@ async def get_dataset(dataset_id: DatasetId, service: ServiceHere) -> DatasetVie
     operation_id="deleteDataset",
     responses=declared("not_found", "dataset_in_use", *_WRITES),
 )
-async def delete_dataset(dataset_id: DatasetId, service: ServiceHere) -> None:
+async def delete_dataset(dataset_id: DatasetId, caller: DatasetWriterHere) -> None:
     """Deletes the dataset and its files, unless an unfinished job uses it."""
-    await service.stores.datasets.delete(dataset_id)
+    await caller.datasets.delete(dataset_id)
 
 
 @router.get(
@@ -104,12 +105,12 @@ async def list_files(
     dataset_id: DatasetId,
     request: Request,
     response: Response,
-    service: ServiceHere,
+    caller: CallerHere,
     limit: Annotated[int, Query(ge=1, le=1000)] = 1000,
     cursor: Annotated[str | None, Query(max_length=2000)] = None,
 ) -> FileList:
     """The files received, by path."""
-    page = await service.stores.datasets.files(dataset_id, limit=limit, cursor=cursor)
+    page = await caller.datasets.files(dataset_id, limit=limit, cursor=cursor)
     response.headers.update(next_link(request, page.next_cursor))
     return FileList(items=[FileView.of(item) for item in page.items], next_cursor=page.next_cursor)
 
@@ -140,19 +141,21 @@ async def put_file(
     dataset_id: DatasetId,
     path: str,
     request: Request,
-    service: ServiceHere,
+    caller: DatasetWriterHere,
     content_length: Annotated[int | None, Header(ge=0)] = None,
     repr_digest: Annotated[str | None, Header(description="`sha-256=:BASE64:`")] = None,
     if_none_match: Annotated[str | None, Header(description="`*` forbids to replace a file.")] = None,
 ) -> Response:
     """One file, as raw bytes. The same request again changes nothing."""
-    limit = service.settings.max_file_bytes
+    limit = caller.service.settings.max_file_bytes
     safe = checked_path(path)
-    refuse_announced_excess(None if content_length is None else str(content_length), limit, service.room)
-    file, new = await service.stores.datasets.add_file(
+    refuse_announced_excess(
+        None if content_length is None else str(content_length), limit, caller.service.room
+    )
+    file, new = await caller.datasets.add_file(
         dataset_id,
         safe,
-        capped(request.stream(), limit, room=service.room),
+        capped(request.stream(), limit, room=caller.service.room),
         sha256=_announced_digest(repr_digest),
         overwrite=(if_none_match or "").strip() != "*",
     )
@@ -195,19 +198,19 @@ def _announced_digest(header: str | None) -> str | None:
         }
     },
 )
-async def upload_archive(dataset_id: DatasetId, request: Request, service: ServiceHere) -> DatasetView:
+async def upload_archive(dataset_id: DatasetId, request: Request, caller: DatasetWriterHere) -> DatasetView:
     """All files of a zip, tar or tar.gz, as the raw body. Folders that merely wrap everything are dropped.
 
     All or nothing: where one entry is not acceptable, no file is taken.
     """
-    limit = service.settings.max_archive_bytes
-    refuse_announced_excess(request.headers.get("content-length"), limit, service.room)
-    await service.stores.datasets.get(dataset_id)
-    async with staging_folder(service.staging_dir) as folder:
-        await write_stream(request.stream(), folder / "archive", limit, service.room)
+    limit = caller.service.settings.max_archive_bytes
+    refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.room)
+    await caller.datasets.get(dataset_id)
+    async with staging_folder(caller.service.staging_dir) as folder:
+        await write_stream(request.stream(), folder / "archive", limit, caller.service.room)
         into = folder / "content"
         into.mkdir()
-        return DatasetView.of(await take_archive(service, dataset_id, folder / "archive", into))
+        return DatasetView.of(await take_archive(caller.service, dataset_id, folder / "archive", into))
 
 
 @router.post(
@@ -221,7 +224,7 @@ async def upload_archive(dataset_id: DatasetId, request: Request, service: Servi
 )
 async def finalize_dataset(
     dataset_id: DatasetId,
-    service: ServiceHere,
+    caller: DatasetWriterHere,
     prefer: Annotated[str, Header(description="`respond-async` answers at once.")] = "",
 ) -> Response:
     """Freezes the files and checks them: poses, intrinsics, names, and every pixel.
@@ -229,7 +232,7 @@ async def finalize_dataset(
     Answers when the check is done: 200 with a `ready` dataset, or 422 with what is wrong and how to mend it
     (the dataset is then `rejected`, and takes neither files nor jobs).
     """
-    view = await begin_check(service, dataset_id)
+    view = await begin_check(caller, dataset_id)
     if "respond-async" in prefer.lower() and view.state == "finalizing":
         body = DatasetView.of(view).model_dump(mode="json")
         headers = {
@@ -238,18 +241,19 @@ async def finalize_dataset(
             "Preference-Applied": "respond-async",
         }
         return JSONResponse(body, status_code=202, headers=headers)
-    checked = await finish_check(service, dataset_id)
+    checked = await finish_check(caller, dataset_id)
     return JSONResponse(DatasetView.of(checked).model_dump(mode="json"))
 
 
-async def begin_check(service: Service, dataset_id: str) -> DatasetRecord:
+async def begin_check(caller: Caller, dataset_id: str) -> DatasetRecord:
     """Freezes the dataset and starts its check, which goes on when the client is gone.
 
     Raises:
         ProblemError: ``name_collision``; then the dataset stays open.
     """
-    store = service.stores.datasets
-    await settle_uploads(service, dataset_id)
+    store = caller.datasets
+    await store.get(dataset_id)  # the caller's own, before anything is done to it
+    await settle_uploads(caller.service, dataset_id)
     names, cursor = NameSet(), None
     while True:
         page = await store.files(dataset_id, cursor=cursor)
@@ -262,16 +266,16 @@ async def begin_check(service: Service, dataset_id: str) -> DatasetRecord:
             break
     dataset = await store.finalize(dataset_id)
     if dataset.state == "finalizing":
-        service.keep_running(asyncio.create_task(store.check(dataset_id), name=f"check {dataset_id}"))
+        caller.service.keep_running(asyncio.create_task(store.check(dataset_id), name=f"check {dataset_id}"))
     return dataset
 
 
-async def finish_check(service: Service, dataset_id: str) -> DatasetRecord:
+async def finish_check(caller: Caller, dataset_id: str) -> DatasetRecord:
     """Waits for the check's outcome; raises ``ProblemError`` with what it found wrong."""
-    for task in list(service.background):
+    for task in list(caller.service.background):
         if task.get_name() == f"check {dataset_id}":
             await asyncio.shield(task)
-    dataset = await service.stores.datasets.check(dataset_id)
+    dataset = await caller.datasets.check(dataset_id)
     if dataset.state == "rejected":
         error = dataset.error
         if error is None:

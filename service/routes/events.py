@@ -10,7 +10,8 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Query
 from fastapi.responses import StreamingResponse
 
-from service.dependencies import JobId, ServiceHere
+from service.access import CallerHere
+from service.dependencies import JobId
 from service.metrics import WebMetrics
 from service.problems import FieldProblem, ProblemError, declared
 from service.schemas import JobView
@@ -64,7 +65,7 @@ class EventStream(StreamingResponse):
 )
 async def follow_job(
     job_id: JobId,
-    service: ServiceHere,
+    caller: CallerHere,
     after: Annotated[
         int | None, Query(ge=0, le=2**31, description="Replay what came after this event.")
     ] = None,
@@ -72,11 +73,11 @@ async def follow_job(
 ) -> EventStream:
     """Follows a job from its first event, or from after the one named by `after` or `Last-Event-ID`."""
     start = _start(after, last_event_id)
-    updates = service.stores.jobs.subscribe(job_id, after=start, heartbeat_s=KEEP_ALIVE_S)
+    updates = caller.jobs.subscribe(job_id, after=start, heartbeat_s=KEEP_ALIVE_S)
     # The first update before the answer begins: a missing job is a 404, not an empty stream.
     first = await anext(updates, None)
     headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
-    events = _counted(_stream(first, updates, service.closing), service.metrics)
+    events = _counted(_stream(first, updates, caller.service.closing), caller.service.metrics)
     return EventStream(events, headers=headers)
 
 

@@ -1,14 +1,13 @@
-"""Probes for whoever runs the service, and figures for Prometheus. None of them needs an API key."""
+"""Probes for whoever runs the service, and figures for Prometheus. Probes need no API key."""
 
 from __future__ import annotations
 
-import hmac
-import ipaddress
 from typing import Annotated
 
 from fastapi import APIRouter, Header
 from fastapi.responses import PlainTextResponse, Response
 
+from service.access import may_scrape
 from service.dependencies import Service, ServiceHere
 from service.metrics import Exposition
 from service.problems import FieldProblem, ProblemError, declared
@@ -69,16 +68,18 @@ async def _require_everything(service: Service) -> None:
                 "text/plain": {"schema": {"type": "string"}, "example": "biresnerf_database_up 1.0\n"}
             },
         },
-        **declared("metrics_token_required", "internal_error"),
+        **declared("metrics_token_required", "database_unavailable", "internal_error"),
     },
 )
 async def get_metrics(
     service: ServiceHere,
     accept: Annotated[str, Header()] = "",
-    authorization: Annotated[str, Header(description="`Bearer` and BIRESNERF_METRICS_TOKEN.")] = "",
+    authorization: Annotated[
+        str, Header(description="`Bearer` and BIRESNERF_METRICS_TOKEN, or an admin key.")
+    ] = "",
 ) -> Response:
     """Figures of this process and of the whole installation. Without the database: of this process alone."""
-    _require_scraper(service, authorization)
+    await _require_scraper(service, authorization)
     try:
         installation = await service.stores.monitor.statistics()
     except Unavailable:
@@ -87,23 +88,12 @@ async def get_metrics(
     return Response(text, media_type=media_type, headers={"Cache-Control": "no-store"})
 
 
-def _require_scraper(service: Service, authorization: str) -> None:
+async def _require_scraper(service: Service, authorization: str) -> None:
     """Figures tell what goes on here, so they are not for everybody who can reach the port."""
-    token = service.settings.metrics_token
-    if token is None and _loopback(service.settings.host):
-        return
-    said = authorization.removeprefix("Bearer ").strip()
-    if token is None or not hmac.compare_digest(said.encode(), token.get_secret_value().encode()):
+    if not await may_scrape(service, authorization):
         raise ProblemError(
             "metrics_token_required",
             "The token of /metrics is missing, wrong, or not set.",
-            mend="Set BIRESNERF_METRICS_TOKEN and send it as Authorization: Bearer.",
+            mend="Set BIRESNERF_METRICS_TOKEN and send it as Authorization: Bearer; an admin key does too.",
             headers={"WWW-Authenticate": "Bearer"},
         )
-
-
-def _loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

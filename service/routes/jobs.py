@@ -9,8 +9,9 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import JSONResponse, Response
 
+from service.access import Caller, CallerHere, JobWriterHere
 from service.conditions import none_match
-from service.dependencies import JobId, Service, ServiceHere, next_link
+from service.dependencies import JobId, next_link
 from service.json_body import json_content, read_json
 from service.one_shot import submit_form
 from service.problems import FieldProblem, ProblemError, declared
@@ -61,7 +62,7 @@ _BODY = {
 )
 async def submit_job(
     request: Request,
-    service: ServiceHere,
+    caller: JobWriterHere,
     idempotency_key: Annotated[
         str | None, Header(description="The same key with the same request answers with the same job.")
     ] = None,
@@ -71,10 +72,10 @@ async def submit_job(
         raise ProblemError("bad_idempotency_key", "The key must be 1 to 255 visible ASCII characters.")
     kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
     if kind == "multipart/form-data":
-        job, new = await submit_form(service, request, idempotency_key)
+        job, new = await submit_form(caller, request, idempotency_key)
     elif kind == "application/json":
         body = await read_json(kind, request.headers.get("content-length"), request.stream(), NewJob)
-        job, new = await service.stores.jobs.submit(
+        job, new = await caller.jobs.submit(
             body.dataset_id, body.options, labels=body.labels, idempotency_key=idempotency_key
         )
     else:
@@ -93,14 +94,14 @@ async def submit_job(
 async def list_jobs(
     request: Request,
     response: Response,
-    service: ServiceHere,
+    caller: CallerHere,
     state: JobState | None = None,
     label: Annotated[str | None, Query(max_length=201, description="`name:value`")] = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     cursor: Annotated[str | None, Query(max_length=500)] = None,
 ) -> JobList:
     """Jobs, newest first."""
-    page = await service.stores.jobs.list(state=state, label=_label(label), limit=limit, cursor=cursor)
+    page = await caller.jobs.list(state=state, label=_label(label), limit=limit, cursor=cursor)
     response.headers.update(next_link(request, page.next_cursor))
     return JobList(items=[JobView.of(job) for job in page.items], next_cursor=page.next_cursor)
 
@@ -125,14 +126,14 @@ def _label(text: str | None) -> tuple[str, str] | None:
 )
 async def get_job(
     job_id: JobId,
-    service: ServiceHere,
+    caller: CallerHere,
     wait: Annotated[
         float, Query(ge=0, le=60, description="Answer when the job is over, or after so many seconds.")
     ] = 0,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
     """The job now: state, stage, step, loss, seconds left, place in the queue."""
-    job = await (_waited_for(service, job_id, wait) if wait else service.stores.jobs.get(job_id))
+    job = await (_waited_for(caller, job_id, wait) if wait else caller.jobs.get(job_id))
     headers = {} if job.final else {"Retry-After": _POLL_S}
     if not none_match(if_none_match, _etag(job)):
         return Response(status_code=304, headers={"ETag": _etag(job), **headers})
@@ -148,9 +149,9 @@ async def get_job(
         **declared("not_found", *_WRITES),
     },
 )
-async def cancel_job(job_id: JobId, service: ServiceHere) -> Response:
+async def cancel_job(job_id: JobId, caller: JobWriterHere) -> Response:
     """Ends a job. One that is over already stays as it is."""
-    job = await service.stores.jobs.cancel(job_id)
+    job = await caller.jobs.cancel(job_id)
     return _answer(job, status=200 if job.final else 202)
 
 
@@ -160,17 +161,17 @@ async def cancel_job(job_id: JobId, service: ServiceHere) -> Response:
     operation_id="deleteJob",
     responses=declared("not_found", "state_conflict", *_WRITES),
 )
-async def delete_job(job_id: JobId, service: ServiceHere) -> None:
+async def delete_job(job_id: JobId, caller: JobWriterHere) -> None:
     """Deletes a job that is over, with its results."""
-    await service.stores.jobs.delete(job_id)
+    await caller.jobs.delete(job_id)
 
 
-async def _waited_for(service: Service, job_id: str, seconds: float) -> Job:
+async def _waited_for(caller: Caller, job_id: str, seconds: float) -> Job:
     """The job when it is over, after so many seconds, or when the service stops."""
-    waiting = asyncio.create_task(service.stores.jobs.wait(job_id, timeout_s=seconds))
+    waiting = asyncio.create_task(caller.jobs.wait(job_id, timeout_s=seconds))
     try:
-        await first_done(waiting, service.closing.wait())
-        return await (waiting if waiting.done() else service.stores.jobs.get(job_id))
+        await first_done(waiting, caller.service.closing.wait())
+        return await (waiting if waiting.done() else caller.jobs.get(job_id))
     finally:
         waiting.cancel()
 

@@ -9,8 +9,8 @@ from fastapi import APIRouter, Header, Response
 
 from biresnerf import __version__
 from biresnerf.config import PRESETS, RefineOptions
+from service.access import CallerHere
 from service.conditions import none_match
-from service.dependencies import ServiceHere
 from service.intake import RATIO_MAX
 from service.problems import declared
 from service.schemas import Info, OptionsView, SizeLimits
@@ -26,7 +26,7 @@ ARCHIVES = ["application/zip", "application/x-tar", "application/gzip"]
     responses={304: {"description": "As you have it."}, **declared("internal_error")},
 )
 async def get_options(
-    response: Response, if_none_match: Annotated[str | None, Header()] = None
+    response: Response, _: CallerHere, if_none_match: Annotated[str | None, Header()] = None
 ) -> OptionsView | Response:
     """JSON Schema of the options, and the presets with every value filled in."""
     view = OptionsView(
@@ -42,10 +42,10 @@ async def get_options(
 
 
 @router.get("/v1/info", operation_id="getInfo", responses=declared("internal_error", "database_unavailable"))
-async def get_info(service: ServiceHere) -> Info:
-    """Version and limits of this service, and how many jobs are in each state."""
+async def get_info(caller: CallerHere) -> Info:
+    """Version and limits of this service, and how many of your jobs are in each state."""
     limits = {
-        name: getattr(service.settings, name)
+        name: getattr(caller.service.settings, name)
         for name in SizeLimits.model_fields
         if name != "max_archive_ratio"
     }
@@ -53,5 +53,5 @@ async def get_info(service: ServiceHere) -> Info:
         version=__version__,
         limits=SizeLimits(**limits, max_archive_ratio=RATIO_MAX),
         archives=ARCHIVES,
-        job_counts=await service.stores.jobs.counts(),
+        job_counts=await caller.jobs.counts(),
     )

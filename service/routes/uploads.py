@@ -16,7 +16,8 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Header, Request
 from fastapi.responses import JSONResponse, Response
 
-from service.dependencies import DatasetId, ServiceHere, UploadId
+from service.access import CallerHere, DatasetWriterHere
+from service.dependencies import DatasetId, UploadId
 from service.intake import begin_taking
 from service.problems import ProblemError, declared
 from service.safe_paths import checked_path
@@ -69,12 +70,12 @@ def _where(upload: Upload) -> dict[str, str]:
     operation_id="describeUploads",
     responses=declared("not_found", "internal_error"),
 )
-async def describe_uploads(dataset_id: DatasetId, service: ServiceHere) -> Response:
+async def describe_uploads(dataset_id: DatasetId, caller: CallerHere) -> Response:
     """What of the tus protocol is spoken here."""
     headers = {
         "Tus-Version": VERSION,
         "Tus-Extension": "creation,expiration,termination",
-        "Tus-Max-Size": str(service.settings.max_archive_bytes),
+        "Tus-Max-Size": str(caller.service.settings.max_archive_bytes),
     }
     return Response(status_code=204, headers=headers)
 
@@ -92,7 +93,7 @@ async def describe_uploads(dataset_id: DatasetId, service: ServiceHere) -> Respo
 )
 async def create_upload(
     dataset_id: DatasetId,
-    service: ServiceHere,
+    caller: DatasetWriterHere,
     upload_length: Annotated[int, Header(ge=0, lt=2**62, description="Bytes that are going to be sent.")],
     upload_metadata: Annotated[str, Header(description=_METADATA, max_length=8192)] = "",
 ) -> Response:
@@ -101,8 +102,8 @@ async def create_upload(
     path, sha256 = said.get("path"), said.get("sha256")
     if sha256 is not None and not _DIGEST.fullmatch(sha256):
         raise ProblemError("invalid_request", "The value of sha256 is no SHA-256.", where="Upload-Metadata")
-    await asyncio.to_thread(service.room.require, upload_length)
-    upload = await service.stores.uploads.create(
+    await asyncio.to_thread(caller.service.room.require, upload_length)
+    upload = await caller.uploads.create(
         dataset_id,
         "archive" if path is None else "file",
         upload_length,
@@ -110,7 +111,7 @@ async def create_upload(
         sha256=sha256,
     )
     if upload.state == "received":
-        begin_taking(service, upload.id)
+        begin_taking(caller.service, upload.id)
     headers = {"Location": upload_url(upload.id), **_where(upload)}
     return JSONResponse(UploadView.of(upload).model_dump(mode="json"), status_code=201, headers=headers)
 
@@ -134,15 +135,15 @@ def _metadata(header: str) -> dict[str, str]:
     responses=declared("not_found", *_ALWAYS),
     dependencies=[SameVersion],
 )
-async def head_upload(upload_id: UploadId, service: ServiceHere) -> Response:
+async def head_upload(upload_id: UploadId, caller: CallerHere) -> Response:
     """At which byte the upload goes on (`Upload-Offset`)."""
-    return Response(status_code=200, headers=_where(await service.stores.uploads.get(upload_id)))
+    return Response(status_code=200, headers=_where(await caller.uploads.get(upload_id)))
 
 
 @router.get("/uploads/{upload_id}", operation_id="getUpload", responses=declared("not_found", *_ALWAYS))
-async def get_upload(upload_id: UploadId, service: ServiceHere) -> UploadView:
+async def get_upload(upload_id: UploadId, caller: CallerHere) -> UploadView:
     """How far the upload is, and once all is received, what became of it (`stored` or `rejected`)."""
-    return UploadView.of(await service.stores.uploads.get(upload_id))
+    return UploadView.of(await caller.uploads.get(upload_id))
 
 
 _APPENDS: dict[str, Any] = {
@@ -167,7 +168,7 @@ _APPENDS: dict[str, Any] = {
 async def append_upload(
     upload_id: UploadId,
     request: Request,
-    service: ServiceHere,
+    caller: DatasetWriterHere,
     upload_offset: Annotated[int, Header(ge=0, lt=2**62, description="Number of the first byte sent.")],
 ) -> Response:
     """The next bytes. What arrived is kept however the connection ends; `HEAD` says how much that is.
@@ -177,14 +178,14 @@ async def append_upload(
     """
     if request.headers.get("content-type", "").partition(";")[0].strip() != CONTENT_TYPE:
         raise ProblemError("unsupported_media", f"The Content-Type must be {CONTENT_TYPE}.")
-    uploads = service.stores.uploads
+    uploads = caller.uploads
     upload = await uploads.get(upload_id)
     room = upload.size - upload_offset
     refuse_announced_excess(request.headers.get("content-length"), max(room, 0))
-    body = capped(request.stream(), max(room, 0), room=service.room)
+    body = capped(request.stream(), max(room, 0), room=caller.service.room)
     upload = await uploads.append(upload_id, upload_offset, body)
     if upload.state == "received":
-        begin_taking(service, upload_id)
+        begin_taking(caller.service, upload_id)
     return Response(status_code=204, headers=_where(upload))
 
 
@@ -195,6 +196,6 @@ async def append_upload(
     responses=declared("not_found", "cross_site", *_ALWAYS),
     dependencies=[SameVersion],
 )
-async def delete_upload(upload_id: UploadId, service: ServiceHere) -> None:
+async def delete_upload(upload_id: UploadId, caller: DatasetWriterHere) -> None:
     """Gives the upload up. What it has brought into the dataset already stays there."""
-    await service.stores.uploads.delete(upload_id)
+    await caller.uploads.delete(upload_id)

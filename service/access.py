@@ -1,0 +1,225 @@
+"""Who calls, for whom, and what they may do.
+
+Every request but those of `OPEN` is identified before anything of it is read (`Access`), so a route that
+forgets to ask is closed, not open. A route says with its parameter what it needs: `CallerHere` (scope
+``read``), `DatasetWriterHere`, `JobWriterHere`, `AdminHere`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hmac
+import ipaddress
+import logging
+import re
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import Security
+from fastapi.security import HTTPBearer, SecurityScopes
+from starlette.requests import Request
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service.dependencies import Service, service_of
+from service.problems import ProblemError
+from workers.api_keys import ALL_SCOPES, KeyRefused
+from workers.api_keys import Scope as KeyScope
+from workers.datasets import DatasetStore
+from workers.errors import Unavailable
+from workers.jobs import JobStore
+from workers.tenants import LOCAL_TENANT
+from workers.uploads import UploadStore
+
+log = logging.getLogger(__name__)
+
+# Health, the docs page and the schema say nothing of anybody; /metrics asks itself (`may_scrape`).
+OPEN = re.compile(r"/(livez|readyz|startupz|metrics|openapi\.json|docs(/.*)?)?")
+# What any guarded operation may answer before it is reached.
+REFUSALS = ("missing_credentials", "invalid_api_key", "scope_required", "cross_site", "database_unavailable")
+_BEARER = re.compile(r"Bearer +(\S+) *", re.IGNORECASE)
+_CHALLENGE = 'Bearer realm="biresnerf"'
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Whom a request acts for. ``key_id`` is none for whoever needs no key."""
+
+    tenant: str
+    scopes: frozenset[KeyScope]
+    key_id: str | None = None
+
+
+@dataclass(frozen=True)
+class Caller:
+    """The identified client of a request; its stores hold what belongs to its tenant, and nothing else."""
+
+    service: Service
+    identity: Identity
+
+    @property
+    def tenant(self) -> str:
+        """Whose things the caller handles."""
+        return self.identity.tenant
+
+    @property
+    def scopes(self) -> frozenset[KeyScope]:
+        """What the caller may do."""
+        return self.identity.scopes
+
+    def require(self, scope: KeyScope) -> None:
+        """Raises ``ProblemError`` (``scope_required``) where the caller may not do that."""
+        if scope not in self.scopes:
+            challenge = f'{_CHALLENGE}, error="insufficient_scope", scope="{scope}"'
+            raise ProblemError(
+                "scope_required", f"The key lacks the scope {scope}.", headers={"WWW-Authenticate": challenge}
+            )
+
+    @property
+    def jobs(self) -> JobStore:
+        """The tenant's jobs."""
+        return self.service.stores.jobs.of(self.tenant)
+
+    @property
+    def datasets(self) -> DatasetStore:
+        """The tenant's datasets."""
+        return self.service.stores.datasets.of(self.tenant)
+
+    @property
+    def uploads(self) -> UploadStore:
+        """The uploads into the tenant's datasets."""
+        return self.service.stores.uploads.of(self.tenant)
+
+
+class Access:
+    """ASGI middleware: identifies the client of each request, before its body is read or its route sought."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and not OPEN.fullmatch(scope["path"]):
+            request = Request(scope)
+            request.state.identity = await identify(service_of(request), request)
+        await self._app(scope, receive, send)
+
+
+async def identify(service: Service, request: Request) -> Identity:
+    """Whom the request acts for.
+
+    Raises:
+        ProblemError: ``missing_credentials``, ``invalid_api_key``, ``cross_site``.
+    """
+    text = request.headers.get("authorization")
+    if text is None:
+        return await _nameless(service, request)
+    bearer = _BEARER.fullmatch(text)
+    if bearer is None:
+        raise _unknown("The Authorization header is not of the form `Bearer brn_…`.")
+    try:
+        key = await service.stores.keys.recognise(bearer[1])
+    except KeyRefused:
+        raise _unknown("The key is unknown, expired or revoked.") from None
+    scopes = ALL_SCOPES if "admin" in key.scopes else frozenset(key.scopes)
+    return Identity(key.tenant, scopes, key.id)
+
+
+async def _nameless(service: Service, request: Request) -> Identity:
+    """The identity of who shows no key, where none is needed."""
+    mode = service.settings.auth
+    if mode == "auto":
+        if not on_loopback(service.settings.host) or await service.stores.keys.any_made():
+            mode = "required"
+        elif _is_public_name(request.url.hostname or ""):
+            # A page may have its own name point at this machine, and would then be of the same site.
+            raise ProblemError(
+                "cross_site",
+                "Without an API key only requests to this machine by its own name are taken.",
+                where="Host",
+                mend="Use http://127.0.0.1 or localhost, or make a key: biresnerf keys create.",
+            )
+    if mode == "required":
+        raise ProblemError(
+            "missing_credentials",
+            "This service wants an API key.",
+            where="Authorization",
+            mend="Send the header `Authorization: Bearer brn_…`; `biresnerf keys create` makes a key.",
+            headers={"WWW-Authenticate": _CHALLENGE},
+        )
+    return Identity(LOCAL_TENANT, ALL_SCOPES)
+
+
+def _is_public_name(host: str) -> bool:
+    """Whether somebody elsewhere could have this name point anywhere: it has a dot and is no loopback address."""
+    return "." in host.rstrip(".") and not on_loopback(host)
+
+
+async def say_who_is_let_in(service: Service) -> None:
+    """Logs at the start what an operator could otherwise find out too late."""
+    settings = service.settings
+    if settings.auth == "off" and not on_loopback(settings.host):
+        log.warning("BIRESNERF_AUTH=off: whoever reaches %s may do everything", settings.host)
+    elif settings.auth == "required" or (settings.auth == "auto" and not on_loopback(settings.host)):
+        with contextlib.suppress(Unavailable):
+            if not await service.stores.keys.any_made():
+                log.warning("nobody can use this service yet; make a key: biresnerf keys create NAME")
+
+
+def on_loopback(host: str) -> bool:
+    """Whether the address or name is this machine's alone."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+async def may_scrape(service: Service, authorization: str) -> bool:
+    """Whether /metrics is for this client: it is the loopback's while no token is set, else the token's.
+
+    A key with the scope ``admin`` opens it too. Asks the database only where nothing else says yes.
+    """
+    token = service.settings.metrics_token
+    if token is None and on_loopback(service.settings.host):
+        return True
+    bearer = _BEARER.fullmatch(authorization)
+    if bearer is None:
+        return False
+    if token is not None and hmac.compare_digest(token.get_secret_value().encode(), bearer[1].encode()):
+        return True
+    try:
+        return "admin" in (await service.stores.keys.recognise(bearer[1])).scopes
+    except KeyRefused:
+        return False
+
+
+def _unknown(detail: str) -> ProblemError:
+    return ProblemError(
+        "invalid_api_key",
+        detail,
+        where="Authorization",
+        headers={"WWW-Authenticate": f'{_CHALLENGE}, error="invalid_token"'},
+    )
+
+
+_bearer = HTTPBearer(
+    auto_error=False,
+    scheme_name="ApiKey",
+    bearerFormat="brn_…",
+    description="An API key. None is needed while the service listens on loopback only and no key was made.",
+)
+
+
+async def _caller(
+    request: Request, needed: SecurityScopes, _documented: Annotated[Any, Security(_bearer)]
+) -> Caller:
+    caller = Caller(service_of(request), request.state.identity)
+    for scope in needed.scopes:
+        caller.require(scope)  # type: ignore[arg-type]
+    return caller
+
+
+CallerHere = Annotated[Caller, Security(_caller, scopes=["read"])]
+DatasetWriterHere = Annotated[Caller, Security(_caller, scopes=["datasets:write"])]
+JobWriterHere = Annotated[Caller, Security(_caller, scopes=["jobs:write"])]
+AdminHere = Annotated[Caller, Security(_caller, scopes=["admin"])]

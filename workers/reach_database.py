@@ -1,0 +1,35 @@
+"""The database for a command that runs beside the service or without it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from workers.embedded_postgres import EmbeddedPostgres
+from workers.errors import SetupError
+from workers.migrate import migrate
+from workers.settings import Settings
+
+
+@contextmanager
+def reached_database(settings: Settings) -> Iterator[str]:
+    """The address of the migrated database: the one of the settings, or the private one of the data folder.
+
+    A private one that runs already (below `biresnerf up`) is used as it is; else it is started for the time
+    of the block. Raises `SetupError`.
+    """
+    if settings.database_url is not None:
+        migrate(settings.database_url)
+        yield settings.database_url
+        return
+    postgres = EmbeddedPostgres(settings.postgres_dir, pg_bin=settings.pg_bin)
+    try:
+        postgres.start()
+    except SetupError as error:
+        if error.code != "already_running":
+            raise
+    try:
+        migrate(postgres.url)
+        yield postgres.url
+    finally:
+        postgres.stop()
