@@ -99,7 +99,10 @@ class Access:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http" and not OPEN.fullmatch(scope["path"]):
             request = Request(scope)
-            request.state.identity = await identify(service_of(request), request)
+            try:
+                request.state.identity = await identify(service_of(request), request)
+            except Unavailable as error:  # here, above the routes, nobody else makes a 503 of it
+                raise ProblemError(error.code, error.what) from None
         await self._app(scope, receive, send)
 
 
