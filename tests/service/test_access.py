@@ -153,10 +153,8 @@ def test_only_health_docs_and_schema_are_open():
 def address(path: str, owner: Tenant) -> str:
     """The path of something that is the owner's. A new kind of id needs a line here."""
     values = {
-        "dataset_id": owner.dataset,
-        "job_id": owner.job,
-        "path": "transforms.json",
-        "name": "report.json",
+        **{"dataset_id": owner.dataset, "job_id": owner.job, "upload_id": owner.upload},
+        **{"path": "transforms.json", "name": "report.json"},
     }
     return re.sub(r"\{(\w+)(:\w+)?\}", lambda match: values[match[1]], path)
 

@@ -88,7 +88,7 @@ def test_what_arrived_before_the_connection_broke_is_kept(service: Running, http
     upload = begin(http, dataset, len(NOISE), path="images/big.bin")
     at = urlsplit(service.url)
     with socket.create_connection((at.hostname, at.port)) as wire:
-        head = f"PATCH {upload} HTTP/1.1\r\nHost: x\r\nTus-Resumable: 1.0.0\r\nUpload-Offset: 0\r\n"
+        head = f"PATCH {upload} HTTP/1.1\r\nHost: {at.netloc}\r\nTus-Resumable: 1.0.0\r\nUpload-Offset: 0\r\n"
         head += f"Content-Type: application/offset+octet-stream\r\nContent-Length: {len(NOISE)}\r\n\r\n"
         wire.sendall(head.encode() + NOISE[:600_000])
     end = time.monotonic() + 20
