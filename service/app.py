@@ -22,7 +22,7 @@ from service.dependencies import Service
 from service.intake import take_upload
 from service.json_body import validation_problem
 from service.metrics import WebMetrics
-from service.observe import Observed
+from service.observe import Observed, is_probe
 from service.openapi import describe
 from service.problems import CATALOGUE, ProblemError
 from service.request_context import RequestContext, render
@@ -31,6 +31,7 @@ from service.uploads import sweep_staging
 from workers.errors import EngineError, NotFound, Unavailable
 from workers.settings import Settings
 from workers.stores import open_stores
+from workers.traces import flush_traces
 
 logger = logging.getLogger(__name__)
 
@@ -69,6 +70,7 @@ def create_app(settings: Settings) -> FastAPI:
                 yield
             finally:
                 service.closing.set()
+                await asyncio.to_thread(flush_traces)
                 for task in service.background:
                     task.cancel()
                 await asyncio.gather(*service.background, return_exceptions=True)
@@ -83,6 +85,8 @@ def create_app(settings: Settings) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
+        # Spans of requests, once `set_up_traces` was called.
+        telemetry={"metrics": False, "logs": False, "operation_spans": False, "exclude": is_probe},
     )
     app.add_middleware(Access)
     app.add_middleware(RequestContext)  # it tells what Access refuses

@@ -43,10 +43,15 @@ class Observed:
         if exchange.answered_s is not None:
             metrics.answer_s.labels(method, route).observe(exchange.answered_s)
         path = exchange.scope["path"]
-        level = logging.DEBUG if path in _PROBES and exchange.status < 400 else logging.INFO
+        level = logging.DEBUG if is_probe(exchange.scope) and exchange.status < 400 else logging.INFO
         if logger.isEnabledFor(level):
             # The path without its query, which may hold a signature.
             logger.log(level, "%s %s %d", method, path, exchange.status, extra={"fields": exchange.fields()})
+
+
+def is_probe(scope: Scope) -> bool:
+    """Whether a machine asks how we are."""
+    return scope.get("path") in _PROBES
 
 
 class _Exchange:

@@ -18,6 +18,7 @@ from service.strict_http import StrictHttp
 from workers.errors import SetupError
 from workers.logs import set_up_logging
 from workers.settings import Settings
+from workers.traces import set_up_traces
 
 logger = logging.getLogger(__name__)
 # Long downloads may use it; event streams end at once (see `_Server`).
@@ -60,6 +61,7 @@ def listen(settings: Settings) -> socket.socket:
 def serve(settings: Settings) -> None:
     """Serves until SIGINT or SIGTERM; raises `SetupError`."""
     settings.require_database_url()
+    set_up_traces("api", settings)
     bound = listen(settings)
     app = create_app(settings)
     config = uvicorn.Config(

@@ -17,6 +17,7 @@ from workers.files import FileStore
 from workers.ledger import Ledger
 from workers.log_lines import LogLines
 from workers.results import files_inside, store_artifact
+from workers.traces import StageSpans
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +38,7 @@ class Courier:
         self._checkpoints, self._previews = _Box(), _Box()
         self._reusable: dict[ReusableStage, _Box] = {"seeding": _Box(), "coarse": _Box()}
         self._stored = 0
+        self._spans = StageSpans()
         self._progress_due = asyncio.Event()
         self._closed = asyncio.Event()
 
@@ -44,6 +46,7 @@ class Courier:
         """Take note of a report."""
         if self._latest is None or progress.stage != self._latest.stage:
             self._stages.append(progress)
+            self._spans.enter(progress.stage)
         self._latest = progress
         self._progress_due.set()
         if progress.checkpoint is not None:
@@ -79,6 +82,7 @@ class Courier:
         finally:
             for task in deliveries:
                 task.cancel()
+            self._spans.end()
 
     async def _carry_progress(self) -> None:
         delivered: Progress | None = None

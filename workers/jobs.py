@@ -21,6 +21,7 @@ from workers.job_rows import JOB, MINE, job_from_row
 from workers.records import Artifact, Job, JobEvent, JobState, JobUpdate, LogLine, Page
 from workers.settings import Settings
 from workers.tenants import LOCAL_TENANT
+from workers.traces import traced, traceparent
 
 # Two submits at once must not both take the last place.
 QUEUE_LIMIT_LOCK = 7_201_604
@@ -44,6 +45,7 @@ class JobStore:
         """The store as this tenant sees it; none: as the operator does."""
         return JobStore(self._database, self._listener, self._settings, tenant)
 
+    @traced("submit")
     async def submit(
         self,
         dataset_id: str,
@@ -87,7 +89,9 @@ class JobStore:
                 ),
             )
             queue_id = await self._database.enqueue(connection, job_id)
-            await connection.execute("UPDATE jobs SET queue_id = %s WHERE id = %s", (queue_id, job_id))
+            await connection.execute(
+                "UPDATE jobs SET queue_id = %s, trace = %s WHERE id = %s", (queue_id, traceparent(), job_id)
+            )
             await connection.execute("SELECT add_job_event(%s, 'queued', '{}')", (job_id,))
             return job_from_row(await self._required(connection, job_id)), True
 

@@ -23,7 +23,7 @@ from procrastinate.jobs import Job
 
 from workers.attempt import Attempt
 from workers.beat import Beat
-from workers.claim import Fenced, claim_job, insist
+from workers.claim import Claim, Fenced, claim_job, insist
 from workers.database import QUEUE, TASK, Database, first_line, open_database
 from workers.errors import LimitReached, SetupError
 from workers.files import open_files
@@ -34,6 +34,7 @@ from workers.receipts import FencedWorker
 from workers.room import room_for_jobs
 from workers.settings import Settings
 from workers.statistics import announce_slot
+from workers.traces import set_up_traces, span
 
 log = logging.getLogger(__name__)
 
@@ -201,7 +202,16 @@ class Slot:
 
         if stopped:
             ask_stop()
-        return await _relay(asyncio.create_task(attempt.run()), ask_stop)
+        return await _relay(asyncio.create_task(self._traced(database, attempt, claim)), ask_stop)
+
+    async def _traced(self, database: Database, attempt: Attempt, claim: Claim) -> bool:
+        """The attempt, as part of the trace of its submission."""
+        if self._settings.traces == "off":
+            return await attempt.run()
+        rows = await insist(lambda: database.fetch("SELECT trace FROM jobs WHERE id = %s", claim.job_id))
+        about_it: dict[str, str | int] = {"job": claim.job_id, "number": claim.attempt}
+        with span("attempt", parent=rows[0]["trace"] if rows else None, about=about_it):
+            return await attempt.run()
 
     def _variables(self) -> Mapping[str, str]:
         """Which device and how many cores the job of this slot may use."""
@@ -239,6 +249,7 @@ def main() -> int:
     set_up_logging(arguments.slot, settings)
     logging.getLogger("procrastinate").setLevel(logging.CRITICAL)  # outcomes are in the job's own history
     try:
+        set_up_traces(arguments.slot, settings)
         asyncio.run(Slot(settings, arguments.slot).run())
     except SetupError as error:
         sys.stderr.write(f"{error.what}\n")
