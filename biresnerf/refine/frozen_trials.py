@@ -47,6 +47,11 @@ class TrialScores:
     ssim: NDArray[np.float64]
 
 
+def joined(parts: Sequence[TrialScores]) -> TrialScores:
+    """The scores of several trials, one after the other."""
+    return TrialScores(np.concatenate([p.psnr for p in parts]), np.concatenate([p.ssim for p in parts]))
+
+
 class FrozenTrials:
     """Scores sets of poses, one after the other, under the same conditions.
 

@@ -91,7 +91,7 @@ def judge(
         if moved >= MEASURABLE_PX:
             heldout = compare_on_unseen_views(
                 before, after, images, given.held_out, optimiser.options, optimiser.device, threads, should_stop,
-                lambda done: tell(0.45 * done),
+                lambda share: tell(0.9 * share),
             )  # fmt: skip
     verdict = decide(
         Findings(

@@ -16,7 +16,7 @@ from biresnerf.data.images import ImageSet
 from biresnerf.geometry.camera import Intrinsics, directions_in_cam, project
 from biresnerf.geometry.epipolar import epipolar_angles
 from biresnerf.geometry.focus import focus_point
-from biresnerf.refine.frozen_trials import FrozenTrials, TrialScores
+from biresnerf.refine.frozen_trials import FrozenTrials, TrialScores, joined
 from biresnerf.refine.verdict import EPIPOLAR_MATTERS, PSNR_MATTERS, SSIM_MATTERS, paired
 from biresnerf.report import EpipolarEvidence, HeldOutEvidence
 
@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 
 LEAST_VIEWS = 5  # unseen, where the set is large enough to spare them
 SPARED_OF = 3  # and one in so many at most
+# Fewer unseen views leave too wide an interval: trainings are repeated with others left out.
+ENOUGH_VIEWS, ROUNDS_MOST = 8, 3
 MATCHES_OF_IMAGE = 8  # an image with fewer says nothing
 LEAST_MATCHED = 4  # images
 LEAST_PX = 0.05  # errors below it are equal: matches are not that exact
@@ -76,6 +78,18 @@ def unseen_views(count: int, held_out: Sequence[int], most: int) -> list[int]:
     return sorted({*held_out, *spread})
 
 
+def unseen_rounds(count: int, held_out: Sequence[int], most: int) -> list[list[int]]:
+    """The views that each pair of trainings leaves out: one round, or in small sets others as well, none twice."""
+    rounds = [unseen_views(count, held_out, most)]
+    while rounds[0] and len(rounds) < ROUNDS_MOST and sum(map(len, rounds)) < ENOUGH_VIEWS:
+        left = sorted(set(range(count)) - {view for views in rounds for view in views})
+        size = min(len(rounds[0]), len(left))
+        if size == 0:
+            break
+        rounds.append([left[int((i + 0.5) * len(left) / size)] for i in range(size)])
+    return rounds
+
+
 def compare_on_unseen_views(
     before: Rig,
     after: Rig,
@@ -85,31 +99,35 @@ def compare_on_unseen_views(
     device: torch.device,
     threads: int,
     should_stop: Callable[[], bool],
-    after_trial: Callable[[int], None] = lambda _done: None,
+    tell: Callable[[float], None] = lambda _share: None,
 ) -> HeldOutComparison | None:
     """Train a field on either rig, held still, and score both on the same unseen views; None of too few images.
+
+    In small sets several times, with other views left out. ``tell`` is called with the share of the work that is done.
 
     Raises:
         Interrupted: ``should_stop`` said so.
     """
     steps = int(options.trial_steps or 0)
-    views = unseen_views(len(images), held_out, most=16)
-    if steps == 0 or not views:
+    rounds = unseen_rounds(len(images), held_out, most=16)
+    if steps == 0 or not rounds[0]:
         return None
     rigs = [before.world_from_cam, after.world_from_cam]
-    trials = FrozenTrials(images, views, rigs, options, steps, device, threads, should_stop)
-    scores = []
-    for done, rig in enumerate((before, after)):
-        scores.append(trials.score(rig.world_from_cam, rig.lenses(images)))
-        after_trial(done + 1)
-    old, new = scores
+    scores: tuple[list[TrialScores], list[TrialScores]] = ([], [])
+    for views in rounds:
+        trials = FrozenTrials(images, views, rigs, options, steps, device, threads, should_stop)
+        for side, rig in zip(scores, (before, after), strict=True):
+            side.append(trials.score(rig.world_from_cam, rig.lenses(images)))
+            tell(sum(map(len, scores)) / (2 * len(rounds)))
+    old, new = (joined(side) for side in scores)
+    seen = [view for views in rounds for view in views]
     evidence = HeldOutEvidence(
         steps=trials.steps,
-        strictly=len(set(views) & set(held_out)),
+        strictly=len(set(seen) & set(held_out)),
         psnr=paired(old.psnr, new.psnr, PSNR_MATTERS),
         ssim=paired(old.ssim, new.ssim, SSIM_MATTERS),
     )
-    return HeldOutComparison(views, old, new, evidence)
+    return HeldOutComparison(seen, old, new, evidence)
 
 
 def compare_on_matches(

@@ -11,10 +11,11 @@ from biresnerf.data.dataset import Dataset
 from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.data.images import ImageSet
 from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.pipeline import held_out_views
 from biresnerf.refine import frozen_trials
 from biresnerf.refine.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refine.judgement import Judgement, judge
-from biresnerf.refine.pose_evidence import Rig, moved_px, unseen_views
+from biresnerf.refine.pose_evidence import Rig, moved_px, unseen_rounds, unseen_views
 from biresnerf.refine.run_input import RunInput
 from biresnerf.refine.start import Start
 from tests.refine.scene import CPU, tiny_optimiser, tiny_options, tiny_set
@@ -130,6 +131,20 @@ def test_unseen_views_hold_those_never_trained_on_and_spare_enough():
         assert len(views) == len(set(views)) <= max(1, min(16, count // 3))
     assert len(unseen_views(100, list(range(0, 100, 10)), 16)) == 16
     assert unseen_views(30, list(range(12)), 16) == list(range(12))
+
+
+@pytest.mark.parametrize("count", range(1, 40))
+def test_small_sets_are_looked_at_in_rounds_until_enough_views_were_unseen_or_all(count):
+    held_out = held_out_views(count, None)
+    rounds = unseen_rounds(count, held_out, 16)
+    assert rounds[0] == unseen_views(count, held_out, 16)
+    seen = [view for views in rounds for view in views]
+    assert len(seen) == len(set(seen)), "no view counts twice"
+    assert all(len(views) <= max(1, count // 3) for views in rounds), "two thirds are left to learn from"
+    if len(rounds[0]) >= 8 or not rounds[0]:
+        assert len(rounds) == 1
+    elif count >= 9:
+        assert len(seen) >= 8
 
 
 def test_a_blurred_photo_tells_on_itself(scene):
