@@ -10,22 +10,24 @@ import contextlib
 import logging
 import time
 from collections import defaultdict
-from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator
+from collections.abc import Iterator
+from typing import LiteralString
 
 import psycopg
 
 from workers.database import AWAY, CONNECT, LISTEN_CHANNEL, QUIET_S, Database, first_line
 from workers.errors import Unavailable
-from workers.records import JobUpdate
 
 log = logging.getLogger(__name__)
+
+ANSWER_S = 10.0
 
 
 class Listener:
     """Wakes who waits for a job. ``poll_s`` is how long a lost notification can go unnoticed."""
 
-    def __init__(self, database: Database, poll_s: float) -> None:
-        self.poll_s = poll_s
+    def __init__(self, database: Database, poll_s: float, channel: LiteralString = LISTEN_CHANNEL) -> None:
+        self.poll_s, self._channel = poll_s, channel
         self._database = database
         self._waiting: dict[str, set[asyncio.Event]] = defaultdict(set)
 
@@ -49,12 +51,15 @@ class Listener:
                 async with await psycopg.AsyncConnection.connect(
                     self._database.url, autocommit=True, **CONNECT
                 ) as connection:
-                    await connection.execute(f"LISTEN {LISTEN_CHANNEL}".encode())
+                    await connection.execute(f"LISTEN {self._channel}".encode())
                     for job_id in list(self._waiting):
                         self._wake(job_id)
-                    async for notification in connection.notifies():
-                        self._wake(notification.payload)
-            except AWAY as error:
+                    while True:
+                        async for notification in connection.notifies(timeout=QUIET_S):
+                            self._wake(notification.payload)
+                        async with asyncio.timeout(ANSWER_S):
+                            await connection.execute("SELECT 1")  # a line can be dead without an end
+            except (*AWAY, TimeoutError) as error:
                 if time.monotonic() - said_at > QUIET_S:
                     said_at = time.monotonic()
                     log.warning("event listener lost the database (%s)", first_line(error))
@@ -71,35 +76,3 @@ class Listener:
         except (Unavailable, TimeoutError):
             return False
         return True
-
-
-async def follow(
-    read: Callable[[str, int], Awaitable[JobUpdate]],
-    listener: Listener,
-    job_id: str,
-    after: int,
-    heartbeat_s: float,
-) -> AsyncGenerator[JobUpdate | None]:
-    """See `JobStore.subscribe`."""
-    revision, said = -1, time.monotonic()
-    with listener.waiting(job_id) as changed:
-        while True:
-            changed.clear()  # before reading: a change during the read is not missed
-            try:
-                update = await read(job_id, after)
-            except Unavailable:
-                if revision < 0:
-                    raise
-                update = None
-            if update is not None and update.job.revision != revision:
-                revision, said = update.job.revision, time.monotonic()
-                after = update.events[-1].seq if update.events else after
-                yield update
-                if update.job.final:
-                    return
-            elif time.monotonic() - said >= heartbeat_s:
-                said = time.monotonic()
-                yield None
-            left = heartbeat_s - (time.monotonic() - said)
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(changed.wait(), max(0.01, min(listener.poll_s, left)))

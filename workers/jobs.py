@@ -15,8 +15,8 @@ from biresnerf.config import RefineOptions
 from workers.database import Connection, Database
 from workers.endings import finish_cancelled
 from workers.errors import Conflict, LimitReached, NotFound
-from workers.follow import Listener, follow
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
+from workers.job_listener import JobListener, follow
 from workers.job_rows import JOB, MINE, job_from_row
 from workers.records import Artifact, Job, JobEvent, JobState, JobUpdate, LogLine, Page
 from workers.settings import Settings
@@ -36,7 +36,7 @@ class JobStore:
     """
 
     def __init__(
-        self, database: Database, listener: Listener, settings: Settings, tenant: str | None = None
+        self, database: Database, listener: JobListener, settings: Settings, tenant: str | None = None
     ) -> None:
         self._database, self._listener, self._settings = database, listener, settings
         self._tenant = tenant
@@ -243,12 +243,12 @@ class JobStore:
         that carries a final state. Progress is in ``update.job``, at most once a second. Survives a restart
         of the database. Raises `NotFound`, also when the job is deleted meanwhile.
         """
-        return follow(self.update, self._listener, job_id, after, heartbeat_s)
+        return follow(self.update, self._listener, self._tenant, job_id, after, heartbeat_s)
 
     async def wait(self, job_id: str, *, timeout_s: float) -> Job:
         """The job as soon as it is final, or as it is after ``timeout_s`` (for long polls)."""
         job = await self.get(job_id)
-        updates = follow(self.update, self._listener, job_id, 0, timeout_s)
+        updates = follow(self.update, self._listener, self._tenant, job_id, 0, timeout_s)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s), contextlib.aclosing(updates):
                 async for update in updates:

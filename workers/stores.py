@@ -11,7 +11,7 @@ from workers.api_keys import KeyStore
 from workers.database import open_database
 from workers.datasets import DatasetStore
 from workers.files import FileStore, open_files
-from workers.follow import Listener
+from workers.job_listener import JobListener
 from workers.jobs import JobStore
 from workers.monitor import Monitor
 from workers.one_store import require_same_store
@@ -44,7 +44,7 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
         settings.require_database_url(), silence_s=settings.stall_s, answer_s=settings.answer_s
     ) as database:
         await require_same_store(database, files)
-        listener = Listener(database, FOLLOW_POLL_S)
+        listener = JobListener(database, FOLLOW_POLL_S)
         listening = asyncio.create_task(listener.run())
         try:
             jobs = JobStore(database, listener, settings)

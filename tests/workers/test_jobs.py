@@ -13,6 +13,7 @@ from biresnerf.errors import InputError
 from tests.workers.conftest import Slots, ready_dataset
 from workers.database import Database, open_database
 from workers.errors import Conflict, LimitReached, NotFound, SetupError, Unavailable
+from workers.jobs import JobStore
 from workers.records import JobUpdate
 from workers.settings import Settings
 from workers.stores import Stores, open_stores
@@ -156,7 +157,7 @@ async def test_only_final_jobs_are_deleted_and_their_files_follow(
     with pytest.raises(NotFound):
         await stores.jobs.get(job.id)
     slots.start(settings, "a")
-    for _ in range(100):
+    for _ in range(600):
         if not (settings.files_dir / "jobs" / job.id).exists():
             return
         await asyncio.sleep(0.05)
@@ -277,3 +278,46 @@ async def test_healthy_tells_whether_the_database_answers(stores: Stores):
     with contextlib.suppress(Unavailable):
         await stores.jobs._database.pool.close()
     assert not await stores.jobs.healthy()
+
+
+async def test_followers_of_one_job_read_it_together_and_all_see_everything(
+    stores: Stores, dataset_id: str, settings: Settings, monkeypatch: pytest.MonkeyPatch
+):
+    job, _ = await stores.jobs.submit(dataset_id, FAST)
+    read, reads = JobStore.update, []
+
+    async def counted(store: JobStore, job_id: str, after: int = 0) -> JobUpdate:
+        reads.append(after)
+        return await read(store, job_id, after)
+
+    monkeypatch.setattr(JobStore, "update", counted)
+
+    async def follow() -> list[int]:
+        return [
+            event.seq async for update in stores.jobs.subscribe(job.id) if update for event in update.events
+        ]
+
+    following = [asyncio.create_task(follow()) for _ in range(50)]
+    await asyncio.sleep(0.3)
+    async with open_database(settings.require_database_url()) as database:
+        for _ in range(5):
+            await database.fetch("SELECT add_job_event(%s, 'requeued', '{}')", job.id)
+            await asyncio.sleep(0.2)
+    await stores.jobs.cancel(job.id)
+    assert set(map(tuple, await asyncio.gather(*following))) == {tuple(range(1, 8))}
+    assert len(reads) < 50, "fewer reads than followers, over seven changes"
+
+
+async def test_a_change_whose_notification_was_lost_is_seen_by_looking(
+    settings: Settings, dataset_id: str, database_url: str
+):
+    async with open_stores(settings) as stores:
+        job, _ = await stores.jobs.submit(dataset_id, FAST)
+        updates = stores.jobs.subscribe(job.id, heartbeat_s=60)
+        await anext(updates)
+        async with await psycopg.AsyncConnection.connect(database_url) as connection:
+            await connection.execute("UPDATE jobs SET revision = revision + 1, message = 'unheard'")
+        async with asyncio.timeout(10):
+            while (update := await anext(updates)) is None or update.job.message != "unheard":
+                continue
+        await updates.aclose()
