@@ -90,8 +90,11 @@ class _Exchange:
     def fields(self) -> dict[str, object]:
         """What the log tells beside the line itself."""
         state, client = self.scope.get("state", {}), self.scope.get("client")
+        identity = state.get("identity")
         said: dict[str, object] = {
             "request_id": state.get("request_id"),
+            "tenant": getattr(identity, "tenant", None),
+            "key": getattr(identity, "key_id", None),
             "client": client[0] if client else None,
             "route": self.route,
             "received": self.received,

@@ -15,6 +15,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.problems import MEDIA_TYPE, ProblemError
+from workers.logs import about
 
 logger = logging.getLogger(__name__)
 # A browser sends at most 8 KiB of cookies; a few long headers beside them fit in too.
@@ -69,7 +70,8 @@ class RequestContext:
         try:
             _refuse_ambiguous(request)
             _refuse_other_sites(request)
-            await self._app(scope, receive, send_with_headers)
+            with about(request_id=request_id(request)):
+                await self._app(scope, receive, send_with_headers)
         except ProblemError as problem:
             await render(problem, request)(scope, receive, send_with_headers)
         except asyncio.CancelledError:
