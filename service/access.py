@@ -29,6 +29,7 @@ from workers.errors import Unavailable
 from workers.jobs import JobStore
 from workers.tenants import LOCAL_TENANT
 from workers.uploads import UploadStore
+from workers.webhooks import WebhookStore
 
 log = logging.getLogger(__name__)
 
@@ -88,6 +89,11 @@ class Caller:
     def uploads(self) -> UploadStore:
         """The uploads into the tenant's datasets."""
         return self.service.stores.uploads.of(self.tenant)
+
+    @property
+    def webhooks(self) -> WebhookStore:
+        """The tenant's webhooks."""
+        return self.service.stores.webhooks.of(self.tenant)
 
 
 class Access:

@@ -26,7 +26,7 @@ from service.observe import Observed, is_probe
 from service.openapi import describe
 from service.problems import CATALOGUE, ProblemError
 from service.request_context import RequestContext, render
-from service.routes import artifacts, datasets, events, health, jobs, meta, uploads
+from service.routes import artifacts, datasets, events, health, jobs, meta, uploads, webhooks
 from service.uploads import sweep_staging
 from workers.errors import EngineError, NotFound, Unavailable
 from workers.settings import Settings
@@ -36,7 +36,10 @@ from workers.traces import flush_traces
 logger = logging.getLogger(__name__)
 
 _UNFINISHED_EVERY_S = 15.0
-_ROUTERS = [module.router for module in (datasets, uploads, jobs, events, artifacts, meta, health, docs_page)]
+_ROUTERS = [
+    module.router
+    for module in (datasets, uploads, jobs, events, artifacts, webhooks, meta, health, docs_page)
+]
 _DESCRIPTION = """
 Refines the camera poses of an image set.
 

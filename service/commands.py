@@ -65,7 +65,7 @@ def setup_problems() -> Iterator[None]:
 )
 @click.option("--data-dir", type=click.Path(path_type=Path), help="Files and private database.")
 def up_command(host: str | None, port: int | None, slots: int | None, data_dir: Path | None) -> None:
-    """Run everything on this machine: database, API and workers.
+    """Run everything on this machine: database, API, dispatcher and workers.
 
     Without BIRESNERF_DATABASE_URL a private PostgreSQL is started from the installed package. Ctrl-C stops
     everything; running jobs write a checkpoint and go on at the next start.
@@ -73,7 +73,7 @@ def up_command(host: str | None, port: int | None, slots: int | None, data_dir: 
     import asyncio
 
     from workers.logs import set_up_logging
-    from workers.supervise import ChildSpec, slot_specs, supervise
+    from workers.supervise import ChildSpec, dispatcher_spec, slot_specs, supervise
 
     with setup_problems():
         settings = settings_with(host=host, port=port, slots=slots, data_dir=data_dir)
@@ -83,7 +83,8 @@ def up_command(host: str | None, port: int | None, slots: int | None, data_dir: 
         variables = {"BIRESNERF_HOST": settings.host, "BIRESNERF_PORT": str(settings.port)}
         api = ChildSpec("api", (sys.executable, "-m", "service.server"), variables)
         ready = _announcer(settings.host, settings.port)
-        sys.exit(asyncio.run(supervise(settings, [api, *slot_specs(settings)], on_ready=ready)))
+        children = [api, dispatcher_spec(settings), *slot_specs(settings)]
+        sys.exit(asyncio.run(supervise(settings, children, on_ready=ready)))
 
 
 def _announcer(host: str, port: int) -> Callable[[str], Coroutine[None, None, None]]:

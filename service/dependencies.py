@@ -75,8 +75,20 @@ def _upload_id(upload_id: Annotated[str, PathParameter(examples=["up_01JD8Y3V1QK
     return _known_form(upload_id)
 
 
+def _webhook_id(webhook_id: Annotated[str, PathParameter(examples=["wh_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])]) -> str:
+    return _known_form(webhook_id)
+
+
+def _delivery_id(
+    delivery_id: Annotated[str, PathParameter(examples=["msg_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])],
+) -> str:
+    return _known_form(delivery_id)
+
+
 JobId = Annotated[str, Depends(_job_id)]
 DatasetId = Annotated[str, Depends(_dataset_id)]
+WebhookId = Annotated[str, Depends(_webhook_id)]
+DeliveryId = Annotated[str, Depends(_delivery_id)]
 UploadId = Annotated[str, Depends(_upload_id)]
 
 

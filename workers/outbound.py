@@ -45,7 +45,7 @@ class Policy:
     """Where the service may connect to."""
 
     plain_http: bool = False
-    ports: tuple[int, ...] = (443,)
+    ports: tuple[int, ...] = (443,)  # none: any
     networks: tuple[Network, ...] = ()
 
     @classmethod
@@ -77,8 +77,8 @@ def _fault(url: httpx.URL, port: int, policy: Policy) -> str:
         return "The scheme must be https."
     if url.userinfo or url.fragment:
         return "It must hold neither a user nor a fragment."
-    if port not in policy.ports:
-        return f"Its port must be one of {', '.join(map(str, policy.ports))}."
+    if not 0 < port < 65536 or (policy.ports and port not in policy.ports):
+        return f"Its port must be one of {', '.join(map(str, policy.ports)) or '1 to 65535'}."
     literal = _literal(host)
     if literal is None and (not _HOST.fullmatch(host) or _looks_like_a_number(host)):
         return "Its host is no name and no address in the usual form."

@@ -105,8 +105,13 @@ class Settings(BaseSettings):
     webhook_timeout_s: float = Field(
         10.0, gt=0, le=60, description="Longest delivery of one webhook message."
     )
+    webhook_retry_s: float = Field(
+        5.0, gt=0, description="Pause after the first failed delivery; then it grows."
+    )
     webhook_http: bool = Field(False, description="Take webhook addresses with http too.")
-    webhook_ports: tuple[int, ...] = Field((443,), description="Ports that webhook addresses may have.")
+    webhook_ports: tuple[int, ...] = Field(
+        (443,), description="Ports that webhook addresses may have; [] takes any."
+    )
     webhook_networks: tuple[Network, ...] = Field(
         (), description="Networks that are not public but may receive webhooks, for example 10.0.0.0/8."
     )

@@ -17,6 +17,7 @@ from workers.monitor import Monitor
 from workers.one_store import require_same_store
 from workers.settings import Settings
 from workers.uploads import UploadStore
+from workers.webhooks import WebhookStore
 
 FOLLOW_POLL_S = 1.5
 
@@ -31,6 +32,7 @@ class Stores:
     uploads: UploadStore
     keys: KeyStore
     monitor: Monitor
+    webhooks: WebhookStore
 
 
 @asynccontextmanager
@@ -51,6 +53,7 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
             monitor = Monitor(database, files, settings.stall_s)
             uploads = UploadStore(database, files, settings)
             datasets = DatasetStore(database, files, settings)
-            yield Stores(jobs, datasets, files, uploads, KeyStore(database), monitor)
+            webhooks = WebhookStore(database, settings)
+            yield Stores(jobs, datasets, files, uploads, KeyStore(database), monitor, webhooks)
         finally:
             listening.cancel()

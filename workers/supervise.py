@@ -56,6 +56,12 @@ def slot_specs(settings: Settings) -> list[ChildSpec]:
     ]
 
 
+def dispatcher_spec(settings: Settings) -> ChildSpec:
+    """The process that sends webhooks; what it is sending when told to stop, it finishes."""
+    grace_s = settings.webhook_timeout_s + KILL_AFTER_S
+    return ChildSpec("dispatcher", (sys.executable, "-m", "workers.dispatcher"), stop_grace_s=grace_s)
+
+
 async def supervise(
     settings: Settings,
     children: Sequence[ChildSpec],

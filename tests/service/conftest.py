@@ -70,6 +70,10 @@ def running_service(folder: Path, **settings: Any) -> Iterator[Running]:
         "poll_s": 0.3,
         "janitor_s": 0.5,
         "data_dir": folder / "data",
+        # Receivers of webhooks live on this machine.
+        "webhook_http": True,
+        "webhook_ports": (),
+        "webhook_networks": ("127.0.0.0/8",),
         **LIMITS,
         **settings,
     }

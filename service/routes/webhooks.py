@@ -1,0 +1,171 @@
+"""Webhooks: who is told of what over signed HTTP messages, and what became of each message."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Query, Request, Response
+
+from service.access import CallerHere, JobWriterHere
+from service.dependencies import DeliveryId, WebhookId, next_link
+from service.json_body import json_content, read_json
+from service.problems import declared
+from service.webhook_schemas import (
+    DeliveryList,
+    DeliveryView,
+    NewWebhook,
+    WebhookChange,
+    WebhookList,
+    WebhookView,
+    WebhookWithSecret,
+    delivery_url,
+    webhook_url,
+)
+
+router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
+_ALWAYS = ("database_unavailable", "internal_error")
+_WRITES = ("cross_site", *_ALWAYS)
+_BODY = ("malformed_json", "body_too_large", "unsupported_media", "body_timeout", "invalid_request")
+
+
+async def _new(request: Request) -> NewWebhook:
+    headers = request.headers
+    return await read_json(
+        headers.get("content-type", ""), headers.get("content-length"), request.stream(), NewWebhook
+    )
+
+
+async def _change(request: Request) -> WebhookChange:
+    headers = request.headers
+    return await read_json(
+        headers.get("content-type", ""), headers.get("content-length"), request.stream(), WebhookChange
+    )
+
+
+def _body_of(model: type[NewWebhook] | type[WebhookChange]) -> dict[str, Any]:
+    return {"requestBody": {"required": True, "content": {"application/json": json_content(model)}}}
+
+
+@router.post(
+    "",
+    status_code=201,
+    operation_id="createWebhook",
+    openapi_extra=_body_of(NewWebhook),
+    responses=declared(*_BODY, "webhook_url_refused", "too_many_webhooks", *_WRITES),
+)
+async def create_webhook(
+    caller: JobWriterHere, body: Annotated[NewWebhook, Depends(_new)], response: Response
+) -> WebhookWithSecret:
+    """A webhook for all jobs and datasets. The secret in the answer is not told again."""
+    webhook, secret = await caller.webhooks.create(caller.tenant, body.url, body.events, body.description)
+    response.headers["Location"] = webhook_url(webhook.id)
+    return WebhookWithSecret.made(webhook, secret)
+
+
+@router.get("", operation_id="listWebhooks", responses=declared("bad_cursor", "invalid_request", *_ALWAYS))
+async def list_webhooks(
+    request: Request,
+    response: Response,
+    caller: CallerHere,
+    job: Annotated[
+        str | None, Query(max_length=100, pattern="^[0-9A-Za-z_]*$", description="Those of this job alone.")
+    ] = None,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+    cursor: Annotated[str | None, Query(max_length=500)] = None,
+) -> WebhookList:
+    """Webhooks for all jobs, or those sent along with one job; newest first."""
+    page = await caller.webhooks.list(job_id=job, limit=limit, cursor=cursor)
+    response.headers.update(next_link(request, page.next_cursor))
+    return WebhookList(items=[WebhookView.of(item) for item in page.items], next_cursor=page.next_cursor)
+
+
+@router.get("/{webhook_id}", operation_id="getWebhook", responses=declared("not_found", *_ALWAYS))
+async def get_webhook(webhook_id: WebhookId, caller: CallerHere) -> WebhookView:
+    """The webhook, and whether it works."""
+    return WebhookView.of(await caller.webhooks.get(webhook_id))
+
+
+@router.patch(
+    "/{webhook_id}",
+    operation_id="changeWebhook",
+    openapi_extra=_body_of(WebhookChange),
+    responses=declared("not_found", *_BODY, "webhook_url_refused", *_WRITES),
+)
+async def change_webhook(
+    caller: JobWriterHere, webhook_id: WebhookId, body: Annotated[WebhookChange, Depends(_change)]
+) -> WebhookView:
+    """Changes what is given; switches it off or on again."""
+    changed = await caller.webhooks.change(webhook_id, **body.model_dump())
+    return WebhookView.of(changed)
+
+
+@router.delete(
+    "/{webhook_id}",
+    status_code=204,
+    operation_id="deleteWebhook",
+    responses=declared("not_found", *_WRITES),
+)
+async def delete_webhook(webhook_id: WebhookId, caller: JobWriterHere) -> None:
+    """Deletes it with its deliveries; what waits is not sent."""
+    await caller.webhooks.delete(webhook_id)
+
+
+@router.post(
+    "/{webhook_id}/secret", operation_id="rotateWebhookSecret", responses=declared("not_found", *_WRITES)
+)
+async def rotate_secret(webhook_id: WebhookId, caller: JobWriterHere) -> WebhookWithSecret:
+    """A new secret. For 24 hours messages are signed with the one before too."""
+    return WebhookWithSecret.made(*await caller.webhooks.rotate(webhook_id))
+
+
+@router.post(
+    "/{webhook_id}/test",
+    status_code=202,
+    operation_id="testWebhook",
+    responses=declared("not_found", "state_conflict", *_WRITES),
+)
+async def test_webhook(webhook_id: WebhookId, caller: JobWriterHere, response: Response) -> DeliveryView:
+    """Sends a message `webhook.test`; the delivery at `Location` tells what came of it."""
+    delivery = await caller.webhooks.test(webhook_id)
+    response.headers["Location"] = delivery_url(delivery)
+    return DeliveryView.of(delivery)
+
+
+@router.get(
+    "/{webhook_id}/deliveries",
+    operation_id="listDeliveries",
+    responses=declared("bad_cursor", "not_found", "invalid_request", *_ALWAYS),
+)
+async def list_deliveries(
+    webhook_id: WebhookId,
+    request: Request,
+    response: Response,
+    caller: CallerHere,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+    cursor: Annotated[str | None, Query(max_length=500)] = None,
+) -> DeliveryList:
+    """What was sent and what waits, newest first, with every attempt's time and status."""
+    page = await caller.webhooks.deliveries(webhook_id, limit=limit, cursor=cursor)
+    response.headers.update(next_link(request, page.next_cursor))
+    return DeliveryList(items=[DeliveryView.of(item) for item in page.items], next_cursor=page.next_cursor)
+
+
+@router.get(
+    "/{webhook_id}/deliveries/{delivery_id}",
+    operation_id="getDelivery",
+    responses=declared("not_found", *_ALWAYS),
+)
+async def get_delivery(webhook_id: WebhookId, delivery_id: DeliveryId, caller: CallerHere) -> DeliveryView:
+    """One message and its attempts."""
+    return DeliveryView.of(await caller.webhooks.delivery(webhook_id, delivery_id))
+
+
+@router.post(
+    "/{webhook_id}/deliveries/{delivery_id}/redeliver",
+    status_code=202,
+    operation_id="redeliver",
+    responses=declared("not_found", "state_conflict", *_WRITES),
+)
+async def redeliver(webhook_id: WebhookId, delivery_id: DeliveryId, caller: JobWriterHere) -> DeliveryView:
+    """Sends a message again at once, under the id it had, so that a receiver can tell."""
+    return DeliveryView.of(await caller.webhooks.redeliver(webhook_id, delivery_id))

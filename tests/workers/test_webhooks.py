@@ -1,0 +1,147 @@
+"""What webhooks are told, to whom, and signed how; an independent library reads the signatures."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import psycopg
+import pytest
+import standardwebhooks
+
+from tests.workers.conftest import Slots
+from tests.workers.webhook_receiver import Dispatchers, Receiver, concluded, hook_settings, queued_job
+from workers.database import open_database
+from workers.errors import LimitReached, NotFound
+from workers.settings import Settings
+from workers.stores import Stores
+from workers.webhook_records import ALL_EVENTS
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def settings(database_url: str, tmp_path: Path) -> Settings:
+    return hook_settings(database_url, tmp_path)
+
+
+@pytest.fixture
+async def dispatchers(settings: Settings, slots: Slots, tmp_path: Path) -> AsyncIterator[Dispatchers]:
+    started = Dispatchers(settings, slots, tmp_path)
+    yield started
+    await started.end()
+
+
+async def test_a_jobs_life_is_told_signed_and_an_independent_reader_believes_it(
+    stores: Stores, settings: Settings, slots: Slots, dispatchers: Dispatchers
+):
+    async with Receiver().open() as receiver:
+        webhook, secret = await stores.webhooks.create("local", receiver.url, ALL_EVENTS)
+        dispatchers.start()
+        slots.start(settings, "cpu0")
+        job_id = await queued_job(stores)
+        messages = await receiver.heard(4)
+        assert sorted(receiver.events()) == [
+            "dataset.validated",
+            "job.queued",
+            "job.started",
+            "job.succeeded",
+        ]
+        for message in messages:
+            told = standardwebhooks.Webhook(secret).verify(message.body, message.headers)
+            assert told["timestamp"].endswith("Z")
+            assert message.headers["content-type"] == "application/json"
+            with pytest.raises(standardwebhooks.WebhookVerificationError):
+                standardwebhooks.Webhook(secret).verify(message.body + b" ", message.headers)
+        by_event = dict(zip(receiver.events(), messages, strict=True))
+        assert by_event["dataset.validated"].data["state"] == "ready"
+        end = by_event["job.succeeded"].data
+        job = await stores.jobs.get(job_id)
+        assert (end["id"], end["state"], end["attempt"]) == (job_id, "succeeded", 1)
+        assert (end["labels"], end["verdict"]) == ({"run": "ä"}, job.verdict)
+        assert by_event["job.queued"].data["state"] == "queued"
+        page = await stores.webhooks.deliveries(webhook.id)
+        assert {item.id for item in page.items} == {m.headers["webhook-id"] for m in messages}
+        last = await concluded(stores, webhook.id, by_event["job.succeeded"].headers["webhook-id"])
+        assert [(a.number, a.status, a.error) for a in last.attempts] == [(1, 204, None)]
+
+
+async def test_only_what_was_asked_for_comes_and_only_to_its_tenant(
+    stores: Stores, settings: Settings, dispatchers: Dispatchers
+):
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute("INSERT INTO tenants (id) VALUES ('other')")
+    async with Receiver().open() as mine, Receiver().open() as other:
+        await stores.webhooks.create("local", mine.url, ["job.cancelled"])
+        foreign, _ = await stores.webhooks.create("other", other.url, ALL_EVENTS)
+        job_id = await queued_job(stores)
+        await stores.jobs.cancel(job_id)
+        dispatchers.start()
+        (message,) = await mine.heard(1)
+        assert (message.data["id"], message.data["state"]) == (job_id, "cancelled")
+        assert other.messages == []
+        assert (await stores.webhooks.deliveries(foreign.id)).items == ()
+        local = stores.webhooks.of("local")
+        for call in (local.get, local.delete, local.test, local.rotate, local.deliveries, local.change):
+            with pytest.raises(NotFound):
+                await call(foreign.id)
+        assert [item.tenant for item in (await local.list()).items] == ["local"]
+
+
+async def test_a_change_that_is_rolled_back_is_told_to_nobody(stores: Stores, settings: Settings):
+    webhook, _ = await stores.webhooks.create("local", "http://127.0.0.1:9999/", ALL_EVENTS)
+    job_id = await queued_job(stores)
+    before = (await stores.webhooks.deliveries(webhook.id)).items
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute("SELECT add_job_event(%s, 'failed', '{}')", (job_id,))
+        connection.rollback()
+    assert (await stores.webhooks.deliveries(webhook.id)).items == before
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute("SELECT add_job_event(%s, 'failed', '{}')", (job_id,))
+    assert len((await stores.webhooks.deliveries(webhook.id)).items) == len(before) + 1
+
+
+async def test_after_a_rotation_both_secrets_are_good_and_later_the_new_one_alone(
+    stores: Stores, settings: Settings, dispatchers: Dispatchers
+):
+    async with Receiver().open() as receiver:
+        webhook, old = await stores.webhooks.create("local", receiver.url, ALL_EVENTS)
+        changed, new = await stores.webhooks.rotate(webhook.id)
+        assert changed.previous_secret_until is not None
+        dispatchers.start()
+        await stores.webhooks.test(webhook.id)
+        (message,) = await receiver.heard(1)
+        for secret in (old, new):
+            standardwebhooks.Webhook(secret).verify(message.body, message.headers)
+        with psycopg.connect(settings.require_database_url()) as connection:
+            connection.execute("UPDATE webhooks SET previous_until = now() - interval '1 second'")
+        await stores.webhooks.test(webhook.id)
+        later = (await receiver.heard(2))[1]
+        standardwebhooks.Webhook(new).verify(later.body, later.headers)
+        with pytest.raises(standardwebhooks.WebhookVerificationError):
+            standardwebhooks.Webhook(old).verify(later.body, later.headers)
+        assert (await stores.webhooks.get(webhook.id)).previous_secret_until is None
+
+
+async def test_an_inside_address_is_not_sent_to_whatever_the_row_says(
+    stores: Stores, settings: Settings, dispatchers: Dispatchers
+):
+    async with Receiver().open() as receiver:
+        webhook, _ = await stores.webhooks.create("local", receiver.url, ALL_EVENTS)
+        delivery = await stores.webhooks.test(webhook.id)
+        strict = settings.model_copy(update={"webhook_networks": ()})
+        dispatchers.start(strict)
+        done = await concluded(stores, webhook.id, delivery.id)
+        assert (done.state, [a.error for a in done.attempts]) == ("failed", ["url_refused"])
+        assert receiver.messages == []
+
+
+async def test_a_tenant_has_so_many_webhooks_and_no_more(settings: Settings, stores: Stores):
+    few = settings.model_copy(update={"max_webhooks": 2})
+    async with open_database(settings.require_database_url(), connections=2) as database:
+        store = type(stores.webhooks)(database, few, "local")
+        for _ in range(2):
+            await store.create("local", "http://127.0.0.1:9999/", ["job.failed"])
+        with pytest.raises(LimitReached) as told:
+            await store.create("local", "http://127.0.0.1:9999/", ["job.failed"])
+        assert told.value.code == "too_many_webhooks"

@@ -1,0 +1,67 @@
+"""The dispatcher: a small process for what has to be done beside the jobs. Sends webhooks.
+
+Several may run at the same time, each on any host: what one has taken, the others leave. Jobs need none of
+them; while no dispatcher runs, messages wait in the database.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import sys
+
+from workers.database import open_database
+from workers.errors import SetupError
+from workers.follow import Listener
+from workers.logs import set_up_logging
+from workers.outbound import Outbound, Policy
+from workers.settings import Settings
+from workers.waiting import first_done
+from workers.webhook_sender import WebhookSender
+
+log = logging.getLogger(__name__)
+
+WEBHOOK_CHANNEL = "biresnerf_webhooks"
+
+
+async def dispatch(settings: Settings, stop: asyncio.Event) -> None:
+    """Work until ``stop``, then finish what is under way; raises `SetupError`."""
+    async with open_database(
+        settings.require_database_url(), connections=4, silence_s=settings.stall_s
+    ) as database:
+        listener = Listener(database, settings.poll_s, WEBHOOK_CHANNEL)
+        listening = asyncio.create_task(listener.run())
+        sender = WebhookSender(database, listener, Outbound(Policy.of(settings)), settings)
+        working = [asyncio.create_task(sender.run(stop))]
+        try:
+            log.info("dispatcher is ready")
+            await first_done(*working)  # before `stop` only by a fault of ours
+            stop.set()
+            await asyncio.gather(*working)
+        finally:
+            for task in (listening, *working):
+                task.cancel()
+
+
+async def _until_told(settings: Settings) -> None:
+    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    await dispatch(settings, stop)
+
+
+def main() -> int:
+    """`python -m workers.dispatcher`, settings from the environment; SIGTERM ends it within a delivery."""
+    settings = Settings()
+    set_up_logging("dispatcher", settings)
+    try:
+        asyncio.run(_until_told(settings))
+    except SetupError as error:
+        sys.stderr.write(f"{error.what}\n")
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
