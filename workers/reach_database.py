@@ -12,14 +12,15 @@ from workers.settings import Settings
 
 
 @contextmanager
-def reached_database(settings: Settings) -> Iterator[str]:
-    """The address of the migrated database: the one of the settings, or the private one of the data folder.
+def reached_database(settings: Settings, *, migrated: bool = True) -> Iterator[str]:
+    """The address of the database: the one of the settings, or the private one of the data folder.
 
     A private one that runs already (below `biresnerf up`) is used as it is; else it is started for the time
-    of the block. Raises `SetupError`.
+    of the block. It is brought up to date first, unless ``migrated`` is off. Raises `SetupError`.
     """
     if settings.database_url is not None:
-        migrate(settings.database_url)
+        if migrated:
+            migrate(settings.database_url)
         yield settings.database_url
         return
     postgres = EmbeddedPostgres(settings.postgres_dir, pg_bin=settings.pg_bin)
@@ -29,7 +30,8 @@ def reached_database(settings: Settings) -> Iterator[str]:
         if error.code != "already_running":
             raise
     try:
-        migrate(postgres.url)
+        if migrated:
+            migrate(postgres.url)
         yield postgres.url
     finally:
         postgres.stop()
