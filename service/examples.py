@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from biresnerf.config import PRESETS, RefineOptions
+from service.webhook_examples import WEBHOOK_EXAMPLES
 
 _AT = "2026-11-21T19:00:00Z"
 _SHA256 = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
@@ -138,6 +139,7 @@ _UPLOAD_VIEW: dict[str, Any] = {
 }
 
 EXAMPLES: dict[str, Any] = {
+    **WEBHOOK_EXAMPLES,
     "JobView": _JOB_VIEW,
     "JobList": {"items": [_JOB_VIEW], "next_cursor": None},
     "DatasetView": _DATASET_VIEW,

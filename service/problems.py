@@ -41,6 +41,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "direct_upload_unavailable": (409, "Files cannot be sent to the store itself"),
     "upload_incomplete": (409, "The file has not arrived at the store"),
     "link_expired": (410, "The link is not good any more"),
+    "expired": (410, "It was kept for its time and is gone"),
     "file_exists": (412, "The file is there already"),
     "precondition_failed": (412, "A condition of the request does not hold"),
     "body_too_large": (413, "The body is larger than the service takes"),

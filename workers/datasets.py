@@ -13,7 +13,7 @@ from biresnerf.errors import InputError
 from workers.checking import Checker
 from workers.claim import insist
 from workers.database import Connection, Database
-from workers.errors import Conflict, LimitReached, NotFound
+from workers.errors import Conflict, Expired, LimitReached, NotFound
 from workers.files import FileStore, StoredFile
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
 from workers.records import DatasetFile, DatasetRecord, DatasetState, ManifestEntry, Page
@@ -162,10 +162,11 @@ class DatasetStore:
     async def files(
         self, dataset_id: str, *, limit: int = 1000, cursor: str | None = None
     ) -> Page[DatasetFile]:
-        """The files, by path; raises `NotFound`, `InputError` (``bad_cursor``)."""
+        """The files, by path; raises `NotFound`, `Expired`, `InputError` (``bad_cursor``)."""
         after = cursor_place(cursor, 1)[0] if cursor else ""
         async with self._database.transaction() as connection:
-            await self._required(connection, dataset_id)
+            if (await self._required(connection, dataset_id)).state == "expired":
+                raise Expired(f"The files of dataset {dataset_id} were not used for long and are gone.")
             found = await connection.execute(
                 FILE + " WHERE dataset_id = %s AND path > %s ORDER BY path LIMIT %s",
                 (dataset_id, after, limit + 1),

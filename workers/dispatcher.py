@@ -1,4 +1,4 @@
-"""The dispatcher: a small process for what has to be done beside the jobs. Sends webhooks.
+"""The dispatcher: a small process for what has to be done beside the jobs: it sends webhooks and lets things expire.
 
 Several may run at the same time, each on any host: what one has taken, the others leave. Jobs need none of
 them; while no dispatcher runs, messages wait in the database.
@@ -13,6 +13,7 @@ import sys
 
 from workers.database import open_database
 from workers.errors import SetupError
+from workers.expiry import Expiry
 from workers.follow import Listener
 from workers.logs import set_up_logging
 from workers.outbound import Outbound, Policy
@@ -33,7 +34,8 @@ async def dispatch(settings: Settings, stop: asyncio.Event) -> None:
         listener = Listener(database, settings.poll_s, WEBHOOK_CHANNEL)
         listening = asyncio.create_task(listener.run())
         sender = WebhookSender(database, listener, Outbound(Policy.of(settings)), settings)
-        working = [asyncio.create_task(sender.run(stop))]
+        expiry = Expiry(database, settings)
+        working = [asyncio.create_task(duty.run(stop)) for duty in (sender, expiry)]
         try:
             log.info("dispatcher is ready")
             await first_done(*working)  # before `stop` only by a fault of ours

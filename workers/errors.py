@@ -20,6 +20,13 @@ class NotFound(EngineError):
         super().__init__("not_found", what)
 
 
+class Expired(EngineError):
+    """It was kept for its time, and its files are gone."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__("expired", what)
+
+
 class Conflict(EngineError):
     """The thing exists, but its state does not allow this.
 

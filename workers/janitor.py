@@ -10,6 +10,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Awaitable, Callable, Collection
+from functools import partial
 
 from psycopg.types.json import Jsonb
 
@@ -18,8 +19,10 @@ from workers.endings import finish_cancelled
 from workers.errors import Unavailable
 from workers.files import FileStore
 from workers.receipts import offer_again
+from workers.records import FINAL_JOB_STATES
 from workers.settings import Settings
 from workers.statistics import fold_tallies
+from workers.trash import take_trash_out
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +59,8 @@ class Janitor:
     async def run(self) -> None:
         """Rounds until cancelled."""
         # Apart, for it can take long, and the pauses between two rounds tell something.
-        await asyncio.gather(self._again_and_again(self._round), self._again_and_again(self._take_trash_out))
+        trash = partial(take_trash_out, self._database, self._files)
+        await asyncio.gather(self._again_and_again(self._round), self._again_and_again(trash))
 
     async def _again_and_again(self, duty: Callable[[], Awaitable[None]]) -> None:
         while True:
@@ -159,14 +163,6 @@ class Janitor:
                 "SELECT add_job_event(%s, 'requeued', %s)", (row["id"], Jsonb({"why": "lost"}))
             )
 
-    async def _take_trash_out(self) -> None:
-        # Outside of a transaction: a thousand files in a bucket take their time. Two of us do no harm.
-        for row in await self._database.fetch(
-            "SELECT id, prefix, keep FROM trash WHERE not_before <= clock_timestamp() ORDER BY id LIMIT 20"
-        ):
-            await self._files.delete_prefix(row["prefix"], keep=row["keep"])
-            await self._database.fetch("DELETE FROM trash WHERE id = %s", row["id"])
-
 
 async def release(connection: Connection, queue_id: int, why: str) -> None:
     """Take a queue row from a worker that is gone, in the caller's transaction.
@@ -183,7 +179,7 @@ async def release(connection: Connection, queue_id: int, why: str) -> None:
     )
     if await cursor.fetchone() is None:
         return  # it came to an end in the meantime
-    if job is None or job["state"] in ("succeeded", "failed", "cancelled"):
+    if job is None or job["state"] in FINAL_JOB_STATES:
         await connection.execute("SELECT procrastinate_finish_job_v1(%s, 'aborted', false)", (queue_id,))
         return
     log.warning("taking job %s back (%s)", job["id"], why)

@@ -29,7 +29,7 @@ def job_from_row(row: dict[str, Any]) -> Job:
         "created_at",
     )
     also = ("started_at", "finished_at", "options", "metrics", "message", "verdict", "labels", "revision")
-    life = ("kind", "parent", "forked_from", "forked_stage", "smaller", "partial")
+    life = ("expires_at", "kind", "parent", "forked_from", "forked_stage", "smaller", "partial")
     progress = JobProgress(**{key: row[key] for key in ("fraction", "step", "steps_total", "eta_s")})
     error = JobError.model_validate(row["error"]) if row["error"] else None
     return Job(**{key: row[key] for key in same + also + life}, progress=progress, error=error)

@@ -14,7 +14,7 @@ from psycopg.types.json import Jsonb
 from biresnerf.config import RefineOptions
 from workers.database import Connection, Database
 from workers.endings import finish_cancelled
-from workers.errors import Conflict, LimitReached, NotFound
+from workers.errors import Conflict, Expired, LimitReached, NotFound
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
 from workers.job_listener import JobListener, follow
 from workers.job_rows import JOB, MINE, job_from_row
@@ -79,13 +79,8 @@ class JobStore:
                 "INSERT INTO jobs (id, dataset_id, tenant, options, labels, idempotency_key, fingerprint)"
                 " VALUES (%s, %s, %s, %s, %s, %s, %s)",
                 (
-                    job_id,
-                    dataset_id,
-                    tenant,
-                    Jsonb(resolved),
-                    Jsonb(dict(labels or {})),
-                    idempotency_key,
-                    fingerprint,
+                    *(job_id, dataset_id, tenant, Jsonb(resolved), Jsonb(dict(labels or {}))),
+                    *(idempotency_key, fingerprint),
                 ),
             )
             queue_id = await self._database.enqueue(connection, job_id)
@@ -208,12 +203,14 @@ class JobStore:
             return await _events(connection, job_id, after, limit)
 
     async def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
-        """The published files, by name, while the job runs its previews; raises `NotFound`."""
+        """The published files, by name, while the job runs its previews; raises `NotFound`, `Expired`."""
         rows = await self._database.fetch(
-            f"SELECT artifacts, previews FROM jobs WHERE id = %s AND {MINE}", *(job_id, self._tenant)
+            f"SELECT state, artifacts, previews FROM jobs WHERE id = %s AND {MINE}", *(job_id, self._tenant)
         )
         if not rows:
             raise NotFound(f"No job {job_id}.")
+        if rows[0]["state"] == "expired":
+            raise Expired(f"The files of job {job_id} were kept for their time and are gone.")
         previews = (rows[0]["previews"] or {}).get("artifacts", [])
         return tuple(Artifact.model_validate(item) for item in [*rows[0]["artifacts"], *previews])
 

@@ -10,9 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from biresnerf.progress import ReusableStage, Stage
 from biresnerf.report import VerdictName
 
-JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
-DatasetState = Literal["open", "finalizing", "ready", "rejected"]
-FINAL_JOB_STATES: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled"})
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "expired"]
+DatasetState = Literal["open", "finalizing", "ready", "rejected", "expired"]
+FINAL_JOB_STATES: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled", "expired"})
 
 LOG_NAME, POSES_NAME = "log.txt", "poses.json"  # files of a result that the engine knows
 PREVIEW_FOLDER = "preview"  # of files that show how far a job is
@@ -31,8 +31,9 @@ EventType = Literal[
     "succeeded",
     "failed",
     "cancelled",
+    "expired",
 ]
-FINAL_EVENTS: frozenset[EventType] = frozenset({"succeeded", "failed", "cancelled"})
+FINAL_EVENTS: frozenset[EventType] = frozenset({"succeeded", "failed", "cancelled", "expired"})
 
 
 class Record(BaseModel):
@@ -84,6 +85,9 @@ class Job(Record):
     created_at: datetime
     started_at: datetime | None = None
     finished_at: datetime | None = None
+    expires_at: datetime | None = Field(
+        None, description="When its files go, once it is over; none where they are kept for ever."
+    )
     options: dict[str, Any] = Field(description="Resolved RefineOptions; of an export, its formats.")
     smaller: dict[str, Any] = Field(
         {}, description="Options that a second try uses instead, after the first ran out of memory."
@@ -169,6 +173,9 @@ class DatasetRecord(Record):
     report: dict[str, Any] | None = None
     error: JobError | None = None
     created_at: datetime
+    expires_at: datetime | None = Field(
+        None, description="When its files go unless it is used; none while a job uses it, or never."
+    )
     revision: int = 0
 
 

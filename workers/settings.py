@@ -102,6 +102,22 @@ class Settings(BaseSettings):
     max_archive_bytes: int = Field(8 * GIB, ge=1, description="Size of an uploaded archive.")
     max_unpacked_bytes: int = Field(20 * GIB, ge=1, description="Size of all that comes out of an archive.")
 
+    keep_results_days: float = Field(
+        7.0, ge=0, description="Files of a job that is over are kept for so long; 0: for ever."
+    )
+    keep_datasets_days: float = Field(
+        7.0, ge=0, description="Datasets are kept for so long after their last use; 0: for ever."
+    )
+    keep_records_days: float = Field(
+        90.0,
+        ge=0,
+        description="Records of what expired, and of deliveries, are kept for so long; 0: for ever.",
+    )
+    keep_keys_hours: float = Field(
+        24.0, gt=0, description="An Idempotency-Key is known for so long after its job is over."
+    )
+    expiry_s: float = Field(30.0, gt=0, description="Seconds between two looks for what has expired.")
+
     webhook_timeout_s: float = Field(
         10.0, gt=0, le=60, description="Longest delivery of one webhook message."
     )

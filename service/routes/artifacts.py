@@ -34,7 +34,7 @@ _ANSWERS: dict[int | str, dict[str, Any]] = {
 @router.get(
     "/artifacts",
     operation_id="listArtifacts",
-    responses=declared("not_found", "database_unavailable", "internal_error"),
+    responses=declared("not_found", "expired", "database_unavailable", "internal_error"),
 )
 async def list_artifacts(job_id: JobId, caller: CallerHere) -> ArtifactList:
     """All files of the result; none while the job has no result. A failed job may have `log.txt`."""
@@ -43,7 +43,7 @@ async def list_artifacts(job_id: JobId, caller: CallerHere) -> ArtifactList:
 
 
 _DOWNLOAD = declared(
-    "bad_range", "not_found", "range_not_satisfiable", "database_unavailable", "internal_error"
+    "bad_range", "not_found", "expired", "range_not_satisfiable", "database_unavailable", "internal_error"
 )
 
 
@@ -90,7 +90,7 @@ async def get_artifact(
     "/report",
     operation_id="getReport",
     response_model=Report,
-    responses=declared("not_found", "result_not_ready", "database_unavailable", "internal_error"),
+    responses=declared("not_found", "expired", "result_not_ready", "database_unavailable", "internal_error"),
 )
 async def get_report(job_id: JobId, caller: CallerHere) -> Response:
     """The machine-readable account of a finished job (the artifact `report.json`)."""

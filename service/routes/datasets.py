@@ -99,7 +99,7 @@ async def delete_dataset(dataset_id: DatasetId, caller: DatasetWriterHere) -> No
 @router.get(
     "/{dataset_id}/files",
     operation_id="listFiles",
-    responses=declared("bad_cursor", "not_found", "invalid_request", *_ALWAYS),
+    responses=declared("bad_cursor", "not_found", "expired", "invalid_request", *_ALWAYS),
 )
 async def list_files(
     dataset_id: DatasetId,

@@ -71,6 +71,7 @@ def running_service(folder: Path, **settings: Any) -> Iterator[Running]:
         "janitor_s": 0.5,
         "data_dir": folder / "data",
         # Receivers of webhooks live on this machine.
+        "expiry_s": 0.5,
         "webhook_http": True,
         "webhook_ports": (),
         "webhook_networks": ("127.0.0.0/8",),

@@ -2,13 +2,16 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 import httpx
+import psycopg
 import pytest
 
-from tests.service.conftest import problem
+from tests.service.conftest import Running, finished, problem, ready_dataset, submit, until
+from workers.embedded_postgres import EmbeddedPostgres
 
 CONTENT = bytes(range(256)) * 40
 
@@ -100,3 +103,27 @@ def test_the_report_is_the_artifact(http: httpx.Client, done_job: dict[str, Any]
 @pytest.mark.parametrize("name", ["nothing.png", "..%2f..%2freport.json", "%00", "report.json/", "renders"])
 def test_other_names_are_404(http: httpx.Client, done_job: dict[str, Any], name: str) -> None:
     problem(http.get(f"{done_job['links']['artifacts']}/{name}"), 404, "not_found")
+
+
+def test_a_result_whose_time_is_over_is_410_while_its_record_stays(
+    service: Running, http: httpx.Client, scene: Path
+) -> None:
+    job = finished(http, submit(http, ready_dataset(http, scene))["id"])
+    here = job["links"]["self"]
+    until(http, job["id"], lambda found: found["expires_at"] is not None)
+    with psycopg.connect(EmbeddedPostgres(service.data_dir / "postgres").url) as connection:
+        connection.execute(
+            "UPDATE jobs SET finished_at = now() - interval '8 days' WHERE id = %s", (job["id"],)
+        )
+    until(http, job["id"], lambda found: found["state"] == "expired")
+    for path in ("/artifacts", "/artifacts/report.json", "/report"):
+        problem(http.get(here + path), 410, "expired")
+    assert http.head(here + "/artifacts/report.json").status_code == 410
+    events = http.get(here + "/events").text
+    assert "event: succeeded" in events
+    assert "event: expired" in events
+    folder = service.data_dir / "files" / "jobs" / job["id"]
+    until(http, job["id"], lambda _: not folder.exists())
+    assert f"deleted jobs/{job['id']}: " in service.log.read_text()
+    assert http.get("/v1/jobs?state=expired").json()["items"][0]["id"] == job["id"]
+    assert http.delete(here).status_code == 204

@@ -68,7 +68,7 @@ $$;
 CREATE FUNCTION tell_of_job() RETURNS trigger LANGUAGE plpgsql AS $$
 BEGIN
     PERFORM queue_webhooks(tenant, id, 'job.' || NEW.type, NEW.at, jsonb_build_object(
-        'id', id, 'dataset_id', dataset_id, 'state', state, 'attempt', attempt, 'verdict', verdict,
+        'id', id, 'kind', kind, 'parent', parent, 'dataset_id', dataset_id, 'state', state, 'attempt', attempt, 'verdict', verdict,
         'error', error - 'log_tail', 'labels', labels, 'created_at', rfc3339(created_at),
         'started_at', rfc3339(started_at), 'finished_at', rfc3339(finished_at),
         'links', jsonb_build_object('self', '/v1/jobs/' || id, 'report', '/v1/jobs/' || id || '/report',
