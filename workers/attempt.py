@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from biresnerf.progress import Progress
 from biresnerf.report import Verdict, VerdictName
 from workers.child import Child, log_tail
-from workers.claim import Claim, crashed_too_often
+from workers.claim import Claim, crashed_too_often, insist
 from workers.courier import Courier
 from workers.database import Database
 from workers.files import FileStore
@@ -84,7 +84,10 @@ class Attempt:
 
     async def _run_process(self) -> int | None:
         """Exit status of the process; none where a stop came before it was started."""
-        staging = asyncio.create_task(stage_job(self._database, self._files, self._claim, self._folder))
+        # From the start again where database or store go away, which is no fault of the job.
+        staging = asyncio.create_task(
+            insist(lambda: stage_job(self._database, self._files, self._claim, self._folder))
+        )
         await first_done(staging, self._stop.wait())
         if not staging.done():
             staging.cancel()

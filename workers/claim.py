@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 import uuid
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Any, TypeVar
 from psycopg.types.json import Jsonb
 
 from biresnerf.progress import ReusableStage
-from workers.database import Database
+from workers.database import QUIET_S, Database
 from workers.endings import finish, finish_cancelled
 from workers.errors import Unavailable
 from workers.records import JobError, JobKind
@@ -104,10 +105,13 @@ def crashed_too_often(attempts: int, log_tail: str = "") -> JobError:
 
 
 async def insist(write: Callable[[], Awaitable[T]]) -> T:
-    """The answer of ``write``, tried again for as long as the database is away."""
+    """The answer of ``write``, tried again for as long as the database or the store is away."""
+    said_at = -QUIET_S
     while True:
         try:
             return await write()
         except Unavailable as error:
-            log.warning("%s; trying again", error)
+            if time.monotonic() - said_at > QUIET_S:
+                said_at = time.monotonic()
+                log.warning("%s; trying again until it answers", error)
             await asyncio.sleep(RETRY_S)

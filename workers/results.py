@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import mimetypes
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path, PurePosixPath
 
+from workers.claim import insist
 from workers.files import FileStore
 from workers.records import LOG_NAME, POSES_NAME, PREVIEW_FOLDER, Artifact
 
@@ -26,7 +28,10 @@ async def store_result(
     log_only: bool = False,
     enough: Callable[[], bool] = lambda: False,
 ) -> list[Artifact]:
-    """Store the output, all but checkpoint and previews, and the log; stops early once ``enough``."""
+    """Store the output, all but checkpoint and previews, and the log; stops early once ``enough``.
+
+    Waits for a store that is away: the work is done by now.
+    """
     names = {LOG_NAME: log_file} if log_file.exists() else {}
     for path in () if log_only else sorted(output.rglob("*")):
         relative = path.relative_to(output)
@@ -36,7 +41,7 @@ async def store_result(
     for name in sorted(names, key=lambda name: (name not in FIRST, name)):
         if enough():
             break
-        artifacts.append(await store_artifact(files, prefix, name, names[name]))
+        artifacts.append(await insist(partial(store_artifact, files, prefix, name, names[name])))
     return sorted(artifacts, key=lambda item: item.name)
 
 

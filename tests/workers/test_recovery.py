@@ -274,3 +274,24 @@ async def test_a_cancelled_job_of_a_dead_worker_ends_cancelled(
     slots.start(quick_settings(settings.data_dir, database_url=settings.database_url), "b")
     assert (await counting.until_final()).state == "cancelled"
     assert len(counting.starts()) == 1
+
+
+async def test_a_store_that_is_away_at_the_end_costs_no_attempt(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    """As where its disk is unmounted: what was computed is kept until it can be stored."""
+    slots.start(settings, "a")
+    await counting.submit(40, 0.05, checkpoint_every=1000)
+    await counting.until(lambda job: job.progress.step >= 5)
+    away = settings.files_dir.with_name("away")
+    settings.files_dir.rename(away)
+    settings.files_dir.touch()
+    program = psutil.Process(int(counting.starts()[0]["pid"]))
+    await asyncio.to_thread(psutil.wait_procs, [program], 20)
+    await asyncio.sleep(1.0)
+    assert (await counting.stores.jobs.get(counting.id)).state == "running"
+    settings.files_dir.unlink()
+    away.rename(settings.files_dir)
+    job = await counting.until_final()
+    assert (job.state, job.attempt, len(counting.starts())) == ("succeeded", 1, 1)
+    await assert_one_result(counting, 40)
