@@ -26,7 +26,7 @@ from service.observe import Observed, is_probe
 from service.openapi import describe
 from service.problems import CATALOGUE, ProblemError
 from service.request_context import RequestContext, render
-from service.routes import artifacts, datasets, events, health, jobs, meta, uploads, webhooks
+from service.routes import artifacts, datasets, events, health, job_life, jobs, meta, uploads, webhooks
 from service.uploads import sweep_staging
 from workers.errors import EngineError, NotFound, Unavailable
 from workers.settings import Settings
@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 _UNFINISHED_EVERY_S = 15.0
 _ROUTERS = [
     module.router
-    for module in (datasets, uploads, jobs, events, artifacts, webhooks, meta, health, docs_page)
+    for module in (datasets, uploads, jobs, job_life, events, artifacts, webhooks, meta, health, docs_page)
 ]
 _DESCRIPTION = """
 Refines the camera poses of an image set.

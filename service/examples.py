@@ -38,7 +38,11 @@ _JOB_VIEW: dict[str, Any] = {
         "events": f"{_JOB}/events",
         "artifacts": f"{_JOB}/artifacts",
         "report": f"{_JOB}/report",
+        "images": f"{_JOB}/images",
+        "logs": f"{_JOB}/logs",
+        "exports": f"{_JOB}/exports",
         "cancel": f"{_JOB}/cancel",
+        "fork": f"{_JOB}/fork",
     },
 }
 _DATASET_VIEW: dict[str, Any] = {
@@ -150,6 +154,17 @@ EXAMPLES: dict[str, Any] = {
     "ArtifactView": _ARTIFACT_VIEW,
     "ArtifactList": {"items": [_ARTIFACT_VIEW]},
     "Report": _REPORT,
+    "ImageList": {
+        "partial": False,
+        "items": [
+            {
+                **_REPORT["images"][0],
+                "trial_psnr_before": 21.4,
+                "trial_psnr_after": 24.9,
+                "delta_psnr": 3.5,
+            }
+        ],
+    },
     "Health": {"status": "ok"},
     "Info": {
         "name": "biresnerf",

@@ -37,6 +37,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "idempotency_in_progress": (409, "The first request with this key is still running"),
     "offset_mismatch": (409, "The upload goes on elsewhere"),
     "too_many_webhooks": (409, "There are as many webhooks as the service takes"),
+    "fork_not_possible": (409, "No work of the job can be taken over"),
     "result_not_ready": (409, "The job has no result yet"),
     "direct_upload_unavailable": (409, "Files cannot be sent to the store itself"),
     "upload_incomplete": (409, "The file has not arrived at the store"),
@@ -150,7 +151,10 @@ class ProblemError(Exception):
     @property
     def retryable(self) -> bool:
         """Whether the same request may succeed later."""
-        return self.status in {429, 503, 507} or self.code == "idempotency_in_progress"
+        return self.status in {429, 503, 507} or self.code in {
+            "idempotency_in_progress",
+            "result_not_ready",
+        }
 
     def response_headers(self) -> dict[str, str]:
         """Extra headers of the answer; what may be tried again says when."""

@@ -76,7 +76,11 @@ class JobLinks(Wire):
     events: str
     artifacts: str
     report: str
+    images: str
+    logs: str
+    exports: str
     cancel: str
+    fork: str
 
 
 class JobView(Job):
@@ -94,7 +98,11 @@ class JobView(Job):
             events=f"{here}/events",
             artifacts=f"{here}/artifacts",
             report=f"{here}/report",
+            images=f"{here}/images",
+            logs=f"{here}/logs",
+            exports=f"{here}/exports",
             cancel=f"{here}/cancel",
+            fork=f"{here}/fork",
         )
         return cls(**dict(job), links=links)
 
@@ -113,6 +121,9 @@ class ArtifactView(Wire):
     size: int
     sha256: str
     media_type: str
+    preview: bool = Field(
+        False, description="It shows a job that is not over; another one will take its place."
+    )
     href: str
 
     @classmethod
@@ -120,6 +131,7 @@ class ArtifactView(Wire):
         """The artifact as the wire has it."""
         return cls(
             **artifact.model_dump(include={"name", "size", "sha256", "media_type"}),
+            preview=artifact.preview,
             href=f"{job_url(job_id)}/artifacts/{quote(artifact.name)}",
         )
 

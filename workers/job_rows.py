@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Mapping
 from typing import Any
 
-from workers.records import Job, JobError, JobProgress
+from workers.database import Connection
+from workers.errors import Conflict
+from workers.records import Job, JobError, JobEvent, JobProgress
 
 JOB = """
     SELECT jobs.*, CASE WHEN jobs.state = 'queued' THEN
@@ -33,3 +38,36 @@ def job_from_row(row: dict[str, Any]) -> Job:
     progress = JobProgress(**{key: row[key] for key in ("fraction", "step", "steps_total", "eta_s")})
     error = JobError.model_validate(row["error"]) if row["error"] else None
     return Job(**{key: row[key] for key in same + also + life}, progress=progress, error=error)
+
+
+async def one_row(connection: Connection, sql: Any, *parameters: Any) -> dict[str, Any] | None:
+    """The first row of a statement, if there is one."""
+    return await (await connection.execute(sql, parameters)).fetchone()
+
+
+def fingerprint_of(subject: str, options: dict[str, Any], labels: Mapping[str, str] | None) -> str:
+    """By which a repeated request is told from another one with the same key."""
+    request = json.dumps([subject, options, dict(labels or {})], sort_keys=True)
+    return hashlib.sha256(request.encode()).hexdigest()
+
+
+async def known_job(
+    connection: Connection, tenant: str, idempotency_key: str, fingerprint: str
+) -> Job | None:
+    """The job of an earlier request with this key; raises `Conflict` where that was a different one."""
+    row = await one_row(
+        connection, JOB + " WHERE tenant = %s AND idempotency_key = %s", *(tenant, idempotency_key)
+    )
+    if row is not None and row["fingerprint"] != fingerprint:
+        raise Conflict("idempotency_key_reused", f"The key was used for another request ({row['id']}).")
+    return None if row is None else job_from_row(row)
+
+
+async def events_of(connection: Connection, job_id: str, after: int, limit: int) -> tuple[JobEvent, ...]:
+    """The job's history after ``seq == after``."""
+    cursor = await connection.execute(
+        "SELECT seq, at, attempt, type, data FROM job_events WHERE job_id = %s AND seq > %s"
+        " ORDER BY seq LIMIT %s",
+        (job_id, after, limit),
+    )
+    return tuple(JobEvent.model_validate(row) for row in await cursor.fetchall())

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
-import json
 from collections.abc import AsyncGenerator, Mapping
+from datetime import datetime
 from typing import Any
 
 from psycopg.types.json import Jsonb
@@ -17,8 +16,8 @@ from workers.endings import finish_cancelled
 from workers.errors import Conflict, Expired, LimitReached, NotFound
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
 from workers.job_listener import JobListener, follow
-from workers.job_rows import JOB, MINE, job_from_row
-from workers.records import Artifact, Job, JobEvent, JobState, JobUpdate, LogLine, Page
+from workers.job_rows import JOB, MINE, events_of, fingerprint_of, job_from_row, known_job, one_row
+from workers.records import LOG_NAME, Artifact, Job, JobEvent, JobState, JobUpdate, LogLine, Page
 from workers.settings import Settings
 from workers.tenants import LOCAL_TENANT
 from workers.traces import traced, traceparent
@@ -64,22 +63,23 @@ class JobStore:
         `LimitReached` (``queue_full``).
         """
         resolved = options.resolved().model_dump(mode="json")
-        fingerprint = _fingerprint(request_digest or dataset_id, resolved, labels)
+        fingerprint = fingerprint_of(request_digest or dataset_id, resolved, labels)
         async with self._database.transaction() as connection:
             # Serialises submits (a millisecond each): the queue limit and repeated keys need no more thought.
             await connection.execute("SELECT pg_advisory_xact_lock(%s)", (QUEUE_LIMIT_LOCK,))
             tenant = await self._tenant_of(connection, dataset_id)
             if idempotency_key is not None:
-                known = await _known(connection, tenant, idempotency_key, fingerprint)
+                known = await known_job(connection, tenant, idempotency_key, fingerprint)
                 if known is not None:
                     return known, False
             await self._require_room(connection, dataset_id)
             job_id = new_id("job")
             await connection.execute(
-                "INSERT INTO jobs (id, dataset_id, tenant, options, labels, idempotency_key, fingerprint)"
-                " VALUES (%s, %s, %s, %s, %s, %s, %s)",
+                "INSERT INTO jobs (id, dataset_id, tenant, options, asked, labels, idempotency_key, fingerprint)"
+                " VALUES (%s, %s, %s, %s, %s, %s, %s, %s)",
                 (
-                    *(job_id, dataset_id, tenant, Jsonb(resolved), Jsonb(dict(labels or {}))),
+                    *(job_id, dataset_id, tenant, Jsonb(resolved)),
+                    *(Jsonb(options.model_dump(mode="json", exclude_unset=True)), Jsonb(dict(labels or {}))),
                     *(idempotency_key, fingerprint),
                 ),
             )
@@ -92,7 +92,7 @@ class JobStore:
 
     async def _tenant_of(self, connection: Connection, dataset_id: str) -> str:
         """A job belongs to whom its dataset belongs to; raises `NotFound`."""
-        dataset = await _one(
+        dataset = await one_row(
             connection,
             "SELECT tenant FROM datasets WHERE id = %s AND tenant = coalesce(%s, tenant)",
             *(dataset_id, self._tenant),
@@ -103,12 +103,12 @@ class JobStore:
         return tenant
 
     async def _require_room(self, connection: Connection, dataset_id: str) -> None:
-        dataset = await _one(connection, "SELECT state FROM datasets WHERE id = %s FOR SHARE", dataset_id)
+        dataset = await one_row(connection, "SELECT state FROM datasets WHERE id = %s FOR SHARE", dataset_id)
         if dataset is None:  # deleted a moment ago
             raise NotFound(f"No dataset {dataset_id}.")
         if dataset["state"] != "ready":
             raise Conflict("dataset_not_ready", f"Dataset {dataset_id} is {dataset['state']}, not ready.")
-        queued = await _one(connection, "SELECT count(*) AS n FROM jobs WHERE state = 'queued'")
+        queued = await one_row(connection, "SELECT count(*) AS n FROM jobs WHERE state = 'queued'")
         if queued is not None and queued["n"] >= self._settings.max_queued:
             raise LimitReached("queue_full", f"{queued['n']} jobs wait already, which is the limit.")
 
@@ -121,8 +121,8 @@ class JobStore:
         """
         resolved = options.resolved().model_dump(mode="json")
         async with self._database.transaction() as connection:
-            fingerprint = _fingerprint(request_digest, resolved, labels)
-            return await _known(connection, self._tenant or LOCAL_TENANT, idempotency_key, fingerprint)
+            fingerprint = fingerprint_of(request_digest, resolved, labels)
+            return await known_job(connection, self._tenant or LOCAL_TENANT, idempotency_key, fingerprint)
 
     async def get(self, job_id: str) -> Job:
         """The job now; raises `NotFound`."""
@@ -134,17 +134,18 @@ class JobStore:
         *,
         state: JobState | None = None,
         label: tuple[str, str] | None = None,
+        created_after: datetime | None = None,
         limit: int = 50,
         cursor: str | None = None,
     ) -> Page[Job]:
-        """Jobs, newest first; raises `InputError` (``bad_cursor``)."""
+        """Refinements, newest first; raises `InputError` (``bad_cursor``)."""
         created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
         rows = await self._database.fetch(
-            JOB + f" WHERE {MINE}"
+            JOB + f" WHERE kind = 'refine' AND {MINE} AND (%s::timestamptz IS NULL OR created_at > %s)"
             " AND (%s::text IS NULL OR state = %s) AND (%s::jsonb IS NULL OR labels @> %s)"
             " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
             " ORDER BY created_at DESC, id DESC LIMIT %s",
-            *(self._tenant, state, state),
+            *(self._tenant, created_after, created_after, state, state),
             *((Jsonb({label[0]: label[1]}),) * 2 if label else (None, None)),
             *((cursor_time(created),) * 2 if created else (None, None)),
             last_id,
@@ -163,7 +164,7 @@ class JobStore:
         partial. The first request decides. A job already final is returned as it is. Raises `NotFound`.
         """
         async with self._database.transaction() as connection:
-            changed = await _one(
+            changed = await one_row(
                 connection,
                 "UPDATE jobs SET cancel_requested = true, keep_partial = %s"
                 f" WHERE id = %s AND {MINE} AND state IN ('queued', 'running') AND NOT cancel_requested"
@@ -183,7 +184,7 @@ class JobStore:
     async def delete(self, job_id: str) -> None:
         """Delete a final job with its files; raises `NotFound`, `Conflict` (``state_conflict``)."""
         async with self._database.transaction() as connection:
-            row = await _one(
+            row = await one_row(
                 connection,
                 f"SELECT state FROM jobs WHERE id = %s AND {MINE} FOR UPDATE",
                 *(job_id, self._tenant),
@@ -192,6 +193,13 @@ class JobStore:
                 raise NotFound(f"No job {job_id}.")
             if row["state"] in ("queued", "running"):
                 raise Conflict("state_conflict", f"Job {job_id} is {row['state']}; cancel it first.")
+            busy = await one_row(
+                connection,
+                "SELECT id FROM jobs WHERE parent = %s AND state IN ('queued', 'running')",
+                job_id,
+            )
+            if busy is not None:
+                raise Conflict("state_conflict", f"Its export {busy['id']} is not over; cancel that first.")
             # Its files, and its exports with theirs, go with it.
             await connection.execute("DELETE FROM jobs WHERE id = %s", (job_id,))
             await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job_id,))
@@ -200,19 +208,26 @@ class JobStore:
         """The history after ``seq == after``, gapless and in order; raises `NotFound`."""
         async with self._database.transaction() as connection:
             await self._required(connection, job_id)
-            return await _events(connection, job_id, after, limit)
+            return await events_of(connection, job_id, after, limit)
 
     async def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
-        """The published files, by name, while the job runs its previews; raises `NotFound`, `Expired`."""
-        rows = await self._database.fetch(
-            f"SELECT state, artifacts, previews FROM jobs WHERE id = %s AND {MINE}", *(job_id, self._tenant)
-        )
-        if not rows:
-            raise NotFound(f"No job {job_id}.")
-        if rows[0]["state"] == "expired":
-            raise Expired(f"The files of job {job_id} were kept for their time and are gone.")
-        previews = (rows[0]["previews"] or {}).get("artifacts", [])
-        return tuple(Artifact.model_validate(item) for item in [*rows[0]["artifacts"], *previews])
+        """The published files, by name, with those of its exports; while the job runs its previews.
+
+        Raises `NotFound`, `Expired`.
+        """
+        async with self._database.transaction() as connection:
+            own = await self._required(connection, job_id)
+            if own["state"] == "expired":
+                raise Expired(f"The files of job {job_id} were kept for their time and are gone.")
+            cursor = await connection.execute(
+                "SELECT artifacts FROM jobs WHERE parent = %s AND state = 'succeeded'", (job_id,)
+            )
+            exports = await cursor.fetchall()
+        listed = [*own["artifacts"], *(own["previews"] or {}).get("artifacts", [])]
+        listed += [item for row in exports for item in row["artifacts"] if item["name"] != LOG_NAME]
+        # A form that the job wrote itself may have been exported as well: the files are the same.
+        named = {item["name"]: item for item in reversed(listed)}
+        return tuple(Artifact.model_validate(named[name]) for name in sorted(named))
 
     async def log(self, job_id: str, *, after: int = 0, limit: int = 1000) -> tuple[LogLine, ...]:
         """What the job's process wrote to standard error, after line ``after``; raises `NotFound`."""
@@ -229,7 +244,7 @@ class JobStore:
         async with self._database.transaction() as connection:
             await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
             job = job_from_row(await self._required(connection, job_id))
-            return JobUpdate(job=job, events=await _events(connection, job_id, after, 10_000))
+            return JobUpdate(job=job, events=await events_of(connection, job_id, after, 10_000))
 
     def subscribe(
         self, job_id: str, *, after: int = 0, heartbeat_s: float = 15.0
@@ -264,34 +279,7 @@ class JobStore:
         return await self._listener.database_answers(2.0)
 
     async def _required(self, connection: Connection, job_id: str) -> dict[str, Any]:
-        row = await _one(connection, JOB + f" WHERE id = %s AND {MINE}", *(job_id, self._tenant))
+        row = await one_row(connection, JOB + f" WHERE id = %s AND {MINE}", *(job_id, self._tenant))
         if row is None:
             raise NotFound(f"No job {job_id}.")
         return row
-
-
-async def _one(connection: Connection, sql: Any, *parameters: Any) -> dict[str, Any] | None:
-    return await (await connection.execute(sql, parameters)).fetchone()
-
-
-def _fingerprint(subject: str, options: dict[str, Any], labels: Mapping[str, str] | None) -> str:
-    request = json.dumps([subject, options, dict(labels or {})], sort_keys=True)
-    return hashlib.sha256(request.encode()).hexdigest()
-
-
-async def _known(connection: Connection, tenant: str, idempotency_key: str, fingerprint: str) -> Job | None:
-    row = await _one(
-        connection, JOB + " WHERE tenant = %s AND idempotency_key = %s", *(tenant, idempotency_key)
-    )
-    if row is not None and row["fingerprint"] != fingerprint:
-        raise Conflict("idempotency_key_reused", f"The key was used for another request ({row['id']}).")
-    return None if row is None else job_from_row(row)
-
-
-async def _events(connection: Connection, job_id: str, after: int, limit: int) -> tuple[JobEvent, ...]:
-    cursor = await connection.execute(
-        "SELECT seq, at, attempt, type, data FROM job_events WHERE job_id = %s AND seq > %s"
-        " ORDER BY seq LIMIT %s",
-        (job_id, after, limit),
-    )
-    return tuple(JobEvent.model_validate(row) for row in await cursor.fetchall())

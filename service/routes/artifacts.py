@@ -37,7 +37,7 @@ _ANSWERS: dict[int | str, dict[str, Any]] = {
     responses=declared("not_found", "expired", "database_unavailable", "internal_error"),
 )
 async def list_artifacts(job_id: JobId, caller: CallerHere) -> ArtifactList:
-    """All files of the result; none while the job has no result. A failed job may have `log.txt`."""
+    """All files of the result and of its exports. While the job runs, previews: the poses so far and a render."""
     found = await caller.jobs.artifacts(job_id)
     return ArtifactList(items=[ArtifactView.of(job_id, artifact) for artifact in found])
 
@@ -94,17 +94,25 @@ async def get_artifact(
 )
 async def get_report(job_id: JobId, caller: CallerHere) -> Response:
     """The machine-readable account of a finished job (the artifact `report.json`)."""
+    artifact = await find_report(caller, job_id)
+    content = await whole_file(caller, artifact)
+    return Response(content, media_type="application/json", headers={"ETag": f'"{artifact.sha256}"'})
+
+
+async def find_report(caller: Caller, job_id: str) -> Artifact:
+    """The report's file; raises `ProblemError` (``result_not_ready``, ``not_found``)."""
     try:
-        artifact = await _find(caller, job_id, REPORT)
+        return await _find(caller, job_id, REPORT)
     except ProblemError:
         job = await caller.jobs.get(job_id)
-        if job.final:
-            raise ProblemError("not_found", f"The job {job.state} without a report.") from None
-        raise ProblemError(
-            "result_not_ready", f"The job is {job.state}.", headers={"Retry-After": "5"}
-        ) from None
-    content = b"".join([chunk async for chunk in caller.service.stores.files.read(artifact.key)])
-    return Response(content, media_type="application/json", headers={"ETag": f'"{artifact.sha256}"'})
+        code = "not_found" if job.final else "result_not_ready"
+        detail = f"The job {job.state} without a report." if job.final else f"The job is {job.state}."
+        raise ProblemError(code, detail) from None
+
+
+async def whole_file(caller: Caller, artifact: Artifact) -> bytes:
+    """All bytes of a file that is small."""
+    return b"".join([chunk async for chunk in caller.service.stores.files.read(artifact.key)])
 
 
 async def _find(caller: Caller, job_id: str, name: str) -> Artifact:
@@ -129,7 +137,8 @@ def _headers(artifact: Artifact, etag: str) -> dict[str, str]:
     return {
         "ETag": etag,
         "Accept-Ranges": "bytes",
-        "Cache-Control": "private, max-age=31536000, immutable",
+        # Another preview will have the same name.
+        "Cache-Control": "no-cache" if artifact.preview else "private, max-age=31536000, immutable",
         "Repr-Digest": f"sha-256=:{digest}:",
         # As an attachment always: what users sent must not run as a page of this origin.
         "Content-Disposition": f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(base, safe='')}",

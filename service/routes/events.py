@@ -24,8 +24,9 @@ _RETRY_MS = 2000
 _STREAM: dict[int | str, dict[str, Any]] = {
     200: {
         "description": (
-            "Events `queued`, `started`, `stage`, `checkpoint`, `attempt_crashed`, `requeued`, "
-            "`cancel_requested`, `succeeded`, `failed`, `cancelled` carry an `id` and are never lost; "
+            "Events `queued`, `started`, `stage`, `checkpoint`, `preview`, `attempt_crashed`, "
+            "`retried_smaller`, `requeued`, `cancel_requested`, `succeeded`, `failed`, `cancelled` carry an `id` "
+            "and are never lost; "
             "`progress` carries the job as it is now, at most once a second. Comments keep the connection "
             "alive. The stream ends after the job."
         ),

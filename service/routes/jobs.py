@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import asyncio
-import re
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import Response
+from pydantic import AwareDatetime
 
-from service.access import Caller, CallerHere, JobWriterHere
+from service.access import CallerHere, JobWriterHere
 from service.conditions import none_match
 from service.dependencies import JobId, next_link
+from service.job_answers import POLL_S, checked_key, job_answer, job_etag, preferred_wait_s, waited_for
+from service.job_bodies import CancelJob
 from service.json_body import json_content, read_json
 from service.one_shot import submit_form
 from service.problems import FieldProblem, ProblemError, declared
-from service.schemas import JobList, JobView, NewJob, job_url
-from workers.records import Job, JobState
-from workers.waiting import first_done
+from service.schemas import JobList, JobView, NewJob
+from workers.records import JobState
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 _ALWAYS = ("database_unavailable", "internal_error")
 _WRITES = ("cross_site", *_ALWAYS)
-_KEY = re.compile(r"^[\x21-\x7e]{1,255}$")
-_POLL_S = "2"
+_JSON = ("malformed_json", "invalid_request", "body_too_large", "unsupported_media", "body_timeout")
 _FORM: dict[str, Any] = {
     "schema": {
         "type": "object",
@@ -54,11 +53,20 @@ _BODY = {
     operation_id="submitJob",
     response_model=JobView,
     openapi_extra=_BODY,
-    responses=declared(
-        *("malformed_json", "bad_idempotency_key", "not_found", "dataset_not_ready", "body_too_large"),
-        *("unsupported_media", "invalid_options", "idempotency_key_reused", "archive_rejected", "queue_full"),
-        *("storage_full", "body_timeout", *_WRITES),
-    ),
+    responses={
+        200: {"model": JobView, "description": "The job is over; only with `Prefer: wait`."},
+        **declared(
+            *("malformed_json", "bad_idempotency_key", "not_found", "dataset_not_ready", "body_too_large"),
+            *(
+                "unsupported_media",
+                "invalid_options",
+                "idempotency_key_reused",
+                "archive_rejected",
+                "queue_full",
+            ),
+            *("storage_full", "body_timeout", *_WRITES),
+        ),
+    },
 )
 async def submit_job(
     request: Request,
@@ -66,10 +74,16 @@ async def submit_job(
     idempotency_key: Annotated[
         str | None, Header(description="The same key with the same request answers with the same job.")
     ] = None,
+    prefer: Annotated[
+        str | None,
+        Header(
+            description="`wait=N` (60 at most): answer once the job is over, or as it is after N seconds.",
+            examples=["wait=30"],
+        ),
+    ] = None,
 ) -> Response:
     """Queues a refinement of a ready dataset, or of the archive in a multipart form."""
-    if idempotency_key is not None and not _KEY.match(idempotency_key):
-        raise ProblemError("bad_idempotency_key", "The key must be 1 to 255 visible ASCII characters.")
+    idempotency_key = checked_key(idempotency_key)
     kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
     if kind == "multipart/form-data":
         job, new = await submit_form(caller, request, idempotency_key)
@@ -84,10 +98,12 @@ async def submit_job(
             f"The Content-Type {kind!r} is neither application/json nor multipart/form-data.",
             where="Content-Type",
         )
-    headers = {"Location": job_url(job.id), "Retry-After": _POLL_S}
-    if not new:
-        headers["Idempotent-Replayed"] = "true"
-    return _answer(job, status=202, headers=headers)
+    wait_s = preferred_wait_s(prefer)
+    if not wait_s:
+        return job_answer(job, status=202, new=new)
+    job = await waited_for(caller.jobs, job.id, wait_s, caller.service.closing)
+    applied = {"Preference-Applied": f"wait={wait_s:g}"}
+    return job_answer(job, status=200 if job.final else 202, new=new, headers=applied)
 
 
 @router.get("", operation_id="listJobs", responses=declared("bad_cursor", "invalid_request", *_ALWAYS))
@@ -97,11 +113,17 @@ async def list_jobs(
     caller: CallerHere,
     state: JobState | None = None,
     label: Annotated[str | None, Query(max_length=201, description="`name:value`")] = None,
+    created_after: Annotated[
+        AwareDatetime | None,
+        Query(description="RFC 3339, with an offset.", examples=["2026-01-31T12:00:00Z"]),
+    ] = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     cursor: Annotated[str | None, Query(max_length=500)] = None,
 ) -> JobList:
-    """Jobs, newest first."""
-    page = await caller.jobs.list(state=state, label=_label(label), limit=limit, cursor=cursor)
+    """Refinements, newest first."""
+    page = await caller.jobs.list(
+        state=state, label=_label(label), created_after=created_after, limit=limit, cursor=cursor
+    )
     response.headers.update(next_link(request, page.next_cursor))
     return JobList(items=[JobView.of(job) for job in page.items], next_cursor=page.next_cursor)
 
@@ -133,26 +155,32 @@ async def get_job(
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
     """The job now: state, stage, step, loss, seconds left, place in the queue."""
-    job = await (_waited_for(caller, job_id, wait) if wait else caller.jobs.get(job_id))
-    headers = {} if job.final else {"Retry-After": _POLL_S}
-    if not none_match(if_none_match, _etag(job)):
-        return Response(status_code=304, headers={"ETag": _etag(job), **headers})
-    return _answer(job, headers=headers)
+    jobs = caller.jobs
+    job = await (waited_for(jobs, job_id, wait, caller.service.closing) if wait else jobs.get(job_id))
+    headers = {} if job.final else {"Retry-After": POLL_S}
+    if not none_match(if_none_match, job_etag(job)):
+        return Response(status_code=304, headers={"ETag": job_etag(job), **headers})
+    return job_answer(job, headers=headers)
 
 
 @router.post(
     "/{job_id}/cancel",
     operation_id="cancelJob",
     response_model=JobView,
+    openapi_extra={"requestBody": {"content": {"application/json": json_content(CancelJob)}}},
     responses={
-        202: {"model": JobView, "description": "Asked for; the job ends within seconds."},
-        **declared("not_found", *_WRITES),
+        202: {"model": JobView, "description": "Asked for; the job ends within 10 seconds."},
+        **declared("not_found", *_JSON, *_WRITES),
     },
 )
-async def cancel_job(job_id: JobId, caller: JobWriterHere) -> Response:
-    """Ends a job. One that is over already stays as it is."""
-    job = await caller.jobs.cancel(job_id)
-    return _answer(job, status=200 if job.final else 202)
+async def cancel_job(job_id: JobId, request: Request, caller: JobWriterHere) -> Response:
+    """Ends a job, with a partial result if the body asks for one. One that is over already stays as it is."""
+    body = CancelJob()
+    if request.headers.get("content-type"):
+        length = request.headers.get("content-length")
+        body = await read_json(request.headers["content-type"], length, request.stream(), CancelJob)
+    job = await caller.jobs.cancel(job_id, keep_partial=body.keep_partial)
+    return job_answer(job, status=200 if job.final else 202)
 
 
 @router.delete(
@@ -162,27 +190,5 @@ async def cancel_job(job_id: JobId, caller: JobWriterHere) -> Response:
     responses=declared("not_found", "state_conflict", *_WRITES),
 )
 async def delete_job(job_id: JobId, caller: JobWriterHere) -> None:
-    """Deletes a job that is over, with its results."""
+    """Deletes a job that is over, with its results and its exports."""
     await caller.jobs.delete(job_id)
-
-
-async def _waited_for(caller: Caller, job_id: str, seconds: float) -> Job:
-    """The job when it is over, after so many seconds, or when the service stops."""
-    waiting = asyncio.create_task(caller.jobs.wait(job_id, timeout_s=seconds))
-    try:
-        await first_done(waiting, caller.service.closing.wait())
-        return await (waiting if waiting.done() else caller.jobs.get(job_id))
-    finally:
-        waiting.cancel()
-
-
-def _etag(job: Job) -> str:
-    # Others move a queued job's place without touching the job.
-    return f'W/"{job.revision}-{job.queue_position or 0}"'
-
-
-def _answer(job: Job, *, status: int = 200, headers: dict[str, str] | None = None) -> Response:
-    body = JobView.of(job).model_dump(mode="json")
-    return JSONResponse(
-        body, status_code=status, headers={"ETag": _etag(job), "Cache-Control": "no-cache", **(headers or {})}
-    )

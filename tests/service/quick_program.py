@@ -18,12 +18,12 @@ from service.examples import EXAMPLES
 folder = Path(sys.argv[1])
 order = json.loads((folder / "job.json").read_text())
 source, output, options = folder / order["input"], folder / order["output"], order["options"]
-steps, step_s = options["steps"], options["seed"] / 1000
+steps, step_s = 0, 0.0
 stopping = []
 signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
 
 
-def tell(stage: str, step: int) -> None:
+def tell(stage: str, step: int, preview: tuple[str, ...] = ()) -> None:
     progress = Progress(
         stage=stage,
         step=step,
@@ -31,12 +31,19 @@ def tell(stage: str, step: int) -> None:
         fraction=step / steps,
         eta_s=(steps - step) * step_s,
         metrics={"loss": 1.0 / (step + 1)},
+        preview=preview,
     )
     sys.stdout.write(progress.model_dump_json() + "\n")
     sys.stdout.flush()
 
 
+if order.get("task") == "export":
+    for form in options["formats"]:
+        (output / f"{form}.txt").write_text("exported")
+    sys.exit(0)
+steps, step_s = options["steps"], options["seed"] / 1000
 tell("preparing", 0)
+sys.stderr.write("images read\nline 2\n")
 if options["threads"] == 77:
     said = {"code": "diverged", "detail": "The loss is not finite.", "where": "", "mend": ""}
     (folder / "error.json").write_text(json.dumps(said))
@@ -44,12 +51,21 @@ if options["threads"] == 77:
 for step in range(1, steps + 1):
     time.sleep(step_s)
     tell("coarse" if step < steps / 2 else "fine", step)
+    if step % 20 == 0:
+        (output / "preview").mkdir(exist_ok=True)
+        (output / "preview" / "poses.json").write_text(json.dumps({"step": step}))
+        tell("fine", step, ("preview/poses.json",))
     if stopping:
+        partial = {"state": "partial", "options": options, "images": []}
+        (output / "poses.json").write_text(json.dumps({"step": step}))
+        (output / "report.json").write_text(json.dumps(partial))
         sys.exit(143)
 poses = next(source.rglob("transforms*.json"))
 shutil.copy(poses, output / "transforms.json")
 (output / "colmap" / "sparse" / "0").mkdir(parents=True)
-(output / "colmap" / "sparse" / "0" / "cameras.bin").write_bytes(bytes(8))
+for table in ("cameras", "images", "points3D"):
+    (output / "colmap" / "sparse" / "0" / f"{table}.bin").write_bytes(bytes(8))
+(output / "poses.json").write_text("{}")
 (output / "renders").mkdir()
 (output / "renders" / "orbit.mp4").write_bytes(bytes(range(256)) * 40)
 (output / "renders" / "Blick über «Dach».png").write_bytes(b"\x89PNG")
