@@ -140,4 +140,8 @@ def _report(code: str, detail: str, where: str, mend: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1])))
+    status = main(Path(sys.argv[1]))
+    logging.shutdown()
+    sys.stderr.flush()
+    # All is on disk and reported. Taking torch apart takes a while, in which whoever cancelled a job would wait.
+    os._exit(status)

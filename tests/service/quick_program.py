@@ -76,6 +76,11 @@ verdict = {
     "why": ["No better."],
     "moved_px": 1,
 }
-report = {**EXAMPLES["Report"], "options": options, "verdict": verdict}
+image = EXAMPLES["Report"]["images"][0]
+images = [
+    {**image, "name": name, "moved_deg": moved, "trial_psnr_before": before, "trial_psnr_after": after}
+    for name, moved, before, after in (("a", 1.0, None, None), ("b", 3.0, 20.0, 21.0), ("c", 2.0, 20.0, 24.0))
+]
+report = {**EXAMPLES["Report"], "options": options, "verdict": verdict, "images": images}
 (output / "report.json").write_text(json.dumps(report))
 tell("exporting", steps)
