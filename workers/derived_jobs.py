@@ -141,10 +141,7 @@ class DerivedJobs(JobStore):
             sql.SQL(", ").join(map(sql.Identifier, row)), sql.SQL(", ").join([sql.Placeholder()] * len(row))
         )
         await connection.execute(statement, list(row.values()))
-        queue_id = await self._database.enqueue(connection, job_id)
-        await connection.execute("UPDATE jobs SET queue_id = %s WHERE id = %s", (queue_id, job_id))
-        await connection.execute("SELECT add_job_event(%s, 'queued', '{}')", (job_id,))
-        return job_from_row(await self._required(connection, job_id))
+        return await self._queue(connection, job_id)
 
 
 def _require_result(parent: Mapping[str, Any]) -> None:

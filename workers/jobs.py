@@ -83,12 +83,16 @@ class JobStore:
                     *(idempotency_key, fingerprint),
                 ),
             )
-            queue_id = await self._database.enqueue(connection, job_id)
-            await connection.execute(
-                "UPDATE jobs SET queue_id = %s, trace = %s WHERE id = %s", (queue_id, traceparent(), job_id)
-            )
-            await connection.execute("SELECT add_job_event(%s, 'queued', '{}')", (job_id,))
-            return job_from_row(await self._required(connection, job_id)), True
+            return await self._queue(connection, job_id), True
+
+    async def _queue(self, connection: Connection, job_id: str) -> Job:
+        """Put a job just written into the queue."""
+        queue_id = await self._database.enqueue(connection, job_id)
+        await connection.execute(
+            "UPDATE jobs SET queue_id = %s, trace = %s WHERE id = %s", (queue_id, traceparent(), job_id)
+        )
+        await connection.execute("SELECT add_job_event(%s, 'queued', '{}')", (job_id,))
+        return job_from_row(await self._required(connection, job_id))
 
     async def _tenant_of(self, connection: Connection, dataset_id: str) -> str:
         """A job belongs to whom its dataset belongs to; raises `NotFound`."""
