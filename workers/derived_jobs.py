@@ -11,7 +11,7 @@ from psycopg.types.json import Jsonb
 from biresnerf.config import PackName
 from biresnerf.progress import ReusableStage
 from workers.database import Connection
-from workers.errors import Conflict
+from workers.errors import Conflict, Expired
 from workers.files import FileStore
 from workers.forks import LATEST_FIRST, WantedStage, plan_fork
 from workers.idents import new_id
@@ -147,6 +147,8 @@ class DerivedJobs(JobStore):
 def _require_result(parent: Mapping[str, Any]) -> None:
     if parent["kind"] != "refine":
         raise Conflict("state_conflict", f"{parent['id']} is an export itself.")
+    if parent["state"] == "expired":
+        raise Expired(f"The files of job {parent['id']} were kept for their time and are gone.")
     if parent["state"] in ("queued", "running"):
         raise Conflict("result_not_ready", f"The job is {parent['state']}.")
     names = {item["name"] for item in parent["artifacts"]}

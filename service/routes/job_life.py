@@ -21,7 +21,7 @@ from workers.derived_jobs import DerivedJobs
 from workers.records import LogLine
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
-_ALWAYS = ("not_found", "invalid_request", "database_unavailable", "internal_error")
+_ALWAYS = ("not_found", "expired", "invalid_request", "database_unavailable", "internal_error")
 _BODY = ("malformed_json", "body_too_large", "unsupported_media", "body_timeout")
 LINES = "application/x-ndjson"
 _LOG: dict[int | str, dict[str, Any]] = {
