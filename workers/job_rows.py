@@ -16,6 +16,9 @@ JOB = """
         (SELECT count(*) FROM jobs AS ahead WHERE ahead.state = 'queued' AND ahead.queue_id <= jobs.queue_id)
         END AS queue_position
     FROM jobs"""
+# The same for many at once: counting for each who is ahead of it takes seconds where thousands wait.
+PLACES = """places AS (SELECT queue_id, row_number() OVER (ORDER BY queue_id) AS queue_position
+    FROM jobs WHERE state = 'queued')"""
 # With the store's tenant as parameter; none for everybody's.
 MINE = "jobs.tenant = coalesce(%s, jobs.tenant)"
 

@@ -16,7 +16,7 @@ from workers.endings import finish_cancelled
 from workers.errors import Conflict, Expired, LimitReached, NotFound
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
 from workers.job_listener import JobListener, follow
-from workers.job_rows import JOB, MINE, events_of, fingerprint_of, job_from_row, known_job, one_row
+from workers.job_rows import JOB, MINE, PLACES, events_of, fingerprint_of, job_from_row, known_job, one_row
 from workers.records import LOG_NAME, Artifact, Job, JobEvent, JobState, JobUpdate, LogLine, Page
 from workers.settings import Settings
 from workers.tenants import LOCAL_TENANT
@@ -145,10 +145,14 @@ class JobStore:
         """Refinements, newest first; raises `InputError` (``bad_cursor``)."""
         created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
         rows = await self._database.fetch(
-            JOB + f" WHERE kind = 'refine' AND {MINE} AND (%s::timestamptz IS NULL OR created_at > %s)"
+            f"WITH page AS MATERIALIZED (SELECT * FROM jobs WHERE kind = 'refine' AND {MINE}"
+            " AND (%s::timestamptz IS NULL OR created_at > %s)"
             " AND (%s::text IS NULL OR state = %s) AND (%s::jsonb IS NULL OR labels @> %s)"
             " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
-            " ORDER BY created_at DESC, id DESC LIMIT %s",
+            f" ORDER BY created_at DESC, id DESC LIMIT %s), {PLACES}"
+            " SELECT page.*, places.queue_position FROM page"
+            " LEFT JOIN places ON page.state = 'queued' AND places.queue_id = page.queue_id"
+            " ORDER BY page.created_at DESC, page.id DESC",
             *(self._tenant, created_after, created_after, state, state),
             *((Jsonb({label[0]: label[1]}),) * 2 if label else (None, None)),
             *((cursor_time(created),) * 2 if created else (None, None)),

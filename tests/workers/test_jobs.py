@@ -123,6 +123,10 @@ async def test_lists_are_newest_first_and_pages_join(stores: Stores, dataset_id:
     assert [job.id for job in odd.items] == [made[3], made[1]]
     assert (await stores.jobs.list(state="running")).items == ()
     assert [(await stores.jobs.get(job_id)).queue_position for job_id in made] == [1, 2, 3, 4, 5]
+    await stores.jobs.cancel(made[1])
+    listed = {job.id: job.queue_position for job in (await stores.jobs.list()).items}
+    assert listed == {job_id: (await stores.jobs.get(job_id)).queue_position for job_id in made}
+    assert sorted(place for place in listed.values() if place) == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("cursor", ["nonsense", "W10", "WyJhIl0", "WyJ4IiwieSJd", "\u00e9"])
