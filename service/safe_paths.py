@@ -12,6 +12,10 @@ PATH_BYTES_MAX = 1024
 DEPTH_MAX = 16
 _DRIVE = re.compile(r"^[A-Za-z]:")
 _MEND = "Use relative names with forward slashes, such as images/0001.png."
+# Devices on Windows, whatever follows the dot: a file of that name could not be unpacked there.
+_DEVICE = re.compile(r"^(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³])(\..*)?$", re.IGNORECASE)
+# They turn the direction of what follows around, so that a name reads as another one.
+_TURNS_TEXT = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 # What Finder and Explorer add by themselves; nobody means to send it.
 _LITTER = {".ds_store", "thumbs.db", "desktop.ini"}
 
@@ -20,7 +24,8 @@ def checked_path(name: str) -> str:
     """`name` as a safe relative POSIX path (a leading `./` dropped); raises `InputError` ``unsafe_path``.
 
     Refuses `..`, absolute names, drive letters, backslashes, NUL and control characters, undecodable
-    bytes, empty parts, parts longer than 255 bytes and nesting deeper than 16.
+    bytes, marks that turn text around, names of devices, empty parts, parts longer than 255 bytes and nesting
+    deeper than 16.
     """
     fault = _fault(name)
     if fault:
@@ -33,6 +38,8 @@ def _fault(name: str) -> str | None:
     # U+FFFD stands where bytes could not be decoded.
     if any(char == "\ufffd" or unicodedata.category(char) in {"Cc", "Cs", "Zl", "Zp"} for char in name):
         return "The name has a control character or bytes that are not text."
+    if not _TURNS_TEXT.isdisjoint(name):
+        return "The name has a mark that turns the direction of text around."
     if "\\" in name:
         return "The name has a backslash."
     if name.startswith("/"):
@@ -44,6 +51,8 @@ def _fault(name: str) -> str | None:
     kept = [part for part in parts if part != "."]
     if not kept or "" in kept:
         return "The name has an empty part."
+    if any(_DEVICE.match(part) for part in kept):
+        return "A part of the name is the name of a device."
     if max(len(part.encode()) for part in kept) > PART_BYTES_MAX:
         return f"A part of the name is longer than {PART_BYTES_MAX} bytes."
     if len(name.encode()) > PATH_BYTES_MAX:

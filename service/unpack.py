@@ -180,6 +180,8 @@ def _unpack_tar(plain: IO[bytes] | gzip.GzipFile, sink: _Sink) -> None:
                 raise _rejected(
                     "The entry is a link, a device or sparse.", where=sink.current, mend=_MEND_PACK
                 )
+            if member.size < 0:
+                raise _rejected("The entry has a size below nothing.", where=sink.current)
             content = archive.extractfile(member)
             if content is None:
                 raise _rejected("The entry has no content.", where=sink.current)

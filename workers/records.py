@@ -156,7 +156,7 @@ class ManifestEntry(Record):
     """A file the client says it is going to send."""
 
     path: str
-    size: int | None = Field(None, ge=0)
+    size: int | None = Field(None, ge=0, lt=2**53)
     sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
 
 
