@@ -32,6 +32,7 @@ from workers.errors import EngineError, NotFound, Unavailable
 from workers.settings import Settings
 from workers.stores import open_stores
 from workers.traces import flush_traces
+from workers.watchdog import watched
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +61,7 @@ def create_app(settings: Settings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        async with open_stores(settings) as stores:
+        async with watched(), open_stores(settings) as stores:
             service = Service(settings, stores, metrics)
             app.state.service = service
             swept = await asyncio.to_thread(sweep_staging, service.staging_dir)

@@ -19,6 +19,7 @@ from workers.logs import set_up_logging
 from workers.outbound import Outbound, Policy
 from workers.settings import Settings
 from workers.waiting import first_done
+from workers.watchdog import watched
 from workers.webhook_sender import WebhookSender
 
 log = logging.getLogger(__name__)
@@ -28,9 +29,10 @@ WEBHOOK_CHANNEL = "biresnerf_webhooks"
 
 async def dispatch(settings: Settings, stop: asyncio.Event) -> None:
     """Work until ``stop``, then finish what is under way; raises `SetupError`."""
-    async with open_database(
-        settings.require_database_url(), connections=4, silence_s=settings.stall_s
-    ) as database:
+    async with (
+        watched(),
+        open_database(settings.require_database_url(), connections=4, silence_s=settings.stall_s) as database,
+    ):
         listener = Listener(database, settings.poll_s, WEBHOOK_CHANNEL)
         listening = asyncio.create_task(listener.run())
         sender = WebhookSender(database, listener, Outbound(Policy.of(settings)), settings)

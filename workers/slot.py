@@ -35,6 +35,7 @@ from workers.room import room_for_jobs
 from workers.settings import Settings
 from workers.statistics import announce_slot
 from workers.traces import set_up_traces, span
+from workers.watchdog import watched
 
 log = logging.getLogger(__name__)
 
@@ -104,12 +105,15 @@ class Slot:
         """Until SIGTERM or SIGINT. A running job then writes a checkpoint and goes back to the queue."""
         shutil.rmtree(self._scratch, ignore_errors=True)  # a predecessor's; the lock says it is gone
         self._scratch.mkdir(parents=True)
-        async with open_database(
-            self._settings.require_database_url(),
-            connections=5,
-            silence_s=self._settings.stall_s,
-            answer_s=self._settings.answer_s,
-        ) as database:
+        async with (
+            watched(),
+            open_database(
+                self._settings.require_database_url(),
+                connections=5,
+                silence_s=self._settings.stall_s,
+                answer_s=self._settings.answer_s,
+            ) as database,
+        ):
             if (predecessor := self._lock.predecessor) is not None:
                 await insist(lambda: release_worker(database, predecessor))
             await require_same_store(database, self._files)

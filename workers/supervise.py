@@ -138,12 +138,17 @@ class _Supervisor:
     async def _keep(self, spec: ChildSpec) -> None:
         pause_s, starts, settled = FIRST_PAUSE_S, 0, False
         while not self._stop.is_set():
-            process = await asyncio.create_subprocess_exec(
-                *tethered(list(spec.command), signal_number=signal.SIGKILL),
-                stdin=asyncio.subprocess.DEVNULL,
-                env={**self._environment, **spec.variables},
-                start_new_session=True,
-            )
+            try:
+                process = await asyncio.create_subprocess_exec(
+                    *tethered(list(spec.command), signal_number=signal.SIGKILL),
+                    stdin=asyncio.subprocess.DEVNULL,
+                    env={**self._environment, **spec.variables},
+                    start_new_session=True,
+                )
+            except OSError as error:  # too many processes, or no memory for one more: not for ever
+                log.error("%s cannot be started (%s); again in %.1f s", spec.name, error, LONGEST_PAUSE_S)
+                await first_done(asyncio.sleep(LONGEST_PAUSE_S), self._stop.wait())
+                continue
             began, starts = time.monotonic(), starts + 1
             ended = asyncio.create_task(process.wait())
             try:
