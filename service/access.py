@@ -33,8 +33,9 @@ from workers.webhooks import WebhookStore
 
 log = logging.getLogger(__name__)
 
-# Health, the docs page and the schema say nothing of anybody; /metrics asks itself (`may_scrape`).
-OPEN = re.compile(r"/(livez|readyz|startupz|metrics|openapi\.json|docs(/.*)?)?")
+# Health, the docs page and the schema say nothing of anybody; /metrics asks itself (`may_scrape`), and what is
+# shared was signed by us.
+OPEN = re.compile(r"/(livez|readyz|startupz|metrics|openapi\.json|docs(/.*)?|v1/shared/.*)?")
 # What any guarded operation may answer before it is reached.
 REFUSALS = ("missing_credentials", "invalid_api_key", "scope_required", "cross_site", "database_unavailable")
 _BEARER = re.compile(r"Bearer +(\S+) *", re.IGNORECASE)

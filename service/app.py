@@ -26,7 +26,19 @@ from service.observe import Observed, is_probe
 from service.openapi import describe
 from service.problems import CATALOGUE, ProblemError
 from service.request_context import RequestContext, render
-from service.routes import artifacts, datasets, events, health, job_life, jobs, meta, uploads, webhooks
+from service.routes import (
+    artifacts,
+    datasets,
+    events,
+    health,
+    job_life,
+    jobs,
+    meta,
+    shares,
+    signed_uploads,
+    uploads,
+    webhooks,
+)
 from service.uploads import sweep_staging
 from workers.errors import EngineError, NotFound, Unavailable
 from workers.settings import Settings
@@ -37,10 +49,8 @@ from workers.watchdog import watched
 logger = logging.getLogger(__name__)
 
 _UNFINISHED_EVERY_S = 15.0
-_ROUTERS = [
-    module.router
-    for module in (datasets, uploads, jobs, job_life, events, artifacts, webhooks, meta, health, docs_page)
-]
+_RESOURCES = (datasets, uploads, signed_uploads, jobs, job_life, events, artifacts, shares, webhooks)
+_ROUTERS = [module.router for module in (*_RESOURCES, meta, health, docs_page)]
 _DESCRIPTION = """
 Refines the camera poses of an image set.
 

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, TypeVar
@@ -18,12 +18,13 @@ from biresnerf.config import RefineOptions
 from biresnerf.errors import BiresnerfError
 from service.problems import Problem
 from service.schemas import ArtifactView, DatasetView, JobView
-from workers.records import FINAL_JOB_STATES
+from workers.records import FINAL_JOB_STATES, ManifestEntry
 
 # The server's keep-alive comes every 15 s; three missed ones mean that the connection is dead.
 _SILENCE_S = 50.0
 _POLL_S = 0.5
 Model = TypeVar("Model", bound=BaseModel)
+Answer = TypeVar("Answer")
 
 
 class ServiceError(BiresnerfError):
@@ -32,6 +33,11 @@ class ServiceError(BiresnerfError):
     def __init__(self, code: str, what: str, *, status: int = 0, where: str = "", mend: str = "") -> None:
         self.code, self.what, self.status, self.where, self.mend = code, what, status, where, mend
         super().__init__(" ".join(part for part in (f"{where}:" if where else "", what, mend) if part))
+
+    @property
+    def retryable(self) -> bool:
+        """Whether the same request may succeed later: nobody answered, or the service asks to wait."""
+        return self.status in {0, 408, 429, 502, 503, 504, 507} and self.code != "stopped"
 
     @property
     def users_fault(self) -> bool:
@@ -92,26 +98,18 @@ class Client:
         except httpx.TransportError:
             return False
 
-    def create_dataset(self, name: str) -> DatasetView:
-        """An empty dataset."""
-        return self._ask(DatasetView, "POST", "/v1/datasets", json={"name": name})
-
-    def upload_archive(self, dataset: DatasetView, content: Iterable[bytes]) -> DatasetView:
-        """Fills the dataset from the bytes of an archive, sent as they come."""
-        # Unpacking happens before the answer.
-        timeout = httpx.Timeout(30.0, read=None, write=120.0)
-        headers = {"Content-Type": "application/octet-stream"}
-        return self._ask(
-            DatasetView, "POST", dataset.links.archive, content=content, headers=headers, timeout=timeout
-        )
+    def create_dataset(self, name: str, manifest: Sequence[ManifestEntry] = ()) -> DatasetView:
+        """A dataset; ``missing`` of it says which files of the manifest have to be sent."""
+        body = {"name": name, "manifest": [entry.model_dump() for entry in manifest]}
+        return self.ask(DatasetView, "POST", "/v1/datasets", json=body)
 
     def finalize(self, dataset: DatasetView) -> DatasetView:
         """Has the dataset checked; returns it once it is ready."""
         headers = {"Prefer": "respond-async"}
-        found = self._ask(DatasetView, "POST", dataset.links.finalize, headers=headers)
+        found = self.ask(DatasetView, "POST", dataset.links.finalize, headers=headers)
         while found.state == "finalizing":
             time.sleep(_POLL_S)
-            found = self._ask(DatasetView, "GET", dataset.links.self)
+            found = self.ask(DatasetView, "GET", dataset.links.self)
         if found.state == "rejected":
             error = found.error
             if error is None:
@@ -121,7 +119,7 @@ class Client:
 
     def delete_dataset(self, dataset: DatasetView) -> None:
         """Deletes the dataset."""
-        self._send("DELETE", dataset.links.self)
+        self.send("DELETE", dataset.links.self)
 
     def submit(
         self,
@@ -138,15 +136,15 @@ class Client:
             "labels": dict(labels or {}),
         }
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
-        return self._ask(JobView, "POST", "/v1/jobs", json=body, headers=headers)
+        return self.ask(JobView, "POST", "/v1/jobs", json=body, headers=headers)
 
     def job(self, job_id: str) -> JobView:
         """The job now."""
-        return self._ask(JobView, "GET", f"/v1/jobs/{job_id}")
+        return self.ask(JobView, "GET", f"/v1/jobs/{job_id}")
 
     def cancel(self, job: JobView) -> JobView:
         """Asks for the job's end."""
-        return self._ask(JobView, "POST", job.links.cancel)
+        return self.ask(JobView, "POST", job.links.cancel)
 
     def follow(self, job: JobView, *, after: int = 0) -> Iterator[Happening]:
         """What happens to the job until it is over, each event once.
@@ -189,7 +187,7 @@ class Client:
 
     def artifacts(self, job: JobView) -> list[ArtifactView]:
         """The files of the job's result."""
-        answer = self._send("GET", job.links.artifacts)
+        answer = self.send("GET", job.links.artifacts)
         return [_known(ArtifactView, item) for item in answer.json()["items"]]
 
     def download(
@@ -220,19 +218,36 @@ class Client:
             partial.unlink(missing_ok=True)
 
     def _bytes(self, artifact: ArtifactView, start: int) -> Iterator[bytes]:
-        headers = {"Accept": "*/*", "Accept-Encoding": "identity"}
+        wanted = {"Accept": "*/*", "Accept-Encoding": "identity"}
         if start:
-            headers |= {"Range": f"bytes={start}-", "If-Range": f'"{artifact.sha256}"'}
-        with self._http.stream("GET", artifact.href, headers=headers) as answer:
-            if answer.status_code != (206 if start else 200):
-                answer.read()
-                raise _refusal(answer)
-            yield from answer.iter_raw()
+            wanted["Range"] = f"bytes={start}-"
+        same = {"If-Range": f'"{artifact.sha256}"'} if start else {}
+        with self._http.stream("GET", artifact.href, headers={**wanted, **same}) as answer:
+            if answer.status_code != 307:
+                yield from _content(answer, start)
+                return
+        # At the service's store, which has tags of its own; files of a result never change.
+        with self._http.stream("GET", answer.headers["Location"], headers=wanted) as answer:
+            yield from _content(answer, start)
 
-    def _ask(self, model: type[Model], method: str, path: str, **arguments: Any) -> Model:
-        return _known(model, self._send(method, path, **arguments).json())
+    def patiently(self, attempt: Callable[[], Answer]) -> Answer:
+        """What ``attempt`` returns, tried again while the service is away or asks to wait, within the patience."""
+        failing_since = None
+        while True:
+            try:
+                return attempt()
+            except ServiceError as error:
+                failing_since = failing_since or time.monotonic()
+                if not error.retryable or time.monotonic() - failing_since > self._patience_s:
+                    raise
+            time.sleep(_POLL_S)
 
-    def _send(self, method: str, path: str, **arguments: Any) -> httpx.Response:
+    def ask(self, model: type[Model], method: str, path: str, **arguments: Any) -> Model:
+        """The answer as a model."""
+        return _known(model, self.send(method, path, **arguments).json())
+
+    def send(self, method: str, path: str, **arguments: Any) -> httpx.Response:
+        """One request."""
         try:
             answer = self._http.request(method, path, **arguments)
         except httpx.TransportError as error:
@@ -240,6 +255,13 @@ class Client:
         if answer.status_code >= 400:
             raise _refusal(answer)
         return answer
+
+
+def _content(answer: httpx.Response, start: int) -> Iterator[bytes]:
+    if answer.status_code != (206 if start else 200):
+        answer.read()
+        raise _refusal(answer)
+    yield from answer.iter_raw()
 
 
 def _known(model: type[Model], values: dict[str, Any]) -> Model:

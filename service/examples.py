@@ -149,6 +149,19 @@ EXAMPLES: dict[str, Any] = {
     "DatasetView": _DATASET_VIEW,
     "DatasetList": {"items": [_DATASET_VIEW], "next_cursor": None},
     "UploadView": _UPLOAD_VIEW,
+    "SignedUploads": {
+        "items": [
+            {
+                "upload": {**_UPLOAD_VIEW, "kind": "signed", "path": "a.jpg", "size": 803_120, "received": 0},
+                "url": "https://s3.example.org/bucket/datasets/…/content?X-Amz-Signature=…",
+            }
+        ]
+    },
+    "ShareView": {
+        "name": "transforms.json",
+        "href": f"/v1/shared/{_JOB_ID}/transforms.json?expires=1795291200&signature=kq0h…",
+        "expires_at": _AT,
+    },
     "FileView": _FILE_VIEW,
     "FileList": {"items": [_FILE_VIEW], "next_cursor": None},
     "ArtifactView": _ARTIFACT_VIEW,

@@ -1,20 +1,14 @@
-"""A scene on this machine as a zip that is made while it is sent: no second copy on disk."""
+"""What of a folder on this machine makes up the scene, and the names its files are sent under."""
 
 from __future__ import annotations
 
 import os
-import zipfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from biresnerf.errors import InputError
 from service.safe_paths import NameSet, checked_path
 
-_CHUNK = 2**18
-_JSON = {".json"}
-# The same scene gives the same bytes, so that a repeated request can be known by its digest.
-_EPOCH = (1980, 1, 1, 0, 0, 0)
 TRANSFORMS = "transforms.json"
 
 
@@ -77,37 +71,3 @@ def _scene(files: list[tuple[str, Path]]) -> Scene:
     for name, _ in files:
         names.add(name)
     return Scene(tuple(files), sum(path.stat().st_size for _, path in files))
-
-
-def zipped(scene: Scene) -> Iterator[bytes]:
-    """The archive, piece by piece. Images go in as they are; they do not get smaller."""
-    outbox = _Outbox()
-    with zipfile.ZipFile(outbox, "w") as archive:  # type: ignore[call-overload]
-        for name, path in scene.files:
-            info = zipfile.ZipInfo(name, _EPOCH)
-            info.compress_type = zipfile.ZIP_DEFLATED if path.suffix.lower() in _JSON else zipfile.ZIP_STORED
-            info.external_attr = 0o100644 << 16
-            large = path.stat().st_size > 2**30
-            with path.open("rb") as source, archive.open(info, "w", force_zip64=large) as entry:
-                while chunk := source.read(_CHUNK):
-                    entry.write(chunk)
-                    yield outbox.taken()
-    yield outbox.taken()
-
-
-class _Outbox:
-    """Where zipfile writes to; it sees a stream that cannot seek."""
-
-    def __init__(self) -> None:
-        self._written: list[bytes] = []
-
-    def write(self, data: bytes) -> int:
-        self._written.append(bytes(data))
-        return len(data)
-
-    def flush(self) -> None:
-        """Nothing waits here."""
-
-    def taken(self) -> bytes:
-        data, self._written = b"".join(self._written), []
-        return data

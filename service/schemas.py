@@ -14,12 +14,8 @@ from workers.records import (
     DatasetFile,
     DatasetRecord,
     Job,
-    JobError,
     JobState,
     ManifestEntry,
-    Upload,
-    UploadKind,
-    UploadState,
 )
 
 Label = Annotated[str, StringConstraints(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f]*$")]
@@ -199,27 +195,6 @@ class FileList(Wire):
     next_cursor: str | None = None
 
 
-class UploadView(Wire):
-    """Bytes on their way into a dataset."""
-
-    id: str
-    dataset_id: str
-    kind: UploadKind
-    path: str | None = Field(None, description="The file's path; null for an archive.")
-    size: int
-    sha256: str | None = None
-    state: UploadState
-    received: int = Field(description="Bytes that are safe; the next byte to send has this number.")
-    error: JobError | None = Field(None, description="Why it was rejected.")
-    created_at: datetime
-    expires_at: datetime = Field(description="It is given up then, unless it goes on.")
-
-    @classmethod
-    def of(cls, upload: Upload) -> UploadView:
-        """The upload as the wire has it."""
-        return cls(**upload.model_dump(exclude={"folder"}))
-
-
 class OptionsView(Wire):
     """What may be asked for: the JSON Schema of `options`, and every preset with all values filled in."""
 
@@ -264,8 +239,3 @@ def job_url(job_id: str) -> str:
 def dataset_url(dataset_id: str) -> str:
     """The dataset's path."""
     return f"/v1/datasets/{quote(dataset_id, safe='')}"
-
-
-def upload_url(upload_id: str) -> str:
-    """The upload's path."""
-    return f"/v1/uploads/{quote(upload_id, safe='')}"

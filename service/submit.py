@@ -11,17 +11,24 @@ from rich.console import Console
 from biresnerf.config import RefineOptions
 from biresnerf.errors import BiresnerfError, InputError
 from service.client import Client, ServiceError
-from service.pack import Scene, look_at, zipped
+from service.pack import Scene, look_at
 from service.progress_view import progress_view, watch
 from service.safe_paths import checked_path
 from service.schemas import DatasetView, JobView
+from service.sending import LocalFile, send_missing
 
 
 def submit_scene(client: Client, scene: Scene, name: str, options: RefineOptions) -> JobView:
-    """Sends the scene, has it checked, queues a job. Leaves nothing behind where one of them fails."""
-    dataset = client.create_dataset(name[:200] or "scene")
+    """Sends what the service lacks of the scene, has it checked, queues a job. Leaves nothing behind on failure.
+
+    Lost connections and restarts of the service are waited for, and sending goes on where it broke off.
+    """
+    files = [LocalFile.at(name, path) for name, path in scene.files]
+    dataset = client.create_dataset(name[:200] or "scene", [file.entry for file in files])
     try:
-        client.upload_archive(dataset, zipped(scene))
+        sent = send_missing(client, dataset, files)
+        if sent < len(files):
+            click.echo(f"{len(files) - sent} of the files were there already", err=True)
         client.finalize(dataset)
         return client.submit(dataset.id, options)
     except BaseException:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import AsyncIterable, Sequence
+import asyncio
+import contextlib
+from collections.abc import AsyncIterable, Awaitable, Callable, Sequence
 from copy import copy
 from typing import Any
 
@@ -13,6 +14,7 @@ from biresnerf.errors import InputError
 from workers.checking import Checker
 from workers.claim import insist
 from workers.database import Connection, Database
+from workers.dataset_rows import DATASET, KNOWN, MINE, file_key, locked, record_file, require_open
 from workers.errors import Conflict, Expired, LimitReached, NotFound
 from workers.files import FileStore, StoredFile
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
@@ -20,17 +22,7 @@ from workers.records import DatasetFile, DatasetRecord, DatasetState, ManifestEn
 from workers.settings import Settings
 from workers.tenants import LOCAL_TENANT
 
-# The file store keeps such names for uploads under way.
-RESERVED_NAME = re.compile(r"#\d+$")
-DATASET = """
-    SELECT datasets.*, coalesce(total.files, 0) AS files, coalesce(total.bytes, 0)::bigint AS bytes,
-        ARRAY(SELECT entry ->> 'path' FROM jsonb_array_elements(datasets.manifest) AS entry WHERE NOT EXISTS (
-            SELECT 1 FROM dataset_files AS file WHERE file.dataset_id = datasets.id
-            AND file.path = entry ->> 'path')) AS missing
-    FROM datasets LEFT JOIN LATERAL (SELECT count(*) AS files, sum(size) AS bytes
-        FROM dataset_files WHERE dataset_id = datasets.id) AS total ON true"""
-# With the store's tenant as parameter; none for everybody's.
-MINE = "datasets.tenant = coalesce(%s, datasets.tenant)"
+COPIES_AT_ONCE = 8
 
 FILE = "SELECT path, key, size, sha256, created_at FROM dataset_files"
 
@@ -110,6 +102,70 @@ class DatasetStore:
         (``body_too_large``, ``too_many_files``), `InputError` (``unsafe_path``, ``digest_mismatch``).
         Where it raises, the dataset is as before.
         """
+
+        async def stored(key: str, room: int) -> StoredFile:
+            return await self._files.put(key, chunks, limit_bytes=room, expected_sha256=sha256)
+
+        return await self._add(dataset_id, path, stored, overwrite=overwrite)
+
+    async def add_copy(
+        self, dataset_id: str, path: str, source: str, *, size: int, sha256: str, trusted: bool
+    ) -> tuple[DatasetFile, bool]:
+        """Like `add_file`, from a key of the store that others may write to, unless it is ``trusted``.
+
+        Raises `NotFound` also where there is no ``source``.
+        """
+
+        async def copied(key: str, room: int) -> StoredFile:
+            if size > room:
+                raise LimitReached("body_too_large", f"{path} has more than the {room} bytes left for it.")
+            file = await self._files.copy(source, key)
+            # Of the copy, which nobody else can write to: the source may change while it is read.
+            found = sha256 if trusted else await self._files.sha256(key)
+            if (file.size, found) != (size, sha256):
+                raise InputError(
+                    "digest_mismatch",
+                    f"What arrived has {file.size} bytes and SHA-256 {found}, not {size} and {sha256}.",
+                    where=path,
+                    mend="Send the file again.",
+                )
+            return file.model_copy(update={"sha256": found})
+
+        return await self._add(dataset_id, path, copied, overwrite=True)
+
+    async def fill_known(self, dataset_id: str) -> DatasetRecord:
+        """Copy what the manifest names and the same tenant has sent before; returns the dataset.
+
+        By digest and size, within one tenant: nobody learns what others have sent. Raises `NotFound`,
+        `LimitReached`.
+        """
+        known = await self._database.fetch(KNOWN, dataset_id, self._tenant)
+        turns = asyncio.Semaphore(COPIES_AT_ONCE)
+
+        async def copy_one(row: dict[str, Any]) -> None:
+            async with turns:
+                with contextlib.suppress(NotFound):  # deleted just now: it has to be sent after all
+                    await self.add_copy(
+                        *(dataset_id, row["path"], row["key"]),
+                        **{"size": row["size"], "sha256": row["sha256"], "trusted": True},
+                    )
+
+        copies = [asyncio.create_task(copy_one(row)) for row in known]
+        try:
+            await asyncio.gather(*copies)
+        finally:
+            for copying in copies:
+                copying.cancel()
+        return await self.get(dataset_id)
+
+    async def _add(
+        self,
+        dataset_id: str,
+        path: str,
+        store: Callable[[str, int], Awaitable[StoredFile]],
+        *,
+        overwrite: bool,
+    ) -> tuple[DatasetFile, bool]:
         # A folder of its own for each upload: one that fails or comes too late never touches an older file.
         folder = f"datasets/{dataset_id}/files/{new_id('v')}"
         key = file_key(folder, path)
@@ -117,10 +173,10 @@ class DatasetStore:
             row = await self._require_open(connection, dataset_id, path, overwrite=overwrite)
         room = min(self._settings.max_file_bytes, self._settings.max_dataset_bytes - row["bytes"])
         try:
-            stored = await self._files.put(key, chunks, limit_bytes=room, expected_sha256=sha256)
+            stored = await store(key, room)
             async with self._database.transaction() as connection:
                 await self._require_open(connection, dataset_id, path, overwrite=overwrite, size=stored.size)
-                return await _record_file(connection, dataset_id, path, stored)
+                return await record_file(connection, dataset_id, path, stored)
         except BaseException:
             await self._files.delete_prefix(folder)
             raise
@@ -182,7 +238,7 @@ class DatasetStore:
         Then call `check` (in a background task, or awaited), which leads to ``ready`` or ``rejected``.
         """
         async with self._database.transaction() as connection:
-            await _locked(connection, dataset_id, self._tenant)
+            await locked(connection, dataset_id, self._tenant)
             dataset = await self._required(connection, dataset_id)
             if dataset.state != "open":
                 return dataset
@@ -211,7 +267,7 @@ class DatasetStore:
     async def delete(self, dataset_id: str) -> None:
         """Delete a dataset with its files; raises `NotFound`, `Conflict` (``dataset_in_use`` by jobs)."""
         async with self._database.transaction() as connection:
-            await _locked(connection, dataset_id, self._tenant)
+            await locked(connection, dataset_id, self._tenant)
             await self._required(connection, dataset_id)
             cursor = await connection.execute(
                 "SELECT id, state FROM jobs WHERE dataset_id = %s", (dataset_id,)
@@ -230,53 +286,6 @@ class DatasetStore:
         if row is None:
             raise NotFound(f"No dataset {dataset_id}.")
         return _record(row)
-
-
-async def _record_file(
-    connection: Connection, dataset_id: str, path: str, stored: StoredFile
-) -> tuple[DatasetFile, bool]:
-    before = await (
-        await connection.execute(
-            "DELETE FROM dataset_files WHERE dataset_id = %s AND path = %s RETURNING key", (dataset_id, path)
-        )
-    ).fetchone()
-    if before is not None:
-        await connection.execute(
-            "INSERT INTO trash (prefix) VALUES (%s)", (before["key"].removesuffix(f"/{path}"),)
-        )
-    cursor = await connection.execute(
-        "INSERT INTO dataset_files (dataset_id, path, key, size, sha256) VALUES (%s, %s, %s, %s, %s)"
-        " RETURNING path, key, size, sha256, created_at",
-        (dataset_id, path, stored.key, stored.size, stored.sha256),
-    )
-    await connection.execute("UPDATE datasets SET revision = revision + 1 WHERE id = %s", (dataset_id,))
-    return DatasetFile.model_validate(await cursor.fetchone()), before is None
-
-
-async def require_open(connection: Connection, dataset_id: str, tenant: str | None) -> None:
-    """Locks the dataset's row; raises `NotFound`, `Conflict` (``dataset_not_open``)."""
-    state = await _locked(connection, dataset_id, tenant)
-    if state != "open":
-        raise Conflict("dataset_not_open", f"Dataset {dataset_id} is {state}; it takes no more files.")
-
-
-async def _locked(connection: Connection, dataset_id: str, tenant: str | None) -> DatasetState:
-    """The state of the dataset, which stays as it is until the transaction ends; raises `NotFound`."""
-    sql = f"SELECT state FROM datasets WHERE id = %s AND {MINE} FOR UPDATE"
-    row = await (await connection.execute(sql, (dataset_id, tenant))).fetchone()
-    if row is None:
-        raise NotFound(f"No dataset {dataset_id}.")
-    state: DatasetState = row["state"]
-    return state
-
-
-def file_key(folder: str, path: str) -> str:
-    """The key of a client's path; raises `InputError` (``unsafe_path``)."""
-    parts = path.split("/")
-    bad = any(part in ("", ".", "..") or len(part.encode()) > 255 for part in parts) or "\0" in path
-    if bad or RESERVED_NAME.search(path):
-        raise InputError("unsafe_path", "Not a usable file name.", where=path[:300], mend="Rename the file.")
-    return f"{folder}/{path}"
 
 
 def _record(row: dict[str, Any]) -> DatasetRecord:

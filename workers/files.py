@@ -170,6 +170,13 @@ class FileStore:
         with contextlib.suppress(FileNotFoundError), _told(f"Cannot delete {prefix}"):
             await self._place.delete_folder(folder, keep)
 
+    async def sha256(self, key: str) -> str:
+        """The digest of what is stored, in hex; raises `NotFound`."""
+        digest = hashlib.sha256()
+        async for chunk in self.read(key):
+            digest.update(chunk)
+        return digest.hexdigest()
+
     async def stage(self, files: Iterable[tuple[str, str]], folder: Path) -> int:
         """Copy files, given as (key, path relative to ``folder``), into a local folder; returns the bytes."""
         total = 0
@@ -183,7 +190,8 @@ class FileStore:
 
     async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
         """An address for each key, good for ``valid_s`` and one method; none where the place cannot."""
-        return await self._place.signed_urls(method, [_checked(key) for key in keys], valid_s)
+        with _told("Cannot sign an address"):
+            return await self._place.signed_urls(method, [_checked(key) for key in keys], valid_s)
 
     async def healthy(self) -> bool:
         """Whether the store can be written to."""

@@ -47,13 +47,14 @@ async def store_result(
 
 async def store_artifact(files: FileStore, prefix: str, name: str, path: Path) -> Artifact:
     """Store one file as ``prefix``/``name``."""
-    stored = await files.put_path(f"{prefix}/{name}", path)
+    media_type = mimetypes.guess_type(name)[0] or "application/octet-stream"
+    stored = await files.put_path(f"{prefix}/{name}", path, media_type)
     return Artifact(
         name=name,
         key=stored.key,
         size=stored.size,
         sha256=stored.sha256 or "",
-        media_type=mimetypes.guess_type(name)[0] or "application/octet-stream",
+        media_type=media_type,
     )
 
 

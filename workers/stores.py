@@ -16,6 +16,7 @@ from workers.jobs import JobStore
 from workers.monitor import Monitor
 from workers.one_store import require_same_store
 from workers.settings import Settings
+from workers.shared_keys import shared_key
 from workers.uploads import UploadStore
 from workers.webhooks import WebhookStore
 
@@ -33,6 +34,7 @@ class Stores:
     keys: KeyStore
     monitor: Monitor
     webhooks: WebhookStore
+    share_key: bytes  # signs links to results
 
 
 @asynccontextmanager
@@ -49,11 +51,13 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
         listener = JobListener(database, FOLLOW_POLL_S)
         listening = asyncio.create_task(listener.run())
         try:
+            given = settings.share_key
+            share_key = given.encode() if given else await shared_key(database, "share")
             jobs = JobStore(database, listener, settings)
             monitor = Monitor(database, files, settings.stall_s)
             uploads = UploadStore(database, files, settings)
             datasets = DatasetStore(database, files, settings)
             webhooks = WebhookStore(database, settings)
-            yield Stores(jobs, datasets, files, uploads, KeyStore(database), monitor, webhooks)
+            yield Stores(jobs, datasets, files, uploads, KeyStore(database), monitor, webhooks, share_key)
         finally:
             listening.cancel()

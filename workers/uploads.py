@@ -15,7 +15,7 @@ from copy import copy
 from psycopg.types.json import Jsonb
 
 from workers.database import Connection, Database
-from workers.datasets import MINE, file_key, require_open
+from workers.dataset_rows import MINE, file_key, require_open
 from workers.errors import Conflict, LimitReached, NotFound
 from workers.files import FileStore
 from workers.idents import new_id
@@ -202,6 +202,16 @@ class UploadStore:
             if row is not None:
                 await connection.execute("DELETE FROM upload_pieces WHERE upload_id = %s", (upload_id,))
                 await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (row["folder"],))
+
+    async def conclude_signed(self, upload_id: str, late_s: float) -> None:
+        """A file that went to the store itself is in its dataset. Its address is still good for ``late_s``."""
+        await self._database.fetch(
+            "WITH done AS (UPDATE uploads SET state = 'stored', received = size"
+            " WHERE id = %s AND kind = 'signed' AND state = 'receiving' RETURNING folder)"
+            " INSERT INTO trash (prefix, not_before)"
+            " SELECT folder, clock_timestamp() + make_interval(secs => %s) FROM done",
+            *(upload_id, late_s),
+        )
 
     async def untaken(self) -> tuple[str, ...]:
         """Ids of received uploads that nobody brings into their dataset just now."""

@@ -56,10 +56,15 @@ async def _new_dataset(request: Request) -> NewDataset:
 async def create_dataset(
     caller: DatasetWriterHere, body: Annotated[NewDataset, Depends(_new_dataset)], response: Response
 ) -> DatasetView:
-    """An empty dataset, to be filled."""
+    """A dataset to be filled. Of a manifest, `missing` in the answer is what has to be sent.
+
+    Files that were sent before (same size and SHA-256, with the same tenant's keys) are there already.
+    """
     for entry in body.manifest:
         checked_path(entry.path)
     dataset = await caller.datasets.create(body.name, body.manifest)
+    if body.manifest:
+        dataset = await caller.datasets.fill_known(dataset.id)
     response.headers["Location"] = dataset_url(dataset.id)
     return DatasetView.of(dataset)
 

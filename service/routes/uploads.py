@@ -21,7 +21,7 @@ from service.dependencies import DatasetId, UploadId
 from service.intake import begin_taking
 from service.problems import ProblemError, declared
 from service.safe_paths import checked_path
-from service.schemas import UploadView, upload_url
+from service.upload_schemas import UploadView, upload_url
 from service.uploads import capped, refuse_announced_excess
 from workers.records import Upload
 

@@ -1,0 +1,104 @@
+"""Files that clients send to the store themselves: signed addresses first, proof of what arrived after."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Request
+
+from service.access import Caller, DatasetWriterHere
+from service.dependencies import DatasetId, UploadId
+from service.json_body import json_content, read_json
+from service.problems import ProblemError, declared
+from service.safe_paths import checked_path
+from service.schemas import FileView
+from service.upload_schemas import NewSignedUploads, SignedUpload, SignedUploads, UploadView
+from workers.errors import NotFound
+from workers.records import Upload
+
+router = APIRouter(prefix="/v1", tags=["uploads"])
+_BODY = ("malformed_json", "unsupported_media", "body_timeout", "invalid_request")
+_ALWAYS = ("not_found", "cross_site", "database_unavailable", "storage_unavailable", "internal_error")
+
+
+async def _new_uploads(request: Request) -> NewSignedUploads:
+    headers = request.headers
+    return await read_json(
+        headers.get("content-type", ""), headers.get("content-length"), request.stream(), NewSignedUploads
+    )
+
+
+@router.post(
+    "/datasets/{dataset_id}/signed-uploads",
+    status_code=201,
+    operation_id="signUploads",
+    responses=declared(
+        *("direct_upload_unavailable", "dataset_not_open", "body_too_large", "too_many_files"),
+        *("unsafe_path", *_BODY, *_ALWAYS),
+    ),
+    openapi_extra={
+        "requestBody": {"required": True, "content": {"application/json": json_content(NewSignedUploads)}}
+    },
+)
+async def sign_uploads(
+    dataset_id: DatasetId, caller: DatasetWriterHere, body: Annotated[NewSignedUploads, Depends(_new_uploads)]
+) -> SignedUploads:
+    """An address at the store for each file. `PUT` the bytes there, then `POST …/complete` the upload here."""
+    paths = [checked_path(file.path) for file in body.files]
+    await _addresses(caller, [])  # refuse before anything is created
+    uploads = [
+        await caller.uploads.create(dataset_id, "signed", file.size, path=path, sha256=file.sha256)
+        for file, path in zip(body.files, paths, strict=True)
+    ]
+    urls = await _addresses(caller, [_key(upload) for upload in uploads])
+    items = [
+        SignedUpload(upload=UploadView.of(upload), url=url) for upload, url in zip(uploads, urls, strict=True)
+    ]
+    return SignedUploads(items=items)
+
+
+async def _addresses(caller: Caller, keys: list[str]) -> list[str]:
+    settings = caller.service.settings
+    files, valid_s = caller.service.stores.files, settings.storage_presign_s
+    urls = await files.signed_urls("PUT", keys, valid_s) if settings.storage_presign else None
+    if urls is None:
+        raise ProblemError(
+            "direct_upload_unavailable",
+            "This service takes files itself only.",
+            mend="Use PUT …/files/{path}, or a resumable upload.",
+        )
+    return list(urls)
+
+
+def _key(upload: Upload) -> str:
+    return f"{upload.folder}/content"
+
+
+@router.post(
+    "/uploads/{upload_id}/complete",
+    operation_id="completeUpload",
+    responses=declared(
+        *("upload_incomplete", "state_conflict", "dataset_not_open", "digest_mismatch"),
+        *("body_too_large", "too_many_files", *_ALWAYS),
+    ),
+)
+async def complete_upload(upload_id: UploadId, caller: DatasetWriterHere) -> FileView:
+    """Verifies size and SHA-256 of what arrived at the store; only then it is a file of the dataset.
+
+    Where they are others (422), the bytes can be sent again. The same request again changes nothing.
+    """
+    upload = await caller.uploads.get(upload_id)
+    path, sha256 = upload.path, upload.sha256
+    if upload.kind != "signed" or path is None or sha256 is None:
+        raise ProblemError("state_conflict", "This upload completes with its last byte.")
+    if upload.state == "stored":
+        return FileView.of(await caller.datasets.file(upload.dataset_id, path))
+    await caller.datasets.get(upload.dataset_id)
+    try:
+        file, _ = await caller.datasets.add_copy(
+            upload.dataset_id, path, _key(upload), size=upload.size, sha256=sha256, trusted=False
+        )
+    except NotFound:
+        raise ProblemError("upload_incomplete", "No bytes have arrived at the signed address.") from None
+    await caller.uploads.conclude_signed(upload_id, caller.service.settings.storage_presign_s)
+    return FileView.of(file)
