@@ -36,6 +36,7 @@ _COUNTERS = {
     ),
     "job_failures": ("biresnerf_job_failures", "code", "Failed jobs by the code of their error."),
     "job_requeues": ("biresnerf_job_requeues", "why", "Jobs given back; why=worker_lost is a take-over."),
+    "webhook_attempts": ("biresnerf_webhook_attempts", "result", "Deliveries of webhook messages tried."),
     "stored_files": ("biresnerf_stored_files", "", "Files stored in datasets."),
     "stored_bytes": ("biresnerf_stored_bytes", "", "Bytes of the files stored in datasets."),
 }
@@ -44,6 +45,7 @@ _FROM_ZERO: dict[str, tuple[str, ...]] = {
     "job_events": get_args(EventType),
     "job_failures": ("engine_error", "timeout", "too_many_crashes"),
     "job_requeues": ("lost", "receipt_lost", "shutdown", "worker_lost"),
+    "webhook_attempts": ("delivered", "failed"),
 }
 _DURATIONS = {
     "stage_seconds": ("biresnerf_stage_seconds", "stage", "Time that jobs spent in each stage."),
@@ -111,6 +113,9 @@ def _families(now: Statistics) -> Iterator[Metric]:
         "biresnerf_queue_oldest_seconds", "Age of the job queued longest.", "", {"": now.oldest_queued_s}
     )
     yield _gauge("biresnerf_trash", "Folders of files that wait for deletion.", "", {"": now.trash})
+    yield _gauge("biresnerf_webhooks_pending", "Webhook messages to send.", "", {"": now.webhooks_pending})
+    late = "How long the most urgent webhook message is overdue: grows where no dispatcher runs."
+    yield _gauge("biresnerf_webhooks_late_seconds", late, "", {"": now.webhooks_late_s})
     slots = GaugeMetricFamily("biresnerf_slots", "Living worker slots.", labels=["kind", "busy"])
     for slot in now.slots:
         slots.add_metric([slot.kind, str(slot.busy).lower()], slot.slots)

@@ -79,7 +79,10 @@ def _with_context(record: logging.LogRecord) -> bool:
 
 def _secret_values(settings: Settings) -> tuple[str, ...]:
     """What the operator gave as a secret, to be kept out of the log wherever it turns up."""
-    found = {value.get_secret_value() for _, value in settings if isinstance(value, SecretStr)}
+    fields = Settings.model_fields
+    values = [(value, fields[name].repr) for name, value in settings]
+    found = {value.get_secret_value() for value, _ in values if isinstance(value, SecretStr)}
+    found |= {value for value, shown in values if isinstance(value, str) and not shown}
     if settings.database_url is not None:
         found.add(urlsplit(settings.database_url).password or "")
     return tuple(sorted((text for text in found if len(text) >= _HIDDEN_LENGTH_MIN), key=len, reverse=True))

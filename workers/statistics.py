@@ -42,6 +42,8 @@ class Statistics(BaseModel):
     oldest_queued_s: float
     slots: tuple[SlotCount, ...]
     trash: int
+    webhooks_pending: int
+    webhooks_late_s: float
     bounds_s: tuple[float, ...]
     tallies: tuple[Tally, ...]
 
@@ -63,6 +65,12 @@ _QUEUED_AGE = """
     FROM jobs WHERE state = 'queued'"""
 
 
+_WEBHOOKS = """
+    SELECT count(*) AS pending,
+        greatest(coalesce(extract(epoch FROM clock_timestamp() - min(due_at)), 0), 0)::float8 AS late_s
+    FROM webhook_deliveries WHERE state = 'pending'"""
+
+
 async def read_statistics(database: Database, stall_s: float) -> Statistics:
     """Everything in one snapshot; raises `Unavailable`."""
     async with database.transaction() as connection:
@@ -71,6 +79,7 @@ async def read_statistics(database: Database, stall_s: float) -> Statistics:
         datasets = await _rows(connection, "SELECT state, count(*) AS n FROM datasets GROUP BY state")
         (age,) = await _rows(connection, _QUEUED_AGE)
         (trash,) = await _rows(connection, "SELECT count(*) AS n FROM trash")
+        (webhooks,) = await _rows(connection, _WEBHOOKS)
         (bounds,) = await _rows(connection, "SELECT tally_bounds() AS bounds_s")
         return Statistics(
             jobs={row["state"]: row["n"] for row in jobs},
@@ -78,6 +87,8 @@ async def read_statistics(database: Database, stall_s: float) -> Statistics:
             oldest_queued_s=max(0.0, age["age_s"]),
             slots=tuple(SlotCount(**row) for row in await _rows(connection, _SLOTS, stall_s)),
             trash=trash["n"],
+            webhooks_pending=webhooks["pending"],
+            webhooks_late_s=webhooks["late_s"],
             bounds_s=tuple(bounds["bounds_s"]),
             tallies=tuple(Tally(**row) for row in await _rows(connection, _TALLIES)),
         )

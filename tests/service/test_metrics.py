@@ -70,13 +70,16 @@ def test_a_job_is_told_from_queue_to_end(http: httpx.Client, scene: Path) -> Non
     def grown(name: str, **labels: str) -> float:
         return at(after, name, **labels) - at(before, name, **labels)
 
+    # What happened, by the job's own history: on a slow machine an attempt may be taken for dead.
+    history = http.get(f"/v1/jobs/{job}/events").text
     for event in ("queued", "started", "succeeded"):
-        assert grown("biresnerf_job_events_total", type=event) == 1
+        assert grown("biresnerf_job_events_total", type=event) == history.count(f"event: {event}\n") >= 1
     assert grown("biresnerf_queue_wait_seconds_count") == 1
     assert grown("biresnerf_job_seconds_count", state="succeeded") == 1
     for stage in ("coarse", "fine", "exporting"):
-        assert grown("biresnerf_stage_seconds_count", stage=stage) == 1
-        assert grown("biresnerf_stage_seconds_bucket", stage=stage, le="+Inf") == 1
+        times = history.count(f'"type":"stage","data":{{"stage":"{stage}"}}')
+        assert grown("biresnerf_stage_seconds_count", stage=stage) == times >= 1
+        assert grown("biresnerf_stage_seconds_bucket", stage=stage, le="+Inf") == times
     # 300 steps of 5 ms and more are in these two stages.
     spent = [grown("biresnerf_stage_seconds_sum", stage=stage) for stage in ("coarse", "fine")]
     assert 1.0 < sum(spent) <= grown("biresnerf_job_seconds_sum", state="succeeded")

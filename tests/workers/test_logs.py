@@ -31,7 +31,7 @@ for secret in (
     "postgresql://me:hunter2secret@host/db", "Authorization: Bearer abcdef123456",
     "whsec_C2FVsBQIhrscChlQIMV+b5sSYspob7oD",
     "https://s3/x?X-Amz-Credential=AKIAIOSFODNN7&X-Amz-Signature=fe5f80f77d5fa3beca038a248ff027",
-    "token=scrape-me-not",
+    "a share-key-of-ours", "token=scrape-me-not",
     "the scrape-me-not itself", "the hunter2secret itself",
 ):
     log.info("%s", secret)
@@ -46,6 +46,7 @@ def said(form: str) -> list[str]:
         "BIRESNERF_LOG_FORMAT": form,
         "BIRESNERF_DATABASE_URL": "postgresql://me:hunter2secret@host/db",
         "BIRESNERF_METRICS_TOKEN": "scrape-me-not",
+        "BIRESNERF_SHARE_KEY": "share-key-of-ours",
     }
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM], env={**os.environ, **settings}, capture_output=True
@@ -83,6 +84,14 @@ def test_a_plain_line_cannot_be_forged_and_moves_no_cursor() -> None:
 @pytest.mark.parametrize("form", ["plain", "json"])
 def test_no_secret_is_logged(form: str) -> None:
     text = "\n".join(said(form))
-    for secret in ("hunter2secret", "abcdef123456", "C2FVsBQI", "AKIAIOS", "fe5f80", "scrape-me-not"):
+    for secret in (
+        "hunter2secret",
+        "abcdef123456",
+        "C2FVsBQI",
+        "AKIAIOS",
+        "fe5f80",
+        "scrape-me-not",
+        "share-key",
+    ):
         assert secret not in text
     assert text.count("***") >= 7
