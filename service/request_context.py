@@ -21,6 +21,13 @@ logger = logging.getLogger(__name__)
 # A browser sends at most 8 KiB of cookies; a few long headers beside them fit in too.
 HEAD_BYTES_MAX = 32 * 2**10
 _SAFE = {"GET", "HEAD", "OPTIONS"}
+# No answer is a page but the docs, which have a policy of their own; none is for other sites to build in.
+_PRUDENT = {
+    "X-Content-Type-Options": "nosniff",
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+}
 _ID = re.compile(r"^[\w.:-]{1,128}$", re.ASCII)
 
 
@@ -62,7 +69,8 @@ class RequestContext:
                 started = True
                 headers = MutableHeaders(scope=message)
                 headers["X-Request-ID"] = request_id(request)
-                headers.setdefault("X-Content-Type-Options", "nosniff")
+                for name, value in _PRUDENT.items():
+                    headers.setdefault(name, value)
                 for name, value in scope.get("state", {}).get("extra_headers", {}).items():
                     headers.setdefault(name, value)
             await send(message)

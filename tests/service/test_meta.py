@@ -98,6 +98,10 @@ def test_the_docs_page_works_without_any_other_host(http: httpx.Client) -> None:
     assert "default-src 'self'" in page.headers["content-security-policy"]
     parts = re.findall(r'(?:src|href)="([^"]+)"', page.text)
     assert {part.rsplit(".", 1)[-1] for part in parts} == {"js", "css", "png"}
+    answer = http.get("/v1/jobs")
+    assert answer.headers["content-security-policy"].startswith("default-src 'none'")
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert answer.headers["cross-origin-resource-policy"] == "same-origin"
     start = http.get("/docs/start.js").text
     assert "://" not in page.text + start
     assert "validatorUrl: null" in start
