@@ -128,10 +128,12 @@ def test_openmetrics_is_told_to_who_asks_for_it(http: httpx.Client) -> None:
     assert {family.name for family in parse_openmetrics(answer.text)} >= {"biresnerf_jobs", "biresnerf_slots"}
 
 
-def test_the_dashboard_asks_for_metrics_that_exist(http: httpx.Client, done_job: dict[str, Any]) -> None:
+def test_dashboard_and_alerts_ask_for_metrics_that_exist(http: httpx.Client, done_job: dict[str, Any]) -> None:
     dashboard = json.loads((DOCS / "grafana-dashboard.json").read_text())
     asked = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", [])]
-    assert len(asked) > 10
+    page = (DOCS / "operations.md").read_text()
+    asked += [query for query in re.findall(r"^\| `([^`]+)`", page, re.M) if "biresnerf_" in query]
+    assert len(asked) > 25
     told: dict[str, set[str]] = {}
     for family in text_string_to_metric_families(http.get("/metrics").text):
         endings = {"counter": ("_total",), "histogram": ("_bucket", "_count", "_sum")}.get(family.type, ("",))
