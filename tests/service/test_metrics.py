@@ -128,7 +128,9 @@ def test_openmetrics_is_told_to_who_asks_for_it(http: httpx.Client) -> None:
     assert {family.name for family in parse_openmetrics(answer.text)} >= {"biresnerf_jobs", "biresnerf_slots"}
 
 
-def test_dashboard_and_alerts_ask_for_metrics_that_exist(http: httpx.Client, done_job: dict[str, Any]) -> None:
+def test_dashboard_and_alerts_ask_for_metrics_that_exist(
+    http: httpx.Client, done_job: dict[str, Any]
+) -> None:
     dashboard = json.loads((DOCS / "grafana-dashboard.json").read_text())
     asked = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", [])]
     page = (DOCS / "operations.md").read_text()
