@@ -17,13 +17,14 @@ from service.schemas import JobTexts
 from service.uploads import Form, refuse_announced_excess, staging_folder
 from workers.errors import EngineError
 from workers.records import Job
+from workers.webhook_records import request_with
 
 # Room for the text fields and the form's own lines beside the archive.
 _FORM_BYTES = 2**20
 
 
 async def submit_form(caller: Caller, request: Request, idempotency_key: str | None) -> tuple[Job, bool]:
-    """Takes the form (`archive`, JSON texts `options`, `labels`); returns the job and whether it is new.
+    """Takes the form (`archive`, JSON texts `options`, `labels`, `webhook`); returns the job and whether it is new.
 
     A repeated request with the same key is known by the archive's digest, before anything is unpacked.
     Where anything is wrong, the dataset made for it is deleted again. Needs the scope ``datasets:write``.
@@ -33,7 +34,7 @@ async def submit_form(caller: Caller, request: Request, idempotency_key: str | N
     refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.room)
     async with staging_folder(caller.service.staging_dir) as folder:
         archive = folder / "archive"
-        form = Form("archive", {"options", "labels"}, archive, limit, caller.service.room)
+        form = Form("archive", {"options", "labels", "webhook"}, archive, limit, caller.service.room)
         await form.read(request.headers["content-type"], request.stream())
         if not form.has_file:
             detail = "The form has no file field `archive`."
@@ -43,7 +44,8 @@ async def submit_form(caller: Caller, request: Request, idempotency_key: str | N
         texts = _texts(form)
         digest = await asyncio.to_thread(file_sha256, archive)
         if idempotency_key is not None:
-            known = await caller.jobs.repeated(digest, texts.options, texts.labels, idempotency_key)
+            subject = request_with(digest, texts.webhook)
+            known = await caller.jobs.repeated(subject, texts.options, texts.labels, idempotency_key)
             if known is not None:
                 return known, False
         into = folder / "content"
@@ -67,6 +69,7 @@ async def _make_job(
             labels=texts.labels,
             idempotency_key=idempotency_key,
             request_digest=digest,
+            webhook=texts.webhook,
         )
         return job, used
     finally:

@@ -17,6 +17,7 @@ from workers.records import (
     JobState,
     ManifestEntry,
 )
+from workers.webhook_records import JobWebhook
 
 Label = Annotated[str, StringConstraints(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f]*$")]
 Labels = Annotated[dict[Label, Label], Field(max_length=20)]
@@ -55,6 +56,7 @@ class NewJob(Wire):
     dataset_id: str = Field(max_length=100)
     options: RefineOptions = RefineOptions()
     labels: Labels = {}
+    webhook: JobWebhook | None = Field(None, description="Who is told of this job, besides all webhooks.")
 
 
 class JobTexts(Wire):
@@ -62,6 +64,7 @@ class JobTexts(Wire):
 
     options: RefineOptions = RefineOptions()
     labels: Labels = {}
+    webhook: JobWebhook | None = Field(None, description="Who is told of this job, besides all webhooks.")
 
 
 class JobLinks(Wire):

@@ -21,6 +21,8 @@ from workers.records import LOG_NAME, Artifact, Job, JobEvent, JobState, JobUpda
 from workers.settings import Settings
 from workers.tenants import LOCAL_TENANT
 from workers.traces import traced, traceparent
+from workers.webhook_records import JobWebhook, request_with
+from workers.webhooks import add_job_webhook
 
 # Two submits at once must not both take the last place.
 QUEUE_LIMIT_LOCK = 7_201_604
@@ -53,6 +55,7 @@ class JobStore:
         labels: Mapping[str, str] | None = None,
         idempotency_key: str | None = None,
         request_digest: str | None = None,
+        webhook: JobWebhook | None = None,
     ) -> tuple[Job, bool]:
         """Queue a job; the job and its queue entry are written in one transaction.
 
@@ -60,10 +63,11 @@ class JobStore:
         files themselves and the dataset was made for them (see `repeated`).
         Returns the job and whether it is new (False: the same key with the same request came before).
         Raises `NotFound` (dataset), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``),
-        `LimitReached` (``queue_full``).
+        `LimitReached` (``queue_full``), `InputError` (``webhook_url_refused``).
         """
         resolved = options.resolved().model_dump(mode="json")
-        fingerprint = fingerprint_of(request_digest or dataset_id, resolved, labels)
+        subject = request_with(request_digest or dataset_id, webhook)
+        fingerprint = fingerprint_of(subject, resolved, labels)
         async with self._database.transaction() as connection:
             # Serialises submits (a millisecond each): the queue limit and repeated keys need no more thought.
             await connection.execute("SELECT pg_advisory_xact_lock(%s)", (QUEUE_LIMIT_LOCK,))
@@ -83,6 +87,8 @@ class JobStore:
                     *(idempotency_key, fingerprint),
                 ),
             )
+            if webhook is not None:
+                await add_job_webhook(connection, self._settings, tenant, job_id, webhook)
             return await self._queue(connection, job_id), True
 
     async def _queue(self, connection: Connection, job_id: str) -> Job:

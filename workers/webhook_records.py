@@ -94,6 +94,11 @@ class JobWebhook(Record):
     )
 
 
+def request_with(subject: str, webhook: JobWebhook | None) -> str:
+    """What a request for a job is about, for its comparison with another one of the same Idempotency-Key."""
+    return subject if webhook is None else f"{subject} {webhook.model_dump_json()}"
+
+
 def new_secret() -> str:
     """A fresh signing secret."""
     return SECRET_PREFIX + base64.b64encode(secrets.token_bytes(32)).decode()

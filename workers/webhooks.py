@@ -231,11 +231,17 @@ class WebhookStore:
         return row
 
 
-async def add_job_webhook(connection: Connection, tenant: str, job_id: str, wanted: JobWebhook) -> None:
-    """The webhook of one job, in the transaction that makes the job and before its first event."""
+async def add_job_webhook(
+    connection: Connection, settings: Settings, tenant: str, job_id: str, wanted: JobWebhook
+) -> None:
+    """The webhook of one job, in the transaction that makes the job and before its first event.
+
+    Raises `InputError` (``webhook_url_refused``).
+    """
+    target = str(checked_url(wanted.url, Policy.of(settings)))
     await connection.execute(
         "INSERT INTO webhooks (id, tenant, job_id, url, events, secret) VALUES (%s, %s, %s, %s, %s, %s)",
-        (new_id("wh"), tenant, job_id, wanted.url, list(wanted.events), wanted.secret),
+        (new_id("wh"), tenant, job_id, target, list(dict.fromkeys(wanted.events)), wanted.secret),
     )
 
 

@@ -32,11 +32,13 @@ _FORM: dict[str, Any] = {
             "archive": {"type": "string", "format": "binary", "description": "zip, tar or tar.gz"},
             "options": json_content(NewJob)["schema"]["properties"]["options"],
             "labels": json_content(NewJob)["schema"]["properties"]["labels"],
+            "webhook": json_content(NewJob)["schema"]["properties"]["webhook"],
         },
     },
     "encoding": {
         "options": {"contentType": "application/json"},
         "labels": {"contentType": "application/json"},
+        "webhook": {"contentType": "application/json"},
     },
 }
 _BODY = {
@@ -64,7 +66,7 @@ _BODY = {
                 "archive_rejected",
                 "queue_full",
             ),
-            *("storage_full", "body_timeout", *_WRITES),
+            *("storage_full", "body_timeout", "webhook_url_refused", *_WRITES),
         ),
     },
 )
@@ -90,7 +92,11 @@ async def submit_job(
     elif kind == "application/json":
         body = await read_json(kind, request.headers.get("content-length"), request.stream(), NewJob)
         job, new = await caller.jobs.submit(
-            body.dataset_id, body.options, labels=body.labels, idempotency_key=idempotency_key
+            body.dataset_id,
+            body.options,
+            labels=body.labels,
+            idempotency_key=idempotency_key,
+            webhook=body.webhook,
         )
     else:
         raise ProblemError(

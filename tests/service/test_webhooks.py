@@ -1,16 +1,18 @@
 from __future__ import annotations
 
 import http.server
+import json
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 import standardwebhooks
 
-from tests.service.conftest import problem
+from tests.service.conftest import finished, problem, ready_dataset, scene_files, submit, zip_of
 
 PATIENCE_S = 20.0
 
@@ -125,3 +127,62 @@ def test_unknown_and_odd_ids_are_404(http: httpx.Client, webhook: dict[str, Any]
         problem(http.get(f"/v1/webhooks/{path}"), 404, "not_found")
     problem(http.get(webhook["links"]["deliveries"] + "/msg_0"), 404, "not_found")
     problem(http.post(webhook["links"]["deliveries"] + "/msg_0/redeliver"), 404, "not_found")
+
+
+SECRET = "whsec_" + "QUJD" * 8
+
+
+@pytest.mark.parametrize("form", [False, True])
+def test_a_webhook_sent_along_with_a_job_hears_of_its_end_and_of_no_other(
+    http: httpx.Client, receiver: Receiver, scene: Path, form: bool
+) -> None:
+    wanted = {"url": receiver.url, "secret": SECRET}
+    options = {"preset": "fast", "steps": 20, "seed": 5}
+    headers = {"Idempotency-Key": f"hook-{form}-{receiver.url}"}
+
+    def send(webhook: dict[str, Any]) -> httpx.Response:
+        if not form:
+            body = {"dataset_id": dataset, "options": options, "webhook": webhook}
+            return http.post("/v1/jobs", json=body, headers=headers)
+        texts = {"options": json.dumps(options), "webhook": json.dumps(webhook)}
+        return http.post("/v1/jobs", files={"archive": archive}, data=texts, headers=headers)
+
+    archive = ("a.zip", zip_of(scene_files(scene)))
+    dataset = "" if form else ready_dataset(http, scene)
+    answer = send(wanted)
+    assert answer.status_code == 202, answer.text
+    job = answer.json()
+    assert SECRET not in answer.text
+    other = submit(http, job["dataset_id"])
+    for found in (job, other):
+        assert finished(http, found["id"])["state"] == "succeeded"
+    (webhook,) = http.get("/v1/webhooks", params={"job": job["id"]}).json()["items"]
+    assert (webhook["job_id"], webhook["events"][0]) == (job["id"], "job.succeeded")
+    (delivery,) = http.get(webhook["links"]["deliveries"]).json()["items"]
+    assert delivered(http, delivery["links"]["self"])["state"] == "delivered"
+    ((heard, body),) = receiver.heard
+    assert standardwebhooks.Webhook(SECRET).verify(body, heard)["data"]["id"] == job["id"]
+    assert send(wanted).json()["id"] == job["id"], "the same request again is the same job"
+    problem(send({**wanted, "events": ["job.failed"]}), 422, "idempotency_key_reused")
+    assert webhook["id"] not in http.get("/v1/webhooks").text
+    assert http.delete(job["links"]["self"]).status_code == 204
+    problem(http.get(webhook["links"]["self"]), 404, "not_found")
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"url": "http://10.0.0.1/"}, "webhook_url_refused"),
+        ({"secret": "whsec_short"}, "invalid_request"),
+        ({"secret": None}, "invalid_request"),
+        ({"events": ["dataset.exploded"]}, "invalid_request"),
+    ],
+)
+def test_a_job_with_a_webhook_that_cannot_be_used_is_not_taken(
+    http: httpx.Client, done_job: dict[str, Any], change: dict[str, Any], code: str
+) -> None:
+    before = http.get("/v1/jobs").json()["items"][0]["id"]
+    webhook = {"url": "https://hooks.example/", "secret": SECRET, **change}
+    body = {"dataset_id": done_job["dataset_id"], "webhook": webhook}
+    problem(http.post("/v1/jobs", json=body), 422, code)
+    assert http.get("/v1/jobs").json()["items"][0]["id"] == before
