@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from biresnerf.progress import Progress
 from biresnerf.report import Verdict, VerdictName
 from workers.child import Child, log_tail
-from workers.claim import Claim, crashed_too_often, insist
+from workers.claim import Claim, Fenced, crashed_too_often, insist
 from workers.courier import Courier
 from workers.database import Database
 from workers.files import FileStore
@@ -74,13 +74,24 @@ class Attempt:
         Whatever goes wrong on our side counts as a crash of the attempt.
         """
         try:
-            status = await self._run_process()
-            return await self._conclude(status)
+            return await self._run()
+        except Fenced:
+            # What was stored meanwhile is nobody's; the trash of this job may be gone already.
+            await self._files.delete_prefix(self._result_prefix)
+            raise
+        finally:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    async def _run(self) -> bool:
+        try:
+            return await self._conclude(await self._run_process())
         except Exception as error:
             log.exception("attempt %s of %s failed on our side", self._claim.name, self._claim.job_id)
             return await self._crashed(f"{type(error).__name__}: {error}")
-        finally:
-            shutil.rmtree(self._folder, ignore_errors=True)
+
+    @property
+    def _result_prefix(self) -> str:
+        return f"jobs/{self._claim.job_id}/results/{self._claim.name}"
 
     async def _run_process(self) -> int | None:
         """Exit status of the process; none where a stop came before it was started."""
@@ -230,7 +241,6 @@ class Attempt:
         self, *, log_only: bool = False, enough: Callable[[], bool] = lambda: False
     ) -> list[Artifact]:
         """The output and the log, under this attempt's own prefix."""
-        prefix = f"jobs/{self._claim.job_id}/results/{self._claim.name}"
         return await store_result(
-            self._files, prefix, self._output, self._log, log_only=log_only, enough=enough
+            self._files, self._result_prefix, self._output, self._log, log_only=log_only, enough=enough
         )

@@ -12,6 +12,7 @@ from pathlib import Path
 from obstore.exceptions import BaseError as StoreError
 
 from biresnerf.progress import Progress, ReusableStage
+from workers.claim import Fenced
 from workers.errors import EngineError
 from workers.files import FileStore
 from workers.ledger import Ledger
@@ -136,7 +137,7 @@ class Courier:
         prefix = self._new_prefix("checkpoints")
         for name, path in files_inside(self._output, [str(progress.checkpoint)]).items():
             await self._files.put_path(f"{prefix}/{name}", path)
-            await self._ledger.checkpoint(prefix, [name], progress.step)
+            await self._point(prefix, self._ledger.checkpoint(prefix, [name], progress.step))
 
     async def _store_preview(self, progress: Progress) -> None:
         """The same for the files that show how far the job is."""
@@ -146,7 +147,7 @@ class Courier:
             await store_artifact(self._files, prefix, name, path) for name, path in sorted(found.items())
         ]
         if artifacts:  # the job may have ended meanwhile, and have cleaned up
-            await self._ledger.preview(prefix, artifacts, progress)
+            await self._point(prefix, self._ledger.preview(prefix, artifacts, progress))
 
     async def _store_reusable(self, stage: ReusableStage, progress: Progress) -> None:
         """The same for the work of a stage."""
@@ -155,7 +156,14 @@ class Courier:
         for name, path in found.items():
             await self._files.put_path(f"{prefix}/{name}", path)
         if len(found) == len(progress.reusable[stage]):
-            await self._ledger.reusable(stage, prefix, list(found))
+            await self._point(prefix, self._ledger.reusable(stage, prefix, list(found)))
+
+    async def _point(self, prefix: str, writing: Awaitable[None]) -> None:
+        try:
+            await writing
+        except Fenced:
+            await self._files.delete_prefix(prefix)  # the new owner knows nothing of it, nor does the trash
+            raise
 
     def _new_prefix(self, kind: str) -> str:
         self._stored += 1

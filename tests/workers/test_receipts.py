@@ -15,12 +15,14 @@ from procrastinate.utils import utcnow
 from biresnerf.config import RefineOptions
 from tests.workers.conftest import ready_dataset
 from workers import claim as claims
-from workers.claim import claim_job
+from workers.attempt import Attempt
+from workers.claim import Fenced, claim_job
 from workers.database import QUEUE, Database, open_database
 from workers.errors import Unavailable
 from workers.file_places import LocalPlace
 from workers.files import FileStore
 from workers.janitor import Janitor
+from workers.ledger import Ledger
 from workers.receipts import FencedWorker
 from workers.settings import Settings
 from workers.stores import Stores
@@ -113,3 +115,32 @@ async def test_a_machine_that_slept_takes_no_job_from_its_workers(
     assert await status_after_a_round() == "doing"
     while await status_after_a_round() == "doing":
         await asyncio.sleep(0.1)
+
+
+async def test_a_result_that_was_stored_in_vain_is_taken_away_again(
+    stores: Stores, database: Database, settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """By who was frozen while storing it: the job has ended since, and its trash was taken out."""
+    claim = await claim_job(database, await queued(stores), 3)
+    assert claim is not None
+    files, folder = stores.files, tmp_path / "job"
+    attempt = Attempt(database, files, settings, claim, folder, {})
+    stored: list[str] = []
+
+    async def another_worker_takes_the_job(_: Attempt) -> int:
+        (folder / "output").mkdir(parents=True)
+        (folder / "output" / "report.json").write_text("{}")
+        assert await claim_job(database, claim.job_id, 3) is not None
+        return 0
+
+    async def published(ledger: Ledger, artifacts, *rest) -> bool:
+        stored.extend(artifact.key for artifact in artifacts)
+        return await publish(ledger, artifacts, *rest)
+
+    publish = Ledger.publish
+    monkeypatch.setattr(Attempt, "_run_process", another_worker_takes_the_job)
+    monkeypatch.setattr(Ledger, "publish", published)
+    with pytest.raises(Fenced):
+        await attempt.run()
+    assert [key.split("/")[2:] for key in stored] == [["results", claim.name, "report.json"]]
+    assert await files.list(f"jobs/{claim.job_id}") == []
