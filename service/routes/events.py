@@ -21,6 +21,8 @@ from workers.records import JobUpdate
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
 KEEP_ALIVE_S = 15.0
 _RETRY_MS = 2000
+# Another process may be there already; the job goes on.
+_GOODBYE = ": this process is stopping; connect again with the last event's id\nretry: 500\n\n"
 _STREAM: dict[int | str, dict[str, Any]] = {
     200: {
         "description": (
@@ -116,6 +118,8 @@ async def _stream(
                 update = await _next_or_closing(updates, closing)
             except (_Ended, NotFound, Unavailable):
                 # Deleted meanwhile, or the database is away: the client comes back and is told which.
+                if closing.is_set():
+                    yield _GOODBYE
                 return
 
 

@@ -37,6 +37,28 @@ def test_a_long_poll_is_answered_when_the_service_stops(
     assert (answer.status, state in ("queued", "running")) == (200, True)
 
 
+def test_a_listener_is_told_to_come_back_when_the_service_stops(
+    http: httpx.Client, service: Running, scene: Any
+) -> None:
+    job = submit(http, ready_dataset(http, scene), steps=400, step_ms=50)
+    server = web_process(service)
+    with http.stream("GET", job["links"]["events"]) as listening:
+        lines = listening.iter_lines()
+        assert next(line for line in lines if line.startswith("event: "))
+        server.send_signal(signal.SIGTERM)
+        rest = list(lines)
+    server.wait(10)
+    with Client(service.url) as client:
+        until_ready(client)
+    http.post(job["links"]["cancel"])
+    finished(http, job["id"])
+    assert rest[-3:] == [
+        ": this process is stopping; connect again with the last event's id",
+        "retry: 500",
+        "",
+    ]
+
+
 @pytest.mark.parametrize("stopping", [True, False])
 def test_what_a_stopping_service_cuts_off_can_be_asked_again(stopping: bool) -> None:
     sent: list[dict[str, Any]] = []
