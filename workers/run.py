@@ -67,7 +67,7 @@ def main(folder: Path) -> int:
         return EXIT_REFINEMENT
     except Exception as error:  # noqa: BLE001 - the last line of defence: a bug ends in the log and in the status
         traceback.print_exc()
-        return EXIT_MEMORY if _is_want_of_memory(error) else EXIT_BUG
+        return EXIT_MEMORY if is_want_of_memory(error) else EXIT_BUG
     return 0
 
 
@@ -86,7 +86,8 @@ class _Stop:
         self.asked.set()
 
 
-def _is_want_of_memory(error: Exception) -> bool:
+def is_want_of_memory(error: Exception) -> bool:
+    """Whether less of everything might have gone well."""
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
     # torch's own, of the GPU (a class) and of the CPU (a text); not imported here, as most jobs never fail.

@@ -7,14 +7,18 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from biresnerf.config import RefineOptions
 from biresnerf.data.synthetic import write_synthetic_scene
 from biresnerf.progress import Progress
 from tests.workers.conftest import ROOT, Counting, Slots, quick_settings, ready_dataset
+from workers.run import is_want_of_memory
 from workers.stores import open_stores
 
 SMALL = RefineOptions(
@@ -97,6 +101,22 @@ def test_a_users_mistake_ends_with_2_and_says_what_to_mend(tmp_path: Path, scene
     said = json.loads((folder / "error.json").read_text())
     assert said["code"] == "invalid_options"
     assert "steps" in said["detail"]
+
+
+@pytest.mark.parametrize(
+    ("work", "wants"),
+    [
+        (lambda: np.empty(2**59, np.uint8), True),
+        (lambda: torch.empty(2**59, dtype=torch.uint8), True),
+        (lambda: torch.cat([torch.zeros(2, 3), torch.zeros(2, 4)]), False),
+        (lambda: Path("/proc/nothing").read_text(), False),
+    ],
+    ids=["numpy", "torch", "shapes", "file"],
+)
+def test_want_of_memory_is_told_from_other_errors(work: Callable[[], object], wants: bool):
+    with pytest.raises((MemoryError, RuntimeError, OSError)) as caught:
+        work()
+    assert is_want_of_memory(caught.value) == wants
 
 
 def test_the_check_names_the_broken_image(tmp_path: Path, scene: Path):
