@@ -65,9 +65,7 @@ def test_a_run_that_shares_stage_1_ends_as_one_that_did_it_all(scene: Path, coar
 
 
 def test_stage_2_may_be_of_another_size(scene: Path, coarse: Path, tmp_path: Path):
-    changed = OPTIONS.model_copy(
-        update={"reconstruction_levels": 4, "table_size_log2": 11, "wiring": "residual"}
-    )
+    changed = OPTIONS.model_copy(update={"reconstruction_levels": 4, "table_size_log2": 11})
     assert np.isfinite(forked(scene, coarse, tmp_path / "out", changed)).all()
 
 
