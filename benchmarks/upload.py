@@ -51,7 +51,10 @@ class Relay:
 
     def _accept(self) -> None:
         while True:
-            here, _ = self._listener.accept()
+            try:
+                here, _ = self._listener.accept()
+            except OSError:  # closed
+                return
             try:
                 there = socket.create_connection(("127.0.0.1", self._target))
             except OSError:  # the service is down
@@ -81,6 +84,12 @@ class Relay:
                 end.shutdown(socket.SHUT_RDWR)
             except OSError:
                 continue  # it ended by itself
+
+    def close(self) -> None:
+        """Nobody gets through any more."""
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self.cut()
 
 
 class Api:
@@ -210,7 +219,7 @@ def measure(
         dataset_id = send(client)
     seconds = time.monotonic() - began
     missed = faults.end()
-    return {
+    row = {
         "how": how,
         "bytes": size,
         "seconds": round(seconds, 1),
@@ -220,6 +229,8 @@ def measure(
         "peak MiB": round(api.peak_mib),
         "identical": check(dataset_id),
     }
+    print(json.dumps(row), flush=True)
+    return row
 
 
 def run(total_bytes: int, folder: Path) -> list[dict[str, Any]]:
@@ -269,8 +280,6 @@ def main() -> int:
         rows = run(asked.bytes, folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    for row in rows:
-        print(json.dumps(row))
     good = all(row["identical"] and row["cuts and kills"] == len(CUTS) + len(KILLS) for row in rows)
     return 0 if good else 1
 
