@@ -117,7 +117,7 @@ class WebhookStore:
             cursor = await connection.execute(
                 "UPDATE webhooks SET url = coalesce(%s, url), events = coalesce(%s, events),"
                 " description = coalesce(%s, description), enabled = coalesce(%s, enabled),"
-                " disabled_why = CASE WHEN %s IS NULL THEN disabled_why END,"
+                " disabled_why = CASE WHEN %s::boolean IS NULL THEN disabled_why END,"
                 " failing_since = CASE WHEN %s THEN NULL ELSE failing_since END WHERE id = %s RETURNING *",
                 (
                     *(target, None if events is None else list(dict.fromkeys(events)), description),

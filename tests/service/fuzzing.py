@@ -8,6 +8,7 @@ one that does not fit its schema ends the command with 1.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -17,7 +18,15 @@ from tempfile import TemporaryDirectory
 import httpx
 
 from biresnerf.data.synthetic import write_synthetic_scene
-from tests.service.conftest import PROGRAM, finished, ready_dataset, running_service, short_folder, submit
+from tests.service.conftest import (
+    PROGRAM,
+    Running,
+    finished,
+    ready_dataset,
+    running_service,
+    short_folder,
+    submit,
+)
 
 ROOT = Path(__file__).parents[2]
 # Not ensure_resource_availability: it mistakes ids that an earlier phase has deleted for new ones.
@@ -30,7 +39,10 @@ CHECKS = (
     "unsupported_method",
     "allow_header_conformance",
     "use_after_free",
+    "ignored_auth",
 )
+# One client asks faster here than a service lets it.
+UNLIMITED = {"key_requests_per_s": 1e6, "key_requests_burst": 10**6}
 # Ids that exist, for what only reads: the chances to guess one are nil. What deletes gets made-up ones and,
 # in chains, those of its own making.
 _CONFIG = """
@@ -45,20 +57,45 @@ parameters = {{ job_id = "{job_id}", name = "report.json" }}
 include-method = ["GET", "HEAD"]
 include-path-regex = "datasets/"
 parameters = {{ dataset_id = "{dataset_id}" }}
+
+[[operations]]
+include-method = ["POST"]
+include-path-regex = "/(fork|exports|shares)$"
+parameters = {{ job_id = "{job_id}" }}
 """
 
 
-def fuzz(url: str, folder: Path, arguments: list[str]) -> subprocess.CompletedProcess[str]:
+def admin_key(service: Running) -> str:
+    """A key that may do everything; from then on nothing works without one."""
+    command = [sys.executable, "-m", "biresnerf.command_line", "keys", "create", "fuzz", "--scope", "admin"]
+    made = subprocess.run(
+        [*command, "--json", "--data-dir", str(service.data_dir)], capture_output=True, check=True
+    )
+    key: str = json.loads(made.stdout)["key"]
+    return key
+
+
+def fuzz(service: Running, folder: Path, arguments: list[str]) -> subprocess.CompletedProcess[str]:
     """Runs schemathesis against the service, which has a finished job by then."""
+    url, access = service.url, {"Authorization": f"Bearer {admin_key(service)}"}
     scene = folder / "scene"
     write_synthetic_scene(scene, n_views=6, size=32, seed=1)
-    with httpx.Client(base_url=url, timeout=60.0) as http:
+    with httpx.Client(base_url=url, timeout=60.0, headers=access) as http:
         dataset_id = ready_dataset(http, scene)
         job_id = finished(http, submit(http, dataset_id)["id"])["id"]
     config = folder / "schemathesis.toml"
     config.write_text(_CONFIG.format(job_id=job_id, dataset_id=dataset_id))
     command = ["schemathesis", "--config-file", str(config), "run", f"{url}/openapi.json"]
-    options = ["--checks", ",".join(CHECKS), "--request-timeout", "70", "--suppress-health-check", "all"]
+    options = [
+        "-H",
+        f"Authorization: {access['Authorization']}",
+        "--checks",
+        ",".join(CHECKS),
+        "--request-timeout",
+        "70",
+        "--suppress-health-check",
+        "all",
+    ]
     return subprocess.run(
         [str(Path(sys.executable).parent / command[0]), *command[1:], *options, *arguments],
         cwd=ROOT,
@@ -73,9 +110,9 @@ def fuzzed(seconds: int, *arguments: str) -> tuple[subprocess.CompletedProcess[s
     with (
         TemporaryDirectory() as folder,
         short_folder() as data,
-        running_service(data, job_command=(sys.executable, str(PROGRAM))) as service,
+        running_service(data, job_command=(sys.executable, str(PROGRAM)), **UNLIMITED) as service,
     ):
-        done = fuzz(service.url, Path(folder), ["--max-time", str(seconds), *arguments])
+        done = fuzz(service, Path(folder), ["--max-time", str(seconds), *arguments])
         log = service.log.read_text()
     return done, "\n".join(line for line in log.splitlines() if " INFO " not in line)
 

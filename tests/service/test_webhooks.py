@@ -97,6 +97,9 @@ def test_the_secret_is_told_once(http: httpx.Client, webhook: dict[str, Any]) ->
 
 def test_a_webhook_is_changed_switched_off_and_deleted(http: httpx.Client, webhook: dict[str, Any]) -> None:
     here = webhook["links"]["self"]
+    renamed = http.patch(here, json={"description": "poses", "enabled": None})
+    assert renamed.status_code == 200, renamed.text
+    assert (renamed.json()["description"], renamed.json()["enabled"]) == ("poses", True)
     changed = http.patch(here, json={"events": ["job.failed"], "enabled": False}).json()
     assert (changed["events"], changed["enabled"], changed["url"]) == (["job.failed"], False, webhook["url"])
     problem(http.post(webhook["links"]["test"]), 409, "state_conflict")
