@@ -10,6 +10,7 @@ import asyncio
 import logging
 from typing import Any
 
+import psycopg
 from psycopg.types.json import Jsonb
 
 from workers.database import Connection, Database
@@ -48,7 +49,7 @@ class Expiry:
         while not stop.is_set():
             try:
                 await self.round()
-            except Unavailable as error:
+            except (Unavailable, psycopg.Error) as error:
                 log.warning("expiry waits: %s", error)
             await first_done(stop.wait(), asyncio.sleep(self._settings.expiry_s))
 

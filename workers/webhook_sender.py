@@ -18,6 +18,7 @@ from functools import partial
 from typing import Any, Literal
 
 import httpcore
+import psycopg
 
 from biresnerf import __version__
 from workers.database import Connection, Database
@@ -91,7 +92,7 @@ class WebhookSender:
                 room = IN_FLIGHT_MAX - len(self._sending)
                 try:
                     claimed = await self._claim(room) if room else []
-                except Unavailable as error:
+                except (Unavailable, psycopg.Error) as error:
                     log.warning("webhooks wait: %s", error)
                     claimed = []
                 for row in claimed:
@@ -124,7 +125,7 @@ class WebhookSender:
         try:
             async with self._database.transaction() as connection:
                 await self._conclude(connection, row, result, at, seconds)
-        except Unavailable as error:
+        except (Unavailable, psycopg.Error) as error:
             log.warning("webhook message %s is going to be sent again: %s", row["id"], error)
 
     async def _post(self, url: str, body: bytes, headers: dict[str, str]) -> Result:
@@ -139,6 +140,10 @@ class WebhookSender:
             return Result("again", error="tls_failed" if _of_tls(error) else "connection_failed")
         except httpcore.ProtocolError:
             return Result("again", error="not_http")
+        except Exception:
+            # A fault of ours with this one message must not be met again every minute for ever.
+            log.exception("webhook message %s could not be sent", headers["webhook-id"])
+            return Result("again", error="internal")
         return Result(outcome_of(answer.status), answer.status, None, retry_after(answer.retry_after))
 
     async def _conclude(

@@ -13,11 +13,14 @@ import standardwebhooks
 
 from tests.workers.conftest import Slots
 from tests.workers.webhook_receiver import Dispatchers, Receiver, concluded, hook_settings, queued_job
+from workers.database import open_database
 from workers.errors import Conflict
+from workers.follow import Listener
+from workers.outbound import Outbound, Policy
 from workers.settings import Settings
 from workers.stores import Stores
 from workers.webhook_records import ALL_EVENTS
-from workers.webhook_sender import outcome_of, pause, retry_after
+from workers.webhook_sender import WebhookSender, outcome_of, pause, retry_after
 
 pytestmark = pytest.mark.anyio
 
@@ -163,6 +166,25 @@ async def test_a_receiver_that_is_gone_or_fails_for_days_is_switched_off(
         assert (on.enabled, on.disabled_why, on.failing_since) == (True, None, None)
         await stores.webhooks.redeliver(webhook.id, delivery.id)
         assert (await concluded(stores, webhook.id, delivery.id)).state == "delivered"
+
+
+async def test_a_fault_of_ours_counts_as_an_attempt_and_ends(stores: Stores, settings: Settings):
+    async def broken(host: str, port: int) -> list[str]:
+        raise RuntimeError("planted")
+
+    webhook, _ = await stores.webhooks.create("local", "http://127.0.0.1:9/", ALL_EVENTS)
+    delivery = await stores.webhooks.test(webhook.id)
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute("UPDATE webhook_deliveries SET round = 11")  # eleven failed before
+    stop = asyncio.Event()
+    async with open_database(settings.require_database_url(), connections=2) as database:
+        listener = Listener(database, settings.poll_s, "biresnerf_webhooks")
+        outbound = Outbound(Policy.of(settings), resolve=broken)
+        sending = asyncio.create_task(WebhookSender(database, listener, outbound, settings).run(stop))
+        done = await concluded(stores, webhook.id, delivery.id)
+        stop.set()
+        await sending
+    assert (done.state, [attempt.error for attempt in done.attempts]) == ("failed", ["internal"])
 
 
 def test_pauses_grow_from_seconds_to_half_a_day_and_scatter():
