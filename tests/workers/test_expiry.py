@@ -99,6 +99,23 @@ async def test_a_result_goes_when_its_time_is_over_and_the_log_proves_it(
     await stores.jobs.delete(old)
 
 
+async def test_a_result_that_an_export_still_reads_stays_until_it_is_done(stores: Stores, settings: Settings):
+    job_id = await finished_job(settings, stores)
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute(
+            "INSERT INTO jobs (id, dataset_id, kind, parent, options, fingerprint)"
+            " SELECT 'job_export', dataset_id, 'export', id, '{}', 'x' FROM jobs WHERE id = %s",
+            (job_id,),
+        )
+    aged(settings, "jobs", job_id, 8)
+    await rounds(settings, stores)
+    assert len(await stores.jobs.artifacts(job_id)) == 2
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute("UPDATE jobs SET state = 'failed', finished_at = now() WHERE id = 'job_export'")
+    await rounds(settings, stores)
+    assert (await stores.jobs.get(job_id)).state == "expired"
+
+
 async def test_a_dataset_goes_when_nothing_used_it_for_long(stores: Stores, settings: Settings):
     unused, queued, lately, fresh = [await ready_dataset(stores, PLAN) for _ in range(4)]
     job, _ = await stores.jobs.submit(queued, RefineOptions(preset="fast"))
