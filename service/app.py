@@ -54,7 +54,8 @@ _ROUTERS = [module.router for module in (*_RESOURCES, meta, health, docs_page)]
 _DESCRIPTION = """
 Refines the camera poses of an image set.
 
-1. `POST /v1/datasets`; then `PUT …/files/{path}` for each file, or `POST …/archive` for all; then
+1. `POST /v1/datasets`, with a manifest to learn what has to be sent; then `PUT …/files/{path}` for each file,
+   or `POST …/archive` for all, or `POST …/uploads` for what should survive broken connections; then
    `POST …/finalize`.
 2. `POST /v1/jobs` with the dataset's id (or one multipart request with an archive does both).
 3. `GET /v1/jobs/{id}` or its event stream tells how far it is.

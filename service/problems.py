@@ -40,7 +40,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "fork_not_possible": (409, "No work of the job can be taken over"),
     "result_not_ready": (409, "The job has no result yet"),
     "direct_upload_unavailable": (409, "Files cannot be sent to the store itself"),
-    "upload_incomplete": (409, "The file has not arrived at the store"),
+    "upload_incomplete": (409, "Not all of it has arrived at the store"),
     "link_expired": (410, "The link is not good any more"),
     "expired": (410, "It was kept for its time and is gone"),
     "file_exists": (412, "The file is there already"),

@@ -23,7 +23,7 @@ from workers.records import ManifestEntry
 RESUMABLE_BYTES = 8 * 2**20
 LANES = 4
 _CHUNK = 2**18
-_POLL_S = 0.5
+_POLL_S, _LONGEST_POLL_S = 0.5, 5.0
 _TUS = {"Tus-Resumable": "1.0.0"}
 _OFFSET_TYPE = {"Content-Type": "application/offset+octet-stream"}
 
@@ -126,6 +126,7 @@ def _append(client: Client, address: str, file: LocalFile, offset: int, stop: Ev
 
 
 def _wait_until_stored(client: Client, address: str) -> None:
+    pause_s = _POLL_S
     while True:
         upload = client.patiently(lambda: client.ask(UploadView, "GET", address))
         if upload.state == "stored":
@@ -133,7 +134,8 @@ def _wait_until_stored(client: Client, address: str) -> None:
         if upload.error is not None:
             error = upload.error
             raise ServiceError(error.code, error.detail, status=422, where=error.where, mend=error.mend)
-        time.sleep(_POLL_S)
+        time.sleep(pause_s)
+        pause_s = min(1.5 * pause_s, _LONGEST_POLL_S)  # unpacking a large set takes a while
 
 
 def _from(file: LocalFile, offset: int, stop: Event) -> Iterator[bytes]:

@@ -71,6 +71,7 @@ class Settings(BaseSettings):
     storage_presign_s: int = Field(900, ge=10, le=604_800, description="How long such an address is good.")
     share_key: str | None = Field(
         None,
+        min_length=16,
         repr=False,
         description="Signs links to results; none: one that is made and kept in the database.",
     )

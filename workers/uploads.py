@@ -169,13 +169,19 @@ class UploadStore:
         raise _elsewhere(await self.get(upload.id))
 
     async def content(self, upload: Upload) -> AsyncIterator[bytes]:
-        """The bytes received, from the first to the last."""
+        """The bytes received, from the first to the last.
+
+        Raises `Conflict` (``upload_incomplete``) where the store has lost some, as after a restore.
+        """
         pieces = await self._database.fetch(
             "SELECT key, size FROM upload_pieces WHERE upload_id = %s ORDER BY start", upload.id
         )
         for piece in pieces:
-            async for chunk in self._files.read(piece["key"]):
-                yield chunk
+            try:
+                async for chunk in self._files.read(piece["key"]):
+                    yield chunk
+            except NotFound:
+                raise Conflict("upload_incomplete", "Bytes of the upload are lost; send it again.") from None
 
     async def take(self, upload_id: str, token: uuid.UUID) -> bool:
         """Take or renew the right to bring a received upload into its dataset. A lease: a dead taker loses it."""

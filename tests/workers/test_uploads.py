@@ -110,3 +110,13 @@ async def test_what_does_not_go_on_is_given_up(settings: Settings, tmp_path: Pat
         await stores.datasets.delete(young.dataset_id)
         with pytest.raises(NotFound):
             await stores.uploads.get(young.id)
+
+
+async def test_lost_pieces_are_said_and_not_taken_for_a_deleted_upload(stores: Stores):
+    upload = await begin(stores)
+    upload = await stores.uploads.append(upload.id, 0, stream(CONTENT))
+    lost = (await stores.files.list(upload.folder))[1].key
+    await stores.files.delete(lost)
+    with pytest.raises(Conflict) as caught:
+        await content_of(stores, upload)
+    assert caught.value.code == "upload_incomplete"
