@@ -11,7 +11,7 @@ export PIP_CONSTRAINT := constraints.txt
 export PIP_BUILD_CONSTRAINT := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test lint format demo serve bench openapi fuzz audit sbom
+.PHONY: help setup test lint format demo serve bench openapi fuzz audit sbom compose-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -51,6 +51,9 @@ sbom: setup $(TOOLS)  ## what is installed, as CycloneDX, in build/sbom.json
 	@mkdir -p build
 	$(TOOLS)/bin/cyclonedx-py environment --pyproject pyproject.toml --gather-license-texts \
 	  --output-reproducible --output-file build/sbom.json $(BIN)/python
+
+compose-check:  ## build the image, run compose.yaml with podman, lose a worker in mid job (root; long)
+	tests/deploy/compose_check.sh
 
 # Tools that need libraries of their own stay out of the environment that they look at.
 $(TOOLS): constraints.txt

@@ -1,0 +1,66 @@
+"""What compose.yaml promises, read from the file; `make compose-check` runs it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from workers.settings import Settings
+
+ROOT = Path(__file__).resolve().parents[2]
+COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())
+SERVICES = COMPOSE["services"]
+
+
+def variables_of_the_files() -> set[str]:
+    named = {name for service in SERVICES.values() for name in service.get("environment", {})}
+    named |= set(re.findall(r"\b(BIRESNERF_[A-Z_]+)=", (ROOT / "Dockerfile").read_text()))
+    return {name for name in named if name.startswith("BIRESNERF_")}
+
+
+@pytest.mark.parametrize("variable", sorted(variables_of_the_files()))
+def test_every_variable_is_a_setting_of_the_service(variable):
+    # An unknown one would be ignored without a word.
+    name = variable.removeprefix("BIRESNERF_").removesuffix("_FILE").lower()
+    assert name in Settings.model_fields
+
+
+def test_only_the_proxy_is_published():
+    assert [name for name, service in SERVICES.items() if "ports" in service] == ["proxy"]
+
+
+@pytest.mark.parametrize("name", sorted(SERVICES))
+def test_every_service_is_held_in(name):
+    service = SERVICES[name]
+    assert service["read_only"] is True
+    assert service["init"] is True
+    assert service["cap_drop"] == ["ALL"]
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert {"memory", "pids"} <= set(service["deploy"]["resources"]["limits"])
+
+
+@pytest.mark.parametrize("name", ["postgres", "store", "migrate", "worker", "worker-gpu"])
+def test_what_serves_no_stranger_reaches_no_stranger(name):
+    assert SERVICES[name]["networks"] == ["back"]
+    assert COMPOSE["networks"]["back"] == {"internal": True}
+
+
+@pytest.mark.parametrize("name", sorted(SERVICES))
+def test_secrets_come_as_files_that_prepare_makes(name):
+    made = set(re.findall(r"^secret (\w+)", (ROOT / "deploy/prepare.sh").read_text(), flags=re.M))
+    for secret in SERVICES[name].get("secrets", []):
+        assert secret in made
+        assert COMPOSE["secrets"][secret] == {"file": f"./secrets/{secret}"}
+    for variable in SERVICES[name].get("environment", {}):
+        assert not re.search(r"(PASSWORD|SECRET|TOKEN|KEY|DATABASE_URL)", variable) or variable.endswith(
+            "_FILE"
+        )
+
+
+@pytest.mark.parametrize("name", ["worker", "worker-gpu"])
+def test_a_worker_may_take_the_time_that_its_job_takes_to_stop(name):
+    grace_s = float(SERVICES[name]["stop_grace_period"].removesuffix("s"))
+    assert grace_s > 2 * Settings.model_fields["stop_grace_s"].default
