@@ -11,7 +11,7 @@ from typing import Any, Literal
 from psycopg.types.json import Jsonb
 
 from workers.database import Connection
-from workers.records import LOG_NAME, POSES_NAME, PREVIEW_FOLDER, Artifact, JobError
+from workers.records import LOG_NAME, POSES_NAME, PREVIEW_FOLDER, REPORT_NAME, Artifact, JobError
 
 End = Literal["succeeded", "failed", "cancelled"]
 STALL_S = 60.0
@@ -62,16 +62,21 @@ async def finish_cancelled(
     row = await cursor.fetchone()
     assert row is not None, "the row is locked"
     kept, shown = [item for item in artifacts if row["keep_partial"] or item.name == LOG_NAME], None
-    has_poses = any(item.name == POSES_NAME for item in kept)
-    if row["keep_partial"] and not has_poses and row["previews"] is not None:
+    whole = _is_whole(kept)
+    if row["keep_partial"] and not whole and row["previews"] is not None:
         shown = row["previews"]["prefix"].rpartition("/")[2]
         kept = [item for item in kept if item.name == LOG_NAME] + [
             item.model_copy(update={"name": item.name.removeprefix(f"{PREVIEW_FOLDER}/")})
             for item in map(Artifact.model_validate, row["previews"]["artifacts"])
         ]
-        has_poses = any(item.name == POSES_NAME for item in kept)
-    await finish(connection, job_id, "cancelled", None, kept, partial=row["keep_partial"] and has_poses)
+        whole = _is_whole(kept)
+    await finish(connection, job_id, "cancelled", None, kept, partial=row["keep_partial"] and whole)
     await trash_attempts(connection, job_id, keep, stall_s, preview=shown)
+
+
+def _is_whole(artifacts: Sequence[Artifact]) -> bool:
+    """Whether there are poses and the report on them, which is written last: a process may have been killed between."""
+    return {POSES_NAME, REPORT_NAME} <= {item.name for item in artifacts}
 
 
 async def trash_attempts(

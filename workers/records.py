@@ -14,7 +14,11 @@ JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "exp
 DatasetState = Literal["open", "finalizing", "ready", "rejected", "expired"]
 FINAL_JOB_STATES: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled", "expired"})
 
-LOG_NAME, POSES_NAME = "log.txt", "poses.json"  # files of a result that the engine knows
+LOG_NAME, POSES_NAME, REPORT_NAME = (
+    "log.txt",
+    "poses.json",
+    "report.json",
+)  # files of a result that the engine knows
 PREVIEW_FOLDER = "preview"  # of files that show how far a job is
 
 JobKind = Literal["refine", "export"]

@@ -97,7 +97,9 @@ for step in range(start + 1, plan["steps"] + 1):
         show(step)
     if plan.get("hungry", 0) and step == 3 and order["options"]["max_image_size"] > plan["hungry"]:
         sys.exit(4)  # as `workers.run` says that memory ran out
-    if stopping and not plan.get("deaf"):
+    if stopping and plan.get("slow_to_end"):
+        (output / "poses.json").write_text("half of a result")
+    elif stopping and not plan.get("deaf"):
         save(step)
         (output / "poses.json").write_text(json.dumps({"step": step}))
         (output / "report.json").write_text(json.dumps({"state": "partial", "steps": step}))

@@ -49,13 +49,13 @@ async def test_a_running_job_shows_previews_and_its_result_takes_their_place(
     assert f"jobs/{counting.id}/previews" in {row["prefix"] for row in garbage}
 
 
-@pytest.mark.parametrize("deaf", [False, True])
+@pytest.mark.parametrize("fault", [None, "deaf", "slow_to_end"])
 async def test_a_cancelled_job_leaves_its_best_poses_if_asked(
-    counting: Counting, settings: Settings, slots: Slots, deaf: bool
+    counting: Counting, settings: Settings, slots: Slots, fault: str | None
 ):
-    """From the process itself, or its last preview where it does not answer."""
+    """From the process itself, or its last preview where it is killed before all is written."""
     slots.start(settings.model_copy(update={"cancel_grace_s": 0.5}), "a")
-    await counting.submit(1000, 0.05, preview_every=5, deaf=deaf)
+    await counting.submit(1000, 0.05, preview_every=5, **({fault: True} if fault else {}))
     await until_previewed(counting, 5)
     await counting.stores.jobs.cancel(counting.id, keep_partial=True)
     job = await counting.until_final(timeout_s=10)
@@ -64,7 +64,7 @@ async def test_a_cancelled_job_leaves_its_best_poses_if_asked(
     assert set(left) == {"log.txt", "poses.json", "report.json"}
     report = await content(counting.stores, left["report.json"])
     assert report["state"] == "partial"
-    assert ("previews" in left["poses.json"].key) == deaf
+    assert ("previews" in left["poses.json"].key) == (fault is not None)
     for _ in range(3):  # what is kept is not collected with the rest
         assert (await content(counting.stores, left["poses.json"]))["step"] >= 5
 
