@@ -61,16 +61,16 @@ async def finish_cancelled(
     cursor = await connection.execute("SELECT keep_partial, previews FROM jobs WHERE id = %s", (job_id,))
     row = await cursor.fetchone()
     assert row is not None, "the row is locked"
-    kept, shown = [item for item in artifacts if row["keep_partial"] or item.name == LOG_NAME], None
-    whole = _is_whole(kept)
-    if row["keep_partial"] and not whole and row["previews"] is not None:
+    logs = [item for item in artifacts if item.name == LOG_NAME]
+    kept, shown = list(artifacts), None
+    if row["keep_partial"] and not _is_whole(kept) and row["previews"] is not None:
         shown = row["previews"]["prefix"].rpartition("/")[2]
-        kept = [item for item in kept if item.name == LOG_NAME] + [
+        kept = logs + [
             item.model_copy(update={"name": item.name.removeprefix(f"{PREVIEW_FOLDER}/")})
             for item in map(Artifact.model_validate, row["previews"]["artifacts"])
         ]
-        whole = _is_whole(kept)
-    await finish(connection, job_id, "cancelled", None, kept, partial=row["keep_partial"] and whole)
+    partial = row["keep_partial"] and _is_whole(kept)
+    await finish(connection, job_id, "cancelled", None, kept if partial else logs, partial=partial)
     await trash_attempts(connection, job_id, keep, stall_s, preview=shown)
 
 
