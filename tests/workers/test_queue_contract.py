@@ -18,6 +18,7 @@ from workers.database import QUEUE, Database, open_database
 from workers.file_places import LocalPlace
 from workers.files import FileStore
 from workers.janitor import Janitor, release, release_worker
+from workers.receipts import FencedWorker
 from workers.settings import Settings
 
 FUNCTIONS = {
@@ -56,6 +57,13 @@ def test_the_worker_takes_our_arguments_and_shows_its_id():
     }
     assert wanted <= set(inspect.signature(Worker.__init__).parameters)
     assert Worker(App(connector=PsycopgConnector())).worker_id is None
+
+
+def test_the_receipt_that_is_fenced_is_the_one_the_worker_gives():
+    given = list(inspect.signature(Worker._persist_job_status).parameters)
+    assert given == ["self", "job", "status", "retry_decision", "context", "job_result"]
+    assert list(inspect.signature(FencedWorker._persist_job_status).parameters) == given
+    assert Worker(App(connector=PsycopgConnector()))._job_ids_to_abort == {}
 
 
 def test_the_context_tells_a_users_wish_from_a_shutdown():
