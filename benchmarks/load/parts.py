@@ -125,10 +125,19 @@ async def listeners(
     """``count`` event streams, spread over ``jobs``, each of which changes once a second."""
     heard: list[tuple[str, int, float]] = []
     opened: set[int] = set()
+    refused = 0
 
     async def listen(n: int, job: str) -> None:
+        nonlocal refused
+        while not await listened(n, job):  # as the answer, 503, asks for
+            refused += 1
+            await asyncio.sleep(1.0)
+
+    async def listened(n: int, job: str) -> bool:
         async with calls.http.stream("GET", f"/v1/jobs/{job}/events") as answer:
             number: int | None = None
+            if answer.status_code != 200:
+                return False
             async for line in answer.aiter_lines():
                 opened.add(n)
                 if line.startswith("id:"):
@@ -136,6 +145,7 @@ async def listeners(
                 elif line.startswith("data:") and number is not None:
                     heard.append((job, number, time.perf_counter()))
                     number = None
+        return True
 
     following = [asyncio.create_task(listen(n, jobs[n % len(jobs)])) for n in range(count)]
     began = time.perf_counter()
@@ -162,6 +172,7 @@ async def listeners(
         "listeners": len(opened),
         "jobs": len(jobs),
         "opened_in_s": round(opened_s, 1),
+        "told_to_come_again": refused,
         "events_written": len(sent),
         "events_due": due,
         "events_heard": told,
