@@ -66,14 +66,19 @@ class Start:
 
     @property
     def doubted(self) -> np.ndarray:
-        """Bool [n], whose pose is a guess from other images; nobody where most are, as all are alike then."""
+        """Bool [n], whose pose is a guess from other images, or one that matches left out where they placed most.
+
+        Nobody where most are guesses, as all are alike then.
+        """
         guessed = np.array([source in GUESSES for source in self.sources])
+        if self.placed.mean() >= MOSTLY_PLACED:
+            guessed = ~self.placed
         return guessed if guessed.mean() <= DOUBTED_MOST else np.zeros_like(guessed)
 
     @property
     def sound(self) -> np.ndarray:
-        """Bool [n], whose pose is as good as the set's can be: placed by matches, where they placed most."""
-        return self.placed if self.placed.mean() >= MOSTLY_PLACED else ~self.doubted
+        """Bool [n], whose pose is as good as any of the set's."""
+        return ~self.doubted
 
     @property
     def mobility(self) -> np.ndarray:

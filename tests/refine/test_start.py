@@ -95,6 +95,7 @@ def test_cameras_that_matches_left_out_where_they_placed_most_are_not_sound(scen
     ):
         start = Start(dataset.world_from_cam, sources[0], sources)
         assert start.sound.tolist() == expected
+        assert start.doubted.tolist() == [not sound for sound in expected]
 
 
 def test_a_stop_ends_the_trial(scene):
