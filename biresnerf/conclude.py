@@ -45,7 +45,7 @@ class Run:
         started = time.monotonic()
         optimiser, held_out = self.stages.optimiser, self.given.held_out
         self.report(Progress(stage="evaluating", fraction=LAST_FRACTION))
-        fit_held_out_poses(optimiser, held_out)
+        fit_held_out_poses(optimiser, self.given.untaught)
         views = held_out or list(range(min(SHOWN_WITHOUT_HELD_OUT, len(self.given.dataset))))
         frames = int(optimiser.options.orbit_frames or 0)
         work = len(views) + frames

@@ -195,10 +195,10 @@ def _optimiser(given: RunInput, options: RefineOptions, device: torch.device, th
     frame = scene_frame(world_from_cam, images, matched_depth(dataset, world_from_cam, given.matches))
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
     lenses = lenses_of(
-        dataset, images, options.refine_intrinsics, given.held_out, device, dollies=not bodies.tied
+        dataset, images, options.refine_intrinsics, given.untaught, device, dollies=not bodies.tied
     )
     optimiser = JointOptimiser(
-        images, frame, poses, options, given.held_out, device, threads, start.mobility, bodies, lenses
+        images, frame, poses, options, given.untaught, device, threads, start.mobility, bodies, lenses
     )
     optimiser.camera_errors.doubt(start.doubted)
     return optimiser

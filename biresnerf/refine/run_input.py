@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.data.images import ImageSet
@@ -18,7 +20,7 @@ class RunInput:
         dataset: the set, with the poses that the result is compared with.
         images: its photos at the working size.
         start: the poses that the optimisation starts from.
-        held_out: indices of the views that teach the field nothing.
+        held_out: indices of the views that are kept from the field to be scored.
         matches: feature matches of the photos, where any were looked for and found.
     """
 
@@ -27,3 +29,8 @@ class RunInput:
     start: Start
     held_out: list[int]
     matches: FeatureMatches | None = None
+
+    @property
+    def untaught(self) -> list[int]:
+        """Indices of all views that teach the field nothing: those held out, and strays, whose poses are doubtful."""
+        return sorted({*self.held_out, *np.flatnonzero(self.start.stray).tolist()})

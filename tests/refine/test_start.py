@@ -87,15 +87,17 @@ def test_stage_1_is_shorter_where_matches_placed_the_cameras_and_its_length_was_
 def test_cameras_that_matches_left_out_where_they_placed_most_are_not_sound(scene):
     dataset, _ = scene
     matched, guess = "matches-incremental", "neighbours"
-    for sources, expected in (
-        ((matched,) * 8 + ("given",), [True] * 8 + [False]),
-        ((matched,) * 2 + ("given",) * 7, [True] * 9),
-        (("given",) * 8 + (guess,), [True] * 8 + [False]),
-        ((guess,) * 9, [True] * 9),
+    everyone = [False] * 9
+    for sources, doubted, stray in (
+        ((matched,) * 8 + ("given",), everyone, [*everyone[1:], True]),
+        ((matched,) * 2 + ("given",) * 7, everyone, everyone),
+        (("given",) * 8 + (guess,), [*everyone[1:], True], everyone),
+        ((guess,) * 9, everyone, everyone),
     ):
         start = Start(dataset.world_from_cam, sources[0], sources)
-        assert start.sound.tolist() == expected
-        assert start.doubted.tolist() == [not sound for sound in expected]
+        assert start.doubted.tolist() == doubted
+        assert start.stray.tolist() == stray
+        assert start.sound.tolist() == [not (a or b) for a, b in zip(doubted, stray, strict=True)]
 
 
 def test_a_stop_ends_the_trial(scene):
