@@ -58,11 +58,13 @@ def restore_command(folder: Path, data_dir: Path | None) -> None:
 
     Every file is checked against its digest. Jobs that were running go on from their last checkpoints.
     """
+    from workers.backup_folder import read_index
     from workers.reach_database import reached_database
     from workers.restore import restore_backup
 
     with setup_problems():
         settings = settings_with(data_dir=data_dir)
+        read_index(folder)  # before a database is made for it
         with reached_database(settings, migrated=False) as url:
             index = asyncio.run(restore_backup(settings, url, folder))
     click.echo(_told(index))

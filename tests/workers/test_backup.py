@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import os
 import shutil
@@ -11,6 +12,7 @@ from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+import psutil
 import psycopg
 import pytest
 
@@ -90,9 +92,14 @@ async def test_after_backup_wipe_and_restore_jobs_and_results_are_back_and_work_
             slot = slots.start(settings, "cpu0")
             done, running_job, queued = (Counting(stores, tmp_path / name) for name in ("a", "b", "c"))
             await done.submit(3, 0.01)
-            await done.until_final()
-            await running_job.submit(150, 0.05)
-            await running_job.until(lambda job: job.progress.step >= 20)
+            await done.until_final(90)
+            await running_job.submit(80, 0.05)
+            await running_job.until(lambda job: job.progress.step >= 20, 90)
+            # Held in the middle of its work, however long the backup takes.
+            for process in psutil.Process(slot.pid).children(recursive=True):
+                process.suspend()
+            while "checkpoint" not in await running_job.events():
+                await asyncio.sleep(0.05)
             await queued.submit(3, 0.01)
             made = command(home / "data", "backup", str(backup))  # while everything runs
             assert made.returncode == 0, made.stderr
@@ -110,7 +117,7 @@ async def test_after_backup_wipe_and_restore_jobs_and_results_are_back_and_work_
         async with open_stores(settings) as stores:
             for counting in (running_job, queued):
                 counting.stores = stores
-                assert (await counting.until_final()).state == "succeeded"
+                assert (await counting.until_final(90)).state == "succeeded"
             assert int(running_job.starts()[-1]["from"]) >= 10, "it went on from its checkpoint"
             assert [event.type for event in await stores.jobs.events(done.id)][-1] == "succeeded"
 
@@ -173,6 +180,14 @@ async def test_a_damaged_backup_or_a_place_that_is_taken_is_refused_and_left_as_
         with pytest.raises(SetupError) as told:
             await restore_backup(settings, settings.require_database_url(), backup)
         assert told.value.code == "store_not_empty"
+
+
+def test_a_folder_without_a_backup_makes_no_installation(home: Path):
+    (home / "backup").mkdir()
+    told = command(home / "data", "restore", str(home / "backup"))
+    assert told.returncode == 2
+    assert "no whole backup" in told.stderr
+    assert not (home / "data").exists()
 
 
 async def test_the_password_of_the_database_is_not_on_a_command_line(home: Path, tmp_path: Path):
