@@ -46,7 +46,7 @@ UNLIMITED = {"key_requests_per_s": 1e6, "key_requests_burst": 10**6}
 # Ids that exist, for what only reads: the chances to guess one are nil. What deletes gets made-up ones and,
 # in chains, those of its own making.
 _CONFIG = """
-hooks = "tests/service/fuzz_hooks.py"
+hooks = "{hooks}"
 
 [[operations]]
 include-method = ["GET", "HEAD"]
@@ -84,7 +84,8 @@ def fuzz(service: Running, folder: Path, arguments: list[str]) -> subprocess.Com
         dataset_id = ready_dataset(http, scene)
         job_id = finished(http, submit(http, dataset_id)["id"])["id"]
     config = folder / "schemathesis.toml"
-    config.write_text(_CONFIG.format(job_id=job_id, dataset_id=dataset_id))
+    hooks = ROOT / "tests" / "service" / "fuzz_hooks.py"
+    config.write_text(_CONFIG.format(hooks=hooks, job_id=job_id, dataset_id=dataset_id))
     command = ["schemathesis", "--config-file", str(config), "run", f"{url}/openapi.json"]
     options = [
         "-H",
@@ -98,21 +99,21 @@ def fuzz(service: Running, folder: Path, arguments: list[str]) -> subprocess.Com
     ]
     return subprocess.run(
         [str(Path(sys.executable).parent / command[0]), *command[1:], *options, *arguments],
-        cwd=ROOT,
+        cwd=folder,  # it keeps what it found where it runs
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
     )
 
 
-def fuzzed(seconds: int, *arguments: str) -> tuple[subprocess.CompletedProcess[str], str]:
-    """A service of its own fuzzed for so long; also what the service found worth a warning."""
+def fuzzed(*arguments: str) -> tuple[subprocess.CompletedProcess[str], str]:
+    """A service of its own fuzzed with these arguments; also what the service found worth a warning."""
     with (
         TemporaryDirectory() as folder,
         short_folder() as data,
         running_service(data, job_command=(sys.executable, str(PROGRAM)), **UNLIMITED) as service,
     ):
-        done = fuzz(service, Path(folder), ["--max-time", str(seconds), *arguments])
+        done = fuzz(service, Path(folder), list(arguments))
         log = service.log.read_text()
     return done, "\n".join(line for line in log.splitlines() if " INFO " not in line)
 
@@ -123,7 +124,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=int, default=600)
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    done, log = fuzzed(arguments.seconds, "--seed", str(arguments.seed))
+    done, log = fuzzed("--max-time", str(arguments.seconds), "--seed", str(arguments.seed))
     sys.stdout.write(f"{log}\n{done.stdout}{done.stderr}")
     return done.returncode
 

@@ -6,8 +6,9 @@ from tests.service.fuzzing import fuzzed
 
 
 def test_made_up_requests_get_no_server_error_and_no_undeclared_answer() -> None:
-    done, log = fuzzed(25, "--generation-deterministic", "--no-color")
+    few = ("--phases", "examples,fuzzing,stateful", "--max-examples", "2")
+    done, log = fuzzed(*few, "--generation-deterministic", "--no-color")
     assert done.returncode == 0, f"{log}\n{done.stdout}"
     assert "Traceback" not in log
-    for phase in ("Examples", "Coverage", "Fuzzing", "Stateful"):
+    for phase in ("Examples", "Fuzzing", "Stateful"):
         assert f"✅ {phase}" in done.stdout, done.stdout
