@@ -6,7 +6,7 @@ from tests.service.fuzzing import fuzzed
 
 
 def test_made_up_requests_get_no_server_error_and_no_undeclared_answer() -> None:
-    few = ("--phases", "examples,fuzzing,stateful", "--max-examples", "2")
+    few = ("--phases", "examples,fuzzing,stateful", "--max-examples", "1")
     done, log = fuzzed(*few, "--generation-deterministic", "--no-color")
     assert done.returncode == 0, f"{log}\n{done.stdout}"
     assert "Traceback" not in log
