@@ -17,16 +17,19 @@ from typing import Annotated, Any
 
 from fastapi import Security
 from fastapi.security import HTTPBearer, SecurityScopes
+from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.dependencies import Service, service_of
 from service.problems import ProblemError
+from service.rate_limits import Allowance, Buckets
 from workers.api_keys import ALL_SCOPES, KeyRefused
 from workers.api_keys import Scope as KeyScope
 from workers.datasets import DatasetStore
 from workers.errors import Unavailable
 from workers.jobs import JobStore
+from workers.settings import Settings
 from workers.tenants import LOCAL_TENANT
 from workers.uploads import UploadStore
 from workers.webhooks import WebhookStore
@@ -37,7 +40,12 @@ log = logging.getLogger(__name__)
 # shared was signed by us.
 OPEN = re.compile(r"/(livez|readyz|startupz|metrics|openapi\.json|docs(/.*)?|v1/shared/.*)?")
 # What any guarded operation may answer before it is reached.
-REFUSALS = ("missing_credentials", "invalid_api_key", "scope_required", "cross_site", "database_unavailable")
+REFUSALS = (
+    *("missing_credentials", "invalid_api_key", "scope_required", "cross_site"),
+    *("rate_limited", "database_unavailable"),
+)
+# Requests with no or a wrong key, of one address.
+STRANGERS_PER_S, STRANGERS_BURST = 1.0, 200
 _BEARER = re.compile(r"Bearer +(\S+) *", re.IGNORECASE)
 _CHALLENGE = 'Bearer realm="biresnerf"'
 
@@ -100,17 +108,58 @@ class Caller:
 class Access:
     """ASGI middleware: identifies the client of each request, before its body is read or its route sought."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+        self._app, self._settings = app, settings
+        self._keys = Buckets("key", settings.key_requests_per_s, settings.key_requests_burst)
+        self._strangers = Buckets("address", STRANGERS_PER_S, STRANGERS_BURST)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and not OPEN.fullmatch(scope["path"]):
-            request = Request(scope)
-            try:
-                request.state.identity = await identify(service_of(request), request)
-            except Unavailable as error:  # here, above the routes, nobody else makes a 503 of it
-                raise ProblemError(error.code, error.what) from None
-        await self._app(scope, receive, send)
+        if scope["type"] != "http" or OPEN.fullmatch(scope["path"]):
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope)
+        request.state.identity = identity = await self._identified(request)
+        allowance = self._allowance(request, identity)
+        if allowance is None:
+            await self._app(scope, receive, send)
+            return
+        _require_allowed(allowance)
+
+        async def send_with_allowance(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(allowance.headers())
+            await send(message)
+
+        await self._app(scope, receive, send_with_allowance)
+
+    async def _identified(self, request: Request) -> Identity:
+        try:
+            return await identify(service_of(request), request)
+        except Unavailable as error:  # here, above the routes, nobody else makes a 503 of it
+            raise ProblemError(error.code, error.what) from None
+        except ProblemError as refusal:
+            # Who shows a key that holds is never stopped for what others send from the same address.
+            if refusal.status == 401:
+                _require_allowed(self._strangers.take(_address(request)))
+            raise
+
+    def _allowance(self, request: Request, identity: Identity) -> Allowance | None:
+        if identity.key_id is not None:
+            return self._keys.take(identity.key_id)
+        return None if on_loopback(self._settings.host) else self._keys.take(_address(request))
+
+
+def _require_allowed(allowance: Allowance) -> None:
+    if allowance.wait_s:
+        raise ProblemError(
+            "rate_limited",
+            f"At most {allowance.limit} requests are taken at once.",
+            headers={**allowance.headers(), "Retry-After": str(allowance.wait_s)},
+        )
+
+
+def _address(request: Request) -> str:
+    return request.client.host if request.client else ""
 
 
 async def identify(service: Service, request: Request) -> Identity:

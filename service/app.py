@@ -103,7 +103,7 @@ def create_app(settings: Settings) -> FastAPI:
         # Spans of requests, once `set_up_traces` was called.
         telemetry={"metrics": False, "logs": False, "operation_spans": False, "exclude": is_probe},
     )
-    app.add_middleware(Access)
+    app.add_middleware(Access, settings=settings)
     app.add_middleware(RequestContext)  # it tells what Access refuses
     app.add_middleware(Observed, metrics=metrics)
     _answer_with_problems(app)

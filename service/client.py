@@ -18,7 +18,7 @@ from biresnerf.config import RefineOptions
 from biresnerf.errors import BiresnerfError
 from service.problems import Problem
 from service.schemas import ArtifactView, DatasetView, JobView
-from workers.records import FINAL_JOB_STATES, ManifestEntry
+from workers.records import FINAL_JOB_STATES, ManifestEntry, PriorityName
 
 # The server's keep-alive comes every 15 s; three missed ones mean that the connection is dead.
 _SILENCE_S = 50.0
@@ -128,12 +128,14 @@ class Client:
         *,
         labels: Mapping[str, str] | None = None,
         idempotency_key: str | None = None,
+        priority: PriorityName = "normal",
     ) -> JobView:
         """Queues a job."""
         body = {
             "dataset_id": dataset_id,
             "options": options.model_dump(mode="json", exclude_unset=True),
             "labels": dict(labels or {}),
+            **({"priority": priority} if priority != "normal" else {}),
         }
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
         return self.ask(JobView, "POST", "/v1/jobs", json=body, headers=headers)

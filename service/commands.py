@@ -152,6 +152,7 @@ def migrate_command() -> None:
 @click.option(
     "--url", envvar="BIRESNERF_URL", default=DEFAULT_URL, show_default=True, help="Where the service is."
 )
+@click.option("--priority", type=click.Choice(["low", "normal", "high"]), default="normal", show_default=True)
 @click.option(
     "--api-key", envvar="BIRESNERF_API_KEY", help="Better in BIRESNERF_API_KEY: others see command lines."
 )
@@ -162,6 +163,7 @@ def submit_command(
     wait: bool,
     output: Path | None,
     url: str,
+    priority: Any,
     api_key: str | None,
 ) -> None:
     """Send PATH (a folder, or a file with poses in a folder of images) to a service.
@@ -170,10 +172,11 @@ def submit_command(
     job goes on.
     """
     from biresnerf.config import parse_options
-    from service.submit import run_submit
+    from service.submit import Where, run_submit
 
     options = parse_options({**settings, **({"preset": preset} if preset else {})})
-    run_submit(path, options, wait=wait, output=output, url=url, api_key=api_key)
+    service = Where(url, api_key)
+    run_submit(path, options, service, wait=wait, output=output, priority=priority)
 
 
 @click.command("demo")

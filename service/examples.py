@@ -194,6 +194,17 @@ EXAMPLES: dict[str, Any] = {
         },
         "archives": ["application/zip", "application/x-tar", "application/gzip"],
         "job_counts": {"queued": 2, "running": 1, "succeeded": 40},
+        "share": {
+            "id": "anna",
+            "weight": 1.0,
+            "top_priority": "normal",
+            "max_running": 2,
+            "max_queued": 100,
+            "max_stored_bytes": 107_374_182_400,
+            "running": 1,
+            "queued": 2,
+            "stored_bytes": 1_288_490_188,
+        },
     },
     "OptionsView": {
         "json_schema": {"type": "object", "properties": {"steps": {"type": "integer"}}},

@@ -15,7 +15,8 @@ import click
 from service.commands import settings_with, setup_problems
 
 if TYPE_CHECKING:
-    from workers.api_keys import ApiKey, KeyStore
+    from workers.api_keys import ApiKey
+    from workers.database import Database
 
 T = TypeVar("T")
 _UNITS = {"h": "hours", "d": "days", "w": "weeks"}
@@ -43,8 +44,10 @@ def keys_command() -> None:
     """
 
 
-_as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-_data_dir = click.option("--data-dir", type=click.Path(path_type=Path), help="Where the private database is.")
+as_json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+data_dir_option = click.option(
+    "--data-dir", type=click.Path(path_type=Path), help="Where the private database is."
+)
 
 
 @keys_command.command("create")
@@ -60,8 +63,8 @@ _data_dir = click.option("--data-dir", type=click.Path(path_type=Path), help="Wh
     help="May be repeated. Default: read, datasets:write and jobs:write. admin may do everything.",
 )
 @click.option("--expires", type=Span(), help="For example 90d. Default: never.")
-@_as_json
-@_data_dir
+@as_json_option
+@data_dir_option
 def create_command(
     name: str,
     tenant: str,
@@ -71,10 +74,11 @@ def create_command(
     data_dir: Path | None,
 ) -> None:
     """Make a key called NAME. Its text is shown once; only a digest of it is kept."""
-    from workers.api_keys import USUAL_SCOPES
+    from workers.api_keys import USUAL_SCOPES, KeyStore
 
-    key, text = _with_keys(
-        data_dir, lambda keys: keys.create(tenant, name, scopes or USUAL_SCOPES, lives=expires)
+    key, text = with_database(
+        data_dir,
+        lambda database: KeyStore(database).create(tenant, name, scopes or USUAL_SCOPES, lives=expires),
     )
     if as_json:
         click.echo(json.dumps({**key.model_dump(mode="json"), "key": text}))
@@ -85,11 +89,13 @@ def create_command(
 
 @keys_command.command("list")
 @click.option("--tenant", help="Of this tenant only.")
-@_as_json
-@_data_dir
+@as_json_option
+@data_dir_option
 def list_command(tenant: str | None, as_json: bool, data_dir: Path | None) -> None:
     """List the keys, revoked ones too."""
-    found = _with_keys(data_dir, lambda keys: keys.list(tenant))
+    from workers.api_keys import KeyStore
+
+    found = with_database(data_dir, lambda database: KeyStore(database).list(tenant))
     if as_json:
         click.echo(json.dumps([key.model_dump(mode="json") for key in found]))
         return
@@ -99,28 +105,29 @@ def list_command(tenant: str | None, as_json: bool, data_dir: Path | None) -> No
 
 @keys_command.command("revoke")
 @click.argument("key_id")
-@_as_json
-@_data_dir
+@as_json_option
+@data_dir_option
 def revoke_command(key_id: str, as_json: bool, data_dir: Path | None) -> None:
     """End the key KEY_ID for good, from its next request on."""
     from biresnerf.errors import InputError
+    from workers.api_keys import KeyStore
     from workers.errors import NotFound
 
     try:
-        key = _with_keys(data_dir, lambda keys: keys.revoke(key_id))
+        key = with_database(data_dir, lambda database: KeyStore(database).revoke(key_id))
     except NotFound as error:
         raise InputError(error.code, error.what, mend="`biresnerf keys list` shows the ids.") from None
     click.echo(json.dumps(key.model_dump(mode="json")) if as_json else _line(key))
 
 
-def _with_keys(data_dir: Path | None, work: Callable[[KeyStore], Awaitable[T]]) -> T:
-    from workers.api_keys import KeyStore
+def with_database(data_dir: Path | None, work: Callable[[Database], Awaitable[T]]) -> T:
+    """What ``work`` makes of the database; raises `InputError` where the operator has to change something."""
     from workers.database import open_database
     from workers.reach_database import reached_database
 
     async def run(url: str) -> T:
         async with open_database(url, connections=1) as database:
-            return await work(KeyStore(database))
+            return await work(database)
 
     with setup_problems(), reached_database(settings_with(data_dir=data_dir)) as url:
         return asyncio.run(run(url))

@@ -11,6 +11,8 @@ from biresnerf.errors import InputError
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = "5"
+# What ends only with a job, or when its owner makes room.
+_LONGER_S = {"queue_full": "30", "quota_exhausted": "60"}
 
 # code -> (status, title). A code stands for one kind of mistake and never changes its meaning.
 CATALOGUE: dict[str, tuple[int, str]] = {
@@ -24,6 +26,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "missing_credentials": (401, "An API key is needed"),
     "invalid_api_key": (401, "The API key is not valid"),
     "scope_required": (403, "The API key may not do that"),
+    "priority_not_allowed": (403, "The tenant may not ask for so high a priority"),
     "cross_site": (403, "Another web site sent this request"),
     "not_found": (404, "There is no such thing here"),
     "method_not_allowed": (405, "This address does not answer that method"),
@@ -64,6 +67,8 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "validation_resources": (422, "Checking the files took too much memory or crashed"),
     "headers_too_large": (431, "The head of the request is too large"),
     "queue_full": (429, "Too many jobs are waiting"),
+    "quota_exhausted": (429, "The tenant has all that it may have"),
+    "rate_limited": (429, "Too many requests came in a short time"),
     "internal_error": (500, "Something is wrong with the service"),
     "unavailable": (503, "The service is not ready"),
     "queue_unavailable": (503, "The queue does not work"),
@@ -158,7 +163,8 @@ class ProblemError(Exception):
 
     def response_headers(self) -> dict[str, str]:
         """Extra headers of the answer; what may be tried again says when."""
-        return {**({"Retry-After": RETRY_AFTER_S} if self.retryable else {}), **self.headers}
+        wait_s = _LONGER_S.get(self.code, RETRY_AFTER_S)
+        return {**({"Retry-After": wait_s} if self.retryable else {}), **self.headers}
 
     def problem(self, instance: str | None = None, request_id: str | None = None) -> Problem:
         """The body of the answer."""

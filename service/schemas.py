@@ -16,7 +16,9 @@ from workers.records import (
     Job,
     JobState,
     ManifestEntry,
+    PriorityName,
 )
+from workers.tenants import TenantShare
 from workers.webhook_records import JobWebhook
 
 Label = Annotated[str, StringConstraints(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f]*$")]
@@ -57,6 +59,9 @@ class NewJob(Wire):
     options: RefineOptions = RefineOptions()
     labels: Labels = {}
     webhook: JobWebhook | None = Field(None, description="Who is told of this job, besides all webhooks.")
+    priority: PriorityName = Field(
+        "normal", description="Before or after other jobs; `high` only where the operator allows it."
+    )
 
 
 class JobTexts(Wire):
@@ -226,6 +231,7 @@ class Info(Wire):
     limits: SizeLimits
     archives: list[str]
     job_counts: dict[JobState, int]
+    share: TenantShare = Field(description="What you may use, and what you use. A limit of 0 is none.")
 
 
 class Health(Wire):

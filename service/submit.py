@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 from rich.console import Console
@@ -16,9 +17,12 @@ from service.progress_view import progress_view, watch
 from service.safe_paths import checked_path
 from service.schemas import DatasetView, JobView
 from service.sending import LocalFile, send_missing
+from workers.records import PriorityName
 
 
-def submit_scene(client: Client, scene: Scene, name: str, options: RefineOptions) -> JobView:
+def submit_scene(
+    client: Client, scene: Scene, name: str, options: RefineOptions, priority: PriorityName = "normal"
+) -> JobView:
     """Sends what the service lacks of the scene, has it checked, queues a job. Leaves nothing behind on failure.
 
     Lost connections and restarts of the service are waited for, and sending goes on where it broke off.
@@ -30,7 +34,7 @@ def submit_scene(client: Client, scene: Scene, name: str, options: RefineOptions
         if sent < len(files):
             click.echo(f"{len(files) - sent} of the files were there already", err=True)
         client.finalize(dataset)
-        return client.submit(dataset.id, options)
+        return client.submit(dataset.id, options, priority=priority)
     except BaseException:
         _forget(client, dataset)
         raise
@@ -65,23 +69,30 @@ def download_all(client: Client, job: JobView, output: Path) -> list[Path]:
     return written
 
 
+class Where(NamedTuple):
+    """A service, and the key that it wants."""
+
+    url: str
+    api_key: str | None = None
+
+
 def run_submit(
     path: Path,
     options: RefineOptions,
+    service: Where,
     *,
     wait: bool,
     output: Path | None,
-    url: str,
-    api_key: str | None = None,
+    priority: PriorityName = "normal",
 ) -> None:
     """The command's work; raises `InputError` (the user's to mend) or another `BiresnerfError`."""
     if output is not None:
         require_empty(output)
     scene = look_at(path)
     try:
-        with Client(url, api_key=api_key) as client:
+        with Client(service.url, api_key=service.api_key) as client:
             click.echo(f"sending {len(scene.files)} files, {scene.total_bytes / 1e6:.1f} MB", err=True)
-            job = submit_scene(client, scene, path.resolve().name, options)
+            job = submit_scene(client, scene, path.resolve().name, options, priority)
             click.echo(f"{client.url}{job.links.self}")
             if not wait and output is None:
                 return

@@ -9,6 +9,7 @@ import re
 import time
 from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
+from datetime import UTC, datetime
 from typing import Any, LiteralString
 
 import psycopg
@@ -39,6 +40,8 @@ CONNECT: dict[str, Any] = {
     # Keepalives rest while bytes are under way; without this a query into a dead line waits a quarter of an hour.
     "tcp_user_timeout": 60_000,
 }
+# When the queue offers a held job: not before `offer_held` says so.
+NOT_YET = datetime(9999, 1, 1, tzinfo=UTC)
 LISTEN_CHANNEL = "biresnerf_jobs"
 RECONNECT_S = 1.0
 QUIET_S = 60.0  # between two warnings of the same outage
@@ -122,8 +125,17 @@ class Database:
             return await cursor.fetchall() if cursor.description else []
 
     async def enqueue(self, connection: Connection, job_id: str) -> int:
-        """Put a job into the queue, in the caller's transaction; returns the queue row's id."""
-        task = self.app.configure_task(TASK, queue=QUEUE, connection=connection)
+        """Put a job into the queue at its turn, in the caller's transaction; returns the queue row's id."""
+        sql = "SELECT queue_order, held FROM jobs WHERE id = %s"
+        row = await (await connection.execute(sql, (job_id,))).fetchone()
+        assert row is not None, "the caller has written it"
+        task = self.app.configure_task(
+            TASK,
+            queue=QUEUE,
+            connection=connection,
+            priority=-row["queue_order"],
+            schedule_at=NOT_YET if row["held"] else None,
+        )
         try:
             return await task.defer_async(job_id=job_id)
         except ConnectorException as error:

@@ -18,6 +18,7 @@ from workers.dataset_rows import DATASET, KNOWN, MINE, file_key, locked, record_
 from workers.errors import Conflict, Expired, LimitReached, NotFound
 from workers.files import FileStore, StoredFile
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
+from workers.quotas import require_byte_quota
 from workers.records import DatasetFile, DatasetRecord, DatasetState, ManifestEntry, Page
 from workers.settings import Settings
 from workers.tenants import LOCAL_TENANT
@@ -171,11 +172,13 @@ class DatasetStore:
         key = file_key(folder, path)
         async with self._database.transaction() as connection:
             row = await self._require_open(connection, dataset_id, path, overwrite=overwrite)
+            await require_byte_quota(connection, dataset_id, 1)
         room = min(self._settings.max_file_bytes, self._settings.max_dataset_bytes - row["bytes"])
         try:
             stored = await store(key, room)
             async with self._database.transaction() as connection:
                 await self._require_open(connection, dataset_id, path, overwrite=overwrite, size=stored.size)
+                await require_byte_quota(connection, dataset_id, stored.size)
                 return await record_file(connection, dataset_id, path, stored)
         except BaseException:
             await self._files.delete_prefix(folder)

@@ -31,13 +31,13 @@ class Conflict(EngineError):
     """The thing exists, but its state does not allow this.
 
     Codes: ``state_conflict``, ``dataset_not_open``, ``dataset_not_ready``, ``dataset_not_complete``,
-    ``dataset_in_use``, ``idempotency_key_reused``, ``offset_mismatch``.
+    ``dataset_in_use``, ``idempotency_key_reused``, ``offset_mismatch``, ``priority_not_allowed``.
     """
 
 
 class LimitReached(EngineError):
     """A configured limit is reached. Codes: ``body_too_large``, ``too_many_files``, ``queue_full``,
-    ``storage_full``.
+    ``quota_exhausted``, ``storage_full``.
     """
 
 

@@ -92,6 +92,11 @@ class Janitor:
                 if self._silence_means_death(row["database_age_s"]):
                     await self._release_stalled(connection)
                 await self._requeue_lost(connection)
+                # Ends make room by themselves; this is for limits that were changed, and jobs passed over.
+                await connection.execute(
+                    "SELECT offer_held(tenant)"
+                    " FROM (SELECT DISTINCT tenant FROM jobs WHERE held AND state = 'queued') AS waiting"
+                )
                 await fold_tallies(connection)
         if time.monotonic() >= self._upkeep_at:
             self._upkeep_at = time.monotonic() + UPKEEP_S

@@ -1,4 +1,4 @@
-"""A row of the table `jobs` as the record that clients see."""
+"""Rows of the table `jobs`: as the record that clients see, and found again by an idempotency key."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from typing import Any
 
 from workers.database import Connection
 from workers.errors import Conflict
-from workers.records import Job, JobError, JobEvent, JobProgress
+from workers.records import Job, JobError, JobEvent, JobProgress, PriorityName, priority_name
 
 JOB = """
     SELECT jobs.*, CASE WHEN jobs.state = 'queued' THEN
-        (SELECT count(*) FROM jobs AS ahead WHERE ahead.state = 'queued' AND ahead.queue_id <= jobs.queue_id)
+        (SELECT count(*) FROM jobs AS ahead WHERE ahead.state = 'queued'
+            AND (ahead.queue_order, ahead.queue_id) <= (jobs.queue_order, jobs.queue_id))
         END AS queue_position
     FROM jobs"""
 # The same for many at once: counting for each who is ahead of it takes seconds where thousands wait.
-PLACES = """places AS (SELECT queue_id, row_number() OVER (ORDER BY queue_id) AS queue_position
+PLACES = """places AS (SELECT queue_id, row_number() OVER (ORDER BY queue_order, queue_id) AS queue_position
     FROM jobs WHERE state = 'queued')"""
 # With the store's tenant as parameter; none for everybody's.
 MINE = "jobs.tenant = coalesce(%s, jobs.tenant)"
@@ -40,7 +41,8 @@ def job_from_row(row: dict[str, Any]) -> Job:
     life = ("expires_at", "kind", "parent", "forked_from", "forked_stage", "smaller", "partial")
     progress = JobProgress(**{key: row[key] for key in ("fraction", "step", "steps_total", "eta_s")})
     error = JobError.model_validate(row["error"]) if row["error"] else None
-    return Job(**{key: row[key] for key in same + also + life}, progress=progress, error=error)
+    values = {key: row[key] for key in same + also + life} | {"priority": priority_name(row["priority"])}
+    return Job(**values, progress=progress, error=error)
 
 
 async def one_row(connection: Connection, sql: Any, *parameters: Any) -> dict[str, Any] | None:
@@ -48,9 +50,15 @@ async def one_row(connection: Connection, sql: Any, *parameters: Any) -> dict[st
     return await (await connection.execute(sql, parameters)).fetchone()
 
 
-def fingerprint_of(subject: str, options: dict[str, Any], labels: Mapping[str, str] | None) -> str:
+def fingerprint_of(
+    subject: str,
+    options: dict[str, Any],
+    labels: Mapping[str, str] | None,
+    priority: PriorityName = "normal",
+) -> str:
     """By which a repeated request is told from another one with the same key."""
-    request = json.dumps([subject, options, dict(labels or {})], sort_keys=True)
+    said = [subject, options, dict(labels or {}), *([priority] if priority != "normal" else [])]
+    request = json.dumps(said, sort_keys=True)
     return hashlib.sha256(request.encode()).hexdigest()
 
 

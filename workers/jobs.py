@@ -13,11 +13,23 @@ from psycopg.types.json import Jsonb
 from biresnerf.config import RefineOptions
 from workers.database import Connection, Database
 from workers.endings import finish_cancelled
-from workers.errors import Conflict, Expired, LimitReached, NotFound
+from workers.errors import Conflict, Expired, NotFound
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
 from workers.job_listener import JobListener, follow
 from workers.job_rows import JOB, MINE, PLACES, events_of, fingerprint_of, job_from_row, known_job, one_row
-from workers.records import LOG_NAME, Artifact, Job, JobEvent, JobState, JobUpdate, LogLine, Page
+from workers.quotas import owner_of, require_room
+from workers.records import (
+    LOG_NAME,
+    PRIORITIES,
+    Artifact,
+    Job,
+    JobEvent,
+    JobState,
+    JobUpdate,
+    LogLine,
+    Page,
+    PriorityName,
+)
 from workers.settings import Settings
 from workers.tenants import LOCAL_TENANT
 from workers.traces import traced, traceparent
@@ -56,33 +68,35 @@ class JobStore:
         idempotency_key: str | None = None,
         request_digest: str | None = None,
         webhook: JobWebhook | None = None,
+        priority: PriorityName = "normal",
     ) -> tuple[Job, bool]:
-        """Queue a job; the job and its queue entry are written in one transaction.
+        """Queue a job at its tenant's turn; the job and its queue entry are written in one transaction.
 
         ``request_digest`` stands for the dataset when requests are compared, where the client sent the
         files themselves and the dataset was made for them (see `repeated`).
         Returns the job and whether it is new (False: the same key with the same request came before).
-        Raises `NotFound` (dataset), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``),
-        `LimitReached` (``queue_full``), `InputError` (``webhook_url_refused``).
+        Raises `NotFound` (dataset), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``,
+        ``priority_not_allowed``), `LimitReached` (``queue_full``, ``quota_exhausted``),
+        `InputError` (``webhook_url_refused``).
         """
         resolved = options.resolved().model_dump(mode="json")
         subject = request_with(request_digest or dataset_id, webhook)
-        fingerprint = fingerprint_of(subject, resolved, labels)
+        fingerprint = fingerprint_of(subject, resolved, labels, priority)
         async with self._database.transaction() as connection:
             # Serialises submits (a millisecond each): the queue limit and repeated keys need no more thought.
             await connection.execute("SELECT pg_advisory_xact_lock(%s)", (QUEUE_LIMIT_LOCK,))
-            tenant = await self._tenant_of(connection, dataset_id)
+            tenant = await owner_of(connection, dataset_id, self._tenant)
             if idempotency_key is not None:
                 known = await known_job(connection, tenant, idempotency_key, fingerprint)
                 if known is not None:
                     return known, False
-            await self._require_room(connection, dataset_id)
+            await self._require_room(connection, dataset_id, priority)
             job_id = new_id("job")
             await connection.execute(
-                "INSERT INTO jobs (id, dataset_id, tenant, options, asked, labels, idempotency_key, fingerprint)"
-                " VALUES (%s, %s, %s, %s, %s, %s, %s, %s)",
+                "INSERT INTO jobs (id, dataset_id, tenant, priority, options, asked, labels, idempotency_key,"
+                " fingerprint) VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s)",
                 (
-                    *(job_id, dataset_id, tenant, Jsonb(resolved)),
+                    *(job_id, dataset_id, tenant, PRIORITIES[priority], Jsonb(resolved)),
                     *(Jsonb(options.model_dump(mode="json", exclude_unset=True)), Jsonb(dict(labels or {}))),
                     *(idempotency_key, fingerprint),
                 ),
@@ -100,27 +114,10 @@ class JobStore:
         await connection.execute("SELECT add_job_event(%s, 'queued', '{}')", (job_id,))
         return job_from_row(await self._required(connection, job_id))
 
-    async def _tenant_of(self, connection: Connection, dataset_id: str) -> str:
-        """A job belongs to whom its dataset belongs to; raises `NotFound`."""
-        dataset = await one_row(
-            connection,
-            "SELECT tenant FROM datasets WHERE id = %s AND tenant = coalesce(%s, tenant)",
-            *(dataset_id, self._tenant),
-        )
-        if dataset is None:
-            raise NotFound(f"No dataset {dataset_id}.")
-        tenant: str = dataset["tenant"]
-        return tenant
-
-    async def _require_room(self, connection: Connection, dataset_id: str) -> None:
-        dataset = await one_row(connection, "SELECT state FROM datasets WHERE id = %s FOR SHARE", dataset_id)
-        if dataset is None:  # deleted a moment ago
-            raise NotFound(f"No dataset {dataset_id}.")
-        if dataset["state"] != "ready":
-            raise Conflict("dataset_not_ready", f"Dataset {dataset_id} is {dataset['state']}, not ready.")
-        queued = await one_row(connection, "SELECT count(*) AS n FROM jobs WHERE state = 'queued'")
-        if queued is not None and queued["n"] >= self._settings.max_queued:
-            raise LimitReached("queue_full", f"{queued['n']} jobs wait already, which is the limit.")
+    async def _require_room(
+        self, connection: Connection, dataset_id: str, priority: PriorityName = "normal"
+    ) -> None:
+        await require_room(connection, dataset_id, PRIORITIES[priority], self._settings.max_queued)
 
     async def repeated(
         self, request_digest: str, options: RefineOptions, labels: Mapping[str, str], idempotency_key: str

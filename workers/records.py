@@ -11,6 +11,8 @@ from biresnerf.progress import ReusableStage, Stage
 from biresnerf.report import VerdictName
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "expired"]
+PriorityName = Literal["low", "normal", "high"]
+PRIORITIES: dict[PriorityName, int] = {"low": -1, "normal": 0, "high": 1}
 DatasetState = Literal["open", "finalizing", "ready", "rejected", "expired"]
 FINAL_JOB_STATES: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled", "expired"})
 
@@ -83,6 +85,7 @@ class Job(Record):
     state: JobState
     stage: Stage | None = None
     progress: JobProgress = JobProgress()
+    priority: PriorityName = "normal"
     queue_position: int | None = Field(None, description="1 is next; none unless queued.")
     attempt: int = 0
     cancel_requested: bool = False
@@ -113,6 +116,11 @@ class Job(Record):
     def final(self) -> bool:
         """Nothing will change any more."""
         return self.state in FINAL_JOB_STATES
+
+
+def priority_name(number: int) -> PriorityName:
+    """As clients say it."""
+    return next(name for name, value in PRIORITIES.items() if value == number)
 
 
 class JobEvent(Record):

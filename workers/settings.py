@@ -43,6 +43,10 @@ class Settings(BaseSettings):
         "and no key was ever made; required: every caller; off: nobody, on whatever address.",
     )
 
+    key_requests_per_s: float = Field(
+        50.0, gt=0, description="Requests with one API key, on average, that each web process takes."
+    )
+    key_requests_burst: int = Field(500, ge=1, description="Requests with one API key at once.")
     log_format: Literal["plain", "json"] = Field("plain", description="Lines for people, or JSON lines.")
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     metrics_token: SecretStr | None = Field(
@@ -95,7 +99,12 @@ class Settings(BaseSettings):
     job_timeout_s: float = Field(2 * 3600, gt=0, description="Longest run of one attempt.")
     check_timeout_s: float = Field(900, gt=0, description="Longest validation of one dataset.")
     max_attempts: int = Field(3, ge=1, description="Attempts of a job that crashes.")
-    max_queued: int = Field(1000, ge=1, description="Jobs that may wait.")
+    max_queued: int = Field(1000, ge=1, description="Jobs that may wait, of all tenants together.")
+    tenant_max_running: int = Field(2, ge=0, description="Jobs of one tenant at the same time; 0: no limit.")
+    tenant_max_queued: int = Field(100, ge=0, description="Jobs of one tenant that may wait; 0: no limit.")
+    tenant_max_stored_bytes: int = Field(
+        100 * GIB, ge=0, description="Bytes of one tenant's datasets, uploads and results; 0: no limit."
+    )
 
     max_files: int = Field(1000, ge=1, description="Files in a dataset.")
     max_file_bytes: int = Field(64 * MIB, ge=1)

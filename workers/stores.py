@@ -17,6 +17,7 @@ from workers.monitor import Monitor
 from workers.one_store import require_same_store
 from workers.settings import Settings
 from workers.shared_keys import shared_key
+from workers.tenants import TenantStore
 from workers.uploads import UploadStore
 from workers.webhooks import WebhookStore
 
@@ -32,6 +33,7 @@ class Stores:
     files: FileStore
     uploads: UploadStore
     keys: KeyStore
+    tenants: TenantStore
     monitor: Monitor
     webhooks: WebhookStore
     share_key: bytes  # signs links to results
@@ -56,8 +58,11 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
             jobs = JobStore(database, listener, settings)
             monitor = Monitor(database, files, settings.stall_s)
             uploads = UploadStore(database, files, settings)
+            tenants = TenantStore(database)
+            await tenants.apply_defaults(settings)
             datasets = DatasetStore(database, files, settings)
             webhooks = WebhookStore(database, settings)
-            yield Stores(jobs, datasets, files, uploads, KeyStore(database), monitor, webhooks, share_key)
+            keys = KeyStore(database)
+            yield Stores(jobs, datasets, files, uploads, keys, tenants, monitor, webhooks, share_key)
         finally:
             listening.cancel()

@@ -1,15 +1,106 @@
-"""Tenants: who owns datasets and jobs. A store bound to one sees nothing of the others."""
+"""Tenants: who owns datasets and jobs, what share of the service each gets, and how much of it at most.
+
+A store bound to a tenant sees nothing of the others. Turns and limits are kept by the database itself
+(migration 008), so they hold for every way a job comes in.
+"""
 
 from __future__ import annotations
 
 import re
 
+from pydantic import Field
+
 from biresnerf.errors import InputError
-from workers.database import Connection
+from workers.database import Connection, Database
+from workers.errors import NotFound
+from workers.records import PRIORITIES, PriorityName, Record, priority_name
+from workers.settings import Settings
 
 # Whoever runs the machine; owns everything while no key is needed.
 LOCAL_TENANT = "local"
 TENANT_FORM = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
+
+
+class TenantShare(Record):
+    """What a tenant may use and what it uses. A limit of 0 is none."""
+
+    id: str
+    weight: float = Field(description="Share of the slots where tenants wait for them; 1 is usual.")
+    top_priority: PriorityName = Field(description="The highest priority its jobs may ask for.")
+    max_running: int = Field(description="Jobs at the same time.")
+    max_queued: int = Field(description="Jobs that wait.")
+    max_stored_bytes: int = Field(description="Bytes of datasets, uploads and results together.")
+    running: int
+    queued: int
+    stored_bytes: int
+
+
+class TenantStore:
+    """Tenants in the database. Get one from `workers.stores.open_stores`.
+
+    Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    async def apply_defaults(self, settings: Settings) -> None:
+        """Make the limits of the settings those of every tenant that has none of its own."""
+        values = (settings.tenant_max_running, settings.tenant_max_queued, settings.tenant_max_stored_bytes)
+        await self._database.fetch(
+            "UPDATE tenant_defaults SET max_running = %s, max_queued = %s, max_stored_bytes = %s"
+            " WHERE (max_running, max_queued, max_stored_bytes) <> (%s, %s, %s)",
+            *(*values, *values),
+        )
+
+    async def share(self, tenant: str) -> TenantShare:
+        """The tenant's share and use of it; raises `NotFound`."""
+        shares = await self.shares(tenant)
+        if not shares:
+            raise NotFound(f"No tenant {tenant}.")
+        return shares[0]
+
+    async def shares(self, tenant: str | None = None) -> tuple[TenantShare, ...]:
+        """All tenants, by name, or the one."""
+        rows = await self._database.fetch(
+            "SELECT tenant_limits.*, coalesce(running, 0) AS running, coalesce(queued, 0) AS queued,"
+            " stored_bytes_of(id) AS stored_bytes FROM tenant_limits LEFT JOIN LATERAL"
+            " (SELECT count(*) FILTER (WHERE state = 'running') AS running,"
+            "  count(*) FILTER (WHERE state = 'queued') AS queued FROM jobs"
+            "  WHERE jobs.tenant = tenant_limits.id AND state IN ('queued', 'running')) AS used ON true"
+            " WHERE id = coalesce(%s, id) ORDER BY id",
+            tenant,
+        )
+        return tuple(
+            TenantShare(**{**row, "top_priority": priority_name(row["top_priority"])}) for row in rows
+        )
+
+    async def set(
+        self,
+        tenant: str,
+        *,
+        weight: float | None = None,
+        top_priority: PriorityName | None = None,
+        max_running: int | None = None,
+        max_queued: int | None = None,
+        max_stored_bytes: int | None = None,
+    ) -> TenantShare:
+        """Change what is given (a limit of -1: what the settings say again); makes the tenant if it is new.
+
+        Raises `InputError` (``bad_tenant``).
+        """
+        top = None if top_priority is None else PRIORITIES[top_priority]
+        async with self._database.transaction() as connection:
+            await ensure_tenant(connection, tenant)
+            await connection.execute(
+                "UPDATE tenants SET weight = coalesce(%s, weight), top_priority = coalesce(%s, top_priority),"
+                " max_running = nullif(coalesce(%s, max_running, -1), -1),"
+                " max_queued = nullif(coalesce(%s, max_queued, -1), -1),"
+                " max_stored_bytes = nullif(coalesce(%s, max_stored_bytes, -1), -1) WHERE id = %s",
+                (weight, top, max_running, max_queued, max_stored_bytes, tenant),
+            )
+            await connection.execute("SELECT offer_held(%s)", (tenant,))
+        return await self.share(tenant)
 
 
 def checked_tenant(name: str) -> str:

@@ -19,6 +19,7 @@ from workers.dataset_rows import MINE, file_key, require_open
 from workers.errors import Conflict, LimitReached, NotFound
 from workers.files import FileStore
 from workers.idents import new_id
+from workers.quotas import require_byte_quota
 from workers.records import JobError, Upload, UploadKind
 from workers.settings import Settings
 
@@ -77,6 +78,7 @@ class UploadStore:
             file_key(folder, path)
         async with self._database.transaction() as connection:
             await require_open(connection, dataset_id, self._tenant)
+            await require_byte_quota(connection, dataset_id, size)
             cursor = await connection.execute(
                 "SELECT count(*) AS n FROM uploads WHERE dataset_id = %s", (dataset_id,)
             )

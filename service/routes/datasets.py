@@ -47,7 +47,8 @@ async def _new_dataset(request: Request) -> NewDataset:
     operation_id="createDataset",
     response_model=DatasetView,
     responses=declared(
-        "malformed_json", "body_too_large", "unsupported_media", "unsafe_path", "body_timeout", *_WRITES
+        *("malformed_json", "body_too_large", "unsupported_media", "unsafe_path", "body_timeout"),
+        *("quota_exhausted", *_WRITES),
     ),
     openapi_extra={
         "requestBody": {"required": True, "content": {"application/json": json_content(NewDataset)}}
@@ -128,6 +129,7 @@ _TAKES = (
     "too_many_files",
     "unsafe_path",
     "storage_full",
+    "quota_exhausted",
 )
 
 

@@ -105,7 +105,14 @@ async def list_images(
     response_model=JobView,
     openapi_extra={"requestBody": {"content": {"application/json": json_content(ForkJob)}}},
     responses=declared(
-        *("fork_not_possible", "dataset_not_ready", "invalid_options", "queue_full", "bad_idempotency_key"),
+        *(
+            "fork_not_possible",
+            "dataset_not_ready",
+            "invalid_options",
+            "queue_full",
+            "quota_exhausted",
+            "bad_idempotency_key",
+        ),
         *("idempotency_key_reused", "storage_unavailable", "storage_full", *_BODY, *_ALWAYS),
     ),
 )
@@ -141,7 +148,15 @@ async def fork_job(
     openapi_extra={"requestBody": {"content": {"application/json": json_content(NewExport)}}},
     responses={
         200: {"model": JobView, "description": "It was asked for before, and is there."},
-        **declared("result_not_ready", "state_conflict", "queue_full", "storage_full", *_BODY, *_ALWAYS),
+        **declared(
+            "result_not_ready",
+            "state_conflict",
+            "queue_full",
+            "quota_exhausted",
+            "storage_full",
+            *_BODY,
+            *_ALWAYS,
+        ),
     },
 )
 async def export_job(job_id: JobId, request: Request, caller: JobWriterHere) -> Response:

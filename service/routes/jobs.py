@@ -66,7 +66,14 @@ _BODY = {
                 "archive_rejected",
                 "queue_full",
             ),
-            *("storage_full", "body_timeout", "webhook_url_refused", *_WRITES),
+            *(
+                "storage_full",
+                "body_timeout",
+                "webhook_url_refused",
+                "priority_not_allowed",
+                "quota_exhausted",
+                *_WRITES,
+            ),
         ),
     },
 )
@@ -97,6 +104,7 @@ async def submit_job(
             labels=body.labels,
             idempotency_key=idempotency_key,
             webhook=body.webhook,
+            priority=body.priority,
         )
     else:
         raise ProblemError(

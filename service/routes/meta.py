@@ -43,7 +43,7 @@ async def get_options(
 
 @router.get("/v1/info", operation_id="getInfo", responses=declared("internal_error", "database_unavailable"))
 async def get_info(caller: CallerHere) -> Info:
-    """Version and limits of this service, and how many of your jobs are in each state."""
+    """Version and limits of this service, your share of it, and how many of your jobs are in each state."""
     limits = {
         name: getattr(caller.service.settings, name)
         for name in SizeLimits.model_fields
@@ -54,4 +54,5 @@ async def get_info(caller: CallerHere) -> Info:
         limits=SizeLimits(**limits, max_archive_ratio=RATIO_MAX),
         archives=ARCHIVES,
         job_counts=await caller.jobs.counts(),
+        share=await caller.service.stores.tenants.share(caller.tenant),
     )

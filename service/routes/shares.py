@@ -10,7 +10,7 @@ from urllib.parse import quote
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import Response, StreamingResponse
 
-from service.access import CallerHere
+from service.access import JobWriterHere
 from service.dependencies import JobId, ServiceHere
 from service.downloads import ANSWERS, Asked, answer_with, find_artifact
 from service.json_body import json_content, read_json
@@ -45,7 +45,7 @@ router = APIRouter(prefix="/v1", tags=["results"])
 )
 async def share_artifact(
     job_id: JobId,
-    caller: CallerHere,
+    caller: JobWriterHere,  # the link outlives the key that made it
     body: Annotated[NewShare, Depends(_new_share)],
     response: Response,
 ) -> ShareView:

@@ -34,7 +34,7 @@ async def _new_uploads(request: Request) -> NewSignedUploads:
     operation_id="signUploads",
     responses=declared(
         *("direct_upload_unavailable", "dataset_not_open", "body_too_large", "too_many_files"),
-        *("unsafe_path", *_BODY, *_ALWAYS),
+        *("unsafe_path", "quota_exhausted", *_BODY, *_ALWAYS),
     ),
     openapi_extra={
         "requestBody": {"required": True, "content": {"application/json": json_content(NewSignedUploads)}}
@@ -44,6 +44,7 @@ async def sign_uploads(
     dataset_id: DatasetId, caller: DatasetWriterHere, body: Annotated[NewSignedUploads, Depends(_new_uploads)]
 ) -> SignedUploads:
     """An address at the store for each file. `PUT` the bytes there, then `POST …/complete` the upload here."""
+    await caller.datasets.get(dataset_id)
     paths = [checked_path(file.path) for file in body.files]
     await _addresses(caller, [])  # refuse before anything is created
     uploads = [
@@ -79,7 +80,7 @@ def _key(upload: Upload) -> str:
     operation_id="completeUpload",
     responses=declared(
         *("upload_incomplete", "state_conflict", "dataset_not_open", "digest_mismatch"),
-        *("body_too_large", "too_many_files", *_ALWAYS),
+        *("body_too_large", "too_many_files", "quota_exhausted", *_ALWAYS),
     ),
 )
 async def complete_upload(upload_id: UploadId, caller: DatasetWriterHere) -> FileView:

@@ -87,7 +87,7 @@ async def describe_uploads(dataset_id: DatasetId, caller: CallerHere) -> Respons
     response_model=UploadView,
     responses=declared(
         *("not_found", "dataset_not_open", "invalid_request", "unsafe_path", "body_too_large"),
-        *("too_many_files", "storage_full", "cross_site", *_ALWAYS),
+        *("too_many_files", "storage_full", "quota_exhausted", "cross_site", *_ALWAYS),
     ),
     dependencies=[SameVersion],
 )

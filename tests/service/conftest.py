@@ -21,8 +21,11 @@ from urllib.parse import unquote
 
 import httpx
 import pytest
+from click.testing import CliRunner
 
 from biresnerf.data.synthetic import write_synthetic_scene
+from service.keys_command import keys_command
+from service.tenants_command import tenants_command
 
 PROGRAM = Path(__file__).with_name("quick_program.py")
 MIB = 2**20
@@ -215,3 +218,68 @@ def done_job(service: Running, scene: Path) -> dict[str, Any]:
         job = finished(client, submit(client, ready_dataset(client, scene))["id"])
     assert job["state"] == "succeeded", job
     return job
+
+
+TUS = {"Tus-Resumable": "1.0.0", "Upload-Length": "9", "Upload-Offset": "0"}
+
+
+def new_upload(http: httpx.Client) -> str:
+    """A resumable upload that waits for its bytes."""
+    made = http.post(f"/v1/datasets/{new_dataset(http)}/uploads", headers=TUS)
+    assert made.status_code == 201, made.text
+    return made.json()["id"]
+
+
+def operator(data_dir: Path, *arguments: str) -> Any:
+    """`biresnerf keys …` or `biresnerf tenants …` with `--json`, beside the running service."""
+    said = CliRunner().invoke(
+        {"keys": keys_command, "tenants": tenants_command}[arguments[0]],
+        [*arguments[1:], "--json", "--data-dir", str(data_dir)],
+        env={"BIRESNERF_DATABASE_URL": None},
+        catch_exceptions=False,
+    )
+    assert said.exit_code == 0, said.output
+    return json.loads(said.stdout)
+
+
+def client_with(service: Running, key: str | None) -> httpx.Client:
+    headers = {"Authorization": f"Bearer {key}"} if key else {}
+    return httpx.Client(base_url=service.url, timeout=60.0, headers=headers)
+
+
+@pytest.fixture(scope="session")
+def closed() -> Iterator[Running]:
+    """A service that wants keys."""
+    with (
+        short_folder() as folder,
+        running_service(folder, auth="required", job_command=(sys.executable, str(PROGRAM))) as running,
+    ):
+        yield running
+
+
+@dataclass(frozen=True)
+class Tenant:
+    http: httpx.Client
+    key: str
+    dataset: str
+    job: str
+    upload: str
+    webhook: str
+    delivery: str
+
+
+@pytest.fixture(scope="session")
+def tenants(closed: Running, scene: Path) -> Iterator[tuple[Tenant, Tenant]]:
+    """Two tenants, each with a dataset and a finished job."""
+    made = []
+    for name in ("anna", "bert"):
+        key = operator(closed.data_dir, "keys", "create", "test", "--tenant", name)["key"]
+        http = client_with(closed, key)
+        dataset = ready_dataset(http, scene)
+        job = finished(http, submit(http, dataset)["id"])["id"]
+        webhook = http.post("/v1/webhooks", json={"url": "http://127.0.0.1:9/in"}).json()["id"]
+        delivery = http.post(f"/v1/webhooks/{webhook}/test").json()["id"]
+        made.append(Tenant(http, key, dataset, job, new_upload(http), webhook, delivery))
+    yield made[0], made[1]
+    for tenant in made:
+        tenant.http.close()
