@@ -66,7 +66,7 @@ def run_report(
             rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
             translation=tuple(float(v) for v in similarity.translation),
         ),
-        warnings=dataset.warnings + _lost_warnings(dataset, lost),
+        warnings=dataset.warnings + _stray_warnings(given) + _lost_warnings(dataset, lost),
     )
 
 
@@ -85,6 +85,17 @@ def camera_reports(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[Came
             params_after=new.params,
         )
         for i, (old, new) in enumerate(zip(dataset.cameras, lenses.refined(dataset).cameras, strict=True))
+    )
+
+
+def _stray_warnings(given: RunInput) -> tuple[str, ...]:
+    strays = np.flatnonzero(given.start.stray).tolist()
+    if not strays:
+        return ()
+    names = ", ".join(given.dataset.names[i] for i in strays)
+    return (
+        f"Feature matches placed all but {len(strays)} of {len(given.dataset)} images: of {names} only the photo "
+        "tells where it was taken from. Look at these poses before you rely on them.",
     )
 
 
