@@ -152,7 +152,7 @@ BAD: dict[str, tuple[Callable[[Files], object], str | None, str]] = {
     "NaN in a pose": (with_entry(float("nan")), None, ""),
     "no rotation": (with_entry(3.0), None, ""),
     "unknown camera model": (edited(lambda d: d.update(camera_model="PANINI")), None, "camera_model"),
-    "no intrinsics": (edited(lambda d: d.pop("camera_angle_x")), None, "transforms.json"),
+    "half a lens": (edited(lambda d: (d.pop("camera_angle_x"), d.update(k1=0.1))), None, "transforms.json"),
     "frames is no list": (edited(lambda d: d.update(frames=7)), None, "transforms.json"),
     "broken JSON": (lambda f: f.update({"transforms.json": b'{"frames": ['}), None, "transforms.json"),
     "JSON bomb": (lambda f: f.update({"transforms.json": b"[" * 10**6}), None, "transforms.json"),
