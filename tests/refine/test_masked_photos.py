@@ -99,7 +99,7 @@ def test_measures_of_photos_do_not_depend_on_what_is_masked(spoilt_twice):
     for measure in (
         foreground_shares,
         photo_distances,
-        lambda images: CameraErrors(images, [], CPU)._hard.numpy(),
+        lambda images: CameraErrors(images, [], CPU)._variances.numpy(),
     ):
         np.testing.assert_allclose(measure(one), measure(other), atol=1e-6)
     assert (

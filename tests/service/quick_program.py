@@ -12,12 +12,13 @@ import sys
 import time
 from pathlib import Path
 
+from biresnerf.config import parse_options
 from biresnerf.progress import Progress
 from service.examples import EXAMPLES
 
 folder = Path(sys.argv[1])
 order = json.loads((folder / "job.json").read_text())
-source, output, options = folder / order["input"], folder / order["output"], order["options"]
+source, output = folder / order["input"], folder / order["output"]
 steps, step_s = 0, 0.0
 stopping = []
 signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
@@ -38,9 +39,10 @@ def tell(stage: str, step: int, preview: tuple[str, ...] = ()) -> None:
 
 
 if order.get("task") == "export":
-    for form in options["formats"]:
+    for form in order["options"]["formats"]:
         (output / f"{form}.txt").write_text("exported")
     sys.exit(0)
+options = parse_options(order["options"]).resolved().model_dump(mode="json")
 steps, step_s = options["steps"], options["seed"] / 1000
 tell("preparing", 0)
 sys.stderr.write("images read\nline 2\n")

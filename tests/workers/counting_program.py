@@ -13,6 +13,7 @@ import sys
 import time
 from pathlib import Path
 
+from biresnerf.config import parse_options
 from biresnerf.progress import Progress
 
 folder = Path(sys.argv[1])
@@ -95,7 +96,8 @@ for step in range(start + 1, plan["steps"] + 1):
         os.kill(os.getpid(), signal.SIGKILL)
     if step % plan.get("preview_every", 10**9) == 0:
         show(step)
-    if plan.get("hungry", 0) and step == 3 and order["options"]["max_image_size"] > plan["hungry"]:
+    size = parse_options(order["options"]).resolved().max_image_size or 0
+    if plan.get("hungry", 0) and step == 3 and size > plan["hungry"]:
         sys.exit(4)  # as `workers.run` says that memory ran out
     if stopping and plan.get("slow_to_end"):
         (output / "poses.json").write_text("half of a result")
