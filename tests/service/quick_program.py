@@ -52,11 +52,12 @@ if options["threads"] == 77:
     sys.exit(3)
 for step in range(1, steps + 1):
     time.sleep(step_s)
-    tell("coarse" if step < steps / 2 else "fine", step)
+    stage = "coarse" if step < steps / 2 else "fine"
+    tell(stage, step)
     if step % 20 == 0:
         (output / "preview").mkdir(exist_ok=True)
         (output / "preview" / "poses.json").write_text(json.dumps({"step": step}))
-        tell("fine", step, ("preview/poses.json",))
+        tell(stage, step, ("preview/poses.json",))
     if stopping:
         partial = {"state": "partial", "options": options, "images": []}
         (output / "poses.json").write_text(json.dumps({"step": step}))
