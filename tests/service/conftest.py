@@ -194,6 +194,11 @@ def submit(
     return found
 
 
+def dataset_ids(http: httpx.Client) -> list[str]:
+    """Which datasets there are, the newest first; when they expire changes with the jobs of other tests."""
+    return [item["id"] for item in http.get("/v1/datasets").json()["items"]]
+
+
 def until(
     http: httpx.Client, job: str, holds: Callable[[dict[str, Any]], bool], patience_s: float = PATIENCE_S
 ) -> dict[str, Any]:

@@ -12,7 +12,16 @@ import httpx
 import pytest
 from PIL import Image
 
-from tests.service.conftest import Running, new_dataset, problem, ready_dataset, scene_files, upload, zip_of
+from tests.service.conftest import (
+    Running,
+    dataset_ids,
+    new_dataset,
+    problem,
+    ready_dataset,
+    scene_files,
+    upload,
+    zip_of,
+)
 
 Files = dict[str, bytes]
 
@@ -184,10 +193,10 @@ def test_a_bad_scene_is_422_with_the_file_and_the_mend(http: httpx.Client, scene
 def test_the_same_bad_scene_in_one_request_is_the_same_problem(http: httpx.Client, scene: Path) -> None:
     files = scene_files(scene)
     files["train/r_2.png"] = b"hello"
-    before = http.get("/v1/datasets").json()
+    before = dataset_ids(http)
     body = problem(http.post("/v1/jobs", files={"archive": zip_of(files)}), 422, "not_an_image")
     assert "r_2" in body["where"]
-    assert http.get("/v1/datasets").json() == before
+    assert dataset_ids(http) == before
 
 
 def test_another_datasets_files_cannot_be_named(http: httpx.Client, service: Running, scene: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from tests.service.conftest import (
     Running,
+    dataset_ids,
     finished,
     problem,
     ready_dataset,
@@ -140,10 +141,6 @@ def test_one_request_with_an_archive_is_a_whole_job(http: httpx.Client, scene: P
     form["data"]["labels"] = "{}"
     problem(http.post("/v1/jobs", **form), 422, "idempotency_key_reused")
     assert finished(http, job["id"])["state"] == "succeeded"
-
-
-def dataset_ids(http: httpx.Client) -> list[str]:
-    return [item["id"] for item in http.get("/v1/datasets").json()["items"]]
 
 
 @pytest.mark.parametrize(
