@@ -23,7 +23,7 @@ import pytest
 from service.client import Client, ServiceError
 from service.commands import free_port
 from service.schemas import ArtifactView
-from tests.service.conftest import Running, finished
+from tests.service.conftest import Running, dataset_ids, finished
 
 COMMAND = (sys.executable, "-m", "biresnerf.command_line", "submit")
 FAST = ("--preset", "fast", "--set", "steps=40", "--set", "seed=50")
@@ -116,11 +116,11 @@ def test_a_bad_scene_is_exit_2_and_leaves_no_dataset(
     shutil.copytree(scene, copy)
     whole = (copy / "train" / "r_2.png").read_bytes()
     (copy / "train" / "r_2.png").write_bytes(whole[: len(whole) // 2])
-    before = http.get("/v1/datasets").json()
+    before = dataset_ids(http)
     done = submit(service, copy, "--wait")
     assert done.returncode == 2, done.stderr
     assert "r_2" in done.stderr
-    assert http.get("/v1/datasets").json() == before
+    assert dataset_ids(http) == before
 
 
 def test_a_failed_job_and_a_missing_service_are_exit_1(service: Running, scene: Path) -> None:
