@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LINT_IMPORTS = Path(sys.executable).with_name("lint-imports")
 # What a package is imported as, where that is not what it is installed as.
 IMPORTED_AS = {
+    "opentelemetry-sdk": {"opentelemetry"},
     "pillow": {"PIL"},
     "psycopg": {"psycopg", "psycopg_pool"},  # by its extra `pool`
     "numba": {"numba", "llvmlite"},  # which pins its version
@@ -126,7 +127,7 @@ def imported(package: str) -> dict[str, str]:
 
 @pytest.mark.parametrize(
     ("package", "extras"),
-    [("biresnerf", ["colmap", "compare"]), ("workers", ["service"]), ("service", ["service"])],
+    [("biresnerf", ["colmap", "compare"]), ("workers", ["service", "otel"]), ("service", ["service"])],
 )
 def test_a_package_imports_only_what_its_installation_brings(package, extras):
     missing = {name: file for name, file in imported(package).items() if name not in declared(*extras)}

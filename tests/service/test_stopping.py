@@ -72,7 +72,8 @@ def test_what_a_stopping_service_cuts_off_can_be_asked_again(stopping: bool) -> 
     async def cut_off() -> None:
         closing = asyncio.Event()
         app = SimpleNamespace(state=SimpleNamespace(service=SimpleNamespace(closing=closing)))
-        scope = {"type": "http", "method": "GET", "path": "/v1/jobs", "headers": [], "app": app}
+        scope = {"type": "http", "http_version": "1.1", "method": "GET", "path": "/v1/jobs", "headers": []}
+        scope |= {"raw_path": b"/v1/jobs", "query_string": b"", "app": app}
         serving = asyncio.create_task(RequestContext(never_answers)(scope, None, send))  # type: ignore[arg-type]
         await asyncio.sleep(0.01)
         if stopping:
