@@ -26,13 +26,15 @@ CREATE FUNCTION tally_seconds(_name text, _label text, _seconds double precision
         VALUES (_name, _label, width_bucket(greatest(_seconds, 0), tally_bounds()), greatest(_seconds, 0))
 $$;
 
+-- Only these end a stage: previews and checkpoints fall into the middle of one.
 CREATE FUNCTION tally_job_event() RETURNS trigger LANGUAGE plpgsql AS $$
 DECLARE
+    _marks text[] := '{started,stage,attempt_crashed,retried_smaller,requeued,succeeded,failed,cancelled}';
     _created timestamptz;
     _before record;
 BEGIN
     INSERT INTO tally_log (name, label) VALUES ('job_events', NEW.type);
-    IF NEW.type IN ('checkpoint', 'preview', 'cancel_requested') THEN
+    IF NEW.type <> ALL (_marks) THEN
         RETURN NULL;
     END IF;
     IF NEW.type = 'failed' THEN
@@ -40,10 +42,8 @@ BEGIN
     ELSIF NEW.type = 'requeued' THEN
         INSERT INTO tally_log (name, label) VALUES ('job_requeues', coalesce(NEW.data ->> 'why', ''));
     END IF;
-    -- Whatever comes after a stage ends it.
     SELECT type, data ->> 'stage' AS stage, at INTO _before FROM job_events
-        WHERE job_id = NEW.job_id AND seq < NEW.seq AND type NOT IN ('checkpoint', 'preview', 'cancel_requested')
-        ORDER BY seq DESC LIMIT 1;
+        WHERE job_id = NEW.job_id AND seq < NEW.seq AND type = ANY (_marks) ORDER BY seq DESC LIMIT 1;
     IF FOUND AND _before.type = 'stage' THEN
         PERFORM tally_seconds('stage_seconds', coalesce(_before.stage, ''), extract(epoch FROM NEW.at - _before.at));
     END IF;
@@ -71,6 +71,16 @@ END;
 $$;
 CREATE TRIGGER tally_stored AFTER INSERT OR UPDATE OF key ON dataset_files
     FOR EACH ROW EXECUTE FUNCTION tally_stored();
+
+CREATE FUNCTION tally_webhook_attempt() RETURNS trigger LANGUAGE plpgsql AS $$
+BEGIN
+    INSERT INTO tally_log (name, label) VALUES ('webhook_attempts',
+        CASE WHEN NEW.error IS NULL AND NEW.status BETWEEN 200 AND 299 THEN 'delivered' ELSE 'failed' END);
+    RETURN NULL;
+END;
+$$;
+CREATE TRIGGER tally_webhook_attempt AFTER INSERT ON webhook_attempts
+    FOR EACH ROW EXECUTE FUNCTION tally_webhook_attempt();
 
 -- Which of the queue's workers is which slot, for as long as it lives.
 CREATE TABLE slots (
