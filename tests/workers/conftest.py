@@ -160,6 +160,11 @@ async def ready_dataset(stores: Stores, files: dict[str, bytes]) -> str:
     return dataset.id
 
 
+@pytest.fixture
+async def dataset_id(stores: Stores) -> str:
+    return await ready_dataset(stores, {"plan.json": b"{}"})
+
+
 class Counting:
     """A job of `counting_program` and the journal of its starts."""
 

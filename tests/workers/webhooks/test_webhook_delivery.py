@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import AsyncIterator
-from pathlib import Path
 
 import psycopg
 import pytest
 import standardwebhooks
 
 from tests.workers.conftest import Slots
-from tests.workers.webhook_receiver import Dispatchers, Receiver, concluded, hook_settings, queued_job
+from tests.workers.webhooks.webhook_receiver import (
+    Dispatchers,
+    Receiver,
+    concluded,
+    queued_job,
+)
 from workers.database import open_database
 from workers.errors import Conflict
 from workers.follow import Listener
@@ -23,18 +26,6 @@ from workers.webhook_records import ALL_EVENTS
 from workers.webhook_sender import WebhookSender, outcome_of, pause, retry_after
 
 pytestmark = pytest.mark.anyio
-
-
-@pytest.fixture
-def settings(database_url: str, tmp_path: Path) -> Settings:
-    return hook_settings(database_url, tmp_path)
-
-
-@pytest.fixture
-async def dispatchers(settings: Settings, slots: Slots, tmp_path: Path) -> AsyncIterator[Dispatchers]:
-    started = Dispatchers(settings, slots, tmp_path)
-    yield started
-    await started.end()
 
 
 async def test_a_failed_message_comes_again_later_and_later_under_the_same_id(

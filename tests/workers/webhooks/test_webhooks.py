@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from pathlib import Path
-
 import psycopg
 import pytest
 import standardwebhooks
 
 from tests.workers.conftest import Slots
-from tests.workers.webhook_receiver import Dispatchers, Receiver, concluded, hook_settings, queued_job
+from tests.workers.webhooks.webhook_receiver import (
+    Dispatchers,
+    Receiver,
+    concluded,
+    queued_job,
+)
 from workers.database import open_database
 from workers.errors import LimitReached, NotFound
 from workers.settings import Settings
@@ -18,18 +20,6 @@ from workers.stores import Stores
 from workers.webhook_records import ALL_EVENTS
 
 pytestmark = pytest.mark.anyio
-
-
-@pytest.fixture
-def settings(database_url: str, tmp_path: Path) -> Settings:
-    return hook_settings(database_url, tmp_path)
-
-
-@pytest.fixture
-async def dispatchers(settings: Settings, slots: Slots, tmp_path: Path) -> AsyncIterator[Dispatchers]:
-    started = Dispatchers(settings, slots, tmp_path)
-    yield started
-    await started.end()
 
 
 async def test_a_jobs_life_is_told_signed_and_an_independent_reader_believes_it(
