@@ -22,7 +22,7 @@ from biresnerf.field.compile_kernels import compile_kernels
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.geometry.similarity import align_robust
-from biresnerf.pipeline import held_out_views
+from biresnerf.refine.left_out_views import held_out_views
 from biresnerf.refine.pose_evidence import Rig, compare_on_unseen_views, moved_px
 
 

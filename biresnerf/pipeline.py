@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,6 +31,7 @@ from biresnerf.refine.forward_facing import find_forward_facing
 from biresnerf.refine.history import Observer
 from biresnerf.refine.intrinsics_parameters import lenses_of
 from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.left_out_views import held_out_views
 from biresnerf.refine.rigid_bodies import rigid_bodies
 from biresnerf.refine.run_input import RunInput
 from biresnerf.refine.scene_depth import matched_depth
@@ -43,7 +43,6 @@ from biresnerf.report import Report
 logger = logging.getLogger(__name__)
 
 MATCHED_IMAGES, MATCHED_XY = "matches.images", "matches.xy"  # in a checkpoint
-HOLD_OUT_ONE_IN, HOLD_OUT_MOST, HOLD_OUT_FROM = 10, 10, 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,21 +234,6 @@ def _find_start(
         return candidates[0]
     report(Progress(stage="seeding", fraction=0.016, message=f"trying {len(candidates)} sets of poses"))
     return choose_start(candidates, prepared.images, options, device, threads, stop)
-
-
-def held_out_views(count: int, asked: int | None, sound: np.ndarray | None = None) -> list[int]:
-    """Indices of the views kept from the field, evenly spread: a tenth, at most 10; none of fewer than 6.
-
-    Args:
-        count: all views.
-        asked: how many are wanted instead.
-        sound: bool [count], views to choose from, where there are any: one whose own pose may be wrong proves nothing.
-    """
-    if asked is None:
-        asked = 0 if count < HOLD_OUT_FROM else max(1, min(HOLD_OUT_MOST, count // HOLD_OUT_ONE_IN))
-    among = np.arange(count) if sound is None or not sound.any() else np.flatnonzero(sound)
-    asked = min(asked, max(0, count - 3), len(among))
-    return sorted({int(among[int((i + 0.5) * len(among) / asked)]) for i in range(asked)})
 
 
 def _prepare(

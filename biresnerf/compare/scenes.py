@@ -15,6 +15,7 @@ from biresnerf.data.folder import look_into
 from biresnerf.data.named_images import refuse_too_few
 from biresnerf.data.transforms_json import read_transforms
 from biresnerf.errors import InputError
+from biresnerf.refine.left_out_views import evenly_spread
 
 TRAIN_NAME, TEST_NAME = "transforms_train.json", "transforms_test.json"
 
@@ -87,7 +88,7 @@ def read_test_views(scene: Scene) -> Dataset | None:
         return None
     dataset = read_transforms(scene.test_file)
     count = min(scene.test_views, len(dataset))
-    chosen = [int((i + 0.5) * len(dataset) / count) for i in range(count)]
+    chosen = evenly_spread(range(len(dataset)), count)
     return replace(dataset, frames=tuple(dataset.frames[i] for i in chosen))
 
 

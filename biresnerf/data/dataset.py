@@ -129,6 +129,10 @@ class Dataset:
     warnings: tuple[str, ...] = ()
     intrinsics_sources: tuple[IntrinsicsSource, ...] = ()
 
+    def __post_init__(self) -> None:
+        if all(by == "given" for by in self.intrinsics_sources):
+            object.__setattr__(self, "intrinsics_sources", ())
+
     def __len__(self) -> int:
         return len(self.frames)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.dataset import Camera, Dataset, Frame, IntrinsicsSource, SourceFormat
-from biresnerf.data.guessed_lens import guess_lens
+from biresnerf.data.guessed_lens import guess_lens, guess_note
 from biresnerf.data.image_files import ImageHeader, read_header
 from biresnerf.data.mask_files import mask_beside
 from biresnerf.data.named_images import few_names, refuse_too_few
@@ -99,17 +99,14 @@ def dataset_of(
     refuse_coinciding([frame.world_from_cam for frame in frames if frame.world_from_cam is not None], place)
     said += _pose_notes(frames) + _mask_notes(frames)
     sources = tuple(by for _, by, _ in cameras)
-    if "exif" in sources:
-        said.append("no intrinsics are given: the focal length is taken from EXIF")
-    if "guessed" in sources:
-        said.append("no intrinsics are given: the focal length is a guess")
+    said += [guess_note(by) for by in sources if by != "given"]
     return Dataset(
         root,
         tuple(camera for camera, _, _ in cameras),
         tuple(frames),
         source,
         tuple(dict.fromkeys(said)),
-        sources if any(by != "given" for by in sources) else (),
+        sources,
     )
 
 

@@ -10,9 +10,8 @@ from biresnerf.data.image_files import ImageHeader
 GUESSED_FOCAL = 1.2  # of the long side, as COLMAP guesses: a field of view of 45 degrees, a normal lens
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 PLAUSIBLE = (0.25, 20.0)  # of the long side, the focal length: angles of view of 127 to 3 degrees
-AGREE = (
-    0.1  # EXIF's two ways of telling the focal length; the sensor's is the finer one, and more often wrong
-)
+# EXIF's two ways of telling the focal length; the sensor's is the finer one, and more often wrong.
+AGREE = 0.1
 
 
 def guess_lens(header: ImageHeader) -> tuple[Camera, IntrinsicsSource]:
@@ -22,6 +21,12 @@ def guess_lens(header: ImageHeader) -> tuple[Camera, IntrinsicsSource]:
     source: IntrinsicsSource = "guessed" if focal is None else "exif"
     focal = GUESSED_FOCAL * max(width, height) if focal is None else focal
     return Camera("SIMPLE_RADIAL", width, height, (focal, width / 2, height / 2, 0.0)), source
+
+
+def guess_note(source: IntrinsicsSource) -> str:
+    """What the user is told of a lens that `guess_lens` found."""
+    found = "taken from EXIF" if source == "exif" else "a guess"
+    return f"no intrinsics are given: the focal length is {found}"
 
 
 def exif_focal_px(header: ImageHeader) -> float | None:

@@ -6,8 +6,9 @@ import math
 from typing import Any, NamedTuple
 
 from biresnerf.data.dataset import Camera, IntrinsicsSource
-from biresnerf.data.guessed_lens import guess_lens
+from biresnerf.data.guessed_lens import guess_lens, guess_note
 from biresnerf.data.image_files import ImageHeader
+from biresnerf.data.lens_json import FOCAL_KEYS
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera_models import (
     COEFFICIENTS,
@@ -21,7 +22,6 @@ from biresnerf.geometry.lens import lens_problem
 _UNSUPPORTED = "camera_model_unsupported"
 # Keys of instant-ngp that mean a lens of neither family.
 _OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
-_FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 _MODEL_MEND = (
     f"Supported are {', '.join(MODEL_IDS)}; undistort the images to one of them "
     "(for example with COLMAP's image_undistorter)."
@@ -75,7 +75,7 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
     """
     preferred, fisheye = _declared_lens(fields)
     width, height, notes = _declared_size(fields, header, name)
-    if not any(fields.get(key) is not None for key in _FOCAL_KEYS):
+    if not any(fields.get(key) is not None for key in FOCAL_KEYS):
         return _guessed(fields, header, preferred, fisheye, notes)
     full, more = _parameters(fields, preferred, fisheye, width, height)
     # nerfstudio writes OPENCV with zeros for a pinhole; PINHOLE is the same camera and more programs read it.
@@ -116,8 +116,7 @@ def _guessed(
     if model is not None:
         name, params = smallest_model(camera.full(), model)
         camera = Camera(name, header.width, header.height, params)
-    by = "taken from EXIF" if source == "exif" else "a guess"
-    return FrameCamera(camera, source, False, (*notes, f"no intrinsics are given: the focal length is {by}"))
+    return FrameCamera(camera, source, False, (*notes, guess_note(source)))
 
 
 def _short(value: Any) -> str:

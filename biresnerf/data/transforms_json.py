@@ -179,8 +179,7 @@ def _cameras(
             mend="Give each frame its own fl_x, fl_y, cx, cy, w and h, or images of one size.",
         )
     sources = tuple(by for _, by in cameras)
-    found = sources if any(by != "given" for by in sources) else ()
-    return tuple(camera for camera, _ in cameras), found, indices, list(notes)
+    return tuple(camera for camera, _ in cameras), sources, indices, list(notes)
 
 
 def _poses(

@@ -17,15 +17,12 @@ from biresnerf.geometry.camera import Intrinsics, directions_in_cam, project
 from biresnerf.geometry.epipolar import epipolar_angles
 from biresnerf.geometry.focus import focus_point
 from biresnerf.refine.frozen_trials import FrozenTrials, TrialScores, joined
+from biresnerf.refine.left_out_views import unseen_rounds
 from biresnerf.refine.verdict import EPIPOLAR_MATTERS, PSNR_MATTERS, SSIM_MATTERS, paired
 from biresnerf.report import EpipolarEvidence, HeldOutEvidence
 
 Array = NDArray[np.float64]
 
-LEAST_VIEWS = 5  # unseen, where the set is large enough to spare them
-SPARED_OF = 3  # and one in so many at most
-# Fewer unseen views leave too wide an interval: trainings are repeated with others left out.
-ENOUGH_VIEWS, ROUNDS_MOST = 8, 3
 MATCHES_OF_IMAGE = 8  # an image with fewer says nothing
 LEAST_MATCHED = 4  # images
 LEAST_PX = 0.05  # errors below it are equal: matches are not that exact
@@ -64,30 +61,6 @@ class EpipolarComparison:
     before: Array
     after: Array
     evidence: EpipolarEvidence
-
-
-def unseen_views(count: int, held_out: Sequence[int], most: int) -> list[int]:
-    """The views that the verdict is passed on: those held out by the refinement, and others, evenly spread.
-
-    `most` in all, unless more are held out; at least `LEAST_VIEWS` where no more than a third of all are needed.
-    """
-    wanted = max(len(held_out), min(most, max(count // SPARED_OF // 2, min(LEAST_VIEWS, count // SPARED_OF))))
-    others = [i for i in range(count) if i not in set(held_out)]
-    more = wanted - len(held_out)
-    spread = [others[int((i + 0.5) * len(others) / more)] for i in range(more)]
-    return sorted({*held_out, *spread})
-
-
-def unseen_rounds(count: int, held_out: Sequence[int], most: int) -> list[list[int]]:
-    """The views that each pair of trainings leaves out: one round, or in small sets others as well, none twice."""
-    rounds = [unseen_views(count, held_out, most)]
-    while rounds[0] and len(rounds) < ROUNDS_MOST and sum(map(len, rounds)) < ENOUGH_VIEWS:
-        left = sorted(set(range(count)) - {view for views in rounds for view in views})
-        size = min(len(rounds[0]), len(left))
-        if size == 0:
-            break
-        rounds.append([left[int((i + 0.5) * len(left) / size)] for i in range(size)])
-    return rounds
 
 
 def compare_on_unseen_views(
@@ -158,10 +131,7 @@ def compare_on_matches(
 def _image_errors(rig: Rig, matches: FeatureMatches) -> Array:
     intrinsics = Intrinsics.from_cameras(rig.cameras)
     a, b = matches.images.T
-    ray_a, ray_b = (
-        directions_in_cam(intrinsics, torch.from_numpy(side.copy()), torch.from_numpy(xy.copy())).numpy()
-        for side, xy in ((a, matches.xy[:, 0]), (b, matches.xy[:, 1]))
-    )
+    ray_a, ray_b = matches.rays(intrinsics)
     focal = ((intrinsics.fx + intrinsics.fy) / 2).numpy()
     errors = epipolar_angles(rig.world_from_cam, a, b, ray_a, ray_b) * (focal[a] + focal[b]) / 2
     medians = np.full(len(rig.cameras), np.nan)

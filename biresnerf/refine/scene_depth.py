@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.feature_matches import FeatureMatches
-from biresnerf.geometry.camera import Intrinsics, directions_in_cam
+from biresnerf.geometry.camera import Intrinsics
 from biresnerf.geometry.epipolar import epipolar_angles, match_depths
 
 AGREE_DEG = 1.0  # matches off by more say nothing: the poses or they are wrong
@@ -27,13 +26,7 @@ def matched_depth(
         return None
     intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
     a, b = matches.images.T
-    kept_xy = matches.kept()[1].astype(
-        np.float64
-    )  # as a checkpoint has them: a resumed run finds the same frame
-    ray_a, ray_b = (
-        directions_in_cam(intrinsics, torch.from_numpy(side.copy()), torch.from_numpy(xy.copy())).numpy()
-        for side, xy in ((a, kept_xy[:, :2]), (b, kept_xy[:, 2:]))
-    )
+    ray_a, ray_b = matches.rays(intrinsics)
     errors = np.degrees(epipolar_angles(world_from_cam, a, b, ray_a, ray_b))
     world_a = np.einsum("mij,mj->mi", world_from_cam[a, :3, :3], ray_a)
     world_b = np.einsum("mij,mj->mi", world_from_cam[b, :3, :3], ray_b)

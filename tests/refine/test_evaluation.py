@@ -8,9 +8,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from biresnerf.data.synthetic import synthetic_cameras
-from biresnerf.pipeline import held_out_views
 from biresnerf.refine import evaluation
 from biresnerf.refine.evaluation import fit_held_out_poses, orbit_poses, render_view, score_views
+from biresnerf.refine.left_out_views import held_out_views
 from tests.refine.scene import tiny_optimiser, tiny_options, tiny_set
 
 

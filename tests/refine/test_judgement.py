@@ -11,11 +11,11 @@ from biresnerf.data.dataset import Dataset
 from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.data.images import ImageSet
 from biresnerf.geometry.perturb import perturb_poses
-from biresnerf.pipeline import held_out_views
 from biresnerf.refine import frozen_trials
 from biresnerf.refine.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refine.judgement import Judgement, judge
-from biresnerf.refine.pose_evidence import Rig, moved_px, unseen_rounds, unseen_views
+from biresnerf.refine.left_out_views import held_out_views, unseen_rounds, unseen_views
+from biresnerf.refine.pose_evidence import Rig, moved_px
 from biresnerf.refine.run_input import RunInput
 from biresnerf.refine.start import Start
 from tests.refine.scene import CPU, tiny_optimiser, tiny_options, tiny_set
