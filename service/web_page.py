@@ -1,0 +1,69 @@
+"""The page for people: what `hatch_build.py` built of service/web, sent as it lies there.
+
+Names of files hold a digest of what is in them, so browsers keep them for good; index.html, which names them, is
+asked for each time.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from fastapi import APIRouter, Request
+from fastapi.responses import FileResponse, Response
+
+from service.problems import ProblemError
+
+FOLDER = Path(__file__).parent / "web" / "dist"
+CSP = (
+    "default-src 'self'; img-src 'self' blob: data:; media-src 'self' blob:; worker-src 'self' blob:; "
+    "object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_NAME = re.compile(r"[a-z]+-[A-Z0-9]{8}\.(js|css|svg)|licences\.txt")
+_MEDIA_TYPES = {
+    ".html": "text/html",
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".svg": "image/svg+xml",
+    ".txt": "text/plain",
+}
+# Best first; the build writes both beside the file where they save something.
+_ENCODINGS = {"br": ".br", "gzip": ".gz"}
+_SAFE = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
+
+router = APIRouter(include_in_schema=False)
+
+
+@router.get("/")
+@router.head("/")
+async def index(request: Request) -> Response:
+    """The page; what it shows is after the `#` of its address, so this is all of it."""
+    if not (FOLDER / "index.html").is_file():
+        raise ProblemError(
+            "unavailable",
+            "The page was not built; the interface under /v1 and its description at /docs are there.",
+            mend="Run `make web` in the source tree, or install a wheel.",
+        )
+    headers = {"Content-Security-Policy": CSP, "Cache-Control": "no-cache", "X-Frame-Options": "DENY"}
+    return _file("index.html", request, headers)
+
+
+@router.get("/web/{name}")
+@router.head("/web/{name}")
+async def part(name: str, request: Request) -> Response:
+    """A script, a style sheet or the icon."""
+    if not _NAME.fullmatch(name) or not (FOLDER / name).is_file():
+        raise ProblemError("not_found", "The page has no such part; load it again.")
+    lasting = "no-cache" if name == "licences.txt" else "public, max-age=31536000, immutable"
+    return _file(name, request, {"Cache-Control": lasting})
+
+
+def _file(name: str, request: Request, headers: dict[str, str]) -> Response:
+    path, sent = FOLDER / name, {**_SAFE, **headers, "Vary": "Accept-Encoding"}
+    taken = {item.split(";")[0].strip() for item in request.headers.get("accept-encoding", "").split(",")}
+    for encoding, suffix in _ENCODINGS.items():
+        packed = FOLDER / (name + suffix)
+        if encoding in taken and packed.is_file():
+            path, sent["Content-Encoding"] = packed, encoding
+            break
+    return FileResponse(path, media_type=_MEDIA_TYPES[Path(name).suffix], headers=sent)
