@@ -16,9 +16,10 @@ from pydantic import BaseModel
 
 from biresnerf.config import RefineOptions
 from biresnerf.errors import BiresnerfError
-from service.problems import Problem
-from service.schemas import ArtifactView, DatasetView, JobView
-from workers.records import FINAL_JOB_STATES, ManifestEntry, PriorityName
+from biresnerf.wire.datasets import DatasetView, ManifestEntry
+from biresnerf.wire.jobs import FINAL_JOB_STATES, JobView, PriorityName
+from biresnerf.wire.problems import Problem
+from biresnerf.wire.results import ArtifactView
 
 # The server's keep-alive comes every 15 s; three missed ones mean that the connection is dead.
 _SILENCE_S = 50.0

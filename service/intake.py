@@ -11,6 +11,8 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 from biresnerf.errors import InputError
+from biresnerf.wire.datasets import DatasetRecord
+from biresnerf.wire.problems import JobError
 from service.confined import Limits, run_confined
 from service.dependencies import Service
 from service.problems import ProblemError
@@ -18,7 +20,7 @@ from service.unpack import UnpackRequest
 from service.uploads import staging_folder, write_stream
 from workers.claim import insist
 from workers.errors import Conflict, EngineError, LimitReached, NotFound, Unavailable
-from workers.records import DatasetRecord, JobError, Upload
+from workers.records import Upload
 
 logger = logging.getLogger(__name__)
 

@@ -7,10 +7,9 @@ import re
 
 from fastapi.responses import JSONResponse, Response
 
+from biresnerf.wire.jobs import Job, JobView, job_url
 from service.problems import ProblemError
-from service.schemas import JobView, job_url
 from workers.jobs import JobStore
-from workers.records import Job
 from workers.waiting import first_done
 
 POLL_S = "2"

@@ -8,7 +8,8 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from service.problems import FieldProblem, ProblemError
+from biresnerf.wire.problems import FieldProblem
+from service.problems import ProblemError
 from service.uploads import capped, refuse_announced_excess
 
 JSON_BYTES_MAX = 2**20

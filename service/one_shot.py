@@ -8,15 +8,15 @@ from pathlib import Path
 
 from fastapi import Request
 
+from biresnerf.wire.jobs import Job, JobTexts
+from biresnerf.wire.problems import FieldProblem
 from service.access import Caller
 from service.intake import file_sha256, take_archive
 from service.json_body import fit, load_json
-from service.problems import FieldProblem, ProblemError
+from service.problems import ProblemError
 from service.routes.datasets import begin_check, finish_check
-from service.schemas import JobTexts
 from service.uploads import Form, refuse_announced_excess, staging_folder
 from workers.errors import EngineError
-from workers.records import Job
 from workers.webhook_records import request_with
 
 # Room for the text fields and the form's own lines beside the archive.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from biresnerf.errors import InputError
-from service.safe_paths import NameSet, checked_path
+from biresnerf.wire.safe_paths import NameSet, checked_path
 
 TRANSFORMS = "transforms.json"
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from http import HTTPStatus
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
-
 from biresnerf.errors import InputError
+from biresnerf.wire.problems import FieldProblem, Problem
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = "5"
@@ -76,56 +75,6 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "storage_unavailable": (503, "The file storage does not answer"),
     "storage_full": (507, "There is no room left for files"),
 }
-
-
-class FieldProblem(BaseModel):
-    """One wrong field."""
-
-    model_config = ConfigDict(frozen=True)
-
-    pointer: str = Field(
-        description="JSON pointer into the body (`#/options/steps`), or `query/limit` and the like."
-    )
-    detail: str
-
-
-class Problem(BaseModel):
-    """An error as RFC 9457 has it, with a stable `code`."""
-
-    model_config = ConfigDict(
-        frozen=True,
-        json_schema_extra={
-            "examples": [
-                {
-                    "type": "urn:biresnerf:problem:unsafe_path",
-                    "title": "A file name is not safe",
-                    "status": 422,
-                    "detail": "The name has a part `..`.",
-                    "instance": "/v1/datasets/ds_01/archive",
-                    "code": "unsafe_path",
-                    "request_id": "5f1c0d9e6a0b4a3c",
-                    "retryable": False,
-                    "where": "../evil.png",
-                    "mend": "Pack the archive with relative names inside one folder.",
-                    "errors": [],
-                }
-            ]
-        },
-    )
-
-    type: str
-    title: str
-    status: int
-    detail: str
-    instance: str | None = None
-    code: str
-    request_id: str | None = None
-    retryable: bool = False
-    where: str | None = Field(
-        None, description="The file or entry at fault, and the field in it where there is one."
-    )
-    mend: str | None = Field(None, description="What to do about it.")
-    errors: list[FieldProblem] = Field(default_factory=list)
 
 
 class ProblemError(Exception):

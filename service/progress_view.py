@@ -11,8 +11,8 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from biresnerf.wire.jobs import JobView
 from service.client import Client, Happening
-from service.schemas import JobView
 
 _LINE_EVERY_S = 10.0
 

@@ -4,26 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import Field
-
-from biresnerf.report import ImageReport
-from service.schemas import Wire
-
-
-class ImageRow(ImageReport):
-    """One image, and how much better its photo was predicted from the refined poses."""
-
-    delta_psnr: float | None = Field(None, description="trial_psnr_after - trial_psnr_before.")
-
-
-class ImageList(Wire):
-    """The images of a result."""
-
-    partial: bool = Field(description="The job was stopped before its end.")
-    items: list[ImageRow]
-
-
-IMAGE_COLUMNS = frozenset(ImageRow.model_fields) - {"exposure"}
+from biresnerf.wire.results import ImageList, ImageRow
 
 
 def image_rows(report: dict[str, Any], column: str, *, descending: bool, limit: int) -> ImageList:

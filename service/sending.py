@@ -14,10 +14,8 @@ from urllib.parse import quote
 
 import httpx
 
+from biresnerf.wire.datasets import DatasetView, ManifestEntry, UploadView
 from service.client import Client, ServiceError
-from service.schemas import DatasetView
-from service.upload_schemas import UploadView
-from workers.records import ManifestEntry
 
 # A file above this size is sent so that a broken connection costs a part of it; below, it is sent again.
 RESUMABLE_BYTES = 8 * 2**20

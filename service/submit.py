@@ -11,13 +11,13 @@ from rich.console import Console
 
 from biresnerf.config import RefineOptions
 from biresnerf.errors import BiresnerfError, InputError
+from biresnerf.wire.datasets import DatasetView
+from biresnerf.wire.jobs import JobView, PriorityName
+from biresnerf.wire.safe_paths import checked_path
 from service.client import Client, ServiceError
 from service.pack import Scene, look_at
 from service.progress_view import progress_view, watch
-from service.safe_paths import checked_path
-from service.schemas import DatasetView, JobView
 from service.sending import LocalFile, send_missing
-from workers.records import PriorityName
 
 
 def submit_scene(

@@ -11,7 +11,7 @@ import click
 from service.keys_command import as_json_option, data_dir_option, with_database
 
 if TYPE_CHECKING:
-    from workers.tenants import TenantShare
+    from biresnerf.wire.service import TenantShare
 
 _LIMIT = click.IntRange(min=-1)
 

@@ -18,8 +18,8 @@ from typing import IO, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.errors import InputError
+from biresnerf.wire.safe_paths import NameSet, checked_path, is_litter
 from service.confined import run_child
-from service.safe_paths import NameSet, checked_path, is_litter
 
 _CHUNK = 2**20
 # Small archives of text may shrink far more than photos do; below this size the ratio says nothing.

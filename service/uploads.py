@@ -16,7 +16,8 @@ from typing import IO
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
-from service.problems import FieldProblem, ProblemError
+from biresnerf.wire.problems import FieldProblem
+from service.problems import ProblemError
 from workers.room import Room
 
 _FIELD_BYTES_MAX = 256 * 1024

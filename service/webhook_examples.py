@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from workers.webhook_records import ALL_EVENTS
+from biresnerf.wire.webhooks import ALL_EVENTS
 
 _AT = "2026-11-21T19:00:00Z"
 _WEBHOOK_ID, _DELIVERY_ID = "wh_01JD8Y3V1QKZ5M0C7W2N4T6XAB", "msg_5f1c0d9e6a0b4a3c8d7e6f5a4b3c2d1e"

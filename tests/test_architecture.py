@@ -63,6 +63,7 @@ def test_contracts_hold():
         ("service/problems.py", "def f():\n    import torch", "never loads torch"),
         ("workers/jobs.py", "import biresnerf.geometry.lie", "only the job child"),
         ("biresnerf/errors.py", "import numpy", "leaves stay leaves"),
+        ("biresnerf/data/dataset.py", "import biresnerf.wire.jobs", "nothing of jobs and HTTP"),
     ],
 )
 def test_an_import_against_the_arrows_breaks_its_contract(copy, module, line, contract):
@@ -79,6 +80,7 @@ def test_an_import_against_the_arrows_breaks_its_contract(copy, module, line, co
     [
         ("biresnerf", HEAVY),
         ("biresnerf.command_line", HEAVY),
+        ("biresnerf.wire.jobs", (*HEAVY, "httpx", "workers", "service")),
         ("workers.jobs", ("torch", "numba", "pycolmap")),
         ("workers.slot", ("torch", "numba", "pycolmap")),
         ("service.app", ("torch", "numba", "pycolmap")),

@@ -13,10 +13,10 @@ from typing import Any, Literal, get_args
 from pydantic import Field
 
 from biresnerf.errors import InputError
+from biresnerf.wire.base import Record
 from workers.database import Database
 from workers.errors import NotFound
 from workers.idents import CROCKFORD, new_id
-from workers.records import Record
 from workers.tenants import ensure_tenant
 
 Scope = Literal["read", "datasets:write", "jobs:write", "admin"]

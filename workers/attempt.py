@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from biresnerf.progress import Progress
 from biresnerf.report import Verdict, VerdictName
+from biresnerf.wire.problems import JobError
 from workers.child import Child, log_tail
 from workers.claim import Claim, Fenced, crashed_too_often, insist
 from workers.courier import Courier
@@ -22,7 +23,7 @@ from workers.database import Database
 from workers.files import FileStore
 from workers.ledger import Ledger
 from workers.memory import OomKills, out_of_memory, smaller_options
-from workers.records import LOG_NAME, Artifact, JobError
+from workers.records import LOG_NAME, Artifact
 from workers.results import store_result
 from workers.settings import Settings
 from workers.staging import stage_job

@@ -16,9 +16,9 @@ from typing import Any
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from pydantic import ValidationError
 
+from biresnerf.wire.base import Record
 from workers.errors import SetupError
 from workers.postgres_binaries import find_binaries
-from workers.records import Record
 from workers.settings import Settings
 
 MARKER_NAME = "biresnerf-backup"

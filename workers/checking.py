@@ -18,12 +18,12 @@ from typing import Any
 
 from psycopg.types.json import Jsonb
 
+from biresnerf.wire.problems import JobError
 from workers.child import Child, log_tail
 from workers.claim import insist
 from workers.database import Database
 from workers.errors import Unavailable
 from workers.files import FileStore
-from workers.records import JobError
 from workers.settings import Settings
 
 log = logging.getLogger(__name__)

@@ -13,10 +13,11 @@ from typing import Any, TypeVar
 from psycopg.types.json import Jsonb
 
 from biresnerf.progress import ReusableStage
+from biresnerf.wire.jobs import JobKind
+from biresnerf.wire.problems import JobError
 from workers.database import QUIET_S, Database
 from workers.endings import finish, finish_cancelled
 from workers.errors import Unavailable
-from workers.records import JobError, JobKind
 
 log = logging.getLogger(__name__)
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 
 from biresnerf.errors import InputError
+from biresnerf.wire.datasets import DatasetState
 from workers.database import Connection
 from workers.errors import Conflict, NotFound
 from workers.files import StoredFile
-from workers.records import DatasetFile, DatasetState
+from workers.records import DatasetFile
 
 DATASET = """
     SELECT datasets.*, coalesce(total.files, 0) AS files, coalesce(total.bytes, 0)::bigint AS bytes,

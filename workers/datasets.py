@@ -11,6 +11,7 @@ from typing import Any
 from psycopg.types.json import Jsonb
 
 from biresnerf.errors import InputError
+from biresnerf.wire.datasets import DatasetRecord, DatasetState, ManifestEntry
 from workers.checking import Checker
 from workers.claim import insist
 from workers.database import Connection, Database
@@ -19,7 +20,7 @@ from workers.errors import Conflict, Expired, LimitReached, NotFound
 from workers.files import FileStore, StoredFile
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
 from workers.quotas import require_byte_quota
-from workers.records import DatasetFile, DatasetRecord, DatasetState, ManifestEntry, Page
+from workers.records import DatasetFile, Page
 from workers.settings import Settings
 from workers.tenants import LOCAL_TENANT
 

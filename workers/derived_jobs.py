@@ -10,14 +10,15 @@ from psycopg.types.json import Jsonb
 
 from biresnerf.config import PackName
 from biresnerf.progress import ReusableStage
+from biresnerf.wire.jobs import Job, WantedStage
 from workers.database import Connection
 from workers.errors import Conflict, Expired
 from workers.files import FileStore
-from workers.forks import LATEST_FIRST, WantedStage, plan_fork
+from workers.forks import LATEST_FIRST, plan_fork
 from workers.idents import new_id
 from workers.job_rows import JOB, fingerprint_of, job_from_row, known_job, one_row
 from workers.jobs import QUEUE_LIMIT_LOCK, JobStore
-from workers.records import Job, Page
+from workers.records import Page
 
 # Of a fork that never came to be; long after any request has ended.
 ABANDONED_S = 3600

@@ -10,8 +10,9 @@ from typing import Any, Literal
 
 from psycopg.types.json import Jsonb
 
+from biresnerf.wire.problems import JobError
 from workers.database import Connection
-from workers.records import LOG_NAME, POSES_NAME, PREVIEW_FOLDER, REPORT_NAME, Artifact, JobError
+from workers.records import LOG_NAME, POSES_NAME, PREVIEW_FOLDER, REPORT_NAME, Artifact
 
 End = Literal["succeeded", "failed", "cancelled"]
 STALL_S = 60.0

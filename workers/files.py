@@ -18,9 +18,9 @@ import obstore
 from obstore.exceptions import BaseError
 
 from biresnerf.errors import InputError
+from biresnerf.wire.base import Record
 from workers.errors import EngineError, LimitReached, NotFound, Unavailable
 from workers.file_places import Bucket, BucketPlace, LocalPlace, Method, Place
-from workers.records import Record
 from workers.settings import Settings
 
 CHUNK_BYTES = 2**20

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 from biresnerf.config import STAGE_2_OPTIONS, RefineOptions, parse_options
 from biresnerf.progress import ReusableStage
+from biresnerf.wire.jobs import WantedStage
 from workers.errors import Conflict
 
-WantedStage = Literal["auto", "seeding", "coarse"]
 LATEST_FIRST: tuple[ReusableStage, ...] = ("coarse", "seeding")
 
 

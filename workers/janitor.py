@@ -14,12 +14,12 @@ from functools import partial
 
 from psycopg.types.json import Jsonb
 
+from biresnerf.wire.jobs import FINAL_JOB_STATES
 from workers.database import QUEUE, Connection, Database
 from workers.endings import finish_cancelled
 from workers.errors import Unavailable
 from workers.files import FileStore
 from workers.receipts import offer_again
-from workers.records import FINAL_JOB_STATES
 from workers.settings import Settings
 from workers.statistics import fold_tallies
 from workers.trash import take_trash_out

@@ -7,9 +7,11 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from biresnerf.wire.jobs import Job, JobEvent, JobProgress, PriorityName
+from biresnerf.wire.problems import JobError
 from workers.database import Connection
 from workers.errors import Conflict
-from workers.records import Job, JobError, JobEvent, JobProgress, PriorityName, priority_name
+from workers.records import priority_name
 
 JOB = """
     SELECT jobs.*, CASE WHEN jobs.state = 'queued' THEN

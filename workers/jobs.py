@@ -11,6 +11,8 @@ from typing import Any
 from psycopg.types.json import Jsonb
 
 from biresnerf.config import RefineOptions
+from biresnerf.wire.jobs import Job, JobEvent, JobState, LogLine, PriorityName
+from biresnerf.wire.webhooks import JobWebhook
 from workers.database import Connection, Database
 from workers.endings import finish_cancelled
 from workers.errors import Conflict, Expired, NotFound
@@ -18,22 +20,11 @@ from workers.idents import cursor_after, cursor_place, cursor_time, new_id
 from workers.job_listener import JobListener, follow
 from workers.job_rows import JOB, MINE, PLACES, events_of, fingerprint_of, job_from_row, known_job, one_row
 from workers.quotas import owner_of, require_room
-from workers.records import (
-    LOG_NAME,
-    PRIORITIES,
-    Artifact,
-    Job,
-    JobEvent,
-    JobState,
-    JobUpdate,
-    LogLine,
-    Page,
-    PriorityName,
-)
+from workers.records import LOG_NAME, PRIORITIES, Artifact, JobUpdate, Page
 from workers.settings import Settings
 from workers.tenants import LOCAL_TENANT
 from workers.traces import traced, traceparent
-from workers.webhook_records import JobWebhook, request_with
+from workers.webhook_records import request_with
 from workers.webhooks import add_job_webhook
 
 # Two submits at once must not both take the last place.

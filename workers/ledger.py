@@ -13,10 +13,12 @@ from psycopg.types.json import Jsonb
 
 from biresnerf.progress import Progress, ReusableStage
 from biresnerf.report import VerdictName
+from biresnerf.wire.jobs import EventType
+from biresnerf.wire.problems import JobError
 from workers.claim import Claim, Fenced, insist
 from workers.database import Connection, Database
 from workers.endings import finish, finish_cancelled, trash_attempts
-from workers.records import LOG_NAME, Artifact, EventType, JobError
+from workers.records import LOG_NAME, Artifact
 
 PREVIEW_KEPT_S = 60.0  # after another one took its place: it may be on its way to somebody
 LOG_LINES_MAX = 20_000  # of one job

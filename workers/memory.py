@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from workers.records import JobError
+from biresnerf.wire.problems import JobError
 
 # What a second try takes instead: the divisor, or what is subtracted, and the least that is allowed.
 DIVIDED: dict[str, tuple[int, int]] = {"samples_per_step": (4, 1024), "max_image_size": (2, 64)}

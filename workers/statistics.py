@@ -6,8 +6,9 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
+from biresnerf.wire.datasets import DatasetState
+from biresnerf.wire.jobs import JobState
 from workers.database import Connection, Database
-from workers.records import DatasetState, JobState
 
 
 class Tally(BaseModel):

@@ -8,31 +8,17 @@ from __future__ import annotations
 
 import re
 
-from pydantic import Field
-
 from biresnerf.errors import InputError
+from biresnerf.wire.jobs import PriorityName
+from biresnerf.wire.service import TenantShare
 from workers.database import Connection, Database
 from workers.errors import NotFound
-from workers.records import PRIORITIES, PriorityName, Record, priority_name
+from workers.records import PRIORITIES, priority_name
 from workers.settings import Settings
 
 # Whoever runs the machine; owns everything while no key is needed.
 LOCAL_TENANT = "local"
 TENANT_FORM = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
-
-
-class TenantShare(Record):
-    """What a tenant may use and what it uses. A limit of 0 is none."""
-
-    id: str
-    weight: float = Field(description="Share of the slots where tenants wait for them; 1 is usual.")
-    top_priority: PriorityName = Field(description="The highest priority its jobs may ask for.")
-    max_running: int = Field(description="Jobs at the same time.")
-    max_queued: int = Field(description="Jobs that wait.")
-    max_stored_bytes: int = Field(description="Bytes of datasets, uploads and results together.")
-    running: int
-    queued: int
-    stored_bytes: int
 
 
 class TenantStore:

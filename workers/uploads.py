@@ -14,13 +14,15 @@ from copy import copy
 
 from psycopg.types.json import Jsonb
 
+from biresnerf.wire.datasets import UploadKind
+from biresnerf.wire.problems import JobError
 from workers.database import Connection, Database
 from workers.dataset_rows import MINE, file_key, require_open
 from workers.errors import Conflict, LimitReached, NotFound
 from workers.files import FileStore
 from workers.idents import new_id
 from workers.quotas import require_byte_quota
-from workers.records import JobError, Upload, UploadKind
+from workers.records import Upload
 from workers.settings import Settings
 
 # Memory of all uploads of this process together, before their pieces are stored; the more uploads, the smaller

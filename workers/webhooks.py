@@ -11,14 +11,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from workers.database import Connection, Database
-from workers.errors import Conflict, LimitReached, NotFound
-from workers.idents import cursor_after, cursor_place, cursor_time, new_id
-from workers.outbound import Policy, checked_url
-from workers.records import Page
-from workers.settings import Settings
-from workers.webhook_records import (
-    TEST_EVENT,
+from biresnerf.wire.webhooks import (
     JobWebhook,
     Webhook,
     WebhookAttempt,
@@ -26,6 +19,13 @@ from workers.webhook_records import (
     WebhookEvent,
     new_secret,
 )
+from workers.database import Connection, Database
+from workers.errors import Conflict, LimitReached, NotFound
+from workers.idents import cursor_after, cursor_place, cursor_time, new_id
+from workers.outbound import Policy, checked_url
+from workers.records import Page
+from workers.settings import Settings
+from workers.webhook_records import TEST_EVENT
 
 ROTATION_HOURS = 24
 _MINE = "tenant = coalesce(%s, tenant)"

@@ -6,11 +6,12 @@ from fastapi import APIRouter, Request
 from fastapi.responses import Response, StreamingResponse
 
 from biresnerf.report import Report
+from biresnerf.wire.results import ArtifactList
 from service.access import Caller, CallerHere
 from service.dependencies import JobId
 from service.downloads import ANSWERS, Asked, answer_with, find_artifact
 from service.problems import ProblemError, declared
-from service.schemas import ArtifactList, ArtifactView
+from service.views import artifact_view
 from workers.records import Artifact
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
@@ -25,7 +26,7 @@ REPORT = "report.json"
 async def list_artifacts(job_id: JobId, caller: CallerHere) -> ArtifactList:
     """All files of the result and of its exports. While the job runs, previews: the poses so far and a render."""
     found = await caller.jobs.artifacts(job_id)
-    return ArtifactList(items=[ArtifactView.of(job_id, artifact) for artifact in found])
+    return ArtifactList(items=[artifact_view(job_id, artifact) for artifact in found])
 
 
 @router.get(

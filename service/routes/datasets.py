@@ -12,15 +12,24 @@ from fastapi import APIRouter, Depends, Header, Query, Request
 from fastapi.responses import JSONResponse, Response
 
 from biresnerf.errors import InputError
+from biresnerf.wire.datasets import (
+    DatasetList,
+    DatasetRecord,
+    DatasetState,
+    DatasetView,
+    FileList,
+    FileView,
+    NewDataset,
+    dataset_url,
+)
+from biresnerf.wire.safe_paths import NameSet, checked_path
 from service.access import Caller, CallerHere, DatasetWriterHere
 from service.dependencies import DatasetId, next_link
 from service.intake import settle_uploads, take_archive
 from service.json_body import json_content, read_json
 from service.problems import ProblemError, declared
-from service.safe_paths import NameSet, checked_path
-from service.schemas import DatasetList, DatasetView, FileList, FileView, NewDataset, dataset_url
 from service.uploads import capped, refuse_announced_excess, staging_folder, write_stream
-from workers.records import DatasetRecord, DatasetState
+from service.views import file_view
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 _ALWAYS = ("database_unavailable", "internal_error")
@@ -118,7 +127,7 @@ async def list_files(
     """The files received, by path."""
     page = await caller.datasets.files(dataset_id, limit=limit, cursor=cursor)
     response.headers.update(next_link(request, page.next_cursor))
-    return FileList(items=[FileView.of(item) for item in page.items], next_cursor=page.next_cursor)
+    return FileList(items=[file_view(item) for item in page.items], next_cursor=page.next_cursor)
 
 
 _TAKES = (
@@ -168,7 +177,7 @@ async def put_file(
     )
     if not new:
         return Response(status_code=204)
-    return JSONResponse(FileView.of(file).model_dump(mode="json"), status_code=201)
+    return JSONResponse(file_view(file).model_dump(mode="json"), status_code=201)
 
 
 def _announced_digest(header: str | None) -> str | None:

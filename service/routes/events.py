@@ -10,11 +10,12 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Query
 from fastapi.responses import StreamingResponse
 
+from biresnerf.wire.jobs import JobView
+from biresnerf.wire.problems import FieldProblem
 from service.access import CallerHere
 from service.dependencies import JobId
 from service.metrics import WebMetrics
-from service.problems import FieldProblem, ProblemError, declared
-from service.schemas import JobView
+from service.problems import ProblemError, declared
 from workers.errors import NotFound, Unavailable
 from workers.records import JobUpdate
 

@@ -7,11 +7,12 @@ from typing import Annotated
 from fastapi import APIRouter, Header
 from fastapi.responses import PlainTextResponse, Response
 
+from biresnerf.wire.problems import FieldProblem
+from biresnerf.wire.service import Health
 from service.access import may_scrape
 from service.dependencies import Service, ServiceHere
 from service.metrics import Exposition
-from service.problems import FieldProblem, ProblemError, declared
-from service.schemas import Health
+from service.problems import ProblemError, declared
 from workers.errors import Unavailable
 from workers.monitor import Need
 

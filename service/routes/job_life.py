@@ -8,17 +8,17 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import Response
 
+from biresnerf.wire.jobs import ForkJob, JobList, JobView, LogLine, NewExport, job_url
+from biresnerf.wire.problems import FieldProblem
+from biresnerf.wire.results import IMAGE_COLUMNS, ImageList
 from service.access import Caller, CallerHere, JobWriterHere
 from service.dependencies import JobId
 from service.job_answers import POLL_S, checked_key, job_answer
-from service.job_bodies import ForkJob, NewExport
 from service.json_body import json_content, read_json
-from service.problems import FieldProblem, ProblemError, declared
-from service.report_rows import IMAGE_COLUMNS, ImageList, image_rows
+from service.problems import ProblemError, declared
+from service.report_rows import image_rows
 from service.routes.artifacts import find_report, whole_file
-from service.schemas import JobList, JobView, job_url
 from workers.derived_jobs import DerivedJobs
-from workers.records import LogLine
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
 _ALWAYS = ("not_found", "expired", "invalid_request", "database_unavailable", "internal_error")

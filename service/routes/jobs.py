@@ -8,16 +8,15 @@ from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import Response
 from pydantic import AwareDatetime
 
+from biresnerf.wire.jobs import CancelJob, JobList, JobState, JobView, NewJob
+from biresnerf.wire.problems import FieldProblem
 from service.access import CallerHere, JobWriterHere
 from service.conditions import none_match
 from service.dependencies import JobId, next_link
 from service.job_answers import POLL_S, checked_key, job_answer, job_etag, preferred_wait_s, waited_for
-from service.job_bodies import CancelJob
 from service.json_body import json_content, read_json
 from service.one_shot import submit_form
-from service.problems import FieldProblem, ProblemError, declared
-from service.schemas import JobList, JobView, NewJob
-from workers.records import JobState
+from service.problems import ProblemError, declared
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 _ALWAYS = ("database_unavailable", "internal_error")

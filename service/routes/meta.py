@@ -9,11 +9,11 @@ from fastapi import APIRouter, Header, Response
 
 from biresnerf import __version__
 from biresnerf.config import PRESETS, RefineOptions
+from biresnerf.wire.service import Info, OptionsView, SizeLimits
 from service.access import CallerHere
 from service.conditions import none_match
 from service.intake import RATIO_MAX
 from service.problems import declared
-from service.schemas import Info, OptionsView, SizeLimits
 
 router = APIRouter(tags=["service"])
 ARCHIVES = ["application/zip", "application/x-tar", "application/gzip"]

@@ -10,13 +10,13 @@ from urllib.parse import quote
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import Response, StreamingResponse
 
+from biresnerf.wire.results import NewShare, ShareView
 from service.access import JobWriterHere
 from service.dependencies import JobId, ServiceHere
 from service.downloads import ANSWERS, Asked, answer_with, find_artifact
 from service.json_body import json_content, read_json
 from service.problems import declared
 from service.share_links import require_signature, signature
-from service.upload_schemas import NewShare, ShareView
 
 _POST = (
     *("malformed_json", "body_too_large", "unsupported_media", "body_timeout", "invalid_request"),

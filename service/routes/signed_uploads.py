@@ -6,13 +6,13 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request
 
+from biresnerf.wire.datasets import FileView, NewSignedUploads, SignedUpload, SignedUploads
+from biresnerf.wire.safe_paths import checked_path
 from service.access import Caller, DatasetWriterHere
 from service.dependencies import DatasetId, UploadId
 from service.json_body import json_content, read_json
 from service.problems import ProblemError, declared
-from service.safe_paths import checked_path
-from service.schemas import FileView
-from service.upload_schemas import NewSignedUploads, SignedUpload, SignedUploads, UploadView
+from service.views import file_view, upload_view
 from workers.errors import NotFound
 from workers.records import Upload
 
@@ -53,7 +53,7 @@ async def sign_uploads(
     ]
     urls = await _addresses(caller, [_key(upload) for upload in uploads])
     items = [
-        SignedUpload(upload=UploadView.of(upload), url=url) for upload, url in zip(uploads, urls, strict=True)
+        SignedUpload(upload=upload_view(upload), url=url) for upload, url in zip(uploads, urls, strict=True)
     ]
     return SignedUploads(items=items)
 
@@ -93,7 +93,7 @@ async def complete_upload(upload_id: UploadId, caller: DatasetWriterHere) -> Fil
     if upload.kind != "signed" or path is None or sha256 is None:
         raise ProblemError("state_conflict", "This upload completes with its last byte.")
     if upload.state == "stored":
-        return FileView.of(await caller.datasets.file(upload.dataset_id, path))
+        return file_view(await caller.datasets.file(upload.dataset_id, path))
     await caller.datasets.get(upload.dataset_id)
     try:
         file, _ = await caller.datasets.add_copy(
@@ -102,4 +102,4 @@ async def complete_upload(upload_id: UploadId, caller: DatasetWriterHere) -> Fil
     except NotFound:
         raise ProblemError("upload_incomplete", "No bytes have arrived at the signed address.") from None
     await caller.uploads.conclude_signed(upload_id, caller.service.settings.storage_presign_s)
-    return FileView.of(file)
+    return file_view(file)

@@ -16,13 +16,14 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Header, Request
 from fastapi.responses import JSONResponse, Response
 
+from biresnerf.wire.datasets import UploadView, upload_url
+from biresnerf.wire.safe_paths import checked_path
 from service.access import CallerHere, DatasetWriterHere
 from service.dependencies import DatasetId, UploadId
 from service.intake import begin_taking
 from service.problems import ProblemError, declared
-from service.safe_paths import checked_path
-from service.upload_schemas import UploadView, upload_url
 from service.uploads import capped, refuse_announced_excess
+from service.views import upload_view
 from workers.records import Upload
 
 VERSION = "1.0.0"
@@ -113,7 +114,7 @@ async def create_upload(
     if upload.state == "received":
         begin_taking(caller.service, upload.id)
     headers = {"Location": upload_url(upload.id), **_where(upload)}
-    return JSONResponse(UploadView.of(upload).model_dump(mode="json"), status_code=201, headers=headers)
+    return JSONResponse(upload_view(upload).model_dump(mode="json"), status_code=201, headers=headers)
 
 
 def _metadata(header: str) -> dict[str, str]:
@@ -143,7 +144,7 @@ async def head_upload(upload_id: UploadId, caller: CallerHere) -> Response:
 @router.get("/uploads/{upload_id}", operation_id="getUpload", responses=declared("not_found", *_ALWAYS))
 async def get_upload(upload_id: UploadId, caller: CallerHere) -> UploadView:
     """How far the upload is, and once all is received, what became of it (`stored` or `rejected`)."""
-    return UploadView.of(await caller.uploads.get(upload_id))
+    return upload_view(await caller.uploads.get(upload_id))
 
 
 _APPENDS: dict[str, Any] = {

@@ -6,11 +6,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
-from service.access import CallerHere, JobWriterHere
-from service.dependencies import DeliveryId, WebhookId, next_link
-from service.json_body import json_content, read_json
-from service.problems import declared
-from service.webhook_schemas import (
+from biresnerf.wire.webhooks import (
     DeliveryList,
     DeliveryView,
     NewWebhook,
@@ -21,6 +17,10 @@ from service.webhook_schemas import (
     delivery_url,
     webhook_url,
 )
+from service.access import CallerHere, JobWriterHere
+from service.dependencies import DeliveryId, WebhookId, next_link
+from service.json_body import json_content, read_json
+from service.problems import declared
 
 router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 _ALWAYS = ("database_unavailable", "internal_error")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import httpx
 
+from biresnerf.wire.jobs import JobView
 from service.client import Client
-from service.schemas import JobView
 from service.submit import download_all
 from tests.service.conftest import (
     PROGRAM,

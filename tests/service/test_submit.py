@@ -20,9 +20,9 @@ from pathlib import Path
 import httpx
 import pytest
 
+from biresnerf.wire.results import ArtifactView
 from service.client import Client, ServiceError
 from service.commands import free_port
-from service.schemas import ArtifactView
 from tests.service.conftest import Running, dataset_ids, finished
 
 COMMAND = (sys.executable, "-m", "biresnerf.command_line", "submit")

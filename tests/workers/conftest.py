@@ -20,10 +20,10 @@ import psycopg
 import pytest
 
 from biresnerf.config import RefineOptions
+from biresnerf.wire.jobs import Job
 from workers.embedded_postgres import EmbeddedPostgres
 from workers.errors import Unavailable
 from workers.migrate import migrate
-from workers.records import Job
 from workers.settings import Settings
 from workers.stores import Stores, open_stores
 

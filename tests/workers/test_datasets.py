@@ -12,9 +12,9 @@ import pytest
 
 from biresnerf.config import RefineOptions
 from biresnerf.errors import InputError
+from biresnerf.wire.datasets import DatasetRecord, ManifestEntry
 from tests.workers.conftest import quick_settings, ready_dataset
 from workers.errors import Conflict, LimitReached, NotFound
-from workers.records import DatasetRecord, ManifestEntry
 from workers.settings import Settings
 from workers.stores import Stores, open_stores
 

@@ -10,11 +10,11 @@ import pytest
 
 from biresnerf.config import RefineOptions
 from biresnerf.data.synthetic import write_synthetic_scene
+from biresnerf.wire.jobs import Job
 from tests.workers.conftest import Counting, Slots, quick_settings, ready_dataset
 from workers.derived_jobs import DerivedJobs
 from workers.errors import Conflict, NotFound
 from workers.forks import plan_fork
-from workers.records import Job
 from workers.stores import Stores, open_stores
 
 SMALL = RefineOptions(

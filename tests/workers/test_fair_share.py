@@ -10,12 +10,12 @@ import psycopg
 import pytest
 
 from biresnerf.config import RefineOptions
+from biresnerf.wire.jobs import PriorityName
 from tests.workers.conftest import ready_dataset
 from workers.claim import claim_job
 from workers.database import QUEUE, Database, open_database
 from workers.endings import finish
 from workers.errors import Conflict, LimitReached
-from workers.records import PriorityName
 from workers.settings import Settings
 from workers.stores import Stores, open_stores
 

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from biresnerf.wire.problems import JobError
 from tests.workers.buckets import environment_of, fresh_bucket, moto_server
 from tests.workers.conftest import quick_settings
 from workers.errors import Conflict, LimitReached, NotFound
-from workers.records import JobError, Upload
+from workers.records import Upload
 from workers.settings import Settings
 from workers.stores import Stores, open_stores
 

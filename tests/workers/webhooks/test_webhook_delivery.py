@@ -9,6 +9,7 @@ import psycopg
 import pytest
 import standardwebhooks
 
+from biresnerf.wire.webhooks import ALL_EVENTS
 from tests.workers.conftest import Slots
 from tests.workers.webhooks.webhook_receiver import (
     Dispatchers,
@@ -22,7 +23,6 @@ from workers.follow import Listener
 from workers.outbound import Outbound, Policy
 from workers.settings import Settings
 from workers.stores import Stores
-from workers.webhook_records import ALL_EVENTS
 from workers.webhook_sender import WebhookSender, outcome_of, pause, retry_after
 
 pytestmark = pytest.mark.anyio

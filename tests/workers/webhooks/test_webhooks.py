@@ -6,6 +6,7 @@ import psycopg
 import pytest
 import standardwebhooks
 
+from biresnerf.wire.webhooks import ALL_EVENTS
 from tests.workers.conftest import Slots
 from tests.workers.webhooks.webhook_receiver import (
     Dispatchers,
@@ -17,7 +18,6 @@ from workers.database import open_database
 from workers.errors import LimitReached, NotFound
 from workers.settings import Settings
 from workers.stores import Stores
-from workers.webhook_records import ALL_EVENTS
 
 pytestmark = pytest.mark.anyio
 

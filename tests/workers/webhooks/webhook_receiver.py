@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from biresnerf.config import RefineOptions
+from biresnerf.wire.webhooks import WebhookDelivery
 from tests.workers.conftest import Slots, quick_settings, ready_dataset
 from workers.dispatcher import dispatch
 from workers.settings import Settings
 from workers.stores import Stores
-from workers.webhook_records import WebhookDelivery
 
 PATIENCE_S = 20.0
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from biresnerf.errors import InputError
-from service.safe_paths import NameSet, checked_path, is_litter
+from biresnerf.wire.safe_paths import NameSet, checked_path, is_litter
 
 PIECES = st.sampled_from(
     ["a", "ä", "..", ".", "", "/", "\\", "C:", "\0", "\n", "\u2028", "\ud800", "img 1.png", "~"]

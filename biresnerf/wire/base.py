@@ -1,0 +1,17 @@
+"""What every message between clients and the service is made of."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+
+class Record(BaseModel):
+    """Base of everything that crosses a process border."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+Label = Annotated[str, StringConstraints(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f]*$")]
+Labels = Annotated[dict[Label, Label], Field(max_length=20)]

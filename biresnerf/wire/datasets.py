@@ -1,0 +1,167 @@
+"""Datasets, their files, and the uploads that bring those."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal
+from urllib.parse import quote
+
+from pydantic import ConfigDict, Field, StringConstraints
+
+from biresnerf.wire.base import Record
+from biresnerf.wire.problems import JobError
+
+DatasetState = Literal["open", "finalizing", "ready", "rejected", "expired"]
+UploadKind = Literal["archive", "file", "signed"]
+UploadState = Literal["receiving", "received", "stored", "rejected"]
+
+
+class ManifestEntry(Record):
+    """A file the client says it is going to send."""
+
+    path: str
+    size: int | None = Field(None, ge=0, lt=2**53)
+    sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
+
+
+class DatasetRecord(Record):
+    """A set of uploaded files. ``report`` is what the validation found (or why it was rejected)."""
+
+    id: str
+    tenant: str = Field("local", description="Whose it is.")
+    name: str
+    state: DatasetState
+    files: int = 0
+    bytes: int = 0
+    missing: tuple[str, ...] = Field((), description="Manifest paths not received yet.")
+    report: dict[str, Any] | None = None
+    error: JobError | None = None
+    created_at: datetime
+    expires_at: datetime | None = Field(
+        None, description="When its files go unless it is used; none while a job uses it, or never."
+    )
+    revision: int = 0
+
+
+class DatasetLinks(Record):
+    """Where the parts of a dataset are."""
+
+    self: str
+    files: str
+    archive: str
+    uploads: str
+    finalize: str
+
+
+class DatasetView(DatasetRecord):
+    """A dataset with links."""
+
+    links: DatasetLinks
+
+    @classmethod
+    def of(cls, dataset: DatasetRecord) -> DatasetView:
+        """The dataset as the wire has it."""
+        here = dataset_url(dataset.id)
+        links = DatasetLinks(
+            self=here,
+            files=f"{here}/files",
+            archive=f"{here}/archive",
+            uploads=f"{here}/uploads",
+            finalize=f"{here}/finalize",
+        )
+        return cls(**dict(dataset), links=links)
+
+
+class DatasetList(Record):
+    """A page of datasets, newest first."""
+
+    items: list[DatasetView]
+    next_cursor: str | None = None
+
+
+class NewDataset(Record):
+    """An empty dataset to create."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"name": "kitchen"}]})
+
+    name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f]*$")] = (
+        "dataset"
+    )
+    manifest: list[ManifestEntry] = Field(
+        default=[],
+        max_length=100_000,
+        description="What is going to be sent; the answer lists what is missing.",
+    )
+
+
+class FileView(Record):
+    """One file of a dataset."""
+
+    path: str
+    size: int
+    sha256: str
+    created_at: datetime
+
+
+class FileList(Record):
+    """A page of a dataset's files, by path."""
+
+    items: list[FileView]
+    next_cursor: str | None = None
+
+
+class UploadView(Record):
+    """Bytes on their way into a dataset."""
+
+    id: str
+    dataset_id: str
+    kind: UploadKind
+    path: str | None = Field(None, description="The file's path; null for an archive.")
+    size: int
+    sha256: str | None = None
+    state: UploadState
+    received: int = Field(description="Bytes that are safe; the next byte to send has this number.")
+    error: JobError | None = Field(None, description="Why it was rejected.")
+    created_at: datetime
+    expires_at: datetime = Field(description="It is given up then, unless it goes on.")
+
+
+class FileToSend(Record):
+    """A file that the client is going to send to the store itself."""
+
+    path: str = Field(max_length=4096)
+    size: int = Field(ge=0)
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+
+
+class NewSignedUploads(Record):
+    """Files to send to the store itself."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"files": [{"path": "a.jpg", "size": 12, "sha256": "0" * 64}]}]}
+    )
+
+    files: list[FileToSend] = Field(min_length=1, max_length=1000)
+
+
+class SignedUpload(Record):
+    """Where to send one file: the bytes as the body of a PUT, without a key."""
+
+    upload: UploadView
+    url: str
+
+
+class SignedUploads(Record):
+    """The addresses, in the order of the files."""
+
+    items: list[SignedUpload]
+
+
+def dataset_url(dataset_id: str) -> str:
+    """The dataset's path."""
+    return f"/v1/datasets/{quote(dataset_id, safe='')}"
+
+
+def upload_url(upload_id: str) -> str:
+    """The upload's path."""
+    return f"/v1/uploads/{quote(upload_id, safe='')}"

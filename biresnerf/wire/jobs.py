@@ -1,0 +1,227 @@
+"""Jobs: how they are, what happens to them, and what is sent to make, fork, end and export them."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, Literal
+from urllib.parse import quote
+
+from pydantic import ConfigDict, Field
+
+from biresnerf.config import PackName, RefineOptions
+from biresnerf.progress import ReusableStage, Stage
+from biresnerf.report import VerdictName
+from biresnerf.wire.base import Labels, Record
+from biresnerf.wire.datasets import dataset_url
+from biresnerf.wire.problems import JobError
+from biresnerf.wire.webhooks import JobWebhook
+
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "expired"]
+FINAL_JOB_STATES: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled", "expired"})
+PriorityName = Literal["low", "normal", "high"]
+JobKind = Literal["refine", "export"]
+
+EventType = Literal[
+    "queued",
+    "started",
+    "stage",
+    "checkpoint",
+    "preview",
+    "attempt_crashed",
+    "retried_smaller",
+    "requeued",
+    "cancel_requested",
+    "succeeded",
+    "failed",
+    "cancelled",
+    "expired",
+]
+WantedStage = Literal["auto", "seeding", "coarse"]
+
+
+class JobProgress(Record):
+    """How far the running attempt is. ``fraction`` never falls within one attempt."""
+
+    fraction: float = Field(0.0, ge=0.0, le=1.0)
+    step: int = 0
+    steps_total: int = 0
+    eta_s: float | None = None
+
+
+class Job(Record):
+    """A job as clients see it. ``revision`` grows with every change (use it as a weak ETag)."""
+
+    id: str
+    tenant: str = Field("local", description="Whose it is.")
+    kind: JobKind = Field("refine", description="`export` writes the result of `parent` in further forms.")
+    parent: str | None = Field(None, description="Of an export: the job whose result it writes.")
+    forked_from: str | None = Field(None, description="The job that this one started from.")
+    forked_stage: ReusableStage | None = Field(None, description="Whose work of that job it took over.")
+    dataset_id: str
+    state: JobState
+    stage: Stage | None = None
+    progress: JobProgress = JobProgress()
+    priority: PriorityName = "normal"
+    queue_position: int | None = Field(None, description="1 is next; none unless queued.")
+    attempt: int = 0
+    cancel_requested: bool = False
+    created_at: datetime
+    started_at: datetime | None = None
+    finished_at: datetime | None = None
+    expires_at: datetime | None = Field(
+        None, description="When its files go, once it is over; none where they are kept for ever."
+    )
+    options: dict[str, Any] = Field(description="Resolved RefineOptions; of an export, its formats.")
+    smaller: dict[str, Any] = Field(
+        {}, description="Options that a second try uses instead, after the first ran out of memory."
+    )
+    partial: bool = Field(
+        False, description="The files are those of a job that was stopped: its best poses until then."
+    )
+    metrics: dict[str, float] = Field({})
+    message: str = ""
+    verdict: VerdictName | None = Field(
+        None,
+        description="Whether refinement helped, once the job has succeeded; the report has the evidence.",
+    )
+    error: JobError | None = None
+    labels: dict[str, str] = Field({})
+    revision: int = 0
+
+    @property
+    def final(self) -> bool:
+        """Nothing will change any more."""
+        return self.state in FINAL_JOB_STATES
+
+
+class JobEvent(Record):
+    """One entry of a job's gapless history; ``seq`` starts at 1 (use it as the SSE id)."""
+
+    seq: int
+    at: datetime
+    attempt: int
+    type: EventType
+    data: dict[str, Any] = Field({})
+
+
+class LogLine(Record):
+    """One line that a job's process wrote to standard error; ``n`` starts at 1 and has no gaps."""
+
+    n: int
+    at: datetime
+    attempt: int
+    text: str
+
+
+class JobLinks(Record):
+    """Where the parts of a job are."""
+
+    self: str
+    dataset: str
+    events: str
+    artifacts: str
+    report: str
+    images: str
+    logs: str
+    exports: str
+    cancel: str
+    fork: str
+
+
+class JobView(Job):
+    """A job with links."""
+
+    links: JobLinks
+
+    @classmethod
+    def of(cls, job: Job) -> JobView:
+        """The job as the wire has it."""
+        here = job_url(job.id)
+        links = JobLinks(
+            self=here,
+            dataset=dataset_url(job.dataset_id),
+            events=f"{here}/events",
+            artifacts=f"{here}/artifacts",
+            report=f"{here}/report",
+            images=f"{here}/images",
+            logs=f"{here}/logs",
+            exports=f"{here}/exports",
+            cancel=f"{here}/cancel",
+            fork=f"{here}/fork",
+        )
+        return cls(**dict(job), links=links)
+
+
+class JobList(Record):
+    """A page of jobs, newest first."""
+
+    items: list[JobView]
+    next_cursor: str | None = Field(None, description="Opaque; null on the last page.")
+
+
+class NewJob(Record):
+    """A refinement to run."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"dataset_id": "ds_01", "options": {"preset": "fast"}, "labels": {"run": "a"}}]
+        }
+    )
+
+    dataset_id: str = Field(max_length=100)
+    options: RefineOptions = RefineOptions()
+    labels: Labels = Field({})
+    webhook: JobWebhook | None = Field(None, description="Who is told of this job, besides all webhooks.")
+    priority: PriorityName = Field(
+        "normal", description="Before or after other jobs; `high` only where the operator allows it."
+    )
+
+
+class JobTexts(Record):
+    """The text fields of the one-shot form."""
+
+    options: RefineOptions = RefineOptions()
+    labels: Labels = Field({})
+    webhook: JobWebhook | None = Field(None, description="Who is told of this job, besides all webhooks.")
+
+
+class CancelJob(Record):
+    """How a job is to end."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"keep_partial": True}]})
+
+    keep_partial: bool = Field(
+        False,
+        description="Publish the best poses so far, with a report whose state is `partial`; else only the log.",
+    )
+
+
+class ForkJob(Record):
+    """What is to be different in a job that takes over the work of another."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"options": {"warmup_steps": 200}, "from_stage": "coarse"}]}
+    )
+
+    options: RefineOptions = Field(
+        RefineOptions(), description="Those to be different; all others stay as they were asked for."
+    )
+    from_stage: WantedStage = Field(
+        "auto",
+        description="Whose work is taken over: COLMAP's answer (`seeding`), poses and field at the end of stage 1 "
+        "(`coarse`), or the latest that the options allow.",
+    )
+    labels: Labels = Field(default_factory=dict)
+
+
+class NewExport(Record):
+    """Forms to write a result in, beside those it has."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"formats": ["kitti", "pinhole"]}]})
+
+    formats: list[PackName] = Field(min_length=1, max_length=20)
+
+
+def job_url(job_id: str) -> str:
+    """The job's path."""
+    return f"/v1/jobs/{quote(job_id, safe='')}"

@@ -1,0 +1,218 @@
+"""Webhooks, their secrets and deliveries (Standard Webhooks)."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import secrets
+from datetime import datetime
+from typing import Annotated, Literal, get_args
+from urllib.parse import quote
+
+from pydantic import AfterValidator, ConfigDict, Field, StringConstraints
+
+from biresnerf.wire.base import Record
+
+WebhookEvent = Literal[
+    "job.queued",
+    "job.started",
+    "job.succeeded",
+    "job.failed",
+    "job.cancelled",
+    "dataset.validated",
+]
+ALL_EVENTS: tuple[WebhookEvent, ...] = get_args(WebhookEvent)
+DeliveryState = Literal["pending", "delivered", "failed"]
+SECRET_PREFIX = "whsec_"
+SECRET_BYTES = (24, 64)
+Events = Annotated[list[WebhookEvent], Field(min_length=1, max_length=len(ALL_EVENTS))]
+Description = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00-\x1f]*$")]
+Url = Annotated[str, Field(max_length=2000, examples=["https://hooks.example.org/biresnerf"])]
+
+
+def new_secret() -> str:
+    """A fresh signing secret."""
+    return SECRET_PREFIX + base64.b64encode(secrets.token_bytes(32)).decode()
+
+
+def key_of(secret: str) -> bytes:
+    """The bytes that sign; raises `ValueError` where the text is no secret."""
+    try:
+        key = base64.b64decode(secret.removeprefix(SECRET_PREFIX), validate=True)
+    except (binascii.Error, ValueError):
+        key = b""
+    if not secret.startswith(SECRET_PREFIX) or not SECRET_BYTES[0] <= len(key) <= SECRET_BYTES[1]:
+        raise ValueError("a secret is whsec_ and 24 to 64 bytes in base64")
+    return key
+
+
+def _is_secret(text: str) -> str:
+    key_of(text)
+    return text
+
+
+Secret = Annotated[str, AfterValidator(_is_secret)]
+
+
+class Webhook(Record):
+    """Who hears of what. The secret is told once, when it is made."""
+
+    id: str
+    tenant: str
+    url: str
+    description: str = ""
+    events: tuple[WebhookEvent, ...]
+    job_id: str | None = Field(None, description="Hears of this job only, and goes with it.")
+    enabled: bool
+    disabled_why: str | None = Field(None, description="Why the service switched it off, where it did.")
+    failing_since: datetime | None = Field(None, description="No delivery has succeeded since.")
+    previous_secret_until: datetime | None = Field(
+        None, description="Until then messages are signed with the secret before the last one too."
+    )
+    created_at: datetime
+
+
+class WebhookAttempt(Record):
+    """One try to deliver: when, how long it took, and the status that came back, or why none did."""
+
+    number: int
+    at: datetime
+    seconds: float
+    status: int | None = None
+    error: str | None = None
+
+
+class WebhookDelivery(Record):
+    """One message to one webhook; ``id`` is what the receiver finds in the header `webhook-id`."""
+
+    id: str
+    webhook_id: str
+    event: str
+    state: DeliveryState
+    next_attempt_at: datetime | None = Field(None, description="None unless pending.")
+    created_at: datetime
+    finished_at: datetime | None = None
+    body: str = Field(description="The message, byte for byte.")
+    attempts: tuple[WebhookAttempt, ...] = ()
+
+
+class JobWebhook(Record):
+    """A webhook for one job, sent along with it. The sender makes the secret."""
+
+    url: str = Field(max_length=2000)
+    secret: Secret = Field(
+        max_length=200,
+        description="`whsec_` and 24 to 64 random bytes in base64; signs the messages.",
+        examples=["whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw"],
+    )
+    events: tuple[WebhookEvent, ...] = Field(
+        ("job.succeeded", "job.failed", "job.cancelled"), min_length=1, max_length=len(ALL_EVENTS)
+    )
+
+
+class NewWebhook(Record):
+    """A webhook to make."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {"url": "https://hooks.example.org/poses", "events": ["job.succeeded", "job.failed"]}
+            ]
+        }
+    )
+
+    url: Url
+    events: Events = Field(default=list(ALL_EVENTS), description="What to send; everything where left out.")
+    description: Description = ""
+
+
+class WebhookChange(Record):
+    """What to change of a webhook; what is left out stays."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"enabled": True}]})
+
+    url: Url | None = None
+    events: Events | None = None
+    description: Description | None = None
+    enabled: bool | None = Field(None, description="Off drops what waits; on (again) forgets failures.")
+
+
+class WebhookLinks(Record):
+    """Where the parts of a webhook are."""
+
+    self: str
+    deliveries: str
+    test: str
+    rotate: str
+
+
+class WebhookView(Webhook):
+    """A webhook with links."""
+
+    links: WebhookLinks
+
+    @classmethod
+    def of(cls, webhook: Webhook) -> WebhookView:
+        """The webhook as the wire has it."""
+        return cls(**dict(webhook), links=_links(webhook.id))
+
+
+class WebhookWithSecret(WebhookView):
+    """A webhook with the secret its messages are signed with, which is not told again."""
+
+    secret: str = Field(examples=["whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSwMfKQ9r8GKYo="])
+
+    @classmethod
+    def made(cls, webhook: Webhook, secret: str) -> WebhookWithSecret:
+        """The answer to who made the webhook or a new secret of it."""
+        return cls(**dict(webhook), links=_links(webhook.id), secret=secret)
+
+
+class WebhookList(Record):
+    """A page of webhooks, newest first."""
+
+    items: list[WebhookView]
+    next_cursor: str | None = Field(None, description="Opaque; null on the last page.")
+
+
+class DeliveryLinks(Record):
+    """Where the parts of a delivery are."""
+
+    self: str
+    redeliver: str
+
+
+class DeliveryView(WebhookDelivery):
+    """A delivery with links."""
+
+    links: DeliveryLinks
+
+    @classmethod
+    def of(cls, delivery: WebhookDelivery) -> DeliveryView:
+        """The delivery as the wire has it."""
+        here = delivery_url(delivery)
+        return cls(**dict(delivery), links=DeliveryLinks(self=here, redeliver=f"{here}/redeliver"))
+
+
+class DeliveryList(Record):
+    """A page of deliveries, newest first."""
+
+    items: list[DeliveryView]
+    next_cursor: str | None = None
+
+
+def webhook_url(webhook_id: str) -> str:
+    """The webhook's path."""
+    return f"/v1/webhooks/{quote(webhook_id, safe='')}"
+
+
+def delivery_url(delivery: WebhookDelivery) -> str:
+    """The delivery's path."""
+    return f"{webhook_url(delivery.webhook_id)}/deliveries/{quote(delivery.id, safe='')}"
+
+
+def _links(webhook_id: str) -> WebhookLinks:
+    here = webhook_url(webhook_id)
+    return WebhookLinks(
+        self=here, deliveries=f"{here}/deliveries", test=f"{here}/test", rotate=f"{here}/secret"
+    )
