@@ -21,6 +21,7 @@ import threading
 import time
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,8 @@ class Relay:
             pass  # cut, here or there
         for end in (source, sink):
             self._open.discard(end)
+            with suppress(OSError):  # not connected any more
+                end.shutdown(socket.SHUT_RDWR)  # wakes the other direction, which `close` alone would not
             end.close()
 
     def cut(self) -> None:
