@@ -11,7 +11,7 @@ export PIP_CONSTRAINT := constraints.txt
 export PIP_BUILD_CONSTRAINT := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup web test lint format demo serve bench openapi fuzz audit sbom compose-check
+.PHONY: help setup web test lint format demo serve bench openapi docs fuzz audit sbom compose-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -44,6 +44,9 @@ bench: setup  ## the measurements; BENCH="arguments"
 
 openapi: setup  ## write docs/openapi.json anew, after a change of the HTTP interface
 	$(BIN)/python -m service.openapi docs/openapi.json
+
+docs: setup  ## write the pages and notebooks anew that are made of the code
+	$(BIN)/python -m docs.generate
 
 fuzz: setup  ## thousands of made-up requests against a real service; FUZZ="arguments"
 	$(BIN)/python -m tests.service.fuzzing $(FUZZ)

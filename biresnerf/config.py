@@ -130,13 +130,17 @@ class RefineOptions(BaseModel):
         "place with fresh networks, or with networks of its own whose outputs are added.",
     )
     pose_levels: int = Field(3, ge=1, le=16, description="Levels of the pose-estimation module.")
-    pose_resolution_min: int = Field(16, ge=2, le=128)
-    pose_resolution_max: int = Field(72, ge=2, le=8192)
+    pose_resolution_min: int = Field(16, ge=2, le=128, description="Cells a side of its coarsest level.")
+    pose_resolution_max: int = Field(72, ge=2, le=8192, description="Cells a side of its finest level.")
     reconstruction_levels: int | None = Field(
         None, ge=1, le=16, description="Levels of the reconstruction module."
     )
-    reconstruction_resolution_min: int | None = Field(None, ge=4, le=8192)
-    reconstruction_resolution_max: int | None = Field(None, ge=4, le=16384)
+    reconstruction_resolution_min: int | None = Field(
+        None, ge=4, le=8192, description="Cells a side of its coarsest level."
+    )
+    reconstruction_resolution_max: int | None = Field(
+        None, ge=4, le=16384, description="Cells a side of its finest level."
+    )
     table_size_log2: int | None = Field(None, ge=10, le=22, description="Entries of a hashed level, log2.")
 
     verdict: bool = Field(

@@ -35,8 +35,8 @@ class Settings(BaseSettings):
         default_factory=default_data_dir, description="Files, scratch and private database."
     )
     pg_bin: Path | None = Field(None, description="Folder with initdb and postgres for the private database.")
-    host: str = "127.0.0.1"
-    port: int = Field(8000, ge=0, le=65535)
+    host: str = Field("127.0.0.1", description="Address that the web process listens on.")
+    port: int = Field(8000, ge=0, le=65535, description="Its port; 0 takes a free one.")
     auth: Literal["auto", "required", "off"] = Field(
         "auto",
         description="Who needs an API key: auto lets everybody in while the service listens on loopback only "
@@ -48,7 +48,9 @@ class Settings(BaseSettings):
     )
     key_requests_burst: int = Field(500, ge=1, description="Requests with one API key at once.")
     log_format: Literal["plain", "json"] = Field("plain", description="Lines for people, or JSON lines.")
-    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = Field(
+        "INFO", description="What is logged at the least."
+    )
     metrics_token: SecretStr | None = Field(
         None, description="Bearer token of /metrics; without one it answers on loopback only."
     )
@@ -65,9 +67,9 @@ class Settings(BaseSettings):
     storage_public_endpoint: str | None = Field(
         None, description="How clients reach the store, where they use another address than this service."
     )
-    storage_region: str = "us-east-1"
+    storage_region: str = Field("us-east-1", description="Region of the bucket.")
     storage_access_key_id: str | None = Field(None, description="None: AWS_… variables or the host's role.")
-    storage_secret_access_key: str | None = Field(None, repr=False)
+    storage_secret_access_key: str | None = Field(None, repr=False, description="The key's secret.")
     storage_presign: bool = Field(
         False,
         description="Clients get signed addresses of the bucket, to download and upload files there themselves.",
@@ -107,8 +109,8 @@ class Settings(BaseSettings):
     )
 
     max_files: int = Field(1000, ge=1, description="Files in a dataset.")
-    max_file_bytes: int = Field(64 * MIB, ge=1)
-    max_dataset_bytes: int = Field(8 * GIB, ge=1)
+    max_file_bytes: int = Field(64 * MIB, ge=1, description="Size of one file of a dataset.")
+    max_dataset_bytes: int = Field(8 * GIB, ge=1, description="Size of all files of a dataset.")
     max_archive_bytes: int = Field(8 * GIB, ge=1, description="Size of an uploaded archive.")
     max_unpacked_bytes: int = Field(20 * GIB, ge=1, description="Size of all that comes out of an archive.")
 

@@ -35,5 +35,5 @@ def settings_option(command: Callable[..., Any]) -> Callable[..., Any]:
         multiple=True,
         metavar="KEY=VALUE",
         callback=lambda _context, _parameter, texts: parse_settings(texts),
-        help="Set any other option; may be repeated. GET /v1/options and the README list them.",
+        help="Set any other option; may be repeated. docs/options.md and GET /v1/options list them.",
     )(command)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -56,44 +57,64 @@ def synthetic_focal(size: int) -> float:
 def render_synthetic(
     world_from_cam: NDArray[np.float64], size: int, seed: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """One view of the scene with the textures of ``seed``, from a pose [4, 4].
+    """One square view of the scene with the textures of ``seed``, from a pose [4, 4]: see `render_shapes`."""
+    textures = random_textures(len(SHAPES), seed)
+    return render_shapes(SHAPES, textures, world_from_cam, size, size, synthetic_focal(size))
+
+
+def random_textures(count: int, seed: int) -> list[Texture]:
+    """Textures that do not resemble each other; the same seed gives the same ones."""
+    return [Texture.random(np.random.default_rng([seed, 2, index])) for index in range(count)]
+
+
+def render_shapes(
+    shapes: Sequence[Shape],
+    textures: Sequence[Texture],
+    world_from_cam: NDArray[np.float64],
+    width: int,
+    height: int,
+    focal: float,
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """One view of shapes, each with its texture, by a pinhole of ``focal`` px centred in the image.
 
     Returns:
-        straight-alpha colours uint8 [size, size, 4], each pixel the mean of 9 rays, and the depth along the
-        optical axis in the pixel centres float32 [size, size], infinite where there is nothing.
+        straight-alpha colours uint8 [height, width, 4], each pixel the mean of 9 rays, and the depth along the
+        optical axis in the pixel centres float32 [height, width], infinite where there is nothing.
     """
-    textures = [Texture.random(np.random.default_rng([seed, 2, index])) for index in range(len(SHAPES))]
     rotation = world_from_cam[:3, :3]
     origin = world_from_cam[:3, 3].astype(np.float32)
-    fine = size * _SUBSAMPLES
-    steps = ((np.arange(fine) + 0.5) / _SUBSAMPLES - size / 2) / synthetic_focal(size)
-    x, y = np.meshgrid(steps, steps)
+    fine_x, fine_y = width * _SUBSAMPLES, height * _SUBSAMPLES
+    x, y = np.meshgrid(
+        ((np.arange(fine_x) + 0.5) / _SUBSAMPLES - width / 2) / focal,
+        ((np.arange(fine_y) + 0.5) / _SUBSAMPLES - height / 2) / focal,
+    )
     along_axis = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
     lengths = np.linalg.norm(along_axis, axis=1)
     directions = ((along_axis / lengths[:, None]) @ rotation.T).astype(np.float32)
-    colour, distance = _trace(origin, directions, textures)
+    colour, distance = _trace(shapes, textures, origin, directions)
 
     hit = np.isfinite(distance)
     samples = np.concatenate([colour * hit[:, None], hit[:, None]], axis=1)
-    mean = samples.reshape(size, _SUBSAMPLES, size, _SUBSAMPLES, 4).mean(axis=(1, 3))
+    mean = samples.reshape(height, _SUBSAMPLES, width, _SUBSAMPLES, 4).mean(axis=(1, 3))
     straight = mean[..., :3] / np.maximum(mean[..., 3:], 1e-6)
     rgba = np.concatenate([straight, mean[..., 3:]], axis=-1)
     middle = _SUBSAMPLES // 2
-    depth = (distance / lengths).reshape(fine, fine)[middle::_SUBSAMPLES, middle::_SUBSAMPLES]
+    depth = (distance / lengths).reshape(fine_y, fine_x)[middle::_SUBSAMPLES, middle::_SUBSAMPLES]
     return np.rint(255.0 * rgba).astype(np.uint8), depth.astype(np.float32)
 
 
 def _trace(
-    origin: NDArray[np.float32], directions: NDArray[np.float32], textures: list[Texture]
+    shapes: Sequence[Shape],
+    textures: Sequence[Texture],
+    origin: NDArray[np.float32],
+    directions: NDArray[np.float32],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Colours [rays, 3] and distances [rays] (infinite for a miss) of the nearest surfaces."""
     nearest = np.full(len(directions), np.inf, dtype=np.float32)
     which = np.full(len(directions), -1)
     normals = np.zeros_like(directions)
-    for index, shape in enumerate(SHAPES):
-        to_centre = np.asarray(shape.centre, np.float32) - origin
-        cosine = np.sqrt(max(0.0, 1.0 - shape.bounding_radius**2 / float(to_centre @ to_centre)))
-        rays = np.flatnonzero(directions @ to_centre >= cosine * np.linalg.norm(to_centre) - 1e-4)
+    for index, shape in enumerate(shapes):
+        rays = _rays_that_may_hit(shape, origin, directions)
         hit = shape.intersect(origin, directions[rays])
         closer = hit.distance < np.minimum(nearest[rays], 1e6)
         chosen = rays[closer]
@@ -104,6 +125,18 @@ def _trace(
         points = origin + nearest[rays, None] * directions[rays]
         colour[rays] = texture.colour(points, normals[rays])
     return colour, nearest
+
+
+def _rays_that_may_hit(
+    shape: Shape, origin: NDArray[np.float32], directions: NDArray[np.float32]
+) -> NDArray[np.intp]:
+    """Those in the cone about the shape's bounding sphere; all of them from within it."""
+    to_centre = np.asarray(shape.centre, np.float32) - origin
+    distance = float(np.linalg.norm(to_centre))
+    if distance <= shape.bounding_radius:
+        return np.arange(len(directions))
+    cosine = np.sqrt(1.0 - (shape.bounding_radius / distance) ** 2)
+    return np.flatnonzero(directions @ to_centre >= cosine * distance - 1e-4)
 
 
 def write_synthetic_scene(folder: Path, n_views: int, size: int, seed: int) -> Path:

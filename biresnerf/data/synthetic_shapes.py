@@ -29,10 +29,10 @@ class Shape:
     """A sphere, box or cylinder (about its z axis): ``size`` holds its three half axes in its own frame.
 
     A sphere takes its radius from ``size[0]``, a cylinder its radius from ``size[0]`` and half height from
-    ``size[2]``.
+    ``size[2]``. A room is a sphere seen from within.
     """
 
-    kind: Literal["sphere", "box", "cylinder"]
+    kind: Literal["sphere", "box", "cylinder", "room"]
     centre: tuple[float, float, float]
     size: tuple[float, float, float]
     turn_deg: tuple[float, float]  # about the world's z axis, then about the shape's own x axis
@@ -48,19 +48,19 @@ class Shape:
     @property
     def bounding_radius(self) -> float:
         """Radius of a sphere about ``centre`` that holds the shape."""
-        if self.kind == "sphere":
+        if self.kind in ("sphere", "room"):
             return self.size[0]
         if self.kind == "cylinder":
             return float(np.hypot(self.size[0], self.size[2]))
         return float(np.linalg.norm(self.size))
 
     def intersect(self, origin_in_world: Array, directions_in_world: Array) -> Hit:
-        """First crossings of rays from one origin [3] along unit directions [rays, 3], from outside."""
+        """First crossings of rays from one origin [3] along unit directions [rays, 3]: from outside, a room's inside."""
         rotation = self.world_from_shape
         origin = (origin_in_world - np.asarray(self.centre, np.float32)) @ rotation
         directions = directions_in_world @ rotation
         size = np.asarray(self.size, np.float32)
-        solve = {"sphere": _sphere, "box": _box, "cylinder": _cylinder}[self.kind]
+        solve = {"sphere": _sphere, "box": _box, "cylinder": _cylinder, "room": _room}[self.kind]
         distance, normal = solve(origin, directions, size)
         return Hit(distance, normal @ rotation.T)
 
@@ -71,6 +71,12 @@ def _sphere(origin: Array, directions: Array, size: Array) -> tuple[Array, Array
     hit = (under_root > 0) & (b < 0)
     distance = np.where(hit, -b - np.sqrt(np.maximum(under_root, 0)), _FAR)
     return distance, (origin + distance[:, None] * directions) / size[0]
+
+
+def _room(origin: Array, directions: Array, size: Array) -> tuple[Array, Array]:
+    b = directions @ origin
+    distance = -b + np.sqrt(np.maximum(b * b - (origin @ origin - size[0] ** 2), 0))
+    return distance, -(origin + distance[:, None] * directions) / size[0]
 
 
 def _box(origin: Array, directions: Array, size: Array) -> tuple[Array, Array]:
@@ -132,6 +138,23 @@ class Texture:
             directions * numbers[:, None],
             rng.uniform(0, 2 * np.pi, len(numbers)),
             amplitudes,
+        )
+        return Texture(*(part.astype(np.float32) for part in parts))
+
+    @staticmethod
+    def glaze(rng: np.random.Generator, base: tuple[float, float, float], contrast: float) -> Texture:
+        """One colour (0 to 1) that varies slowly by `contrast`, without any edge: next to nothing for features."""
+        numbers = np.repeat(_WAVE_NUMBERS[:2], _WAVES_EACH)
+        directions = rng.normal(size=(len(numbers), 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        tints = rng.normal(size=(len(numbers), 3))
+        tints /= np.linalg.norm(tints, axis=1, keepdims=True)
+        parts = (
+            np.array([base, base]),
+            np.zeros((2, 3)),
+            directions * numbers[:, None],
+            rng.uniform(0, 2 * np.pi, len(numbers)),
+            contrast * tints,
         )
         return Texture(*(part.astype(np.float32) for part in parts))
 

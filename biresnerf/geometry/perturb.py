@@ -11,6 +11,11 @@ from biresnerf.geometry.lie import se3_exp
 
 RIG_DISTANCE = 4.0  # of the cameras from the scene in the Blender sets that BARF's noise levels were made for
 LOST_DEG = (45.0, 180.0)
+# What tracking by camera and inertial sensors loses over a minute's walk around a table: two degrees or so of heading,
+# a few percent of the distance.
+HEADING_STEP_DEG, HEADING_KEPT = 0.12, 0.8  # a photo's change of heading rate, and how much of the rate stays
+SCALE_ERROR, STEP_LOST = 0.01, 0.03
+JITTER_DEG, JITTER_OF_DISTANCE = 0.25, 0.004
 
 
 def perturb_poses(world_from_cam: NDArray[np.float64], noise: float, seed: int) -> NDArray[np.float64]:
@@ -69,3 +74,37 @@ def orbit_away(world_from_cam: NDArray[np.float64], indices: list[int], seed: in
         poses[index, :3, :3] = turn @ poses[index, :3, :3]
         poses[index, :3, 3] = turn @ (poses[index, :3, 3] - focus) + focus
     return poses
+
+
+def drift_like_a_phone(world_from_cam: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+    """Poses [n, 4, 4], in the order they were taken, as a phone's tracking gives them: drift, jitter, level.
+
+    Each motion from one photo to the next is turned by a heading that drifts smoothly and lengthened by one wrong
+    scale, and a little is lost of it; gravity holds roll and pitch, so about the rig's own up axis alone the cameras
+    drift. On top each pose jitters. The first pose stays but for its jitter.
+    """
+    poses = np.asarray(world_from_cam, dtype=np.float64)
+    random = np.random.default_rng([seed, 6])
+    count, distance = len(poses), focus_point(poses).mean_distance
+    up = -poses[:, :3, 1].mean(axis=0)
+    rate = np.zeros(count)
+    for k in range(1, count):
+        rate[k] = HEADING_KEPT * rate[k - 1] + random.normal(0.0, np.radians(HEADING_STEP_DEG))
+    heading = _turns(up / np.linalg.norm(up) * np.cumsum(rate)[:, None])
+    steps = np.diff(poses[:, :3, 3], axis=0)
+    lost = random.normal(0.0, STEP_LOST, steps.shape) * np.linalg.norm(steps, axis=1, keepdims=True)
+    scale = 1.0 + random.normal(0.0, SCALE_ERROR)
+    walked = np.einsum("nij,nj->ni", heading[:-1], scale * steps + lost)
+    moved = poses.copy()
+    moved[1:, :3, 3] = poses[0, :3, 3] + np.cumsum(walked, axis=0)
+    moved[:, :3, 3] += random.normal(0.0, JITTER_OF_DISTANCE * distance, (count, 3))
+    jitter = _turns(random.normal(0.0, np.radians(JITTER_DEG), (count, 3)))
+    moved[:, :3, :3] = jitter @ heading @ poses[:, :3, :3]
+    return moved
+
+
+def _turns(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotations [n, 3, 3] by vectors [n, 3] (rad)."""
+    rotation, _ = se3_exp(torch.from_numpy(vectors), torch.zeros(len(vectors), 3, dtype=torch.float64))
+    turns: NDArray[np.float64] = rotation.numpy()
+    return turns

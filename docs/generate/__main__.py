@@ -1,0 +1,17 @@
+"""`python -m docs.generate`: writes every page and notebook that is made of the code."""
+
+from __future__ import annotations
+
+from docs.generate.pages import generated
+
+
+def main() -> None:
+    """Writes what differs, and says what that was."""
+    for path, text in generated().items():
+        if not path.is_file() or path.read_text("utf-8") != text:
+            path.write_text(text, "utf-8")
+            print(f"written: {path}")
+
+
+if __name__ == "__main__":
+    main()

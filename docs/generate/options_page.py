@@ -1,0 +1,80 @@
+"""docs/options.md, from `RefineOptions` and the presets."""
+
+from __future__ import annotations
+
+from biresnerf.config import RefineOptions
+from biresnerf.presets import (
+    COMMON_VALUES,
+    CUDA_SCALE,
+    METHOD_PAPER_VALUES,
+    METHOD_VALUES,
+    PRESETS,
+)
+from docs.generate.markdown import DASH, code, table
+from docs.generate.schema_words import takes
+
+_HEAD = """# Options of a refinement
+
+Written by `make docs` from the models in `biresnerf/config.py` and `biresnerf/presets.py`; a test fails when they differ.
+
+On the command line `--set KEY=VALUE` sets any of them (`--preset`, `--device` and `--seed` have flags of their own), over
+HTTP they are the object `options` of a job, from Python `biresnerf.RefineOptions(...)`. Values are JSON where they can be
+read as such, else text: `--set holdout=0`, `--set start=given`, `--set verdict=false`. `GET /v1/options` is the same as a
+JSON Schema.
+
+- Which to start with: [quick start](quick-start.md). What they do, with the paper's symbols: [method](method.md).
+- A key that is left out takes the method's value, else the preset's, else its own.
+- With `steps` alone the preset's proportions are kept: `coarse_steps_min`, `coarse_steps_max`, `check_every`,
+  `warmup_steps` and (never above the preset's) `trial_steps` are scaled.
+"""
+
+
+def options_page() -> str:
+    """The page."""
+    schema = RefineOptions.model_json_schema()
+    definitions = schema.get("$defs", {})
+    rows, by_preset = [], []
+    for key, field in schema["properties"].items():
+        rows.append(
+            (f"`{key}`", _default(key), takes(field, definitions), field.get("description", "").rstrip("."))
+        )
+        if any(key in values for values in PRESETS.values()):
+            by_preset.append((f"`{key}`", *(code(PRESETS[name][key]) for name in PRESETS)))
+    scaled = " and ".join(f"{factor} times `{key}`" for key, factor in CUDA_SCALE.items())
+    return "\n".join(
+        (
+            _HEAD,
+            "## All options\n",
+            table(("key", "default", "takes", "meaning"), rows),
+            "## What the presets fill in\n",
+            table(("key", *(f"`{name}`" for name in PRESETS)), by_preset),
+            f"With `device` `cuda` every preset but `paper` takes {scaled}.\n",
+            "## What methods fill in instead\n",
+            _methods(),
+        )
+    )
+
+
+def _default(key: str) -> str:
+    if any(key in values for values in PRESETS.values()):
+        return "preset"
+    if key in COMMON_VALUES:
+        return code(COMMON_VALUES[key])
+    default = RefineOptions.model_fields[key].default
+    return DASH if default is None or default == () else code(default)
+
+
+def _methods() -> str:
+    rows = []
+    for name, values in METHOD_VALUES.items():
+        for title, filled in (
+            (f"`{name}`", values),
+            (f"`{name}` in the preset `paper`", METHOD_PAPER_VALUES[name]),
+        ):
+            if filled:
+                rows.append((title, ", ".join(f"`{key}={_plain(value)}`" for key, value in filled.items())))
+    return table(("method", "fills in"), rows)
+
+
+def _plain(value: object) -> str:
+    return code(value).strip("`")

@@ -1,0 +1,23 @@
+"""Everything that is generated, by the file it lies in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from docs.generate.commands_page import commands_page
+from docs.generate.notebooks import notebook
+from docs.generate.options_page import options_page
+from docs.generate.settings_page import settings_page
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def generated() -> dict[Path, str]:
+    """The text of every page and notebook, as it should be now."""
+    pages = {
+        ROOT / "docs/options.md": options_page(),
+        ROOT / "docs/settings.md": settings_page(),
+        ROOT / "docs/commands.md": commands_page(),
+    }
+    walks = [path for path in sorted((ROOT / "examples").glob("*.py")) if "# %%" in path.read_text("utf-8")]
+    return pages | {walk.with_suffix(".ipynb"): notebook(walk) for walk in walks}
