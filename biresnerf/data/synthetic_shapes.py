@@ -55,7 +55,7 @@ class Shape:
         return float(np.linalg.norm(self.size))
 
     def intersect(self, origin_in_world: Array, directions_in_world: Array) -> Hit:
-        """First crossings of rays from one origin [3] along unit directions [rays, 3]: from outside, a room's inside."""
+        """First crossings by rays from one origin [3] along unit vectors [rays, 3]: from outside, a room's within."""
         rotation = self.world_from_shape
         origin = (origin_in_world - np.asarray(self.centre, np.float32)) @ rotation
         directions = directions_in_world @ rotation
