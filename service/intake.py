@@ -33,10 +33,12 @@ _UNPACK_MEMORY_BYTES = 1536 * 2**20
 _KEPT_FOLDERS = {"images"}
 
 
-async def take_archive(service: Service, dataset_id: str, archive: Path, into: Path) -> DatasetRecord:
+async def take_archive(
+    service: Service, dataset_id: str, archive: Path, into: Path, upload_id: str | None = None
+) -> DatasetRecord:
     """Unpacks ``archive`` in a child, into the empty folder ``into``; then stores what came out.
 
-    Nothing is stored unless the whole archive is good.
+    ``upload_id``: the upload that it came by. Nothing is stored unless the whole archive is good.
 
     Raises:
         ProblemError: what is wrong with the archive, and with which entry.
@@ -72,7 +74,7 @@ async def take_archive(service: Service, dataset_id: str, archive: Path, into: P
     root = await asyncio.to_thread(content_root, into)
     for path in await asyncio.to_thread(_files_below, root):
         name = path.relative_to(root).as_posix()
-        await service.stores.datasets.add_file(dataset_id, name, _chunks(path))
+        await service.stores.datasets.add_file(dataset_id, name, _chunks(path), upload_id=upload_id)
     return await service.stores.datasets.get(dataset_id)
 
 
@@ -146,7 +148,10 @@ def _clients_mistake(error: ProblemError | InputError | EngineError) -> JobError
 async def _bring_in(service: Service, upload: Upload) -> None:
     uploads, datasets = service.stores.uploads, service.stores.datasets
     if upload.path is not None:
-        await datasets.add_file(upload.dataset_id, upload.path, uploads.content(upload), sha256=upload.sha256)
+        content = uploads.content(upload)
+        await datasets.add_file(
+            upload.dataset_id, upload.path, content, sha256=upload.sha256, upload_id=upload.id
+        )
         return
     async with staging_folder(service.staging_dir) as folder:
         archive, into = folder / "archive", folder / "content"
@@ -160,7 +165,7 @@ async def _bring_in(service: Service, upload: Upload) -> None:
                     f"What arrived has SHA-256 {found}, announced was {upload.sha256}.",
                     mend="Send the archive again.",
                 )
-        await take_archive(service, upload.dataset_id, archive, into)
+        await take_archive(service, upload.dataset_id, archive, into, upload.id)
 
 
 async def settle_uploads(service: Service, dataset_id: str) -> None:

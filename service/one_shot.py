@@ -21,20 +21,24 @@ from workers.webhook_records import request_with
 
 # Room for the text fields and the form's own lines beside the archive.
 _FORM_BYTES = 2**20
+TEXTS = frozenset(JobTexts.model_fields)
+# A word as it stands; the other texts are JSON.
+PLAIN = "priority"
 
 
 async def submit_form(caller: Caller, request: Request, idempotency_key: str | None) -> tuple[Job, bool]:
-    """Takes the form (`archive`, JSON texts `options`, `labels`, `webhook`); returns the job and whether it is new.
+    """Takes the form (`archive`, JSON `options`, `labels`, `webhook`, the word `priority`).
 
-    A repeated request with the same key is known by the archive's digest, before anything is unpacked.
-    Where anything is wrong, the dataset made for it is deleted again. Needs the scope ``datasets:write``.
+    Returns the job and whether it is new. A repeated request with the same key is known by the archive's digest,
+    before anything is unpacked. Where anything is wrong, the dataset made for it is deleted again. Needs the scope
+    ``datasets:write``.
     """
     caller.require("datasets:write")
     limit = caller.service.settings.max_archive_bytes + _FORM_BYTES
     refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.room)
     async with staging_folder(caller.service.staging_dir) as folder:
         archive = folder / "archive"
-        form = Form("archive", {"options", "labels", "webhook"}, archive, limit, caller.service.room)
+        form = Form("archive", TEXTS, archive, limit, caller.service.room)
         await form.read(request.headers["content-type"], request.stream())
         if not form.has_file:
             detail = "The form has no file field `archive`."
@@ -45,7 +49,9 @@ async def submit_form(caller: Caller, request: Request, idempotency_key: str | N
         digest = await asyncio.to_thread(file_sha256, archive)
         if idempotency_key is not None:
             subject = request_with(digest, texts.webhook)
-            known = await caller.jobs.repeated(subject, texts.options, texts.labels, idempotency_key)
+            known = await caller.jobs.repeated(
+                subject, texts.options, texts.labels, idempotency_key, texts.priority
+            )
             if known is not None:
                 return known, False
         into = folder / "content"
@@ -70,6 +76,7 @@ async def _make_job(
             idempotency_key=idempotency_key,
             request_digest=digest,
             webhook=texts.webhook,
+            priority=texts.priority,
         )
         return job, used
     finally:
@@ -79,5 +86,6 @@ async def _make_job(
 
 
 def _texts(form: Form) -> JobTexts:
-    values = {name: load_json(text) for name, text in form.texts.items() if text.strip()}
+    said = {name: text.strip() for name, text in form.texts.items() if text.strip()}
+    values = {name: text if name == PLAIN else load_json(text) for name, text in said.items()}
     return fit(values, JobTexts)

@@ -8,7 +8,7 @@ import re
 import shutil
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Collection
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import IO
@@ -128,7 +128,12 @@ class Form:
     """A multipart form read from a stream: one file part to disk, small text fields to memory."""
 
     def __init__(
-        self, file_field: str, text_fields: set[str], target: Path, limit_bytes: int, room: Room | None = None
+        self,
+        file_field: str,
+        text_fields: Collection[str],
+        target: Path,
+        limit_bytes: int,
+        room: Room | None = None,
     ) -> None:
         self.texts: dict[str, str] = {}
         self.has_file = False

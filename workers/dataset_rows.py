@@ -7,9 +7,10 @@ import re
 from biresnerf.errors import InputError
 from biresnerf.wire.datasets import DatasetState
 from workers.database import Connection
-from workers.errors import Conflict, NotFound
+from workers.errors import Conflict, LimitReached, NotFound
 from workers.files import StoredFile
 from workers.records import DatasetFile
+from workers.settings import Settings
 
 DATASET = """
     SELECT datasets.*, coalesce(total.files, 0) AS files, coalesce(total.bytes, 0)::bigint AS bytes,
@@ -35,9 +36,16 @@ RESERVED_NAME = re.compile(r"#\d+$")
 
 
 async def record_file(
-    connection: Connection, dataset_id: str, path: str, stored: StoredFile
+    connection: Connection, dataset_id: str, path: str, stored: StoredFile, upload_id: str | None = None
 ) -> tuple[DatasetFile, bool]:
-    """Make a stored file the dataset's at ``path``; also tells whether the path is new. What was there is trash."""
+    """Make a stored file the dataset's at ``path``; also tells whether the path is new. What was there is trash.
+
+    ``upload_id``: the upload that brought it.
+    """
+    if upload_id is not None:
+        await connection.execute(
+            "UPDATE uploads SET brought = least(size, brought + %s) WHERE id = %s", (stored.size, upload_id)
+        )
     before = await (
         await connection.execute(
             "DELETE FROM dataset_files WHERE dataset_id = %s AND path = %s RETURNING key", (dataset_id, path)
@@ -61,6 +69,30 @@ async def require_open(connection: Connection, dataset_id: str, tenant: str | No
     state = await locked(connection, dataset_id, tenant)
     if state != "open":
         raise Conflict("dataset_not_open", f"Dataset {dataset_id} is {state}; it takes no more files.")
+
+
+async def require_place(
+    connection: Connection, settings: Settings, dataset_id: str, path: str, overwrite: bool, size: int
+) -> int:
+    """That ``path`` may be a file of ``size`` bytes; returns the bytes of the dataset's other files.
+
+    Raises `Conflict` (``file_exists``), `LimitReached` (``too_many_files``, ``body_too_large``).
+    """
+    cursor = await connection.execute(
+        "SELECT count(*) FILTER (WHERE path <> %s) AS files, count(*) FILTER (WHERE path = %s) AS same,"
+        " coalesce(sum(size) FILTER (WHERE path <> %s), 0)::bigint AS bytes"
+        " FROM dataset_files WHERE dataset_id = %s",
+        (path, path, path, dataset_id),
+    )
+    row = await cursor.fetchone()
+    assert row is not None, "an aggregate gives a row"
+    if row["same"] and not overwrite:
+        raise Conflict("file_exists", f"{path} is there already.")
+    if row["files"] >= settings.max_files:
+        raise LimitReached("too_many_files", f"A dataset holds at most {settings.max_files} files.")
+    if row["bytes"] + size > settings.max_dataset_bytes:
+        raise LimitReached("body_too_large", f"A dataset holds at most {settings.max_dataset_bytes} bytes.")
+    return int(row["bytes"])
 
 
 async def locked(connection: Connection, dataset_id: str, tenant: str | None) -> DatasetState:

@@ -15,7 +15,16 @@ from biresnerf.wire.datasets import DatasetRecord, DatasetState, ManifestEntry
 from workers.checking import Checker
 from workers.claim import insist
 from workers.database import Connection, Database
-from workers.dataset_rows import DATASET, KNOWN, MINE, file_key, locked, record_file, require_open
+from workers.dataset_rows import (
+    DATASET,
+    KNOWN,
+    MINE,
+    file_key,
+    locked,
+    record_file,
+    require_open,
+    require_place,
+)
 from workers.errors import Conflict, Expired, LimitReached, NotFound
 from workers.files import FileStore, StoredFile
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
@@ -25,7 +34,6 @@ from workers.settings import Settings
 from workers.tenants import LOCAL_TENANT
 
 COPIES_AT_ONCE = 8
-
 FILE = "SELECT path, key, size, sha256, created_at FROM dataset_files"
 
 
@@ -97,9 +105,11 @@ class DatasetStore:
         *,
         sha256: str | None = None,
         overwrite: bool = True,
+        upload_id: str | None = None,
     ) -> tuple[DatasetFile, bool]:
         """Store one file under its relative path; returns it and whether the path is new.
 
+        ``upload_id``: the upload that brought the bytes, whose size the tenant's quota has counted already.
         Raises `NotFound`, `Conflict` (``dataset_not_open``, ``file_exists``), `LimitReached`
         (``body_too_large``, ``too_many_files``), `InputError` (``unsafe_path``, ``digest_mismatch``).
         Where it raises, the dataset is as before.
@@ -108,10 +118,18 @@ class DatasetStore:
         async def stored(key: str, room: int) -> StoredFile:
             return await self._files.put(key, chunks, limit_bytes=room, expected_sha256=sha256)
 
-        return await self._add(dataset_id, path, stored, overwrite=overwrite)
+        return await self._add(dataset_id, path, stored, upload_id, overwrite=overwrite)
 
     async def add_copy(
-        self, dataset_id: str, path: str, source: str, *, size: int, sha256: str, trusted: bool
+        self,
+        dataset_id: str,
+        path: str,
+        source: str,
+        *,
+        size: int,
+        sha256: str,
+        trusted: bool,
+        upload_id: str | None = None,
     ) -> tuple[DatasetFile, bool]:
         """Like `add_file`, from a key of the store that others may write to, unless it is ``trusted``.
 
@@ -133,7 +151,7 @@ class DatasetStore:
                 )
             return file.model_copy(update={"sha256": found})
 
-        return await self._add(dataset_id, path, copied, overwrite=True)
+        return await self._add(dataset_id, path, copied, upload_id, overwrite=True)
 
     async def fill_known(self, dataset_id: str) -> DatasetRecord:
         """Copy what the manifest names and the same tenant has sent before; returns the dataset.
@@ -165,6 +183,7 @@ class DatasetStore:
         dataset_id: str,
         path: str,
         store: Callable[[str, int], Awaitable[StoredFile]],
+        upload_id: str | None,
         *,
         overwrite: bool,
     ) -> tuple[DatasetFile, bool]:
@@ -172,41 +191,26 @@ class DatasetStore:
         folder = f"datasets/{dataset_id}/files/{new_id('v')}"
         key = file_key(folder, path)
         async with self._database.transaction() as connection:
-            row = await self._require_open(connection, dataset_id, path, overwrite=overwrite)
-            await require_byte_quota(connection, dataset_id, 1)
-        room = min(self._settings.max_file_bytes, self._settings.max_dataset_bytes - row["bytes"])
+            there = await self._require_place(connection, dataset_id, path, overwrite)
+            await require_byte_quota(connection, dataset_id, 1 if upload_id is None else 0)
+        room = min(self._settings.max_file_bytes, self._settings.max_dataset_bytes - there)
         try:
             stored = await store(key, room)
             async with self._database.transaction() as connection:
-                await self._require_open(connection, dataset_id, path, overwrite=overwrite, size=stored.size)
-                await require_byte_quota(connection, dataset_id, stored.size)
-                return await record_file(connection, dataset_id, path, stored)
+                await self._require_place(connection, dataset_id, path, overwrite, stored.size)
+                recorded = await record_file(connection, dataset_id, path, stored, upload_id)
+                # All is counted now, also what the file replaced and what the upload has left.
+                await require_byte_quota(connection, dataset_id, 0)
+                return recorded
         except BaseException:
             await self._files.delete_prefix(folder)
             raise
 
-    async def _require_open(
-        self, connection: Connection, dataset_id: str, path: str, *, overwrite: bool, size: int = 0
-    ) -> dict[str, Any]:
-        """The dataset's row, locked, with the bytes and files it would have besides ``path``."""
+    async def _require_place(
+        self, connection: Connection, dataset_id: str, path: str, overwrite: bool, size: int = 0
+    ) -> int:
         await require_open(connection, dataset_id, self._tenant)
-        cursor = await connection.execute(
-            "SELECT count(*) FILTER (WHERE path <> %s) AS files, count(*) FILTER (WHERE path = %s) AS same,"
-            " coalesce(sum(size) FILTER (WHERE path <> %s), 0)::bigint AS bytes"
-            " FROM dataset_files WHERE dataset_id = %s",
-            (path, path, path, dataset_id),
-        )
-        row = await cursor.fetchone()
-        assert row is not None, "an aggregate gives a row"
-        if row["same"] and not overwrite:
-            raise Conflict("file_exists", f"{path} is there already.")
-        if row["files"] >= self._settings.max_files:
-            raise LimitReached("too_many_files", f"A dataset holds at most {self._settings.max_files} files.")
-        if row["bytes"] + size > self._settings.max_dataset_bytes:
-            raise LimitReached(
-                "body_too_large", f"A dataset holds at most {self._settings.max_dataset_bytes} bytes."
-            )
-        return row
+        return await require_place(connection, self._settings, dataset_id, path, overwrite, size)
 
     async def file(self, dataset_id: str, path: str) -> DatasetFile:
         """One file; raises `NotFound`."""

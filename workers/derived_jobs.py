@@ -18,8 +18,10 @@ from workers.forks import LATEST_FIRST, plan_fork
 from workers.idents import new_id
 from workers.job_rows import JOB, fingerprint_of, job_from_row, known_job, one_row
 from workers.jobs import QUEUE_LIMIT_LOCK, JobStore
-from workers.records import Page
+from workers.quotas import require_room
+from workers.records import PRIORITIES, Page
 
+NORMAL = PRIORITIES["normal"]
 # Of a fork that never came to be; long after any request has ended.
 ABANDONED_S = 3600
 EXPORTABLE = ("poses.json", "colmap/sparse/0/cameras.bin", "colmap/sparse/0/images.bin")
@@ -63,7 +65,7 @@ class DerivedJobs(JobStore):
                 known = await known_job(connection, parent["tenant"], idempotency_key, fingerprint)
                 if known is not None:
                     return known, False
-            await self._require_room(connection, parent["dataset_id"])
+            await require_room(connection, parent["dataset_id"], NORMAL, self._settings.max_queued)
             values = {
                 "options": Jsonb(resolved),
                 "asked": Jsonb(options.model_dump(mode="json", exclude_unset=True)),
@@ -117,7 +119,7 @@ class DerivedJobs(JobStore):
             )
             if same is not None:
                 return job_from_row(same), False
-            await self._require_room(connection, parent["dataset_id"])
+            await require_room(connection, parent["dataset_id"], NORMAL, self._settings.max_queued)
             values = {
                 "kind": "export",
                 "parent": job_id,

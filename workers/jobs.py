@@ -81,7 +81,7 @@ class JobStore:
                 known = await known_job(connection, tenant, idempotency_key, fingerprint)
                 if known is not None:
                     return known, False
-            await self._require_room(connection, dataset_id, priority)
+            await require_room(connection, dataset_id, PRIORITIES[priority], self._settings.max_queued)
             job_id = new_id("job")
             await connection.execute(
                 "INSERT INTO jobs (id, dataset_id, tenant, priority, options, asked, labels, idempotency_key,"
@@ -105,13 +105,13 @@ class JobStore:
         await connection.execute("SELECT add_job_event(%s, 'queued', '{}')", (job_id,))
         return job_from_row(await self._required(connection, job_id))
 
-    async def _require_room(
-        self, connection: Connection, dataset_id: str, priority: PriorityName = "normal"
-    ) -> None:
-        await require_room(connection, dataset_id, PRIORITIES[priority], self._settings.max_queued)
-
     async def repeated(
-        self, request_digest: str, options: RefineOptions, labels: Mapping[str, str], idempotency_key: str
+        self,
+        request_digest: str,
+        options: RefineOptions,
+        labels: Mapping[str, str],
+        idempotency_key: str,
+        priority: PriorityName = "normal",
     ) -> Job | None:
         """The job of an earlier request with this key, before anything is done for this one.
 
@@ -119,7 +119,7 @@ class JobStore:
         """
         resolved = options.resolved().model_dump(mode="json")
         async with self._database.transaction() as connection:
-            fingerprint = fingerprint_of(request_digest, resolved, labels)
+            fingerprint = fingerprint_of(request_digest, resolved, labels, priority)
             return await known_job(connection, self._tenant or LOCAL_TENANT, idempotency_key, fingerprint)
 
     async def get(self, job_id: str) -> Job:
@@ -277,7 +277,7 @@ class JobStore:
         return {row["state"]: row["n"] for row in rows}
 
     async def healthy(self) -> bool:
-        """Whether the database answers within two seconds."""
+        """Whether the database answers in time."""
         return await self._listener.database_answers(2.0)
 
     async def _required(self, connection: Connection, job_id: str) -> dict[str, Any]:

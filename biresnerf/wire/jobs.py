@@ -159,6 +159,9 @@ class JobList(Record):
     next_cursor: str | None = Field(None, description="Opaque; null on the last page.")
 
 
+PRIORITY = "Before or after other jobs; `high` only where the operator allows it."
+
+
 class NewJob(Record):
     """A refinement to run."""
 
@@ -172,9 +175,7 @@ class NewJob(Record):
     options: RefineOptions = RefineOptions()
     labels: Labels = Field({})
     webhook: JobWebhook | None = Field(None, description="Who is told of this job, besides all webhooks.")
-    priority: PriorityName = Field(
-        "normal", description="Before or after other jobs; `high` only where the operator allows it."
-    )
+    priority: PriorityName = Field("normal", description=PRIORITY)
 
 
 class JobTexts(Record):
@@ -183,6 +184,7 @@ class JobTexts(Record):
     options: RefineOptions = RefineOptions()
     labels: Labels = Field({})
     webhook: JobWebhook | None = Field(None, description="Who is told of this job, besides all webhooks.")
+    priority: PriorityName = Field("normal", description=PRIORITY)
 
 
 class CancelJob(Record):

@@ -22,6 +22,7 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 _ALWAYS = ("database_unavailable", "internal_error")
 _WRITES = ("cross_site", *_ALWAYS)
 _JSON = ("malformed_json", "invalid_request", "body_too_large", "unsupported_media", "body_timeout")
+_TEXTS = json_content(NewJob)["schema"]["properties"]
 _FORM: dict[str, Any] = {
     "schema": {
         "type": "object",
@@ -29,15 +30,12 @@ _FORM: dict[str, Any] = {
         "additionalProperties": False,
         "properties": {
             "archive": {"type": "string", "format": "binary", "description": "zip, tar or tar.gz"},
-            "options": json_content(NewJob)["schema"]["properties"]["options"],
-            "labels": json_content(NewJob)["schema"]["properties"]["labels"],
-            "webhook": json_content(NewJob)["schema"]["properties"]["webhook"],
+            **{name: _TEXTS[name] for name in ("options", "labels", "webhook", "priority")},
         },
     },
     "encoding": {
-        "options": {"contentType": "application/json"},
-        "labels": {"contentType": "application/json"},
-        "webhook": {"contentType": "application/json"},
+        **{name: {"contentType": "application/json"} for name in ("options", "labels", "webhook")},
+        "priority": {"contentType": "text/plain"},
     },
 }
 _BODY = {

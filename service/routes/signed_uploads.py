@@ -97,7 +97,13 @@ async def complete_upload(upload_id: UploadId, caller: DatasetWriterHere) -> Fil
     await caller.datasets.get(upload.dataset_id)
     try:
         file, _ = await caller.datasets.add_copy(
-            upload.dataset_id, path, _key(upload), size=upload.size, sha256=sha256, trusted=False
+            upload.dataset_id,
+            path,
+            _key(upload),
+            size=upload.size,
+            sha256=sha256,
+            trusted=False,
+            upload_id=upload_id,
         )
     except NotFound:
         raise ProblemError("upload_incomplete", "No bytes have arrived at the signed address.") from None

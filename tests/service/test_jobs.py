@@ -126,6 +126,7 @@ def test_one_request_with_an_archive_is_a_whole_job(http: httpx.Client, scene: P
         "data": {
             "options": json.dumps({"preset": "fast", "steps": 20, "seed": 1}),
             "labels": '{"by": "form"}',
+            "priority": "high",
         },
         "headers": {"Idempotency-Key": "form-1"},
     }
@@ -134,12 +135,14 @@ def test_one_request_with_an_archive_is_a_whole_job(http: httpx.Client, scene: P
     assert answer.status_code == 202, answer.text
     job = answer.json()
     assert job["labels"] == {"by": "form"}
+    assert job["priority"] == "high"
     assert http.get(job["links"]["dataset"]).json()["files"] == 7
     again = http.post("/v1/jobs", **form)
     assert again.json()["id"] == job["id"]
     assert len(http.get("/v1/datasets?limit=200").json()["items"]) == before + 1
-    form["data"]["labels"] = "{}"
-    problem(http.post("/v1/jobs", **form), 422, "idempotency_key_reused")
+    for other in ({"labels": "{}"}, {"priority": "low"}):
+        changed = {**form, "data": {**form["data"], **other}}
+        problem(http.post("/v1/jobs", **changed), 422, "idempotency_key_reused")
     assert finished(http, job["id"])["state"] == "succeeded"
 
 
@@ -154,6 +157,7 @@ def test_one_request_with_an_archive_is_a_whole_job(http: httpx.Client, scene: P
             "#/archives",
         ),
         ({"data": {"options": "{"}, "files": {"archive": b"x"}}, 400, "malformed_json", None),
+        ({"data": {"priority": "top"}, "files": {"archive": b"x"}}, 422, "invalid_request", "#/priority"),
         (
             {"data": {"options": '{"steps": 5}'}, "files": {"archive": b"x"}},
             422,

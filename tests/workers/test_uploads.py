@@ -121,3 +121,44 @@ async def test_lost_pieces_are_said_and_not_taken_for_a_deleted_upload(stores: S
     with pytest.raises(Conflict) as caught:
         await content_of(stores, upload)
     assert caught.value.code == "upload_incomplete"
+
+
+async def taken(stores: Stores, upload: Upload, files: dict[str, bytes]) -> None:
+    """What the web process does with a received upload that holds these files."""
+    token = uuid.uuid4()
+    assert await stores.uploads.take(upload.id, token)
+    for path, content in files.items():
+        await stores.datasets.add_file(upload.dataset_id, path, stream(content), upload_id=upload.id)
+    await stores.uploads.conclude(upload.id, token, None)
+
+
+async def stored(stores: Stores) -> int:
+    return (await stores.tenants.share("anna")).stored_bytes
+
+
+async def test_an_upload_that_fills_the_quota_is_brought_in_and_counted_once(stores: Stores):
+    await stores.tenants.set("anna", max_stored_bytes=1000)
+    dataset = await stores.datasets.of("anna").create("full")
+    upload = await stores.uploads.create(dataset.id, "file", 1000, path="a.png")
+    upload = await stores.uploads.append(upload.id, 0, stream(bytes(1000)))
+    assert await stored(stores) == 1000
+    # The process died when the file was stored, before it said so: the next one does it again.
+    await stores.datasets.add_file(dataset.id, "a.png", stream(bytes(1000)), upload_id=upload.id)
+    assert await stored(stores) == 1000
+    await taken(stores, upload, {"a.png": bytes(1000)})
+    assert await stored(stores) == 1000
+
+
+async def test_what_an_archive_unpacks_to_is_counted_and_the_archive_only_until_then(stores: Stores):
+    await stores.tenants.set("anna", max_stored_bytes=1500)
+    dataset = await stores.datasets.of("anna").create("packed")
+    upload = await stores.uploads.create(dataset.id, "archive", 1000)
+    upload = await stores.uploads.append(upload.id, 0, stream(bytes(1000)))
+    await stores.datasets.add_file(dataset.id, "a.png", stream(bytes(400)), upload_id=upload.id)
+    assert await stored(stores) == 1000, "400 in the dataset, 600 for the rest"
+    with pytest.raises(LimitReached) as refused:
+        await stores.datasets.add_file(dataset.id, "b.png", stream(bytes(1200)), upload_id=upload.id)
+    assert refused.value.code == "quota_exhausted"
+    assert (await stored(stores), (await stores.datasets.get(dataset.id)).files) == (1000, 1)
+    await taken(stores, upload, {"a.png": bytes(400), "b.png": bytes(1100)})
+    assert await stored(stores) == 1500

@@ -86,7 +86,7 @@ BEGIN
     IF NOT EXISTS (SELECT 1 FROM jobs WHERE tenant = _tenant AND held AND state = 'queued') THEN
         RETURN 0;
     END IF;
-    -- Two jobs that end at once each make room for one.
+    -- Of two that offer at once (a janitor, an end, a new limit) neither sees what the other offers.
     PERFORM 1 FROM tenants WHERE id = _tenant FOR NO KEY UPDATE;
     SELECT max_running INTO STRICT _limit FROM tenant_limits WHERE id = _tenant;
     SELECT CASE WHEN _limit = 0 THEN 2147483647 ELSE greatest(0, _limit - count(*)) END INTO _room
