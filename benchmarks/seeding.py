@@ -2,13 +2,15 @@
 
 Without options all poses and lenses are taken away, as if SET were a folder of images. With `--missing`, that share
 of the poses is (`numpy.random.default_rng(0)`), and the others get BARF's noise (seed 1); lenses stay. Errors are
-rotations after alignment of all cameras by their centres. `--focal 1.05` makes given focal lengths 5 % too long.
+rotations after alignment of all cameras by their centres. `--focal 1.05` makes given focal lengths 5 % too long,
+`--effort low` spends what a job does that ran out of memory before.
 """
 
 from __future__ import annotations
 
 import argparse
 import logging
+import resource
 import tempfile
 import time
 from collections import Counter
@@ -96,6 +98,7 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=0.15)
     parser.add_argument("--size", type=int)
     parser.add_argument("--focal", type=float, default=1.0)
+    parser.add_argument("--effort", choices=("full", "low"), default="full")
     asked = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     truth = read_dataset(asked.set)
@@ -110,7 +113,7 @@ def main() -> None:
         )
         given = replace(given, cameras=tuple(with_focal(camera, asked.focal) for camera in given.cameras))
         began = time.monotonic()
-        found = seed_poses(given)
+        found = seed_poses(given, effort=asked.effort)
         seconds = time.monotonic() - began
     missing, all_of_them = ~given.posed, np.ones(len(truth), dtype=bool)
     for candidate in found.candidates:
@@ -123,6 +126,8 @@ def main() -> None:
         print(warning)
     known, was = found.dataset.cameras[0].full(), truth.cameras[0].full()
     print(f"focal length {known.fx:.1f} px, in truth {was.fx:.1f}; {seconds:.0f} s")
+    most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    print(f"COLMAP's process: {most:.0f} MiB at the highest")
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ PoseParametrisation = Literal["se3_world", "so3xr3", "so3xr3_camp"]
 PackName = Literal["colmap-text", "instant-ngp", "kitti", "bundler", "pinhole"]
 StartPoses = Literal["auto", "given", "colmap", "none"]
 RefineIntrinsics = Literal["auto", "none", "focal", "all"]
+SeedingEffort = Literal["full", "low"]
 
 # Options that have no say before stage 2 begins: runs that differ in these alone can share stage 1.
 STAGE_2_OPTIONS = frozenset(
@@ -80,6 +81,12 @@ class RefineOptions(BaseModel):
         description="auto: feature matches find missing poses, and poses they support are tried against the given "
         "ones; given: the given poses, of all images; colmap: COLMAP's poses, whatever is given; none: no feature "
         "matches, missing poses are guessed from other images.",
+    )
+
+    seeding_effort: SeedingEffort = Field(
+        "full",
+        description="low: COLMAP looks for fewer features in smaller photos, in one thread; it takes less memory and "
+        "places fewer photos.",
     )
 
     fixed: tuple[str, ...] = Field(

@@ -253,6 +253,7 @@ def _prepare(
         options.start or "auto",
         should_stop=stop,
         seed=options.seed,
+        effort=options.seeding_effort,
         remember=seeding,
         on_start=lambda: report(Progress(stage="seeding", fraction=0.01, message=message)),
     )

@@ -53,4 +53,6 @@ def _why_not(
         return "The job has no poses from COLMAP."
     if new["start"] not in ("auto", "colmap"):
         return f"start={new['start']} does not ask COLMAP."
+    if "seeding_effort" in changed and new["seeding_effort"] == "full":
+        return "COLMAP's answer was found with seeding_effort=low."
     return "COLMAP's answer depends on seed." if "seed" in changed else None

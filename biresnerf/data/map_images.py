@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from biresnerf.config import SeedingEffort
 from biresnerf.data.colmap_process import run_colmap
 from biresnerf.data.dataset import Camera, Dataset
 from biresnerf.data.decode import decode
@@ -37,6 +38,8 @@ WIDEST_ALONE, MOST_FEATURES_ALONE = 1600, 4096
 # COLMAP's bounds on reprojection errors are made for photos of thousands of px. At 200 px they let wrong matches pass:
 # with 0.35 of them temple's mean rotation error went from 6.8 to 1.4 deg, entry-P10's from 4.9 to 0.8.
 ERROR_SIZE = 1600  # px, long side at which COLMAP's own bounds hold; they shrink with the root of the size
+# Where memory is short.
+WIDEST_LOW, MOST_FEATURES_LOW = 800, 1024
 # Pixels in all: affine shapes and pooled scales find more and cost several times as much, by the number of features.
 THOROUGH_UP_TO, THOROUGH_ALONE_UP_TO = 10e6, 4e6
 
@@ -95,13 +98,14 @@ def ask_colmap(
     *,
     should_stop: Callable[[], bool],
     seed: int,
+    effort: SeedingEffort,
     limit_s: float,
     log_folder: Path | None = None,
 ) -> dict[str, Any]:
     """What COLMAP finds, as plain data for `read_mapping`. Poses that the set has guide it.
 
     Beside the log in ``log_folder`` the matches are left, for `FeatureMatches.load`. One thread where all poses are
-    given: more would make the answer differ from run to run.
+    given: more would make the answer differ from run to run. One where little is asked of it, too: each takes memory.
 
     Raises:
         InputError: ``seed_timeout``, or a code of `open_image`.
@@ -119,9 +123,9 @@ def ask_colmap(
             "work": work,
             "answer": str(Path(work, "answer.json")),
             "seed": seed,
-            "threads": 1 if posed.all() else -1,
+            "threads": 1 if posed.all() or effort == "low" else -1,
             **_request_images(dataset, names),
-            **_thoroughness(dataset),
+            **_thoroughness(dataset, effort),
         }
         answer = run_colmap(request, Path(work), should_stop, limit_s, log_folder)
         if log_folder is not None:
@@ -168,17 +172,18 @@ def _request_images(dataset: Dataset, names: list[str]) -> dict[str, Any]:
     }
 
 
-def _thoroughness(dataset: Dataset) -> dict[str, Any]:
+def _thoroughness(dataset: Dataset, effort: SeedingEffort) -> dict[str, Any]:
     sizes = [dataset.camera_of(i) for i in range(len(dataset))]
     alone = not dataset.posed.all()
-    most = WIDEST_ALONE if alone else WIDEST_IMAGE
+    low = effort == "low"
+    most = WIDEST_LOW if low else WIDEST_ALONE if alone else WIDEST_IMAGE
     widest = min(most, float(np.median([max(c.width, c.height) for c in sizes])))
     return {
         "widest_image": most,
-        "most_features": MOST_FEATURES_ALONE if alone else MOST_FEATURES,
+        "most_features": MOST_FEATURES_LOW if low else MOST_FEATURES_ALONE if alone else MOST_FEATURES,
         "error_scale": min(1.0, (widest / ERROR_SIZE) ** 0.5),
-        "thorough": sum(c.width * c.height for c in sizes)
-        <= (THOROUGH_ALONE_UP_TO if alone else THOROUGH_UP_TO),
+        "thorough": not low
+        and sum(c.width * c.height for c in sizes) <= (THOROUGH_ALONE_UP_TO if alone else THOROUGH_UP_TO),
     }
 
 

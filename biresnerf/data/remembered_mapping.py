@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from biresnerf.config import SeedingEffort
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.map_images import Mapping, ask_colmap, read_mapping
@@ -19,11 +20,14 @@ def remembered_mapping(
     dataset: Dataset,
     should_stop: Callable[[], bool],
     seed: int,
+    effort: SeedingEffort,
     limit_s: float | None,
     remember: Path | None,
     on_start: Callable[[], None],
 ) -> Mapping:
     """What COLMAP finds, or found when it was asked the same before and the file ``remember`` kept it.
+
+    An answer found with more effort than is asked for now is as good.
 
     Raises:
         InputError: ``seed_timeout``.
@@ -31,7 +35,8 @@ def remembered_mapping(
         RefinementError: ``seeding_crashed``.
     """
     key = _fingerprint(dataset, seed) if remember is not None else ""
-    answer = _remembered(remember, key)
+    keys = {"full": (key,), "low": (f"{key} low", key)}[effort]
+    answer = _remembered(remember, keys)
     if answer is None:
         on_start()
         if limit_s is None:
@@ -40,12 +45,13 @@ def remembered_mapping(
             dataset,
             should_stop=should_stop,
             seed=seed,
+            effort=effort,
             limit_s=limit_s,
             log_folder=remember.parent if remember is not None else None,
         )
         if remember is not None:
             with whole_file(remember) as temporary:
-                temporary.write_text(json.dumps({"key": key, "answer": answer}), "utf-8")
+                temporary.write_text(json.dumps({"key": keys[0], "answer": answer}), "utf-8")
     return read_mapping(dataset, answer)
 
 
@@ -60,9 +66,9 @@ def _fingerprint(dataset: Dataset, seed: int) -> str:
     return digest.hexdigest()
 
 
-def _remembered(remember: Path | None, key: str) -> dict[str, Any] | None:
+def _remembered(remember: Path | None, keys: tuple[str, ...]) -> dict[str, Any] | None:
     """The answer kept for the same images, if there is one; our own file, written whole."""
     if remember is None or not remember.is_file():
         return None
     kept = json.loads(remember.read_text("utf-8"))
-    return kept["answer"] if kept["key"] == key else None
+    return kept["answer"] if kept["key"] in keys else None

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.config import StartPoses
+from biresnerf.config import SeedingEffort, StartPoses
 from biresnerf.data.compare_models import adds_to, model_lens_problem, with_found_lenses
 from biresnerf.data.dataset import GUESSES, Dataset
 from biresnerf.data.image_likeness import likeness
@@ -96,6 +96,7 @@ def seed_poses(
     *,
     should_stop: Callable[[], bool] = lambda: False,
     seed: int = 0,
+    effort: SeedingEffort = "full",
     limit_s: float | None = None,
     remember: Path | None = None,
     on_start: Callable[[], None] = lambda: None,
@@ -129,7 +130,7 @@ def seed_poses(
             replace(dataset, frames=tuple(replace(f, world_from_cam=None) for f in dataset.frames))
             if start == "colmap"
             else dataset,
-            should_stop, seed, limit_s, remember, on_start,
+            should_stop, seed, effort, limit_s, remember, on_start,
         )  # fmt: skip
     except (InputError, RefinementError) as error:
         if start == "colmap" or not given.posed.any():

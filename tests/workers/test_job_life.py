@@ -169,4 +169,6 @@ def test_a_second_try_asks_for_less_but_never_for_too_little():
     assert smaller_options(options) == {
         "samples_per_step": 2**15, "max_image_size": 200, "table_size_log2": 17,
     }  # fmt: skip
-    assert smaller_options({"samples_per_step": 1024, "max_image_size": 64, "table_size_log2": 10}) == {}
+    least = {"samples_per_step": 1024, "max_image_size": 64, "table_size_log2": 10, "seeding_effort": "low"}
+    assert smaller_options(least) == {}
+    assert smaller_options({**least, "seeding_effort": "full"}) == {"seeding_effort": "low"}
