@@ -55,6 +55,29 @@ def make_scene_command(
 
     The true poses are in OUTPUT.truth.json; `biresnerf pose-error` compares a result with them.
     """
+    click.echo(make_scene(output, kind, own=own, views=views, size=size, noise=noise, seed=seed))
+
+
+def make_scene(
+    output: Path,
+    kind: str = "dome",
+    *,
+    own: Path | None = None,
+    views: int = 60,
+    size: int = 100,
+    noise: float = 0.15,
+    seed: int = 0,
+) -> str:
+    """Writes a set of a kind of `KINDS` to `output`, and its true poses to OUTPUT.truth.json; says what it has written.
+
+    Args:
+        own: a set with poses, in any form that is read, to make wrong instead of rendering one.
+        size: width of the images (px), of those rendered.
+        noise: standard deviation of the poses' noise, as BARF has it, of the kinds that are turned at random.
+
+    Raises:
+        InputError: `output` is not empty, or `own` cannot be read or lacks poses.
+    """
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise InputError(
             "output_not_empty", "is not an empty folder.", where=str(output), mend="Name a new folder."
@@ -68,8 +91,9 @@ def make_scene_command(
     if kind == "half":
         said = _keep_half(dataset, path)
     else:
-        said = _make_wrong(dataset, path, kind, noise, seed)
-    click.echo(f"{len(dataset)} views in {output}{said}, true poses in {truth}")
+        said = ""
+        _make_wrong(dataset, path, kind, noise, seed)
+    return f"{len(dataset)} views in {output}{said}, true poses in {truth}"
 
 
 def _made(output: Path, kind: str, views: int, size: int, seed: int) -> Path:
@@ -114,8 +138,8 @@ def _copied(own: Path, output: Path) -> Path:
     return path
 
 
-def _make_wrong(dataset: Dataset, path: Path, kind: str, noise: float, seed: int) -> str:
-    """Writes wrong poses into the transforms file; says how wrong."""
+def _make_wrong(dataset: Dataset, path: Path, kind: str, noise: float, seed: int) -> None:
+    """Writes wrong poses into the transforms file."""
     import json
 
     from biresnerf.data.image_order import natural_order
@@ -125,7 +149,7 @@ def _make_wrong(dataset: Dataset, path: Path, kind: str, noise: float, seed: int
     true = dataset.world_from_cam
     if kind != "phone":
         write_transforms(dataset, perturb_poses(true, noise, seed), path)
-        return ""
+        return
     order = natural_order(dataset.file_names)
     drifted = true.copy()
     drifted[order] = drift_like_a_phone(true[order], seed)
@@ -134,7 +158,6 @@ def _make_wrong(dataset: Dataset, path: Path, kind: str, noise: float, seed: int
     for part in (document, *document["frames"]):
         part.update({key: part[key] * _FOCAL_TOO_LONG for key in ("fl_x", "fl_y") if key in part})
     path.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
-    return ""
 
 
 def _keep_half(dataset: Dataset, path: Path) -> str:

@@ -28,7 +28,9 @@ TABLE_SCENE = (
     Shape("box", (0.1, -0.05, -0.64), (1.9, 1.5, 0.06), (12.0, 0.0)),
     Shape("room", (0.0, 0.0, 0.0), (8.0, 8.0, 8.0), (0.0, 0.0)),
 )
-# Nothing but its handle and a glaze that hardly changes tells one side of it from another.
+# Walls far away show patches, not grain.
+_TABLE_SCALES, _ROOM_SCALES = 4, 2
+# Nothing but its spout and a glaze that hardly changes tells one side of it from another.
 VASE = (
     Shape("cylinder", (0.0, 0.0, -0.85), (0.36, 0.36, 0.08), (0.0, 0.0)),
     Shape("sphere", (0.0, 0.0, -0.25), (0.62, 0.62, 0.62), (0.0, 0.0)),
@@ -67,6 +69,15 @@ def walking_cameras(n_views: int, seed: int) -> NDArray[np.float64]:
     return poses
 
 
+def table_textures(seed: int) -> list[Texture]:
+    """Those of `TABLE_SCENE`."""
+    around = [
+        Texture.random(np.random.default_rng([seed, 7, scales]), scales)
+        for scales in (_TABLE_SCALES, _ROOM_SCALES)
+    ]
+    return random_textures(len(SHAPES), seed) + around
+
+
 def write_walk(folder: Path, n_views: int, width: int, seed: int) -> Path:
     """Writes photos of a walk around the table and transforms.json as NeRFCapture does, with true poses, in metres.
 
@@ -75,7 +86,7 @@ def write_walk(folder: Path, n_views: int, width: int, seed: int) -> Path:
     """
     height, focal = round(width * 3 / 4), PHONE_FOCAL_OF_WIDTH * width
     poses = walking_cameras(n_views, seed)
-    textures = random_textures(len(TABLE_SCENE), seed)
+    textures = table_textures(seed)
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for index, pose in enumerate(poses):
         pixels = render_shapes(TABLE_SCENE, textures, pose, width, height, focal)[0]

@@ -123,9 +123,9 @@ class Texture:
     amplitudes: Array  # [waves, 3]
 
     @staticmethod
-    def random(rng: np.random.Generator) -> Texture:
-        """A texture that no other draw resembles."""
-        numbers = np.repeat(_WAVE_NUMBERS, _WAVES_EACH)
+    def random(rng: np.random.Generator, scales: int = len(_WAVE_NUMBERS)) -> Texture:
+        """A texture that no other draw resembles, of so many scales of detail, from the coarsest on."""
+        numbers = np.repeat(_WAVE_NUMBERS[:scales], _WAVES_EACH)
         directions = rng.normal(size=(len(numbers), 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         tints = rng.normal(size=(len(numbers), 3))

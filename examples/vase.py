@@ -1,0 +1,39 @@
+"""A plain vase with rough poses; vase.md walks through it.
+
+The notebook is made of this file (`make docs`).
+"""
+
+# %% [markdown]
+# # A plain vase
+#
+# A glazed vase gives features next to nothing to hold on to. But the poses are roughly known, from a turntable or a rig,
+# and outline, light and the slow change of colour are enough for a field.
+
+# %%
+from walk import arguments, pose_table, show_progress
+
+from biresnerf import refine_poses
+from biresnerf.commands.make_scene import make_scene
+
+here = arguments("vase", views=40, size=160, preset="fast", steps=1500, trial_steps=200, orbit_frames=0)
+print(make_scene(here.scene, "vase", own=here.of, views=here.views, size=here.size, noise=0.1, seed=1))
+print(pose_table(here.truth, given=here.scene))
+
+# %% [markdown]
+# ## Refine
+#
+# The few matches there are may mislead; a trial on unseen views decides whether to begin from them.
+
+# %%
+report = refine_poses(here.scene, here.refined, here.options, show_progress)
+print()
+for line in report.verdict.in_words() if report.verdict else ():
+    print(line)
+for warning in report.warnings:
+    print("warning:", warning)
+
+# %% [markdown]
+# ## Before and after, against the truth
+
+# %%
+print(pose_table(here.truth, given=here.scene, refined=here.refined))

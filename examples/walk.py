@@ -1,0 +1,92 @@
+"""What the walks share: their arguments, and the poses before and after against the true ones."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from biresnerf import RefineOptions
+from biresnerf.commands.pose_error import matched_names
+from biresnerf.commands.settings_option import parse_settings
+from biresnerf.config import parse_options
+from biresnerf.data.pose_file import read_poses
+from biresnerf.errors import InputError
+from biresnerf.geometry.pose_error import pose_error
+from biresnerf.progress import Progress
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What a walk is run with.
+
+    Attributes:
+        output: a new folder for all of its files.
+        of: the user's own set, taken for true; None to have one made.
+        views, size: of the made set; size is the images' width (px).
+        options: of the refinement.
+    """
+
+    output: Path
+    of: Path | None
+    views: int
+    size: int
+    options: RefineOptions
+
+    @property
+    def scene(self) -> Path:
+        """The set with wrong or missing poses."""
+        return self.output / "scene"
+
+    @property
+    def truth(self) -> Path:
+        """Its true poses."""
+        return self.output / "scene.truth.json"
+
+    @property
+    def refined(self) -> Path:
+        """The result."""
+        return self.output / "refined"
+
+
+def arguments(name: str, *, views: int, size: int, **settings: object) -> Arguments:
+    """The walk's own values, with those of the command line in their place; in a notebook there is none."""
+    parser = argparse.ArgumentParser(prog=f"{name}.py")
+    parser.add_argument("--output", type=Path, default=Path(name), help=f"new folder (default: {name})")
+    parser.add_argument("--of", type=Path, help="your own images and poses, taken for true")
+    parser.add_argument("--views", type=int, default=views)
+    parser.add_argument("--size", type=int, default=size, help="width of the images, px")
+    parser.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE")
+    given = parser.parse_args([] if "ipykernel" in sys.modules else None)
+    try:
+        options = parse_options({**settings, **parse_settings(tuple(given.settings))})
+    except InputError as error:
+        parser.error(str(error))
+    return Arguments(given.output, given.of, given.views, given.size, options)
+
+
+def show_progress(progress: Progress) -> None:
+    """One line that changes."""
+    print(f"\r{progress.stage:<10} {100 * progress.fraction:3.0f} %", end="", file=sys.stderr, flush=True)
+
+
+def pose_table(truth: Path, **sets: Path) -> str:
+    """Rotation (deg) and centre (% of the cameras' distance) errors of each set, after robust alignment."""
+    true = read_poses(truth)
+    lines = [
+        f"{'':<10}{'poses':>8}{'rotation: median':>18}{'largest':>10}{'position: median':>18}{'largest':>10}"
+    ]
+    for name, path in sets.items():
+        poses = read_poses(path)
+        pairs = matched_names(list(poses), list(true))
+        both = np.stack([poses[a] for a, _ in pairs]), np.stack([true[b] for _, b in pairs])
+        error = pose_error(*both).aligned_robust
+        turned, moved = error.rotation_deg, error.centre_percent
+        lines.append(
+            f"{name:<10}{len(pairs):>4}/{len(true):<3}{turned.median:>17.2f}°{turned.max:>9.2f}°"
+            f"{moved.median:>16.2f} %{moved.max:>8.2f} %"
+        )
+    return "\n".join(lines)
