@@ -28,8 +28,7 @@ from typing import Any
 import psutil
 import psycopg
 
-from service.client import Client
-from service.sending import LocalFile, send_archive, send_missing
+from biresnerf.client import Client, LocalFile
 from workers.embedded_postgres import EmbeddedPostgres
 from workers.migrate import migrate
 
@@ -248,12 +247,12 @@ def run(total_bytes: int, folder: Path) -> list[dict[str, Any]]:
 
     def as_archive(client: Client) -> str:
         dataset = client.create_dataset("archive")
-        send_archive(client, dataset, archive)
+        client.send_archive(dataset, archive)
         return dataset.id
 
     def as_files(client: Client) -> str:
         dataset = client.create_dataset("files", [file.entry for file in files])
-        send_missing(client, dataset, files)
+        client.send_missing(dataset, files)
         return dataset.id
 
     def check(dataset_id: str) -> bool:

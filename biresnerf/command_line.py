@@ -5,18 +5,24 @@ A command's module is imported only when it is used, so that `biresnerf submit` 
 
 from __future__ import annotations
 
-import signal
 import sys
 from importlib.metadata import EntryPoint, entry_points
 
 import click
 
+from biresnerf.commands import exit_codes
 from biresnerf.errors import BiresnerfError, InputError
 
+NAME = "biresnerf"
 GROUP = "biresnerf.commands"
-EXIT_FAILURE = 1
-EXIT_INPUT = 2
-EXIT_SIGINT = 128 + signal.SIGINT
+# What brings a package that is not installed; all others come with the service.
+_EXTRAS = {
+    "httpx": "client",
+    "anyio": "client",
+    "scipy": "compare",
+    "matplotlib": "compare",
+    "pycolmap": "colmap",
+}
 
 
 class _FoundCommands(click.Group):
@@ -42,18 +48,23 @@ def _loaded(point: EntryPoint) -> click.Command:
             point.name, context_settings={"ignore_unknown_options": True, "allow_extra_args": True}
         )
         def unavailable() -> None:
-            raise InputError(
-                "extra_missing",
-                f"needs the package {missing}, which is not installed.",
-                where=f"biresnerf {point.name}",
-                mend="Install it with: pip install 'biresnerf[service]'",
-            )
+            raise _missing(missing, point.name)
 
         unavailable.help = f"(not installed: {missing})"
         return unavailable
     if not isinstance(command, click.Command):
         raise TypeError(f"entry point {point.name} is no click command")
     return command
+
+
+def _missing(package: str | None, command: str) -> InputError:
+    extra = _EXTRAS.get(package or "", "service")
+    return InputError(
+        "extra_missing",
+        f"needs the package {package}, which is not installed.",
+        where=f"biresnerf {command}",
+        mend=f"Install it with: pip install 'biresnerf[{extra}]'",
+    )
 
 
 @click.command(cls=_FoundCommands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -63,22 +74,22 @@ def cli() -> None:
 
 
 def main() -> None:
-    """Entry point. Exit status: 0 done, 2 input or usage to mend, 1 other failure, 130 Ctrl-C, 143 SIGTERM."""
+    """Entry point; `exit_codes` says what the exit status means."""
     try:
-        status = cli.main(standalone_mode=False)
-        sys.exit(status if isinstance(status, int) else 0)
+        status = cli.main(prog_name=NAME, standalone_mode=False)
+        sys.exit(status if isinstance(status, int) else exit_codes.DONE)
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
     except (click.Abort, KeyboardInterrupt):
         click.echo("stopped", err=True)
-        sys.exit(EXIT_SIGINT)
+        sys.exit(exit_codes.SIGINT)
     except InputError as error:
         click.echo(f"error: {error}", err=True)
-        sys.exit(EXIT_INPUT)
-    except BiresnerfError as error:
+        sys.exit(exit_codes.INPUT)
+    except (BiresnerfError, OSError) as error:
         click.echo(f"error: {error}", err=True)
-        sys.exit(EXIT_FAILURE)
+        sys.exit(exit_codes.FAILED)
 
 
 if __name__ == "__main__":

@@ -17,8 +17,6 @@ from biresnerf.errors import InputError
 if TYPE_CHECKING:
     from workers.settings import Settings
 
-DEFAULT_URL = "http://127.0.0.1:8000"
-
 
 def free_port() -> int:
     """A port that nobody listens on just now."""
@@ -101,7 +99,7 @@ def _announcer(host: str, port: int) -> Callable[[str], Coroutine[None, None, No
 
 
 def _answers(url: str) -> bool:
-    from service.client import Client
+    from biresnerf.client import Client
 
     with Client(url) as client:
         return client.ready()
@@ -141,42 +139,6 @@ def migrate_command() -> None:
     with setup_problems():
         applied = migrate(settings_with().require_database_url())
     click.echo("\n".join(f"applied {name}" for name in applied) or "The database is up to date.")
-
-
-@click.command("submit")
-@click.argument("path", type=click.Path(path_type=Path))
-@click.option("--preset", help="fast, balanced, quality or paper.")
-@settings_option
-@click.option("--wait", is_flag=True, help="Show progress until the job is over.")
-@click.option("--output", type=click.Path(path_type=Path), help="Download the result here; implies --wait.")
-@click.option(
-    "--url", envvar="BIRESNERF_URL", default=DEFAULT_URL, show_default=True, help="Where the service is."
-)
-@click.option("--priority", type=click.Choice(["low", "normal", "high"]), default="normal", show_default=True)
-@click.option(
-    "--api-key", envvar="BIRESNERF_API_KEY", help="Better in BIRESNERF_API_KEY: others see command lines."
-)
-def submit_command(
-    path: Path,
-    preset: str | None,
-    settings: dict[str, Any],
-    wait: bool,
-    output: Path | None,
-    url: str,
-    priority: Any,
-    api_key: str | None,
-) -> None:
-    """Send PATH (a folder, or a file with poses in a folder of images) to a service.
-
-    Exit status: 0 done, 2 the input or options have to change, 1 anything else. Ctrl-C ends the waiting; the
-    job goes on.
-    """
-    from biresnerf.config import parse_options
-    from service.submit import Where, run_submit
-
-    options = parse_options({**settings, **({"preset": preset} if preset else {})})
-    service = Where(url, api_key)
-    run_submit(path, options, service, wait=wait, output=output, priority=priority)
 
 
 @click.command("demo")

@@ -22,15 +22,14 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.console import Console
 
+from biresnerf.client.scene import look_at
+from biresnerf.commands.follow_job import fetch, require_success
+from biresnerf.commands.job_progress import JobProgressView, SendingView, watch
+from biresnerf.commands.service_options import service_at
 from biresnerf.config import RefineOptions
 from biresnerf.errors import BiresnerfError, InputError
 from biresnerf.report import Report
-from service.client import Client, ServiceError
-from service.pack import look_at
-from service.progress_view import progress_view, watch
-from service.submit import download_all, submit_scene
 
 # By this file a later run knows that it may clear the folder.
 _MARK = ".made-by-biresnerf-demo"
@@ -137,22 +136,13 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def _send_and_fetch(url: str, scene: Path, target: Path, options: RefineOptions) -> None:
-    packed = look_at(scene)
-    try:
-        with Client(url) as client:
-            click.echo(f"sending {len(packed.files)} files, {packed.total_bytes / 1e6:.1f} MB")
-            job = submit_scene(client, packed, scene.resolve().name, options)
-            with progress_view(Console(stderr=True)) as view:
-                job = watch(client, job, view)
-            if job.error is not None:
-                error = job.error
-                raise InputError(error.code, error.detail, where=error.where, mend=error.mend)
-            files = download_all(client, job, target)
-            click.echo(f"fetched {len(files)} files")
-    except ServiceError as error:
-        if error.users_fault:
-            raise InputError(error.code, error.what, where=error.where, mend=error.mend) from None
-        raise
+    with service_at(url, None) as client:
+        with SendingView() as view:
+            job = client.submit(scene, options, on_progress=view.sending)
+        with JobProgressView() as progress:
+            job = watch(client, job, progress)
+        require_success(job)
+        click.echo(f"fetched {len(fetch(client, job, target))} files")
 
 
 def _tell(folders: Folders, truth: Path | None, scene: Path) -> None:

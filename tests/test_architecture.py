@@ -64,6 +64,8 @@ def test_contracts_hold():
         ("workers/jobs.py", "import biresnerf.geometry.lie", "only the job child"),
         ("biresnerf/errors.py", "import numpy", "leaves stay leaves"),
         ("biresnerf/data/dataset.py", "import biresnerf.wire.jobs", "nothing of jobs and HTTP"),
+        ("biresnerf/client/events.py", "def f():\n    import numpy", "neither numpy nor torch"),
+        ("biresnerf/wire/jobs.py", "import workers.settings", "neither numpy nor torch"),
     ],
 )
 def test_an_import_against_the_arrows_breaks_its_contract(copy, module, line, contract):
@@ -81,6 +83,7 @@ def test_an_import_against_the_arrows_breaks_its_contract(copy, module, line, co
         ("biresnerf", HEAVY),
         ("biresnerf.command_line", HEAVY),
         ("biresnerf.wire.jobs", (*HEAVY, "httpx", "workers", "service")),
+        ("biresnerf.client", (*HEAVY, "pydantic_settings", "workers", "service")),
         ("workers.jobs", ("torch", "numba", "pycolmap")),
         ("workers.slot", ("torch", "numba", "pycolmap")),
         ("service.app", ("torch", "numba", "pycolmap")),
@@ -129,7 +132,11 @@ def imported(package: str) -> dict[str, str]:
 
 @pytest.mark.parametrize(
     ("package", "extras"),
-    [("biresnerf", ["colmap", "compare"]), ("workers", ["service", "otel"]), ("service", ["service"])],
+    [
+        ("biresnerf", ["client", "colmap", "compare"]),
+        ("workers", ["service", "otel"]),
+        ("service", ["service"]),
+    ],
 )
 def test_a_package_imports_only_what_its_installation_brings(package, extras):
     missing = {name: file for name, file in imported(package).items() if name not in declared(*extras)}

@@ -190,7 +190,7 @@ class DeliveryView(WebhookDelivery):
     @classmethod
     def of(cls, delivery: WebhookDelivery) -> DeliveryView:
         """The delivery as the wire has it."""
-        here = delivery_url(delivery)
+        here = delivery_path(delivery.webhook_id, delivery.id)
         return cls(**dict(delivery), links=DeliveryLinks(self=here, redeliver=f"{here}/redeliver"))
 
 
@@ -206,9 +206,9 @@ def webhook_url(webhook_id: str) -> str:
     return f"/v1/webhooks/{quote(webhook_id, safe='')}"
 
 
-def delivery_url(delivery: WebhookDelivery) -> str:
-    """The delivery's path."""
-    return f"{webhook_url(delivery.webhook_id)}/deliveries/{quote(delivery.id, safe='')}"
+def delivery_path(webhook_id: str, delivery_id: str) -> str:
+    """The path of a delivery."""
+    return f"{webhook_url(webhook_id)}/deliveries/{quote(delivery_id, safe='')}"
 
 
 def _links(webhook_id: str) -> WebhookLinks:

@@ -14,7 +14,7 @@ from biresnerf.wire.webhooks import (
     WebhookList,
     WebhookView,
     WebhookWithSecret,
-    delivery_url,
+    delivery_path,
     webhook_url,
 )
 from service.access import CallerHere, JobWriterHere
@@ -127,7 +127,7 @@ async def rotate_secret(webhook_id: WebhookId, caller: JobWriterHere) -> Webhook
 async def test_webhook(webhook_id: WebhookId, caller: JobWriterHere, response: Response) -> DeliveryView:
     """Sends a message `webhook.test`; the delivery at `Location` tells what came of it."""
     delivery = await caller.webhooks.test(webhook_id)
-    response.headers["Location"] = delivery_url(delivery)
+    response.headers["Location"] = delivery_path(delivery.webhook_id, delivery.id)
     return DeliveryView.of(delivery)
 
 

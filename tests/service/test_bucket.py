@@ -8,9 +8,7 @@ from pathlib import Path
 
 import httpx
 
-from biresnerf.wire.jobs import JobView
-from service.client import Client
-from service.submit import download_all
+from biresnerf.client import Client
 from tests.service.conftest import (
     PROGRAM,
     finished,
@@ -53,7 +51,7 @@ def test_a_job_leaves_nothing_on_local_disk_and_its_files_come_from_the_bucket(
             assert http.get(artifact["href"], headers=etag).status_code == 304
             assert http.head(artifact["href"]).status_code == 200
             with Client(service.url) as client:
-                written = download_all(client, JobView.model_validate(job), tmp_path / "out")
+                written = client.download_all(job["id"], tmp_path / "out")
             assert tmp_path / "out/transforms.json" in written
             assert (tmp_path / "out/transforms.json").read_bytes() == there.content
             assert service.staging_is_empty()

@@ -12,7 +12,7 @@ import httpx
 import psutil
 import pytest
 
-from service.client import Client
+from biresnerf.client import Client
 from tests.service.conftest import PATIENCE_S, Running, finished, problem, ready_dataset, submit, until
 
 
@@ -95,7 +95,7 @@ def test_following_goes_on_through_the_death_of_the_web_process(
     job = submit(http, dataset, steps=100, step_ms=50)
     seen, killed = [], False
     with Client(service.url) as client:
-        for happening in client.follow(client.job(job["id"])):
+        for happening in client.events(job["id"]):
             seen.append(happening)
             if not killed and happening.kind == "progress" and happening.data["stage"] == "coarse":
                 os.kill(web_process(service).pid, signal.SIGKILL)

@@ -8,8 +8,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from biresnerf.client import Client, ServiceError
 from service.access import STRANGERS_BURST
-from service.client import Client, ServiceError
 from service.rate_limits import Buckets
 from tests.service.conftest import (
     Running,
@@ -90,10 +90,10 @@ def test_the_client_and_the_stream_take_a_key(closed: Running, tenants: tuple[Te
     anna, bert = tenants
     with Client(closed.url, api_key=anna.key) as client:
         job = client.job(anna.job)
-        assert [happening.kind for happening in client.follow(job)][-1] == "succeeded"
-        assert client.artifacts(job)
+        assert [happening.kind for happening in client.events(job.id)][-1] == "succeeded"
+        assert client.artifacts(job.id)
     with Client(closed.url, api_key=bert.key) as client, pytest.raises(ServiceError, match="No job"):
-        list(client.follow(job))
+        list(client.events(job.id))
     with Client(closed.url) as client, pytest.raises(ServiceError, match="API key"):
         client.job(anna.job)
 

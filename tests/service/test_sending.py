@@ -13,8 +13,7 @@ import httpx
 import pytest
 
 from benchmarks.upload import Relay
-from service.client import Client, ServiceError
-from service.sending import LocalFile, send_archive, send_missing
+from biresnerf.client import Client, LocalFile, ServiceError
 from tests.service.conftest import MIB, Running
 
 
@@ -56,7 +55,7 @@ def test_an_archive_gets_through_three_cuts_and_little_is_sent_twice(
     cutting = cut_after(relay, MIB, MIB, MIB)
     with Client(f"http://127.0.0.1:{relay.port}") as client:
         dataset = client.create_dataset("cut")
-        send_archive(client, dataset, tmp_path / "set.zip")
+        client.send_archive(dataset, tmp_path / "set.zip")
     cutting.join(10)
     assert not cutting.is_alive()
     assert stored(http, dataset.id) == {
@@ -73,13 +72,13 @@ def test_files_get_through_a_cut_and_the_second_time_nothing_is_sent(
     cutting = cut_after(relay, 2 * MIB)
     with Client(f"http://127.0.0.1:{relay.port}") as client:
         dataset = client.create_dataset("cut", [file.entry for file in files])
-        assert send_missing(client, dataset, files) == 6
+        assert client.send_missing(dataset, files) == 6
         cutting.join(10)
         assert not cutting.is_alive()
         assert stored(http, dataset.id) == {file.name: file.sha256 for file in files}
         again = client.create_dataset("again", [file.entry for file in files])
         before = relay.sent
-        assert send_missing(client, again, files) == 0
+        assert client.send_missing(again, files) == 0
         assert relay.sent - before < 10_000
     assert stored(http, again.id) == {file.name: file.sha256 for file in files}
 
@@ -93,7 +92,7 @@ def test_what_the_service_refuses_ends_the_sending_at_once(relay: Relay, tmp_pat
         for file, code in ((large, "body_too_large"), (changed, "digest_mismatch")):
             dataset = client.create_dataset("refused", [file.entry])
             with pytest.raises(ServiceError) as caught:
-                send_missing(client, dataset, [file])
+                client.send_missing(dataset, [file])
             assert caught.value.code == code
 
 
@@ -104,5 +103,5 @@ def test_a_service_that_stays_away_is_given_up(relay: Relay, tmp_path: Path) -> 
         dataset = client.create_dataset("away", [file.entry])
         relay.close()
         with pytest.raises(ServiceError) as caught:
-            send_missing(client, dataset, [file])
+            client.send_missing(dataset, [file])
     assert caught.value.code == "unreachable"

@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 import pytest
 
-from service.client import Client
+from biresnerf.client import Client
 from service.request_context import RequestContext
 from tests.service.conftest import Running, finished, ready_dataset, submit
 from tests.service.test_events import until_ready, web_process

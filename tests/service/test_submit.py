@@ -20,8 +20,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from biresnerf.client import Client, ServiceError
 from biresnerf.wire.results import ArtifactView
-from service.client import Client, ServiceError
 from service.commands import free_port
 from tests.service.conftest import Running, dataset_ids, finished
 
@@ -123,13 +123,14 @@ def test_a_bad_scene_is_exit_2_and_leaves_no_dataset(
     assert dataset_ids(http) == before
 
 
-def test_a_failed_job_and_a_missing_service_are_exit_1(service: Running, scene: Path) -> None:
+def test_a_failed_job_is_exit_3_and_a_missing_service_exit_6(service: Running, scene: Path) -> None:
     done = submit(service, scene, "--set", "threads=77", "--wait")
-    assert done.returncode == 1
+    assert done.returncode == 3
     assert "diverged" in done.stderr
     done = submit(service, scene, "--url", f"http://127.0.0.1:{free_port()}")
-    assert done.returncode == 1
+    assert done.returncode == 6
     assert "biresnerf up" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
 
 
 def test_ctrl_c_ends_the_waiting_and_not_the_job(http: httpx.Client, service: Running, scene: Path) -> None:
@@ -148,6 +149,7 @@ def test_ctrl_c_ends_the_waiting_and_not_the_job(http: httpx.Client, service: Ru
     _, said = process.communicate(timeout=20)
     assert process.returncode == 130
     assert "Traceback" not in said
+    assert f"biresnerf wait {url}" in said
     assert finished(http, url.rsplit("/", 1)[1])["state"] == "succeeded"
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from biresnerf.client.scene import Scene, look_at
 from biresnerf.data.read import read_dataset
 from biresnerf.errors import InputError
-from service.pack import Scene, look_at
 from tests.data import trajectories
 from tests.data.scenes import write_image
 from tests.service.conftest import scene_files

@@ -1,0 +1,123 @@
+"""What goes wrong between a client and its service."""
+
+from __future__ import annotations
+
+import email.utils
+import time
+from collections.abc import Mapping
+
+from pydantic import ValidationError
+
+from biresnerf.errors import BiresnerfError
+from biresnerf.wire.jobs import JobView
+from biresnerf.wire.problems import FieldProblem, JobError, Problem
+
+# Answers that say: not now.
+_LATER = frozenset({408, 429, 502, 503, 504, 507})
+# Of them, those with which the service has surely not done what was asked.
+_REFUSED = frozenset({408, 429, 503, 507})
+
+
+class ServiceError(BiresnerfError):
+    """The service refused, failed, or could not be reached.
+
+    Attributes:
+        code: the problem's stable code; the client's own are ``unreachable``, ``unexpected_answer``,
+            ``download_damaged`` and ``stopped``.
+        detail: what is wrong, in one sentence.
+        status: the HTTP status; 0 where there was no answer.
+        where, mend: the file or field at fault, and what to do about it; empty where the service does not say.
+        errors: every wrong field by its pointer.
+        request_id: by which the service's log knows the request; none where there was no answer.
+        retry_after_s: how long the service asks to wait.
+    """
+
+    def __init__(
+        self,
+        code: str,
+        detail: str,
+        *,
+        status: int = 0,
+        where: str = "",
+        mend: str = "",
+        errors: tuple[FieldProblem, ...] = (),
+        request_id: str | None = None,
+        retry_after_s: float | None = None,
+        untouched: bool = False,
+    ) -> None:
+        self.code, self.detail, self.status, self.where, self.mend = code, detail, status, where, mend
+        self.errors, self.request_id, self.retry_after_s = errors, request_id, retry_after_s
+        self._untouched = untouched
+        super().__init__(" ".join(part for part in (f"{where}:" if where else "", detail, mend) if part))
+
+    @property
+    def retryable(self) -> bool:
+        """Whether the same request may succeed in a moment."""
+        return self.code == "idempotency_in_progress" or self.code == "unreachable" or self.status in _LATER
+
+    @property
+    def undone(self) -> bool:
+        """Whether the service has surely not done what was asked."""
+        return self._untouched or self.status in _REFUSED
+
+    @property
+    def users_fault(self) -> bool:
+        """Whether the request itself has to change."""
+        return 400 <= self.status < 500 and not self.retryable
+
+    @classmethod
+    def of_answer(cls, status: int, headers: Mapping[str, str], content: bytes) -> ServiceError:
+        """What an answer of 400 or more says."""
+        wait_s = retry_after_s(headers.get("retry-after"))
+        try:
+            problem = Problem.model_validate_json(content, extra="ignore")
+        except ValidationError:
+            return cls(
+                "unexpected_answer",
+                f"The answer has status {status} and is none that a BiResNeRF service gives.",
+                status=status,
+                mend="Look whether the address is right.",
+                request_id=headers.get("x-request-id"),
+                retry_after_s=wait_s,
+            )
+        return cls(
+            problem.code,
+            problem.detail,
+            status=status,
+            where=problem.where or "",
+            mend=problem.mend or "",
+            errors=tuple(problem.errors),
+            request_id=problem.request_id,
+            retry_after_s=wait_s,
+        )
+
+    @classmethod
+    def of_failure(cls, error: JobError) -> ServiceError:
+        """What the check of a dataset or upload found wrong, as if it had been answered at once."""
+        return cls(error.code, error.detail, status=422, where=error.where, mend=error.mend)
+
+
+class JobFailed(BiresnerfError):
+    """The job ended without the result that was waited for; ``job`` is how it ended."""
+
+    def __init__(self, job: JobView) -> None:
+        self.job = job
+        error = job.error
+        if error is None:
+            super().__init__(f"The job {job.id} is {job.state}.")
+            return
+        parts = (f"The job {job.id} failed ({error.code}):", f"{error.where}:" if error.where else "")
+        super().__init__(" ".join(part for part in (*parts, error.detail, error.mend) if part))
+
+
+def retry_after_s(header: str | None) -> float | None:
+    """Seconds of a Retry-After header, which is a number of them or a date; none where it is neither."""
+    if header is None:
+        return None
+    if header.strip().isdecimal():
+        return float(header)
+    try:
+        at = email.utils.parsedate_to_datetime(header)
+    except ValueError:
+        return None
+    return max(0.0, at.timestamp() - time.time())

@@ -1,0 +1,37 @@
+"""Answers of commands: one JSON document, or lines for people."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import click
+from pydantic import BaseModel
+
+
+def print_json(answer: BaseModel | dict[str, Any]) -> None:
+    """Print one JSON document on standard output; what is no number there is null."""
+    if isinstance(answer, BaseModel):
+        click.echo(answer.model_dump_json(indent=1))
+    else:
+        click.echo(json.dumps(_plain(answer), indent=1, ensure_ascii=False, allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def table(rows: Sequence[Sequence[str]]) -> str:
+    """Rows in columns as wide as they need, the last one without filling."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))] if rows else []
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    )

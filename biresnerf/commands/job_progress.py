@@ -1,0 +1,167 @@
+"""Progress for people, on standard error: bars on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from threading import Lock
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
+
+from biresnerf.wire.jobs import JobView
+
+if TYPE_CHECKING:
+    from biresnerf.client import Client, Happening, Sending
+
+_LINE_EVERY_S = 10.0
+
+
+class _View:
+    """A bar on a terminal; elsewhere nothing is put up."""
+
+    def __init__(self, *columns: ProgressColumn) -> None:
+        console = Console(stderr=True)
+        self._bar = Progress(*columns, console=console) if console.is_terminal else None
+
+    def __enter__(self) -> Self:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def note(self, text: str) -> None:
+        """Something worth a line."""
+        if self._bar is not None:
+            self._bar.console.print(text, highlight=False, markup=False)
+        else:
+            click.echo(text, err=True)
+
+
+class JobProgressView(_View):
+    """Stage, step, loss and time left of a job; in a pipe a line at each stage and every few seconds."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            TextColumn("{task.fields[stage]:<10}", markup=False),
+            BarColumn(bar_width=None),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TextColumn("{task.fields[numbers]}", markup=False),
+            TextColumn("left {task.fields[left]}"),
+            TimeElapsedColumn(),
+        )
+        self._stage, self._said = "", 0.0
+        if self._bar is not None:
+            self._task = self._bar.add_task("job", total=1.0, stage="waiting", numbers="", left="?")
+
+    def job(self, job: JobView) -> None:
+        """How far the job is."""
+        stage, numbers, left = stage_of(job), numbers_of(job), left_of(job)
+        fraction = job.progress.fraction
+        if self._bar is not None:
+            self._bar.update(self._task, completed=fraction, stage=stage, numbers=numbers, left=left)
+            return
+        now = time.monotonic()
+        if stage != self._stage or now - self._said >= _LINE_EVERY_S:
+            self._stage, self._said = stage, now
+            self.note(f"{stage:<10} {100 * fraction:3.0f} %  {numbers}  left {left}")
+
+
+class BytesView(_View):
+    """Bytes on their way, in either direction; in a pipe a line where nothing else would tell for long."""
+
+    def __init__(self, title: str) -> None:
+        super().__init__(
+            TextColumn("{task.description:<11}"),
+            BarColumn(bar_width=None),
+            DownloadColumn(),
+            TimeElapsedColumn(),
+        )
+        self._title, self._done, self._said, self._lock = title, 0, time.monotonic(), Lock()
+        if self._bar is not None:
+            self._task = self._bar.add_task(title, total=None)
+
+    def more(self, count: int, total: int) -> None:
+        """So many bytes more, of so many; may be called from several threads."""
+        with self._lock:
+            self._done += count
+            self._show(total)
+
+    def _show(self, total: int) -> None:
+        if self._bar is not None:
+            self._bar.update(self._task, description=self._title, completed=self._done, total=total)
+            return
+        now = time.monotonic()
+        if now - self._said >= _LINE_EVERY_S:
+            self._said = now
+            self.note(f"{self._title} {self._done / 1e6:.1f} of {total / 1e6:.1f} MB")
+
+
+class SendingView(BytesView):
+    """A submission: what is sent, and what comes after."""
+
+    def __init__(self) -> None:
+        super().__init__("reading")
+
+    def sending(self, sending: Sending) -> None:
+        """How far the submission is."""
+        begins, self._title, self._done = sending.step != self._title, sending.step, sending.bytes_sent
+        if begins and sending.step == "sending":
+            there = sending.files - sending.files_missing
+            known = f", {there} are there already" if there else ""
+            size = f"{sending.bytes_missing / 1e6:.1f} MB"
+            self.note(f"sending {sending.files_missing} of {sending.files} files, {size}{known}")
+        elif begins and sending.step == "checking":
+            self.note("checking what was sent")
+        self._show(sending.bytes_missing)
+
+
+def watch(client: Client, job: JobView, view: JobProgressView) -> JobView:
+    """Shows the job until it is over; returns it. Raises `ServiceError`."""
+    view.job(job)
+    for happening in client.events(job.id):
+        if (now := happening.job) is not None:
+            view.job(now)
+        elif (text := _worth_a_line(happening)) is not None:
+            view.note(text)
+    return client.job(job.id)
+
+
+def _worth_a_line(happening: Happening) -> str | None:
+    if happening.kind == "attempt_crashed":
+        return f"Attempt {happening.data.get('attempt')} broke off; the job goes on from its last checkpoint."
+    if happening.kind == "retried_smaller":
+        return "It ran out of memory; the job begins again with less."
+    if happening.kind == "cancel_requested":
+        return "The job was asked to end."
+    return None
+
+
+def stage_of(job: JobView) -> str:
+    """Where the job is: its place in the queue, its stage, or how it ended."""
+    if job.state == "queued":
+        return f"waiting {job.queue_position or ''}".strip()
+    return job.state if job.final else job.stage or job.state
+
+
+def numbers_of(job: JobView) -> str:
+    """Step, loss and PSNR, as far as known."""
+    parts = [f"step {job.progress.step}/{job.progress.steps_total}"] if job.progress.steps_total else []
+    parts += [f"{name} {job.metrics[name]:.4g}" for name in ("loss", "psnr") if name in job.metrics]
+    return "  ".join(parts)
+
+
+def left_of(job: JobView) -> str:
+    """Minutes and seconds to the end."""
+    left = job.progress.eta_s
+    if left is None:
+        return "?"
+    minutes, seconds = divmod(round(left), 60)
+    return f"{minutes}:{seconds:02d}"

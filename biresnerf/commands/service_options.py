@@ -1,0 +1,97 @@
+"""What all commands share that speak to a service: its address and key, its errors, the jobs it is asked about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+
+from biresnerf.commands import exit_codes
+from biresnerf.commands.exit_codes import CommandFailed
+from biresnerf.errors import InputError
+
+if TYPE_CHECKING:
+    from biresnerf.client import Client, ServiceError
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+
+
+class JobName(NamedTuple):
+    """A job as it is named on a command line: by its id, or by its address, which says where its service is."""
+
+    id: str
+    url: str | None = None
+
+
+class _JobParameter(click.ParamType):
+    name = "job"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> JobName:
+        if isinstance(value, JobName):
+            return value
+        url, path, ident = value.rpartition("/v1/jobs/")
+        if (not path and "/" in value) or not ident.strip("/"):
+            self.fail(f"{value!r} is neither a job's id nor its address.", param, ctx)
+        return JobName(ident.strip("/"), url or None)
+
+
+JOB = _JobParameter()
+
+
+def service_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a click command `--url` and `--api-key`, as ``url`` and ``api_key``."""
+    url = click.option(
+        "--url",
+        envvar="BIRESNERF_URL",
+        help=f"Where the service is. Default: BIRESNERF_URL, else {DEFAULT_URL}.",
+    )
+    key = click.option(
+        "--api-key", envvar="BIRESNERF_API_KEY", help="Better in BIRESNERF_API_KEY: others see command lines."
+    )
+    return url(key(command))
+
+
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print one JSON document, and nothing else."
+)
+
+
+@contextmanager
+def service_at(url: str | None, api_key: str | None, job: JobName | None = None) -> Iterator[Client]:
+    """The service: of the job's address, of `--url`, or of this machine. Its errors become exit codes."""
+    try:
+        from biresnerf.client import Client, JobFailed, ServiceError
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "extra_missing",
+            f"The package {error.name} is not installed.",
+            mend="Install it with: pip install 'biresnerf[client]'",
+        ) from None
+    try:
+        chosen = (job.url if job is not None else None) or url or DEFAULT_URL
+        with Client(chosen, api_key=api_key, on_pause=_tell_pause) as client:
+            yield client
+    except ServiceError as error:
+        raise CommandFailed(str(error), exit_code_of(error)) from None
+    except JobFailed as error:
+        raise CommandFailed(str(error), exit_codes.JOB) from None
+
+
+def _tell_pause(error: ServiceError, seconds: float) -> None:
+    if seconds >= 2.0:
+        click.echo(f"trying again in {seconds:.0f} s: {error.detail}", err=True)
+
+
+def exit_code_of(error: ServiceError) -> int:
+    """The exit status for what a service answered."""
+    if error.status in {404, 410}:
+        return exit_codes.NOT_FOUND
+    if error.status in {401, 403}:
+        return exit_codes.KEY
+    if error.users_fault:
+        return exit_codes.INPUT
+    if error.retryable:
+        return exit_codes.AWAY
+    return exit_codes.FAILED
