@@ -1,7 +1,8 @@
 // What the widgets shared by the service's page and report.html take, and the files that it is made from.
 //
 // The files are written by the library and documented in docs/formats.md; `job_data.ts` turns them into props:
-//   sceneOf(poses, view, points), rowsOf(report), cameraPicturesOf(view), historyOf(text), verdictOf(report).
+//   camerasOf(poses, report), centresOf(poses), rowsOf(report), historyOf(text), pointsOf(entry, bytes),
+//   cellsOf(view, images, urlOf).
 // A widget fetches nothing: pictures are URLs that a callback gives for a file of the result, points are bytes.
 
 // ---------------------------------------------------------------- files
@@ -232,6 +233,9 @@ export interface SheetCell {
   readonly y: number;
   readonly width: number;
   readonly height: number;
+  /** Size of the whole sheet, for those who show it smaller. */
+  readonly sheet_width: number;
+  readonly sheet_height: number;
 }
 
 /** (4) One row an image: sorted by a click on a heading, filtered by name and flag. */

@@ -1,0 +1,50 @@
+// What takes the place of the three-dimensional picture where the browser cannot draw it.
+import { short } from "./numbers";
+import { centreOf } from "./poses";
+import type { SceneCamera, Triple } from "./types";
+
+const words = (centre: Triple): string => centre.map((value) => short(value, 4)).join(", ");
+
+export function CameraTable(props: {
+  cameras: readonly SceneCamera[];
+  selected: number | null;
+  onSelect: (image: number) => void;
+}) {
+  return (
+    <section class="scene" aria-label="Cameras">
+      <p class="notice">This browser shows no WebGL, so the cameras stand in a table instead of a picture.</p>
+      <div class="table-scroll" tabIndex={0} role="region" aria-label="Positions of the cameras">
+        <table class="table">
+          <thead>
+            <tr>
+              <th scope="col">image</th>
+              <th scope="col">centre before</th>
+              <th scope="col">centre after</th>
+              <th scope="col" class="number">
+                turned °
+              </th>
+              <th scope="col" class="number">
+                moved
+              </th>
+            </tr>
+          </thead>
+          <tbody>
+            {props.cameras.map((camera, index) => (
+              <tr key={index} aria-current={index === props.selected ? "true" : undefined}>
+                <th scope="row">
+                  <button type="button" class="link" onClick={() => props.onSelect(index)}>
+                    <bdi>{camera.name}</bdi>
+                  </button>
+                </th>
+                <td>{camera.before ? words(centreOf(camera.before)) : "–"}</td>
+                <td>{words(centreOf(camera.after))}</td>
+                <td class="number">{short(camera.moved_deg)}</td>
+                <td class="number">{short(camera.moved_units)}</td>
+              </tr>
+            ))}
+          </tbody>
+        </table>
+      </div>
+    </section>
+  );
+}

@@ -1,0 +1,120 @@
+// Small controls that several widgets use.
+import type { ComponentChildren } from "preact";
+import { useId } from "preact/hooks";
+
+/** One of a few: radio buttons that look like one bar. */
+export function Choice<T extends string | number>(props: {
+  label: string;
+  value: T;
+  options: readonly { value: T; text: string; disabled?: boolean }[];
+  onChange: (value: T) => void;
+}) {
+  const name = useId();
+  return (
+    <fieldset class="choice">
+      <legend>{props.label}</legend>
+      <div class="choice-bar">
+        {props.options.map((option) => (
+          <label key={option.value} class={option.disabled ? "choice-off" : ""}>
+            <input
+              type="radio"
+              name={name}
+              checked={option.value === props.value}
+              disabled={option.disabled}
+              onChange={() => props.onChange(option.value)}
+            />
+            <span>{option.text}</span>
+          </label>
+        ))}
+      </div>
+    </fieldset>
+  );
+}
+
+export function Pick<T extends string | number>(props: {
+  label: string;
+  value: T;
+  options: readonly { value: T; text: string }[];
+  onChange: (value: T) => void;
+}) {
+  return (
+    <label class="pick">
+      <span>{props.label}</span>
+      <select
+        value={String(props.value)}
+        onChange={(event) => {
+          const chosen = props.options.find((o) => String(o.value) === event.currentTarget.value);
+          if (chosen) props.onChange(chosen.value);
+        }}
+      >
+        {props.options.map((option) => (
+          <option key={option.value} value={String(option.value)}>
+            {option.text}
+          </option>
+        ))}
+      </select>
+    </label>
+  );
+}
+
+export function Switch(props: { label: string; on: boolean; onChange: (on: boolean) => void }) {
+  return (
+    <label class="switch">
+      <input type="checkbox" checked={props.on} onChange={(event) => props.onChange(event.currentTarget.checked)} />
+      <span>{props.label}</span>
+    </label>
+  );
+}
+
+export function Button(props: {
+  onClick: () => void;
+  children: ComponentChildren;
+  label?: string;
+  disabled?: boolean;
+  pressed?: boolean;
+}) {
+  return (
+    <button
+      type="button"
+      class="button"
+      aria-label={props.label}
+      aria-pressed={props.pressed}
+      disabled={props.disabled}
+      onClick={props.onClick}
+    >
+      {props.children}
+    </button>
+  );
+}
+
+/** The image's name, with the ones before and after it. */
+export function ImageStepper(props: {
+  names: readonly string[];
+  selected: number | null;
+  onSelect: (image: number | null) => void;
+}) {
+  const { names, selected, onSelect } = props;
+  const step = (by: number) => onSelect(selected === null ? 0 : (selected + by + names.length) % names.length);
+  return (
+    <div class="stepper">
+      <Button label="Previous image" onClick={() => step(-1)}>
+        ‹
+      </Button>
+      <span class="stepper-name" aria-live="polite">
+        {selected === null ? (
+          <span class="soft">no image chosen</span>
+        ) : (
+          <>
+            <bdi title={names[selected]}>{names[selected]}</bdi>{" "}
+            <span class="soft">
+              {selected + 1}/{names.length}
+            </span>
+          </>
+        )}
+      </span>
+      <Button label="Next image" onClick={() => step(1)}>
+        ›
+      </Button>
+    </div>
+  );
+}

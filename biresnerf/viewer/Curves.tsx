@@ -1,0 +1,214 @@
+// (3) Curves of the run: how well the field fits, how much the cameras still move, when the detector calls it stable.
+import { useEffect, useMemo, useRef } from "preact/hooks";
+import uPlot from "uplot";
+import { fixed, short } from "./numbers";
+import { themeColour, useDark } from "./theme";
+import type { CurvesProps, HistoryLine } from "./types";
+
+const HIGH_PX = 170;
+
+interface Curve {
+  readonly label: string;
+  readonly colour: string;
+  readonly value: (line: HistoryLine) => number | undefined;
+  readonly scale?: string;
+  readonly dashed?: boolean;
+}
+
+interface Chart {
+  readonly title: string;
+  readonly axis: string;
+  readonly logarithmic?: boolean;
+  readonly second?: string;
+  readonly curves: readonly Curve[];
+  readonly summary: (lines: readonly HistoryLine[]) => string;
+}
+
+const CHARTS: readonly Chart[] = [
+  {
+    title: "Fit to the photos",
+    axis: "PSNR (dB)",
+    second: "loss",
+    curves: [
+      { label: "PSNR, dB", colour: "--curve-1", value: (line) => line.psnr },
+      { label: "loss", colour: "--curve-2", value: (line) => line.loss, scale: "second", dashed: true },
+    ],
+    summary: (lines) => ends(lines, "PSNR of the training views", (line) => `${fixed(line.psnr, 1)} dB`),
+  },
+  {
+    title: "Motion of the cameras between checks",
+    axis: "degrees",
+    logarithmic: true,
+    curves: [
+      { label: "turned, ° (90 % of cameras turn less)", colour: "--curve-1", value: (line) => positive(line.moved_deg) },
+      { label: "settled below", colour: "--curve-3", value: (line) => line.still_deg, dashed: true },
+    ],
+    summary: (lines) => ends(lines, "Turning between checks", (line) => `${short(line.moved_deg)} degrees`),
+  },
+  {
+    title: "Stability signal",
+    axis: "dB over the window",
+    curves: [
+      { label: "trend of the error, dB", colour: "--curve-1", value: (line) => line.trend_db },
+      { label: "level within ±", colour: "--curve-3", value: (line) => line.level_db, dashed: true },
+      { label: "", colour: "--curve-3", value: (line) => negative(line.level_db), dashed: true },
+    ],
+    summary: (lines) =>
+      ends(
+        lines.filter((line) => line.trend_db !== undefined),
+        "Trend of the error over the detector's window, in stage 1",
+        (line) => `${fixed(line.trend_db, 2)} dB`,
+      ),
+  },
+];
+
+const positive = (value: number): number | undefined => (value > 0 ? value : undefined); // a logarithm has no zero
+const negative = (value: number | undefined): number | undefined => (value === undefined ? undefined : -value);
+
+function ends(lines: readonly HistoryLine[], what: string, say: (line: HistoryLine) => string): string {
+  const [first, last] = [lines[0], lines[lines.length - 1]];
+  if (!first || !last) return `${what}: nothing yet`;
+  return `${what}: ${say(first)} at step ${first.step}, ${say(last)} at step ${last.step}`;
+}
+
+export function Curves({ lines, switchStep = null, switchReason = null, steps = null }: CurvesProps) {
+  if (lines.length === 0) {
+    return (
+      <section class="curves" aria-label="Curves of the run">
+        <p class="notice">No check has been made yet; the first line comes with the first look of the detector.</p>
+      </section>
+    );
+  }
+  const shown = CHARTS.filter((chart) => chart.curves.some((curve) => lines.some((line) => curve.value(line) !== undefined)));
+  const began = switchStep ?? switchOf(lines);
+  return (
+    <section class="curves" aria-label="Curves of the run">
+      {shown.map((chart) => (
+        <Plot key={chart.title} chart={chart} lines={lines} switchStep={began} steps={steps} />
+      ))}
+      <p class="curves-stages soft">
+        <i class="stage-1" /> stage 1, low resolution: poses{" "}
+        {began !== null && began > 0 ? (
+          <>
+            <i class="stage-2" /> stage 2, high resolution: detail, from step {began}
+            {switchReason === "stable" && " (the error was stable)"}
+            {switchReason === "cap" && " (its last step, stable or not)"}
+          </>
+        ) : (
+          "(stage 2 has not begun)"
+        )}
+      </p>
+    </section>
+  );
+}
+
+/** The last step of stage 1, where lines of stage 2 are there. */
+function switchOf(lines: readonly HistoryLine[]): number | null {
+  const first = lines.findIndex((line) => line.stage === "fine");
+  return first < 0 ? null : first === 0 ? 0 : (lines[first - 1]?.step ?? null);
+}
+
+function Plot(props: { chart: Chart; lines: readonly HistoryLine[]; switchStep: number | null; steps: number | null }) {
+  const { chart, lines, switchStep, steps } = props;
+  const dark = useDark();
+  const host = useRef<HTMLDivElement>(null);
+  const plot = useRef<uPlot | null>(null);
+  const data = useMemo<uPlot.AlignedData>(
+    () => [lines.map((line) => line.step), ...chart.curves.map((curve) => lines.map((line) => curve.value(line) ?? null))],
+    [chart, lines],
+  );
+  const latest = useRef({ data, switchStep, steps });
+  latest.current = { data, switchStep, steps };
+
+  useEffect(() => {
+    const element = host.current;
+    if (!element) return;
+    const made = new uPlot(optionsOf(chart, element.clientWidth, latest), latest.current.data, element);
+    plot.current = made;
+    const observer = new ResizeObserver(() => made.setSize({ width: element.clientWidth, height: HIGH_PX }));
+    observer.observe(element);
+    return () => {
+      observer.disconnect();
+      made.destroy();
+      plot.current = null;
+    };
+  }, [chart, dark]);
+
+  useEffect(() => plot.current?.setData(data), [data, switchStep, steps]);
+
+  return (
+    <figure class="curve">
+      <figcaption>
+        <b>{chart.title}</b>
+        {chart.curves
+          .filter((curve) => curve.label)
+          .map((curve) => (
+            <span key={curve.label} class="soft">
+              <i class={curve.dashed ? "dash dash-dashed" : "dash"} style={{ color: `var(${curve.colour})` }} /> {curve.label}
+            </span>
+          ))}
+      </figcaption>
+      <div ref={host} role="img" aria-label={`${chart.title}. ${chart.summary(lines)}.`} />
+    </figure>
+  );
+}
+
+function optionsOf(
+  chart: Chart,
+  width: number,
+  latest: { readonly current: { switchStep: number | null; steps: number | null } },
+): uPlot.Options {
+  const [text, line] = [themeColour("--text-soft"), themeColour("--line")];
+  const font = "11px system-ui, sans-serif";
+  const axis = (more: uPlot.Axis): uPlot.Axis => ({
+    stroke: text,
+    font,
+    labelFont: font,
+    labelSize: 16,
+    ticks: { stroke: line, width: 1, size: 4 },
+    grid: { stroke: line, width: 1 },
+    ...more,
+  });
+  return {
+    width,
+    height: HIGH_PX,
+    legend: { show: false },
+    cursor: { sync: { key: "biresnerf-curves" }, drag: { x: false, y: false }, points: { size: 6 } },
+    scales: {
+      x: { time: false, range: (_, low, high) => [Math.min(0, low), Math.max(latest.current.steps ?? 0, high)] },
+      y: chart.logarithmic ? { distr: 3 } : {},
+      second: { distr: 3 },
+    },
+    axes: [
+      axis({ size: 26 }),
+      axis({ label: chart.axis, size: 46 }),
+      ...(chart.second ? [axis({ scale: "second", side: 1, label: chart.second, size: 52, grid: { show: false } })] : []),
+    ],
+    series: [
+      {},
+      ...chart.curves.map((curve): uPlot.Series => ({
+        label: curve.label,
+        stroke: themeColour(curve.colour),
+        width: curve.dashed ? 1.25 : 1.75,
+        dash: curve.dashed ? [5, 4] : undefined,
+        scale: curve.scale ?? "y",
+        points: { show: false },
+        spanGaps: false,
+      })),
+    ],
+    hooks: { drawClear: [(plot) => drawStages(plot, latest.current.switchStep)] },
+  };
+}
+
+/** The two stages as bands behind the curves. */
+function drawStages(plot: uPlot, switchStep: number | null): void {
+  const { ctx, bbox } = plot;
+  const at = (step: number) => Math.min(bbox.left + bbox.width, Math.max(bbox.left, plot.valToPos(step, "x", true)));
+  const middle = switchStep === null ? bbox.left + bbox.width : at(switchStep);
+  ctx.save();
+  ctx.fillStyle = themeColour("--stage-1");
+  ctx.fillRect(bbox.left, bbox.top, middle - bbox.left, bbox.height);
+  ctx.fillStyle = themeColour("--stage-2");
+  ctx.fillRect(middle, bbox.top, bbox.left + bbox.width - middle, bbox.height);
+  ctx.restore();
+}

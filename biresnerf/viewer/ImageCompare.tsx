@@ -1,0 +1,158 @@
+// (2) What the field shows at a camera, against the photo that was taken there.
+import { useMemo, useState } from "preact/hooks";
+import { Choice, ImageStepper } from "./Controls";
+import { fixed } from "./numbers";
+import { length, minus } from "./poses";
+import type { ImageCompareProps, PictureKind, RenderedView, Triple } from "./types";
+
+type Mode = "swipe" | "difference" | "depth";
+const NEAR = 3;
+
+export function ImageCompare({ names, views, centres, urlOf, selected, onSelect }: ImageCompareProps) {
+  const [mode, setMode] = useState<Mode>("swipe");
+  const view = views.find((one) => one.image === selected);
+  const shown = useMemo(() => views.map((one) => one.image).sort((a, b) => a - b), [views]);
+  if (views.length === 0) {
+    return (
+      <section class="compare" aria-label="Render against photo">
+        <p class="notice">No view of this result has been rendered.</p>
+      </section>
+    );
+  }
+  return (
+    <section class="compare" aria-label="Render against photo">
+      <div class="compare-controls">
+        <Choice
+          label="Show"
+          value={mode}
+          onChange={setMode}
+          options={[
+            { value: "swipe", text: "photo | render" },
+            { value: "difference", text: "difference", disabled: view !== undefined && !view.pictures.difference },
+            { value: "depth", text: "depth", disabled: view !== undefined && !view.pictures.depth },
+          ]}
+        />
+      </div>
+      {view ? (
+        <Picture view={view} name={names[view.image] ?? ""} mode={mode} urlOf={urlOf} />
+      ) : (
+        <NotRendered {...{ names, shown, centres, selected, onSelect }} />
+      )}
+      <div class="compare-foot">
+        <ImageStepper
+          names={shown.map((image) => names[image] ?? "")}
+          selected={view ? shown.indexOf(view.image) : null}
+          onSelect={(position) => onSelect(position === null ? null : (shown[position] ?? null))}
+        />
+        <span class="soft">{shown.length === 1 ? "the only rendered view" : `of ${shown.length} rendered views`}</span>
+      </div>
+    </section>
+  );
+}
+
+function Picture(props: { view: RenderedView; name: string; mode: Mode; urlOf: ImageCompareProps["urlOf"] }) {
+  const { view, name, mode, urlOf } = props;
+  const [at, setAt] = useState(0.5);
+  const [missing, setMissing] = useState<string | null>(null);
+  const url = (kind: PictureKind) => {
+    const file = view.pictures[kind];
+    return file === undefined ? null : urlOf(file);
+  };
+  const frame = { aspectRatio: `${view.width} / ${view.height}`, maxWidth: `calc(62vh * ${view.width / view.height})` };
+  const picture = (kind: PictureKind, alt: string, style?: Record<string, string>) => {
+    const source = url(kind);
+    return source === null ? (
+      <p class="notice compare-missing">The {kind} is not in this file; it lies beside the result.</p>
+    ) : (
+      <img key={kind} src={source} alt={alt} style={style} draggable={false} onError={() => setMissing(kind)} />
+    );
+  };
+  return (
+    <figure class="compare-figure">
+      {mode === "swipe" ? (
+        <div class="compare-frame" style={frame}>
+          {picture("render", `What the field shows at ${name}`)}
+          {picture("photo", `Photo ${name}`, { clipPath: `inset(0 ${100 * (1 - at)}% 0 0)` })}
+          <span class="compare-tag compare-left" aria-hidden="true">
+            photo
+          </span>
+          <span class="compare-tag compare-right" aria-hidden="true">
+            render
+          </span>
+          <span class="compare-edge" style={{ left: `${100 * at}%` }} aria-hidden="true" />
+          <input
+            type="range"
+            min={0}
+            max={1}
+            step={0.01}
+            value={at}
+            aria-label="Swipe between photo and render"
+            aria-valuetext={`${Math.round(100 * at)} % photo`}
+            onInput={(event) => setAt(Number(event.currentTarget.value))}
+          />
+        </div>
+      ) : (
+        <div class="compare-frame" style={frame}>
+          {picture(mode, mode === "depth" ? `Depth at ${name}` : `Difference between photo and render at ${name}`)}
+        </div>
+      )}
+      {missing && <p class="notice">The {missing} could not be loaded.</p>}
+      <figcaption>
+        {mode === "difference" && <Key left="equal" right="a quarter of the full range, and more" />}
+        {mode === "depth" && <Key left="far" right="near" />}
+        <span>
+          PSNR <b>{fixed(view.psnr, 2)} dB</b> at {view.width} × {view.height} px,{" "}
+          {view.held_out ? "a view that the field never learnt from" : "a view that the field learnt from"}
+        </span>
+      </figcaption>
+    </figure>
+  );
+}
+
+function Key({ left, right }: { left: string; right: string }) {
+  return (
+    <span class="key">
+      {left} <i class="key-ramp" /> {right}
+    </span>
+  );
+}
+
+function NotRendered(props: {
+  names: readonly string[];
+  shown: readonly number[];
+  centres: readonly Triple[];
+  selected: number | null;
+  onSelect: (image: number) => void;
+}) {
+  const { names, shown, centres, selected, onSelect } = props;
+  const here = selected === null ? undefined : centres[selected];
+  const far = (image: number) => {
+    const there = centres[image];
+    return here && there ? length(minus(there, here)) : image;
+  };
+  const near = [...shown].sort((a, b) => far(a) - far(b)).slice(0, NEAR);
+  return (
+    <div class="notice">
+      <p>
+        {selected === null ? (
+          "Choose an image to see what the field shows there."
+        ) : (
+          <>
+            <bdi>{names[selected]}</bdi> was not rendered: {shown.length} of {names.length} views were.
+          </>
+        )}
+      </p>
+      <p>
+        {selected === null ? "Rendered: " : "Nearest that were: "}
+        {near.map((image, position) => (
+          <>
+            {position > 0 && ", "}
+            <button type="button" class="link" onClick={() => onSelect(image)}>
+              <bdi>{names[image]}</bdi>
+            </button>
+          </>
+        ))}
+      </p>
+    </div>
+  );
+}

@@ -1,0 +1,190 @@
+// (4) One row an image.
+import { useMemo, useState } from "preact/hooks";
+import { Pick } from "./Controls";
+import { ALARMING, count, fixed, flagWords, short, signed, sourceWords } from "./numbers";
+import type { ImageRow, ImageTableProps, SheetCell } from "./types";
+
+const SHOWN_AT_FIRST = 200;
+const THUMB_PX = 30;
+
+interface Column {
+  readonly key: string;
+  readonly title: string;
+  readonly hint: string;
+  readonly value: (row: ImageRow) => number | string | null;
+  readonly text: (row: ImageRow) => string;
+}
+
+const gain = (row: ImageRow): number | null =>
+  row.psnr_before === null || row.psnr_after === null ? null : row.psnr_after - row.psnr_before;
+
+const COLUMNS: readonly Column[] = [
+  { key: "moved_deg", title: "turned °", hint: "Rotation from the input's pose to the refined one", value: (r) => r.moved_deg, text: (r) => fixed(r.moved_deg, 2) },
+  { key: "moved_units", title: "moved", hint: "Distance between the centres, in the input's units", value: (r) => r.moved_units, text: (r) => short(r.moved_units) },
+  { key: "psnr_before", title: "PSNR before", hint: "dB, in the verdict's training on the input's poses", value: (r) => r.psnr_before, text: (r) => fixed(r.psnr_before, 2) },
+  { key: "psnr_after", title: "PSNR after", hint: "dB, in the verdict's training on the refined poses", value: (r) => r.psnr_after, text: (r) => fixed(r.psnr_after, 2) },
+  { key: "gain", title: "gain dB", hint: "PSNR after minus before", value: gain, text: (r) => signed(gain(r), 2) },
+  { key: "epipolar_px_before", title: "epi before", hint: "Median epipolar error of feature matches with the input's poses, px", value: (r) => r.epipolar_px_before, text: (r) => short(r.epipolar_px_before) },
+  { key: "epipolar_px_after", title: "epi after", hint: "The same with the refined poses, px", value: (r) => r.epipolar_px_after, text: (r) => short(r.epipolar_px_after) },
+  { key: "psnr", title: "PSNR end", hint: "Render against photo at the end, dB; held-out views only", value: (r) => r.psnr, text: (r) => fixed(r.psnr, 2) },
+];
+const NAME: Column = { key: "name", title: "image", hint: "", value: (r) => r.name, text: (r) => r.name };
+const SOURCE: Column = { key: "source", title: "pose from", hint: "Who found the pose that it started from", value: (r) => r.source, text: (r) => sourceWords(r.source) };
+
+const natural = new Intl.Collator("en", { numeric: true });
+
+function sorted(rows: readonly ImageRow[], by: Column, down: boolean): ImageRow[] {
+  return [...rows].sort((a, b) => {
+    const [x, y] = [by.value(a), by.value(b)];
+    if (x === null || y === null) return x === y ? a.image - b.image : x === null ? 1 : -1; // unknown comes last
+    const order = typeof x === "number" && typeof y === "number" ? x - y : natural.compare(String(x), String(y));
+    return (down ? -order : order) || a.image - b.image;
+  });
+}
+
+export function ImageTable({ rows, selected, onSelect, cellOf }: ImageTableProps) {
+  const [order, setOrder] = useState<{ key: string; down: boolean } | null>(null);
+  const [text, setText] = useState("");
+  const [kind, setKind] = useState("");
+  const [all, setAll] = useState(false);
+  const columns = useMemo(() => COLUMNS.filter((column) => rows.some((row) => column.value(row) !== null)), [rows]);
+  const kinds = useMemo(() => [...new Set(rows.flatMap((row) => row.flags))].sort(), [rows]);
+  const sources = useMemo(() => [...new Set(rows.map((row) => row.source))].sort(), [rows]);
+  const most = useMemo(() => Math.max(1e-9, ...rows.map((row) => row.moved_deg)), [rows]);
+  const found = useMemo(() => {
+    const wanted = text.toLocaleLowerCase();
+    const kept = rows.filter(
+      (row) =>
+        row.name.toLocaleLowerCase().includes(wanted) &&
+        (kind === "" || row.flags.includes(kind) || kind === `from ${row.source}`),
+    );
+    const by = [NAME, SOURCE, ...COLUMNS].find((column) => column.key === order?.key);
+    return by && order ? sorted(kept, by, order.down) : kept;
+  }, [rows, text, kind, order]);
+  const shown = all ? found : found.slice(0, SHOWN_AT_FIRST);
+  const heading = (column: Column, first: "down" | "up", className: string) => (
+    <Heading
+      key={column.key}
+      column={column}
+      className={className}
+      order={order?.key === column.key ? (order.down ? "descending" : "ascending") : "none"}
+      onClick={() =>
+        setOrder(
+          order?.key === column.key ? { key: column.key, down: !order.down } : { key: column.key, down: first === "down" },
+        )
+      }
+    />
+  );
+  return (
+    <section class="images" aria-label="Images">
+      <div class="images-controls">
+        <label class="pick">
+          <span>Find</span>
+          <input type="search" value={text} placeholder="name" onInput={(event) => setText(event.currentTarget.value)} />
+        </label>
+        <Pick
+          label="Show"
+          value={kind}
+          onChange={setKind}
+          options={[
+            { value: "", text: "all" },
+            ...kinds.map((flag) => ({ value: flag, text: flagWords(flag) })),
+            ...(sources.length > 1
+              ? sources.map((source) => ({ value: `from ${source}`, text: `pose from ${sourceWords(source)}` }))
+              : []),
+          ]}
+        />
+        <span class="soft" role="status">
+          {found.length === rows.length ? count(rows.length, "image") : `${found.length} of ${count(rows.length, "image")}`}
+        </span>
+      </div>
+      <div class="table-scroll" tabIndex={0} role="region" aria-label="Table of images">
+        <table class="table">
+          <thead>
+            <tr>
+              {heading(NAME, "up", "")}
+              {columns.map((column) => heading(column, "down", "number"))}
+              {heading(SOURCE, "up", "")}
+              <th scope="col">notes</th>
+            </tr>
+          </thead>
+          <tbody>
+            {shown.map((row) => (
+              <tr
+                key={row.image}
+                aria-current={row.image === selected ? "true" : undefined}
+                data-image={row.image}
+                onClick={() => onSelect(row.image)}
+              >
+                <th scope="row">
+                  <span class="images-name">
+                    {cellOf && <Thumb cell={cellOf(row.image)} />}
+                    <button type="button" class="link" onClick={() => onSelect(row.image)}>
+                      <bdi>{row.name}</bdi>
+                    </button>
+                  </span>
+                </th>
+                {columns.map((column) => (
+                  <td key={column.key} class="number">
+                    {column.key === "moved_deg" && (
+                      <span class="bar" style={{ width: `${(100 * row.moved_deg) / most}%` }} aria-hidden="true" />
+                    )}
+                    {column.text(row)}
+                  </td>
+                ))}
+                <td>{sourceWords(row.source)}</td>
+                <td>
+                  {row.flags.map((flag) => (
+                    <span key={flag} class={ALARMING.has(flag) ? "flag flag-bad" : "flag"}>
+                      {flagWords(flag)}
+                    </span>
+                  ))}
+                </td>
+              </tr>
+            ))}
+          </tbody>
+        </table>
+        {found.length === 0 && <p class="notice">No image is called so.</p>}
+      </div>
+      {found.length > shown.length && (
+        <button type="button" class="button" onClick={() => setAll(true)}>
+          Show all {found.length}
+        </button>
+      )}
+    </section>
+  );
+}
+
+function Heading(props: {
+  column: Column;
+  className: string;
+  order: "ascending" | "descending" | "none";
+  onClick: () => void;
+}) {
+  return (
+    <th scope="col" class={props.className} aria-sort={props.order} title={props.column.hint || undefined}>
+      <button type="button" class="sort" onClick={props.onClick}>
+        {props.column.title}
+        <span aria-hidden="true">{{ ascending: "▲", descending: "▼", none: "" }[props.order]}</span>
+      </button>
+    </th>
+  );
+}
+
+function Thumb({ cell }: { cell: SheetCell | null }) {
+  if (!cell) return null;
+  const scale = THUMB_PX / Math.max(cell.width, cell.height);
+  return (
+    <span
+      class="thumb"
+      aria-hidden="true"
+      style={{
+        width: `${cell.width * scale}px`,
+        height: `${cell.height * scale}px`,
+        backgroundImage: `url("${cell.url}")`,
+        backgroundPosition: `${-cell.x * scale}px ${-cell.y * scale}px`,
+        backgroundSize: `${cell.sheet_width * scale}px ${cell.sheet_height * scale}px`,
+      }}
+    />
+  );
+}

@@ -1,0 +1,135 @@
+// (5) Whether refinement helped, in one sentence, and what proves it.
+import { count, fixed, short, signed } from "./numbers";
+import type { PairedDifference, Verdict, VerdictName, VerdictSentenceProps } from "./types";
+
+const WORDS: Readonly<Record<VerdictName, { chip: string; tone: "good" | "plain" | "unsure" | "bad" }>> = {
+  improved: { chip: "Improved", tone: "good" },
+  unchanged: { chip: "Unchanged", tone: "plain" },
+  kept_input: { chip: "Input kept", tone: "plain" },
+  inconclusive: { chip: "Inconclusive", tone: "unsure" },
+  failed_check: { chip: "Check failed", tone: "bad" },
+};
+
+/** The verdict as a small label, for lists of jobs. */
+export function VerdictChip({ verdict }: { verdict: VerdictName }) {
+  const { chip, tone } = WORDS[verdict];
+  return <span class={`chip chip-${tone}`}>{chip}</span>;
+}
+
+export function VerdictSentence({ verdict, state, asked = true }: VerdictSentenceProps) {
+  if (!verdict) {
+    return (
+      <section class="verdict" aria-label="Verdict">
+        <p class="verdict-sentence">
+          <span class="chip chip-plain">{state === "partial" ? "Partial" : "No verdict"}</span>
+          {state === "partial"
+            ? "The run was stopped before its end: these are the best poses until then, and nobody has compared them with the input's."
+            : asked
+              ? "No verdict was passed."
+              : "No verdict was asked for: the refined poses are given back as they are."}
+        </p>
+      </section>
+    );
+  }
+  return (
+    <section class="verdict" aria-label="Verdict">
+      <p class="verdict-sentence">
+        <VerdictChip verdict={verdict.verdict} />
+        {verdict.why[0]} {RETURNED[verdict.returned]}
+      </p>
+      <div class="proofs">
+        {verdict.heldout && (
+          <Proof
+            title={`${count(verdict.heldout.psnr.count, "unseen view")}, PSNR`}
+            difference={verdict.heldout.psnr}
+            unit="dB"
+            before={fixed(verdict.heldout.psnr.before, 2)}
+            after={fixed(verdict.heldout.psnr.after, 2)}
+            least={0.5}
+            note={`Two equal trainings of ${count(verdict.heldout.steps, "step")}, poses held still.`}
+          />
+        )}
+        {verdict.epipolar && (
+          <Proof
+            title={`${count(verdict.epipolar.matches, "feature match", "feature matches")}, epipolar error`}
+            difference={verdict.epipolar.error_px}
+            unit="octaves"
+            before={`${short(verdict.epipolar.error_px.before)} px`}
+            after={`${short(verdict.epipolar.error_px.after)} px`}
+            least={0.1}
+            note={
+              verdict.epipolar.independent
+                ? "Matches that the start had nothing to do with; an octave is half the error."
+                : "The start came from these matches: they can speak against the refined poses only."
+            }
+          />
+        )}
+        {!verdict.heldout && !verdict.epipolar && (
+          <p class="soft">The scene's middle moved by {short(verdict.moved_px)} px in the photos (median).</p>
+        )}
+      </div>
+    </section>
+  );
+}
+
+const RETURNED: Readonly<Record<Verdict["returned"], string>> = {
+  refined: "The result holds the refined poses.",
+  input: "The result holds the input's poses; refined/ has the refined ones.",
+};
+
+const FINDING: Readonly<Record<PairedDifference["finding"], string>> = {
+  better: "better",
+  worse: "worse",
+  same: "the same",
+  open: "not certain",
+};
+
+function Proof(props: {
+  title: string;
+  difference: PairedDifference;
+  unit: string;
+  before: string;
+  after: string;
+  least: number;
+  note: string;
+}) {
+  const { difference: d, unit } = props;
+  return (
+    <div class="proof">
+      <div class="proof-title">{props.title}</div>
+      <div class="proof-figures">
+        <span>
+          {props.before} → <b>{props.after}</b>
+        </span>
+        <span class={`proof-finding proof-${d.finding}`}>{FINDING[d.finding]}</span>
+      </div>
+      <Interval difference={d} least={props.least} unit={unit} />
+      <div class="soft">
+        gain {signed(d.difference, 2)} {unit}
+        {d.low !== null && d.high !== null && `, 95 % interval ${signed(d.low, 2)} to ${signed(d.high, 2)}`}. {props.note}
+      </div>
+    </div>
+  );
+}
+
+const WIDE = 260;
+const HIGH = 26;
+
+/** The difference and its interval on a line; what is within the grey band would not matter. */
+function Interval({ difference: d, least, unit }: { difference: PairedDifference; least: number; unit: string }) {
+  const ends = [d.difference, d.low ?? d.difference, d.high ?? d.difference];
+  const reach = 1.15 * Math.max(2 * least, ...ends.map(Math.abs));
+  const x = (value: number) => WIDE / 2 + (value / reach) * (WIDE / 2 - 6);
+  const said = `Gain ${signed(d.difference, 2)} ${unit}${d.low !== null && d.high !== null ? `, 95 % interval ${signed(d.low, 2)} to ${signed(d.high, 2)}` : ""}`;
+  return (
+    <svg class="interval" viewBox={`0 0 ${WIDE} ${HIGH}`} role="img" aria-label={said}>
+      <rect class="interval-band" x={x(-least)} width={x(least) - x(-least)} y={3} height={HIGH - 6} rx={2} />
+      <line class="interval-axis" x1={0} x2={WIDE} y1={HIGH / 2} y2={HIGH / 2} />
+      <line class="interval-zero" x1={x(0)} x2={x(0)} y1={2} y2={HIGH - 2} />
+      {d.low !== null && d.high !== null && (
+        <line class={`interval-range interval-${d.finding}`} x1={x(d.low)} x2={x(d.high)} y1={HIGH / 2} y2={HIGH / 2} />
+      )}
+      <circle class={`interval-dot interval-${d.finding}`} cx={x(d.difference)} cy={HIGH / 2} r={4.5} />
+    </svg>
+  );
+}

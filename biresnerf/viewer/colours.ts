@@ -1,0 +1,107 @@
+// Colours of values, on absolute scales: the same value has the same colour in every job and on every page.
+import type { ColourBy, SceneCamera } from "./types";
+
+export type Colour = readonly [number, number, number]; // 0 to 255
+
+// Viridis, as in the pictures of differences and depths: even steps look even, also without colour vision.
+const VIRIDIS: readonly Colour[] = [
+  [68, 1, 84],
+  [71, 44, 122],
+  [59, 81, 139],
+  [44, 113, 142],
+  [33, 144, 141],
+  [39, 173, 129],
+  [92, 200, 99],
+  [170, 220, 50],
+  [253, 231, 37],
+];
+// Orange is worse, blue is better; the two that people with any colour vision tell apart.
+const WORSE: Colour = [213, 94, 0];
+const BETTER: Colour = [0, 114, 178];
+const BETTER_ON_DARK: Colour = [86, 180, 233];
+export const UNKNOWN: Colour = [128, 134, 140];
+// Okabe and Ito's, without black and yellow, which one ground or the other hides.
+const KINDS: readonly Colour[] = [
+  [0, 114, 178],
+  [230, 159, 0],
+  [0, 158, 115],
+  [204, 121, 167],
+  [213, 94, 0],
+  [86, 180, 233],
+];
+
+const blend = (a: Colour, b: Colour, share: number): Colour => [
+  Math.round(a[0] + share * (b[0] - a[0])),
+  Math.round(a[1] + share * (b[1] - a[1])),
+  Math.round(a[2] + share * (b[2] - a[2])),
+];
+
+/** Colour of 0 to 1; values outside take the ends. The end that the ground would hide is left out. */
+export function rampColour(value: number, dark: boolean): Colour {
+  const inside = Math.min(1, Math.max(0, value));
+  const position = (dark ? 0.22 + 0.78 * inside : 0.88 * inside) * (VIRIDIS.length - 1);
+  const below = Math.min(Math.floor(position), VIRIDIS.length - 2);
+  return blend(VIRIDIS[below] ?? UNKNOWN, VIRIDIS[below + 1] ?? UNKNOWN, position - below);
+}
+
+/** Colour of -1 (worse) to 1 (better); the middle is grey. */
+export function signedColour(value: number, dark: boolean): Colour {
+  const inside = Math.min(1, Math.max(-1, value));
+  const grey: Colour = dark ? [150, 155, 160] : [150, 154, 158];
+  return inside < 0 ? blend(grey, WORSE, -inside) : blend(grey, dark ? BETTER_ON_DARK : BETTER, inside);
+}
+
+export function kindColour(kind: string, kinds: readonly string[]): Colour {
+  const found = kinds.indexOf(kind);
+  return found < 0 ? UNKNOWN : (KINDS[found % KINDS.length] ?? UNKNOWN);
+}
+
+export const css = ([r, g, b]: Colour): string => `rgb(${r} ${g} ${b})`;
+
+export interface Scale {
+  readonly label: string;
+  readonly unit: string;
+  /** Caps to choose from; the first is where it starts. None for a scale of kinds. */
+  readonly caps: readonly number[];
+  readonly signed: boolean;
+}
+
+/** The scales, absolute: caps do not depend on the data, but in world units, which have no size of their own. */
+export function scaleOf(by: ColourBy, spread: number): Scale {
+  switch (by) {
+    case "moved_deg":
+      return { label: "turned", unit: "°", caps: [10, 1, 3, 30, 90], signed: false };
+    case "moved_units":
+      return { label: "moved", unit: "units", caps: unitCaps(spread), signed: false };
+    case "delta_psnr":
+      return { label: "PSNR gain", unit: "dB", caps: [3, 1, 10], signed: true };
+    case "source":
+      return { label: "pose from", unit: "", caps: [], signed: false };
+  }
+}
+
+/** Round numbers about a tenth of the rig's size, in its own units. */
+export function unitCaps(spread: number): number[] {
+  const power = 10 ** Math.floor(Math.log10(Math.max(spread, 1e-12) / 10));
+  return [1, 0.1, 10, 100].map((times) => Number((times * power).toPrecision(1)));
+}
+
+export function valueOf(camera: SceneCamera, by: ColourBy): number | null {
+  switch (by) {
+    case "moved_deg":
+      return camera.moved_deg;
+    case "moved_units":
+      return camera.moved_units;
+    case "delta_psnr":
+      return camera.delta_psnr;
+    case "source":
+      return null;
+  }
+}
+
+export function colourOf(camera: SceneCamera, by: ColourBy, cap: number, kinds: readonly string[], dark: boolean): Colour {
+  if (by === "source") return kindColour(camera.source, kinds);
+  const value = valueOf(camera, by);
+  if (value === null || !Number.isFinite(value)) return UNKNOWN;
+  return by === "delta_psnr" ? signedColour(value / cap, dark) : rampColour(value / cap, dark);
+}

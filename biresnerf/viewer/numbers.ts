@@ -1,0 +1,50 @@
+// Numbers as people read them.
+
+/** Three digits that count, without exponents where they can be had. */
+export function short(value: number | null | undefined, digits = 3): string {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+  if (value === 0) return "0";
+  const size = Math.abs(value);
+  if (size >= 1e6 || size < 1e-4) return value.toExponential(digits - 1);
+  const decimals = Math.max(0, digits - 1 - Math.floor(Math.log10(size)));
+  return value.toFixed(Math.min(decimals, 6));
+}
+
+export const fixed = (value: number | null | undefined, decimals: number): string =>
+  value === null || value === undefined || !Number.isFinite(value) ? "–" : value.toFixed(decimals);
+
+/** With its sign; the minus is as wide as the plus. */
+export const signed = (value: number | null | undefined, decimals: number): string =>
+  value === null || value === undefined || !Number.isFinite(value)
+    ? "–"
+    : `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(decimals)}`;
+
+export const count = (value: number, one: string, many = `${one}s`): string =>
+  `${value.toLocaleString("en-GB")} ${value === 1 ? one : many}`;
+
+export function duration(seconds: number): string {
+  const whole = Math.round(seconds);
+  if (whole < 60) return `${whole} s`;
+  const minutes = Math.floor(whole / 60);
+  return minutes < 60
+    ? `${minutes} min ${String(whole % 60).padStart(2, "0")} s`
+    : `${Math.floor(minutes / 60)} h ${String(minutes % 60).padStart(2, "0")} min`;
+}
+
+const FLAGS: Readonly<Record<string, string>> = {
+  held_out: "held out",
+  fixed: "fixed",
+  lost: "lost",
+  repaired: "repaired",
+  moved_far: "moved far",
+  blurred: "blurred",
+  exposure_off: "exposure off",
+};
+
+export const flagWords = (flag: string): string => FLAGS[flag] ?? flag.replaceAll("_", " ");
+
+/** Flags that ask for a look. */
+export const ALARMING: ReadonlySet<string> = new Set(["lost", "moved_far", "blurred", "exposure_off"]);
+
+export const sourceWords = (source: string): string =>
+  source === "given" ? "given" : source.replaceAll("-", " ");
