@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -14,6 +14,7 @@ from biresnerf.progress import OnProgress, Progress
 from biresnerf.refine.evaluation import ViewScore, fit_held_out_poses, render_orbit, score_views
 from biresnerf.refine.judgement import Judgement, judge
 from biresnerf.refine.run_input import RunInput
+from biresnerf.refine.shown_views import Shown, spread_views, surface_of
 from biresnerf.refine.two_stages import LAST_FRACTION, TwoStages
 from biresnerf.report import Report
 
@@ -21,6 +22,7 @@ logger = logging.getLogger(__name__)
 
 EVALUATED_FRACTION, JUDGED_FRACTION, EXPORTING_FRACTION = 0.95, 0.985, 0.99  # of the whole run's progress
 SHOWN_WITHOUT_HELD_OUT = 2  # training views rendered when none is held out
+SHOWN_SHARE = 0.05  # of the run's time, at most, for views rendered to be looked at alone
 
 
 @dataclass(eq=False)
@@ -35,6 +37,7 @@ class Run:
     stop: Callable[[], bool]
     scores: list[ViewScore] = field(default_factory=list)
     judgement: Judgement | None = None
+    shown: Shown = field(default_factory=Shown)
 
     def evaluate(self) -> None:
         """Fit the poses of held-out views, score and render views, film the orbit.
@@ -47,8 +50,9 @@ class Run:
         self.report(Progress(stage="evaluating", fraction=LAST_FRACTION))
         fit_held_out_poses(optimiser, self.given.untaught)
         views = held_out or list(range(min(SHOWN_WITHOUT_HELD_OUT, len(self.given.dataset))))
-        frames = int(optimiser.options.orbit_frames or 0)
-        work = len(views) + frames
+        frames, more = int(optimiser.options.orbit_frames or 0), int(optimiser.options.shown_views or 0)
+        further = spread_views(self.given.dataset.world_from_cam, views, more)
+        work = len(views) + len(further) + frames
         rendering_from = time.monotonic()
 
         def tell(done: int) -> None:
@@ -67,15 +71,30 @@ class Run:
             )
 
         tell(0)
-        scores = []
+        scores, shown = [], Shown()
         for score in score_views(optimiser, self.given.images, views):
-            self.folder.write_view(self.given.dataset.names, self.given.images, score)
+            shown.add(self.folder.write_view(self.given, score), *surface_of(optimiser, score))
             scores.append(score)
             tell(len(scores))
+        for score in score_views(optimiser, self.given.images, self._while_cheap(further)):
+            shown.add(self.folder.write_view(self.given, score), *surface_of(optimiser, score))
+            tell(len(shown.views))
         if frames:
-            self.folder.write_orbit(render_orbit(optimiser, frames, lambda i: tell(len(views) + i + 1)))
+            done = len(views) + len(further)
+            self.folder.write_orbit(render_orbit(optimiser, frames, lambda i: tell(done + i + 1)))
+        self.shown = shown
         self.stages.record.seconds["evaluating"] = time.monotonic() - started
         self.scores = scores if held_out else []
+
+    def _while_cheap(self, views: list[int]) -> Iterator[int]:
+        """The views one by one, until showing another would take more than its share of the run."""
+        started, spent_before = time.monotonic(), sum(self.stages.record.seconds.values())
+        for done, view in enumerate(views):
+            spent = time.monotonic() - started
+            if done and spent * (done + 1) / done > SHOWN_SHARE * spent_before:
+                logger.info("%d of %d further views rendered: more would take too long", done, len(views))
+                return
+            yield view
 
     def judge(self) -> None:
         """Pass the verdict on the refined poses, if one is asked for.
@@ -107,7 +126,7 @@ class Run:
         if state == "complete":
             self.report(Progress(stage="exporting", fraction=EXPORTING_FRACTION))
         result = self.folder.write_result(
-            self.given, self.stages, self.scores, self.judgement,
+            self.given, self.stages, self.scores, self.judgement, self.shown,
             threads=self.threads, state=state, should_stop=self.stop if state == "complete" else lambda: False,
         )  # fmt: skip
         if state == "complete":

@@ -36,7 +36,7 @@ STAGE_2_OPTIONS = frozenset(
     {
         *("reconstruction_levels", "reconstruction_resolution_min", "reconstruction_resolution_max"),
         *("table_size_log2", "wiring", "warmup_steps", "verdict", "trial_steps"),
-        *("threads", "checkpoint_every_s", "orbit_frames", "packs"),
+        *("threads", "checkpoint_every_s", "orbit_frames", "shown_views", "packs"),
     }
 )
 
@@ -166,6 +166,13 @@ class RefineOptions(BaseModel):
     checkpoint_every_s: float = Field(20.0, gt=0, description="Seconds between two checkpoints.")
     orbit_frames: int | None = Field(
         None, ge=0, le=600, description="Frames of the orbit video; 0 leaves it out."
+    )
+    shown_views: int | None = Field(
+        None,
+        ge=0,
+        le=200,
+        description="Views rendered at the end beside the held-out ones, spread over the set, to be looked at; fewer "
+        "where they would take more than a twentieth of the run.",
     )
     packs: tuple[PackName, ...] = Field(
         (),

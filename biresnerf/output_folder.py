@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -13,13 +14,14 @@ from biresnerf.config import PackName
 from biresnerf.data.area_resize import area_resize
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
-from biresnerf.data.images import ImageSet
 from biresnerf.data.packs.input_form import forms_of_input, write_input_form
 from biresnerf.data.packs.poses_json import POSES, write_poses_json
 from biresnerf.data.packs.write_packs import write_packs
 from biresnerf.data.refined_points import with_points_of
 from biresnerf.data.refined_set import RefinedSet, refined_set
 from biresnerf.data.renders import picture_stems, write_orbit, write_view
+from biresnerf.data.view_file import THUMBNAIL, ShownPictures, ShownView, ViewFile, write_view_file
+from biresnerf.data.view_pictures import write_contact_sheet, write_points, write_thumbnail
 from biresnerf.data.write import transforms_notes, write_transforms
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera import Intrinsics
@@ -33,8 +35,12 @@ from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.judgement import Judgement
 from biresnerf.refine.run_input import RunInput
 from biresnerf.refine.run_report import run_report
+from biresnerf.refine.shown_views import Points, Shown
 from biresnerf.refine.two_stages import TwoStages
 from biresnerf.report import PointsReport, Report
+from biresnerf.viewer.report_html import write_report_html
+
+logger = logging.getLogger(__name__)
 
 REPORT, CONFIG, TRANSFORMS = "report.json", "config.json", "transforms.json"
 RENDERS, ORBIT = "renders", "orbit.mp4"
@@ -101,14 +107,24 @@ class OutputFolder:
             )
         self.path.mkdir(parents=True, exist_ok=True)
 
-    def write_view(self, names: tuple[str, ...], images: ImageSet, score: ViewScore) -> None:
+    def write_view(self, given: RunInput, score: ViewScore) -> ShownView:
         """Render, photo, difference and depth of one view."""
-        write_view(
+        photo = given.images.image(score.image)
+        files = write_view(
             self.path / RENDERS,
-            picture_stems(names)[score.image],
+            picture_stems(given.dataset.names)[score.image],
             render=score.view.colour,
-            photo=images.image(score.image),
+            photo=photo,
             depth=np.where(score.view.opacity > SOLID, score.view.depth, np.nan),
+        )
+        names = {path.stem.rpartition("_")[2]: path.relative_to(self.path).as_posix() for path in files}
+        return ShownView(
+            image=score.image,
+            held_out=score.image in given.held_out,
+            width=photo.shape[1],
+            height=photo.shape[0],
+            psnr=score.psnr,
+            pictures=ShownPictures.model_validate(names),
         )
 
     def write_preview(self, given: RunInput, stages: TwoStages, threads: int) -> tuple[str, ...]:
@@ -127,6 +143,9 @@ class OutputFolder:
         self._write_text(f"{PREVIEW}/{REPORT}", report.model_dump_json(indent=2))
         pictures = self._preview_pictures(given, optimiser)
         texts = [f"{PREVIEW}/{name}" for name in (POSES, REPORT, TRANSFORMS)]
+        if (self.path / HISTORY).is_file():
+            self._write_text(f"{PREVIEW}/{HISTORY}", (self.path / HISTORY).read_text("utf-8").rstrip("\n"))
+            texts.append(f"{PREVIEW}/{HISTORY}")
         return (*texts, *(path.relative_to(self.path).as_posix() for path in pictures))
 
     def _preview_pictures(self, given: RunInput, optimiser: JointOptimiser) -> list[Path]:
@@ -138,13 +157,14 @@ class OutputFolder:
         intrinsics = Intrinsics.from_cameras(halves).to(optimiser.device)
         pose = optimiser.poses.matrices()[view].detach()
         rendered = render_view(optimiser, pose, view, intrinsics, as_photo=True)
-        return write_view(
+        pictures = write_view(
             self.path / PREVIEW,
             picture_stems(given.dataset.names)[view],
             render=rendered.colour,
             photo=area_resize(images.image(view), halves[view].width, halves[view].height) / 255,
             depth=np.where(rendered.opacity > SOLID, rendered.depth, np.nan),
         )
+        return [*pictures, write_thumbnail(images.image(view), self.path / PREVIEW / THUMBNAIL)]
 
     def drop_traces(self) -> None:
         """Remove what only a run that goes on needs, and what others could start from unless that is to be kept."""
@@ -164,6 +184,7 @@ class OutputFolder:
         stages: TwoStages,
         scores: list[ViewScore],
         judgement: Judgement | None = None,
+        shown: Shown | None = None,
         *,
         threads: int,
         state: Literal["complete", "partial"],
@@ -177,22 +198,50 @@ class OutputFolder:
             Interrupted: ``should_stop`` said so while packs were written.
         """
         dataset, optimiser = given.dataset, stages.optimiser
+        shown = shown or Shown()
         self._write_text(CONFIG, optimiser.options.model_dump_json(indent=2))
         refined, similarity = poses_in_input_frame(dataset, optimiser)
         report = run_report(
             given, stages, scores, judgement, refined, similarity, threads=threads, state=state
         )
         refined_dataset = optimiser.lenses.refined(dataset)
-        returned, returned_dataset = refined, refined_dataset
+        returned, returned_dataset, poses, moved = refined, refined_dataset, POSES, None
         if judgement is not None and judgement.verdict.returned == "input":
             returned, returned_dataset = dataset.world_from_cam, dataset
             if np.isfinite(refined).all():
-                self._write_poses(self.path / REFINED, given, refined_dataset, refined, report, ())
+                _, moved = self._write_poses(self.path / REFINED, given, refined_dataset, refined, report, ())
+                poses = f"{REFINED}/{POSES}"
         # On the way to the end nobody waits for large packs.
         packs = optimiser.options.packs if state == "complete" else ()
-        report = self._write_poses(self.path, given, returned_dataset, returned, report, packs, should_stop)
+        report, result = self._write_poses(
+            self.path, given, returned_dataset, returned, report, packs, should_stop
+        )
+        surface = shown.surface(optimiser.frame.unit_from_world, similarity)
+        self._write_view_file(given, shown, moved or result, surface, poses)
+        notes = write_report_html(self.path, report)
+        for note in notes:
+            logger.warning("%s", note)
+        report = report.model_copy(update={"warnings": report.warnings + notes})
         self._write_text(REPORT, report.model_dump_json(indent=2))
         return report
+
+    def _write_view_file(
+        self, given: RunInput, shown: Shown, refined: RefinedSet, surface: Points, poses: str
+    ) -> None:
+        """view.json and what it lists beside the renders; ``poses`` is the file that says where ``refined`` is."""
+        images, sparse = given.images, refined.model.points
+        write_thumbnail(images.image((given.held_out or [0])[0]), self.path / THUMBNAIL)
+        view = ViewFile(
+            poses=poses,
+            thumbnail=THUMBNAIL,
+            contact_sheet=write_contact_sheet(images, self.path),
+            views=tuple(shown.views),
+            points=write_points(
+                [(refined.points_source, sparse.xyz, sparse.rgb), ("field", *surface)], self.path
+            ),
+            orbit=f"{RENDERS}/{ORBIT}" if (self.path / RENDERS / ORBIT).is_file() else None,
+        )
+        write_view_file(view, self.path)
 
     @staticmethod
     def _write_poses(
@@ -203,10 +252,10 @@ class OutputFolder:
         report: Report,
         packs: Sequence[PackName],
         should_stop: Callable[[], bool] = lambda: False,
-    ) -> Report:
+    ) -> tuple[Report, RefinedSet]:
         """Poses [n, 4, 4] of ``dataset``, the input with other lenses or none, in the input's form, and the packs.
 
-        Returns the report with notes on them.
+        Returns the report with notes on them, and the set as written.
         """
         write_transforms(dataset, world_from_cam, folder / TRANSFORMS)
         refined = _described(dataset, world_from_cam, report)
@@ -215,7 +264,7 @@ class OutputFolder:
         notes = write_packs(refined, folder, asked, should_stop) + transforms_notes(dataset, world_from_cam)
         write_input_form(dataset, refined, folder)
         points = PointsReport(source=refined.points_source, count=len(refined.model.points))
-        return report.model_copy(update={"points": points, "warnings": report.warnings + notes})
+        return report.model_copy(update={"points": points, "warnings": report.warnings + notes}), refined
 
     def _write_text(self, name: str, text: str) -> None:
         with whole_file(self.path / name) as temporary:

@@ -263,7 +263,8 @@ def _prepare(
     if images.counts is not None:
         digest.update(images.counts.tobytes())
     # What changes neither result nor effort may differ between a run and its continuation.
-    asked = options.model_dump(exclude={"threads", "checkpoint_every_s", "orbit_frames", "packs"})
+    idle = {"threads", "checkpoint_every_s", "orbit_frames", "shown_views", "packs"}
+    asked = options.model_dump(exclude=idle)
     stage_1 = options.model_dump(exclude=set(STAGE_2_OPTIONS))
     return Prepared(
         dataset,

@@ -28,6 +28,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "table_size_log2": 16,
         "trial_steps": 200,
         "orbit_frames": 24,
+        "shown_views": 6,
     },
     "balanced": {
         "max_image_size": 200,
@@ -46,6 +47,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "table_size_log2": 17,
         "trial_steps": 500,
         "orbit_frames": 48,
+        "shown_views": 8,
     },
     "quality": {
         "max_image_size": 400,
@@ -64,6 +66,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "table_size_log2": 19,
         "trial_steps": 1000,
         "orbit_frames": 96,
+        "shown_views": 12,
     },
     # Guo et al., Appl. Sci. 2023, 13(24), 13333: Table 1 for the encodings; steps, period and floor inferred
     # from its timing tables; rates and loss inherited from BAA-NGP, which it builds on.
@@ -84,6 +87,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
         "table_size_log2": 19,
         "trial_steps": 1000,
         "orbit_frames": 96,
+        "shown_views": 12,
     },
 }
 

@@ -27,6 +27,7 @@ from biresnerf.pipeline import refine_poses
 from biresnerf.progress import STAGES, Progress
 from biresnerf.refine.checkpoint import CHECKPOINT
 from biresnerf.report import Report
+from biresnerf.viewer.report_html import BUNDLE
 
 VIEWS, HELD_OUT = 30, 3
 # The input lies anywhere and has any scale: results must come back into this frame.
@@ -196,7 +197,10 @@ def test_options_as_used_lie_beside_the_result(run):
 def test_a_finished_folder_holds_results_only(run):
     names = {path.name for path in run.output.iterdir()}
     packs = {"transforms.json", "colmap", "poses.json", "tum.txt", "scene.glb"}
-    assert names == packs | {"report.json", "config.json", "history.jsonl", "renders"}
+    shown = {"view.json", "view", "thumbnail.jpg", "renders"} | (
+        {"report.html"} if (BUNDLE / "report.js").is_file() else set()
+    )
+    assert names == packs | shown | {"report.json", "config.json", "history.jsonl"}
 
 
 def test_progress_goes_through_the_stages_and_never_falls(run):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,7 +108,7 @@ def render_view(
     return RenderedView(whole[..., :3].clip(0, 1), whole[..., 3], whole[..., 4])
 
 
-def score_views(optimiser: JointOptimiser, images: ImageSet, views: list[int]) -> Iterator[ViewScore]:
+def score_views(optimiser: JointOptimiser, images: ImageSet, views: Iterable[int]) -> Iterator[ViewScore]:
     """Render each view at its present pose and score it against its photo, where its pixels count."""
     matrices = optimiser.poses.matrices().detach()
     for image in views:

@@ -87,6 +87,17 @@ class StabilityDetector:
             return "stable"
         return "running"
 
+    def signal(self) -> dict[str, float]:
+        """What it sees, for curves: the trend over the window and what of it counts as level, dB; checks in a row."""
+        if len(self.decibels) < WINDOW:
+            return {"confirmed": self.confirmed}
+        change, fluctuation = self._trend()
+        return {
+            "trend_db": change,
+            "level_db": max(SLOPE_DB, fluctuation),
+            "confirmed": self.confirmed,
+        }
+
     def _flat(self) -> bool:
         """Whether the last window shows neither trend nor unrest, as the chosen reading has it."""
         imbalance = abs(int(np.sign(np.diff(self.decibels[-WINDOW:])).sum()))

@@ -142,12 +142,13 @@ class TwoStages:
         self._moved_deg = float(np.quantile(rotation_angle_deg(turn.numpy()), 0.9))
         self._poses_at_check = now
         optimiser.camera_errors.close_block()
-        self._write_history(error, last)
         if optimiser.switch is not None:
+            self._write_history(error, last, {})
             self._repair_if_due()
             return
         still_deg = self.detector.still_deg(optimiser.pose_rate(), int(optimiser.options.check_every or 1))
         verdict = self.detector.check(optimiser.step_index, error, self._moved_deg, still_deg)
+        self._write_history(error, last, {"still_deg": still_deg, **self.detector.signal()})
         if verdict == "diverging":
             self._roll_back()
             return
@@ -173,7 +174,7 @@ class TwoStages:
         self.repair.run(switching=switching)
         self._poses_at_check = self.optimiser.poses.poses()
 
-    def _write_history(self, mean_squared_error: float, last: StepResult) -> None:
+    def _write_history(self, mean_squared_error: float, last: StepResult, signal: dict[str, float]) -> None:
         optimiser = self.optimiser
         # The error is the mean since the last check; loss, rays and samples are the last step's, rates the next's.
         rates = optimiser.schedule.field_rates(optimiser.step_index, optimiser.switch)
@@ -191,6 +192,7 @@ class TwoStages:
                 "field_rate": rates.pose,
                 "reconstruction_rate": max(rates.reconstruction, default=0.0),
                 "seconds": round(sum(self.record.seconds[stage] for stage in ("coarse", "fine")), 3),
+                **signal,
                 **self.observer.at_check(optimiser),
             }
         )

@@ -1,0 +1,31 @@
+"""`biresnerf report RESULT`: report.html of a finished result, written again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from biresnerf.errors import BiresnerfError
+
+
+@click.command("report")
+@click.argument("result", type=click.Path(path_type=Path))
+@click.option("--title", help="What it is of. Default: how many images there are.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object: the file and its size.")
+def report_command(result: Path, title: str | None, as_json: bool) -> None:
+    """Write report.html of RESULT anew, from the files that lie there.
+
+    One page with everything there is to see, opened from disk without network.
+    """
+    from biresnerf.viewer.report_html import REPORT_HTML, read_report, write_report_html
+
+    notes = write_report_html(result, read_report(result), title)
+    if notes:
+        raise BiresnerfError(notes[0])
+    page = result / REPORT_HTML
+    if as_json:
+        click.echo(json.dumps({"file": str(page), "bytes": page.stat().st_size}))
+    else:
+        click.echo(f"{page} written ({page.stat().st_size / 1e6:.1f} MB)")

@@ -1,0 +1,194 @@
+"""``report.html``: one file that shows a result in any browser, opened from disk, without network.
+
+The bundle that draws it is built from the TypeScript beside this file (docs/formats.md says how the page is fed).
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import json
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+from PIL import Image
+
+from biresnerf.data.atomic_file import whole_file
+from biresnerf.data.packs.poses_json import POSES
+from biresnerf.data.view_file import VIEW, ViewFile, read_view_file
+from biresnerf.errors import InputError
+from biresnerf.report import Report
+
+REPORT_HTML, HISTORY = "report.html", "history.jsonl"
+BUNDLE = Path(__file__).parent / "dist"
+# Of pictures, points and video before base64; what more there is lies beside the page.
+MOST_BYTES = 9_000_000
+MOST_VIDEO_BYTES = 2_000_000
+PICTURE_PX, QUALITY = 640, 82  # long side and JPEG's quality of a picture in the page
+_MEDIA = {".jpg": "image/jpeg", ".mp4": "video/mp4", ".bin": "application/octet-stream"}
+NOT_BUILT = (
+    "report.html was not written: its viewer is not built. Run `make web`, then `biresnerf report OUT`."
+)
+
+
+def write_report_html(folder: Path, report: Report, title: str | None = None) -> tuple[str, ...]:
+    """Writes the page of the result in ``folder``, whole or not at all.
+
+    Args:
+        title: what it is of; how many images there are where left out.
+
+    Returns:
+        a sentence where it could not be written.
+
+    Raises:
+        InputError: a file of the result is not as it was written.
+    """
+    try:
+        script, style, licences = (
+            (BUNDLE / name).read_text("utf-8") for name in ("report.js", "report.css", "licences.txt")
+        )
+    except FileNotFoundError:
+        return (NOT_BUILT,)
+    view = read_view_file(folder) if (folder / VIEW).is_file() else None
+    files, left_out = _embedded(folder, view)
+    title = title or f"Refined poses of {len(report.images)} images"
+    history = folder / HISTORY
+    data = {
+        "title": title,
+        "written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "poses": json.loads((folder / (view.poses if view else POSES)).read_text("utf-8")),
+        "report": report.model_dump(mode="json"),
+        "view": view.model_dump(mode="json") if view else None,
+        "history": history.read_text("utf-8") if history.is_file() else "",
+        "files": files,
+        "left_out": left_out,
+    }
+    page = _PAGE.format(
+        title=html.escape(title),
+        style=_inside("style", style),
+        data=_as_script(data),
+        licences=_as_script(licences),
+        script=_inside("script", script),
+    )
+    with whole_file(folder / REPORT_HTML) as temporary:
+        temporary.write_text(page, "utf-8")
+    return ()
+
+
+def read_report(folder: Path) -> Report:
+    """The report.json of the result in ``folder``.
+
+    Raises:
+        InputError: ``result_missing`` or ``report_invalid``.
+    """
+    path = folder / "report.json"
+    try:
+        return Report.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        raise InputError(
+            "result_missing",
+            "holds no report.json.",
+            where=str(folder),
+            mend="Name the output folder of a finished `biresnerf refine`.",
+        ) from None
+    except ValueError as error:
+        raise InputError(
+            "report_invalid",
+            str(error).splitlines()[0],
+            where=str(path),
+            mend="Give a result of this version, as it was written.",
+        ) from None
+
+
+def _embedded(folder: Path, view: ViewFile | None) -> tuple[dict[str, str], list[str]]:
+    """The result's files as data: URLs within the limit, the most telling first; and what was left out."""
+    if view is None:
+        return {}, ["Pictures: this result has no view.json."]
+    files: dict[str, str] = {}
+    spent, over, missing = 0, 0, 0
+    for name in _wanted(view):
+        path = folder / name
+        if not path.is_file():
+            missing += 1
+            continue
+        content, media = _content(path)
+        if spent + len(content) > MOST_BYTES:
+            over += 1
+            continue
+        spent += len(content)
+        files[name] = f"data:{media};base64,{base64.b64encode(content).decode('ascii')}"
+    left_out = []
+    if view.orbit is not None and (folder / view.orbit).is_file():
+        video = (folder / view.orbit).read_bytes()
+        if len(video) <= min(MOST_VIDEO_BYTES, MOST_BYTES - spent):
+            files[view.orbit] = f"data:video/mp4;base64,{base64.b64encode(video).decode('ascii')}"
+        else:
+            left_out.append(f"The orbit video ({len(video) / 1e6:.1f} MB): {view.orbit}")
+    if over:
+        left_out.append(
+            f"{over} pictures, beyond {MOST_BYTES / 1e6:g} MB; they lie in renders/ beside the page."
+        )
+    if missing:
+        left_out.append(f"{missing} files that view.json names and that are not there.")
+    return files, left_out
+
+
+def _wanted(view: ViewFile) -> Iterator[str]:
+    """Names of the files to embed, in the order of their use."""
+    yield from (points.file for points in view.points)
+    if view.contact_sheet is not None:
+        yield view.contact_sheet.file
+    for kind in ("render", "photo", "difference", "depth"):
+        yield from (getattr(shown.pictures, kind) for shown in view.views)
+
+
+def _content(path: Path) -> tuple[bytes, str]:
+    """A file's bytes, pictures made small, and their type."""
+    if path.suffix != ".png":
+        return path.read_bytes(), _MEDIA[path.suffix]
+    with Image.open(path) as picture:
+        small = picture.convert("RGB")
+    small.thumbnail((PICTURE_PX, PICTURE_PX), Image.Resampling.LANCZOS)
+    buffer = io.BytesIO()
+    small.save(buffer, format="JPEG", quality=QUALITY)
+    return buffer.getvalue(), "image/jpeg"
+
+
+def _as_script(data: object) -> str:
+    """JSON that no name can break out of: a script's content ends at ``</script``, wherever that stands."""
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for character in "<>&\u2028\u2029":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text
+
+
+def _inside(tag: str, code: str) -> str:
+    """Our own code, checked rather than changed: within JavaScript there is no one way to escape it."""
+    if f"</{tag}" in code.lower() or (tag == "script" and "<!--" in code):
+        raise ValueError(f"the bundle holds what ends a {tag}")
+    return code
+
+
+# The policy has the browser itself refuse whatever would leave the page.
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'unsafe-inline'; \
+style-src 'unsafe-inline'; img-src data: blob:; media-src data:; base-uri 'none'; form-action 'none'">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<title>{title}</title>
+<style>{style}</style>
+</head>
+<body>
+<div id="report"></div>
+<noscript>This page is drawn by a script that it carries; report.json beside it says the same in numbers.</noscript>
+<script type="application/json" id="data">{data}</script>
+<script type="application/json" id="licences">{licences}</script>
+<script>{script}</script>
+</body>
+</html>
+"""

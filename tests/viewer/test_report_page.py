@@ -1,0 +1,174 @@
+"""report.html in a real browser, from disk, without network: what it shows is what the files say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from biresnerf.geometry.pose_interpolation import interpolate_pose
+from tests.viewer.conftest import ARGUMENTS, CHROMIUM, HOSTILE, HOSTILE_IMAGE, SCREENSHOTS, VIEWS, open_report
+
+STAGE = "document.querySelector('.scene-stage').dataset"  # what is really drawn
+WIDGETS = (".verdict", ".scene canvas", ".compare", ".images tbody tr", ".curve canvas")
+
+
+def stage(page) -> dict[str, str]:
+    return page.evaluate(f"() => ({{...{STAGE}}})")
+
+
+def choose(page, image: int) -> None:
+    """By the keyboard, as someone without a mouse does."""
+    page.locator(".scene-stage").focus()
+    for _ in range(VIEWS + 1):
+        before = stage(page)["selected"]
+        if before == str(image):
+            return
+        page.keyboard.press("ArrowRight")
+        page.wait_for_function(f"() => {STAGE}.selected !== '{before}'")
+    raise AssertionError(f"image {image} was not reached")
+
+
+def slide(page, share: float) -> None:
+    page.get_by_label("From the input's poses to the refined ones").fill(str(share))
+    page.wait_for_function(f"() => Number({STAGE}.share) === {share}")
+
+
+def test_all_widgets_are_there_and_nothing_is_loaded_from_elsewhere(opened, result):
+    for widget in WIDGETS:
+        opened.page.wait_for_selector(widget)
+    assert opened.complaints == []
+    own = (result.folder / "report.html").as_uri()
+    assert {url for url in opened.asked if not url.startswith(("data:", "blob:"))} == {own}
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_the_slider_moves_the_drawn_cameras_along_the_way_between_the_poses(opened, result, share):
+    page = opened.page
+    slide(page, share)
+    for image in (HOSTILE_IMAGE, VIEWS - 1):
+        choose(page, image)
+        before, after = result.pose(image, "world_from_cam_before"), result.pose(image)
+        assert np.linalg.norm(before[:3, 3] - after[:3, 3]) > 1e-3
+        drawn = np.array([float(value) for value in stage(page)["centre"].split()])
+        np.testing.assert_allclose(drawn, interpolate_pose(before, after, share)[:3, 3], atol=1e-5)
+    slide(page, 1)
+
+
+def test_a_click_chooses_the_camera_under_it(opened):
+    page = opened.page
+    places = {}
+    for image in range(VIEWS):
+        choose(page, image)
+        places[image] = tuple(float(value) for value in stage(page)["onScreen"].split())
+    apart = {
+        image: min(np.hypot(x - u, y - v) for other, (u, v) in places.items() if other != image)
+        for image, (x, y) in places.items()
+    }
+    image = max(apart, key=apart.get)
+    choose(page, (image + 1) % VIEWS)
+    page.locator(".scene-stage").click(position=dict(zip("xy", places[image], strict=True)))
+    page.wait_for_function(f"() => {STAGE}.selected === '{image}'")
+
+
+def test_a_click_on_a_heading_sorts_the_table_and_another_turns_it_round(opened, result):
+    page, heading = opened.page, opened.page.get_by_role("button", name="turned °")
+    moved = [image.moved_deg for image in result.report.images]
+    heading.click()
+    assert table(page) == sorted(range(VIEWS), key=lambda image: -moved[image])
+    assert page.locator("th", has=heading).get_attribute("aria-sort") == "descending"
+    heading.click()
+    assert table(page) == sorted(range(VIEWS), key=lambda image: moved[image])
+
+
+def test_the_table_finds_images_by_name(opened):
+    page = opened.page
+    page.get_by_label("Find").fill("r_7")
+    assert table(page) == [7]
+    page.get_by_label("Find").fill("")
+    assert len(table(page)) == VIEWS
+
+
+def table(page) -> list[int]:
+    return [int(row.get_attribute("data-image")) for row in page.locator(".images tbody tr").all()]
+
+
+def test_a_hostile_name_stays_text(opened):
+    page = opened.page
+    assert page.locator(".images .link", has_text=HOSTILE).text_content() == HOSTILE
+    assert page.evaluate(
+        "() => [window.hit ?? null, document.querySelectorAll('img[src=\"x\"]').length]"
+    ) == [None, 0]
+
+
+def test_a_camera_without_a_render_says_so_and_names_the_nearest(opened, result):
+    page = opened.page
+    shown = [view["image"] for view in result.view["views"]]
+    image = next(i for i in range(VIEWS) if i not in shown and i != HOSTILE_IMAGE)
+    choose(page, image)
+    said = page.locator(".compare .notice")
+    assert f"was not rendered: {len(shown)} of {VIEWS} views were" in said.text_content()
+    centres = [result.pose(i)[:3, 3] for i in range(VIEWS)]
+    nearest = min(shown, key=lambda other: np.linalg.norm(centres[other] - centres[image]))
+    first = said.locator(".link").first
+    assert first.text_content() == result.report.images[nearest].name
+    first.click()
+    assert page.locator(".compare-frame img").count() == 2
+
+
+def test_the_swipe_is_worked_by_keys_and_uncovers_the_render(opened, result):
+    page = opened.page
+    choose(page, result.view["views"][0]["image"])
+    page.get_by_label("Swipe between photo and render").focus()
+    for key, uncovered in (("Home", 0), ("End", 1)):
+        page.keyboard.press(key)
+        page.wait_for_function(
+            f"() => document.querySelector('.compare-frame input').value === '{uncovered}'"
+        )
+        photo, render = (
+            page.locator(".compare-frame").bounding_box(),
+            page.locator(".compare-edge").bounding_box(),
+        )
+        edge = render["x"] + render["width"] / 2
+        covering = page.locator(".compare-frame img").nth(1)
+        assert covering.get_attribute("alt").startswith("Photo")
+        assert f"{100 - 100 * uncovered}%" in covering.evaluate("e => e.style.clipPath")
+        assert abs(edge - (photo["x"] + uncovered * photo["width"])) < 1
+    for kind in ("difference", "depth"):
+        page.get_by_role("radio", name=kind).check()
+        assert page.locator(".compare-frame img").evaluate("e => e.decode().then(() => e.naturalWidth)") == 32
+    page.get_by_role("radio", name="photo | render").check()
+
+
+def test_the_verdict_is_said_with_its_figures(opened, result):
+    text = " ".join(opened.page.locator(".verdict").text_content().split())
+    verdict = result.report.verdict
+    assert verdict.why[0] in text
+    assert f"{verdict.heldout.psnr.before:.2f} → {verdict.heldout.psnr.after:.2f}" in text
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("device", "width", "height"), [("desktop", 1400, 900), ("phone", 360, 780)])
+def test_no_serious_fault_of_accessibility_and_nothing_wider_than_the_screen(
+    browser, result, axe, scheme, device, width, height
+):
+    size = {"width": width, "height": height}
+    opened = open_report(browser, result.folder / "report.html", color_scheme=scheme, viewport=size)
+    page = opened.page
+    page.wait_for_selector(".curve canvas")
+    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=SCREENSHOTS / f"report-{device}-{scheme}.png", full_page=True)
+    assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
+    page.evaluate(axe)
+    found = page.evaluate("() => axe.run()")["violations"]
+    serious = [(f["id"], f["nodes"][0]["html"]) for f in found if f["impact"] in ("serious", "critical")]
+    assert serious == []
+    page.context.close()
+
+
+def test_without_webgl_the_cameras_stand_in_a_table(result, browser):
+    blind = browser.browser_type.launch(executable_path=str(CHROMIUM), args=[*ARGUMENTS, "--disable-3d-apis"])
+    page = open_report(blind, result.folder / "report.html").page
+    rows = page.locator(".scene tbody tr")
+    assert rows.count() == VIEWS
+    assert "no WebGL" in page.locator(".scene .notice").text_content()
+    blind.close()
