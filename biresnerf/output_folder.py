@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -50,7 +51,7 @@ _ANOTHER = "Choose another output folder, or remove this one."
 
 
 class OutputFolder:
-    """Refuses folders that hold something else; creates nothing before `claim` but what COLMAP answered."""
+    """Refuses folders that hold something else; before `claim` it creates what COLMAP answered and previews alone."""
 
     def __init__(self, path: Path, *, keep_reusable: bool = False) -> None:
         self.path, self._keep_reusable = Path(path), keep_reusable
@@ -61,7 +62,7 @@ class OutputFolder:
             raise InputError("output_not_a_folder", "is a file.", where=str(self.path), mend="Name a folder.")
         if not self.path.is_dir() or (self.path / CHECKPOINT).is_file():
             return
-        if not {path.name for path in self.path.iterdir()} - {CHECKPOINT.parent.name, HISTORY}:
+        if not {path.name for path in self.path.iterdir()} - {CHECKPOINT.parent.name, HISTORY, PREVIEW}:
             return  # new, or killed before the first checkpoint
         report = self.path / REPORT
         if report.is_file():
@@ -79,6 +80,10 @@ class OutputFolder:
     def seeding(self) -> Path:
         """The file that keeps what COLMAP answered until the run is complete."""
         return self.path / SEEDING
+
+    def kept_seeding(self) -> str | None:
+        """What COLMAP answered, where it was asked."""
+        return self.seeding.read_text("utf-8") if self.seeding.is_file() else None
 
     @property
     def matches(self) -> Path:
@@ -165,6 +170,12 @@ class OutputFolder:
             depth=np.where(rendered.opacity > SOLID, rendered.depth, np.nan),
         )
         return [*pictures, write_thumbnail(images.image(view), self.path / PREVIEW / THUMBNAIL)]
+
+    def drop_preview(self) -> None:
+        """Remove what was shown, and the folder where it holds nothing else."""
+        shutil.rmtree(self.path / PREVIEW, ignore_errors=True)
+        with suppress(OSError):  # not empty, or never made
+            self.path.rmdir()
 
     def drop_traces(self) -> None:
         """Remove what only a run that goes on needs, and what others could start from unless that is to be kept."""

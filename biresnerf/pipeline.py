@@ -39,6 +39,7 @@ from biresnerf.refine.scene_frame import scene_frame
 from biresnerf.refine.start import Start, choose_start
 from biresnerf.refine.two_stages import TwoStages
 from biresnerf.report import Report
+from biresnerf.show_seeding import ShowSeeding
 
 logger = logging.getLogger(__name__)
 
@@ -124,7 +125,7 @@ def _begin(
     begun = checkpoint or stage_1
     notes = begun[1] if begun is not None else unstarted
     folder.restore_seeding(notes["seeding"])
-    prepared = _prepare(input, options, folder.seeding, report, stop)
+    prepared = _prepare(input, options, folder, report, stop)
     folder.claim(prepared.fingerprint, notes["fingerprint"] if stage_1 is None else None)
     if stage_1 is not None and notes["stage_1_fingerprint"] != prepared.stage_1_fingerprint:
         raise InputError(
@@ -239,24 +240,24 @@ def _find_start(
 def _prepare(
     given: Path | Dataset,
     options: RefineOptions,
-    seeding: Path,
+    folder: OutputFolder,
     report: OnProgress,
     stop: Callable[[], bool],
 ) -> Prepared:
     dataset = given if isinstance(given, Dataset) else read_dataset(Path(given))
     rigid_bodies(dataset, options)  # names that are not there are told before anything takes time
-    missing = not dataset.posed.all()
-    message = "COLMAP looks for poses" if missing else "comparing the poses with feature matches"
     given_poses = [None if f.world_from_cam is None else f.world_from_cam.tolist() for f in dataset.frames]
-    found = seed_poses(
-        dataset,
-        options.start or "auto",
-        should_stop=stop,
-        seed=options.seed,
-        effort=options.seeding_effort,
-        remember=seeding,
-        on_start=lambda: report(Progress(stage="seeding", fraction=0.01, message=message)),
-    )
+    with ShowSeeding(dataset, folder, report) as show:
+        found = seed_poses(
+            dataset,
+            options.start or "auto",
+            should_stop=stop,
+            seed=options.seed,
+            effort=options.seeding_effort,
+            remember=folder.seeding,
+            on_progress=show,
+        )
+        show.end(found)
     dataset = found.dataset
     images = load_images(dataset, options.max_image_size, options.background)
     digest = hashlib.sha256(images.pixels.tobytes())
@@ -272,7 +273,7 @@ def _prepare(
         _fingerprint(digest, asked, dataset.names, given_poses),
         _fingerprint(digest, stage_1, dataset.names, given_poses),
         found.candidates,
-        seeding.read_text("utf-8") if seeding.is_file() else None,
+        folder.kept_seeding(),
     )
 
 

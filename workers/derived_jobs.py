@@ -17,8 +17,8 @@ from workers.files import FileStore
 from workers.forks import LATEST_FIRST, plan_fork
 from workers.idents import new_id
 from workers.job_rows import JOB, fingerprint_of, job_from_row, known_job, one_row
-from workers.jobs import QUEUE_LIMIT_LOCK, JobStore
-from workers.quotas import require_room
+from workers.jobs import JobStore
+from workers.quotas import require_room, submitting_for
 from workers.records import PRIORITIES, Page
 
 NORMAL = PRIORITIES["normal"]
@@ -60,7 +60,7 @@ class DerivedJobs(JobStore):
         fork_id = new_id("job")
         taken = await self._copied(parent["reusable"], stage, fork_id)
         async with self._database.transaction() as connection:
-            await connection.execute("SELECT pg_advisory_xact_lock(%s)", (QUEUE_LIMIT_LOCK,))
+            await submitting_for(connection, parent["dataset_id"], self._tenant)
             if idempotency_key is not None:
                 known = await known_job(connection, parent["tenant"], idempotency_key, fingerprint)
                 if known is not None:
@@ -108,9 +108,9 @@ class DerivedJobs(JobStore):
         options = {"formats": sorted(set(formats))}
         fingerprint = fingerprint_of(f"export {job_id}", options, None)
         async with self._database.transaction() as connection:
-            await connection.execute("SELECT pg_advisory_xact_lock(%s)", (QUEUE_LIMIT_LOCK,))
             parent = await self._required(connection, job_id)
             _require_result(parent)
+            await submitting_for(connection, parent["dataset_id"], self._tenant)
             same = await one_row(
                 connection,
                 JOB + " WHERE parent = %s AND fingerprint = %s AND kind = 'export'"

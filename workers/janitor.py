@@ -14,7 +14,6 @@ from functools import partial
 
 from psycopg.types.json import Jsonb
 
-from biresnerf.wire.jobs import FINAL_JOB_STATES
 from workers.database import QUEUE, Connection, Database
 from workers.endings import finish_cancelled
 from workers.errors import Unavailable
@@ -176,7 +175,9 @@ async def release(connection: Connection, queue_id: int, why: str) -> None:
     already, leaves the queue. The token is dropped, so a worker that was only asleep is fenced from here on.
     """
     cursor = await connection.execute(
-        "SELECT id, state, cancel_requested FROM jobs WHERE queue_id = %s FOR UPDATE", (queue_id,)
+        "SELECT id, cancel_requested FROM jobs"
+        " WHERE queue_id = %s AND state IN ('queued', 'running') FOR UPDATE",  # of these there is an index
+        (queue_id,),
     )
     job = await cursor.fetchone()
     cursor = await connection.execute(
@@ -184,7 +185,7 @@ async def release(connection: Connection, queue_id: int, why: str) -> None:
     )
     if await cursor.fetchone() is None:
         return  # it came to an end in the meantime
-    if job is None or job["state"] in FINAL_JOB_STATES:
+    if job is None:  # or final
         await connection.execute("SELECT procrastinate_finish_job_v1(%s, 'aborted', false)", (queue_id,))
         return
     log.warning("taking job %s back (%s)", job["id"], why)

@@ -19,16 +19,13 @@ from workers.errors import Conflict, Expired, NotFound
 from workers.idents import cursor_after, cursor_place, cursor_time, new_id
 from workers.job_listener import JobListener, follow
 from workers.job_rows import JOB, MINE, PLACES, events_of, fingerprint_of, job_from_row, known_job, one_row
-from workers.quotas import owner_of, require_room
+from workers.quotas import require_room, submitting_for
 from workers.records import LOG_NAME, PRIORITIES, Artifact, JobUpdate, Page
 from workers.settings import Settings
 from workers.tenants import LOCAL_TENANT
 from workers.traces import traced, traceparent
 from workers.webhook_records import request_with
 from workers.webhooks import add_job_webhook
-
-# Two submits at once must not both take the last place.
-QUEUE_LIMIT_LOCK = 7_201_604
 
 
 class JobStore:
@@ -74,9 +71,7 @@ class JobStore:
         subject = request_with(request_digest or dataset_id, webhook)
         fingerprint = fingerprint_of(subject, resolved, labels, priority)
         async with self._database.transaction() as connection:
-            # Serialises submits (a millisecond each): the queue limit and repeated keys need no more thought.
-            await connection.execute("SELECT pg_advisory_xact_lock(%s)", (QUEUE_LIMIT_LOCK,))
-            tenant = await owner_of(connection, dataset_id, self._tenant)
+            tenant = await submitting_for(connection, dataset_id, self._tenant)
             if idempotency_key is not None:
                 known = await known_job(connection, tenant, idempotency_key, fingerprint)
                 if known is not None:

@@ -6,12 +6,20 @@ from workers.database import Connection
 from workers.errors import Conflict, LimitReached, NotFound
 
 
-async def owner_of(connection: Connection, dataset_id: str, seen_by: str | None) -> str:
-    """Whose a job on the dataset is; raises `NotFound` where the tenant ``seen_by`` does not see it."""
-    sql = "SELECT tenant FROM datasets WHERE id = %s AND tenant = coalesce(%s, tenant)"
+async def submitting_for(connection: Connection, dataset_id: str, seen_by: str | None) -> str:
+    """Whose a job on the dataset is. That tenant's submits take turns from here to the end of the transaction.
+
+    So no two of them take its last place, or the same idempotency key. Other tenants' do not wait for them: at the
+    limit of the whole queue as many jobs more can get in as submits run at that moment.
+
+    Raises `NotFound` where the tenant ``seen_by`` does not see the dataset.
+    """
+    # The dataset before the tenant, as uploads lock them.
+    sql = "SELECT tenant FROM datasets WHERE id = %s AND tenant = coalesce(%s, tenant) FOR SHARE"
     dataset = await (await connection.execute(sql, (dataset_id, seen_by))).fetchone()
     if dataset is None:
         raise NotFound(f"No dataset {dataset_id}.")
+    await _lock_tenant(connection, dataset["tenant"])
     return str(dataset["tenant"])
 
 
@@ -62,11 +70,15 @@ async def require_byte_quota(connection: Connection, dataset_id: str, size: int)
 
 
 async def _limits(connection: Connection, tenant: str) -> dict[str, int]:
-    await connection.execute("SELECT 1 FROM tenants WHERE id = %s FOR NO KEY UPDATE", (tenant,))
+    await _lock_tenant(connection, tenant)
     sql = "SELECT top_priority, max_queued, max_stored_bytes FROM tenant_limits WHERE id = %s"
     row = await (await connection.execute(sql, (tenant,))).fetchone()
     assert row is not None, "referenced by what the tenant owns"
     return row
+
+
+async def _lock_tenant(connection: Connection, tenant: str) -> None:
+    await connection.execute("SELECT 1 FROM tenants WHERE id = %s FOR NO KEY UPDATE", (tenant,))
 
 
 async def _require_bytes(connection: Connection, tenant: str, limit: int, size: int) -> None:

@@ -21,6 +21,7 @@ from biresnerf.data.colmap_pairs import (
     write_position_priors,
 )
 
+DATABASE = "database.db"
 SAYS = "seeding: "  # before lines meant for the job's log; all others are COLMAP's own
 # Small photos have few features: faint ones count as well, and fewer matches than COLMAP asks for must do.
 FAINTEST_PEAK, LEAST_SEEN = 0.003, 10
@@ -51,7 +52,7 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     import pycolmap
 
     work = Path(request["work"])
-    database, images = work / "database.db", Path(request["root"])
+    database, images = work / DATABASE, Path(request["root"])
     count = sum(len(camera["names"]) for camera in request["cameras"])
     pycolmap.set_random_seed(request["seed"])
     given = [camera["known"] for camera in request["cameras"]]

@@ -34,11 +34,12 @@ def run_colmap(
     should_stop: Callable[[], bool],
     limit_s: float,
     log_folder: Path | None = None,
+    look: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """The answer of `colmap_child` to a request; its files lie in the folder ``work``.
 
     What it says of its progress goes to the log of this module; all that COLMAP says is kept as colmap.log in
-    ``log_folder``, unless it was stopped.
+    ``log_folder``, unless it was stopped. ``look`` is called while it runs, a few times a second.
 
     Raises:
         InputError: ``seed_timeout``.
@@ -61,7 +62,7 @@ def run_colmap(
             preexec_fn=_die_with_parent if sys.platform == "linux" else None,
         )
         try:
-            _wait(child, said, Path(request["set"]).name, should_stop, limit_s)
+            _wait(child, said, Path(request["set"]).name, should_stop, limit_s, look)
             _keep(log_path, log_folder)
         except InputError:
             _keep(log_path, log_folder)
@@ -84,6 +85,7 @@ def _wait(
     set_name: str,
     should_stop: Callable[[], bool],
     limit_s: float,
+    look: Callable[[], None],
 ) -> None:
     end = time.monotonic() + limit_s
     running = True
@@ -92,6 +94,8 @@ def _wait(
         for line in said.read().decode("utf-8", errors="replace").splitlines():
             if line.startswith(SAYS):
                 logger.info("%s", line.removeprefix(SAYS))
+        if running:
+            look()
         if running and should_stop():
             raise Interrupted("stopped while COLMAP looked for poses")
         if running and time.monotonic() > end:

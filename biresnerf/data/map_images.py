@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from biresnerf.config import SeedingEffort
+from biresnerf.data.colmap_child import DATABASE
 from biresnerf.data.colmap_process import run_colmap
 from biresnerf.data.dataset import Camera, Dataset
 from biresnerf.data.decode import decode
@@ -20,6 +21,7 @@ from biresnerf.data.feature_matches import KEPT, keep_matches
 from biresnerf.data.image_likeness import likeness
 from biresnerf.data.image_order import natural_order, pose_distances
 from biresnerf.data.masks import write_masks
+from biresnerf.data.seeding_progress import OnSeeding, SeedingWatch
 from biresnerf.geometry.focus import focus_point
 
 # Images whose poses are given; beyond it, each is matched with those whose given poses see most nearly the same.
@@ -101,6 +103,7 @@ def ask_colmap(
     effort: SeedingEffort,
     limit_s: float,
     log_folder: Path | None = None,
+    on_progress: OnSeeding = lambda _found: None,
 ) -> dict[str, Any]:
     """What COLMAP finds, as plain data for `read_mapping`. Poses that the set has guide it.
 
@@ -127,7 +130,8 @@ def ask_colmap(
             **_request_images(dataset, names),
             **_thoroughness(dataset, effort),
         }
-        answer = run_colmap(request, Path(work), should_stop, limit_s, log_folder)
+        watch = SeedingWatch(Path(work, DATABASE), on_progress)
+        answer = run_colmap(request, Path(work), should_stop, limit_s, log_folder, watch.look)
         if log_folder is not None:
             keep_matches(Path(work), dataset.names, log_folder / KEPT)
         return answer

@@ -12,6 +12,7 @@ from biresnerf.config import SeedingEffort
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.map_images import Mapping, ask_colmap, read_mapping
+from biresnerf.data.seeding_progress import OnSeeding, SeedingProgress
 
 GUIDED_LIMIT_S, LIMIT_S = 900.0, 3600.0  # where all poses are given, and else
 
@@ -23,7 +24,7 @@ def remembered_mapping(
     effort: SeedingEffort,
     limit_s: float | None,
     remember: Path | None,
-    on_start: Callable[[], None],
+    on_progress: OnSeeding,
 ) -> Mapping:
     """What COLMAP finds, or found when it was asked the same before and the file ``remember`` kept it.
 
@@ -38,7 +39,7 @@ def remembered_mapping(
     keys = {"full": (key,), "low": (f"{key} low", key)}[effort]
     answer = _remembered(remember, keys)
     if answer is None:
-        on_start()
+        on_progress(SeedingProgress())
         if limit_s is None:
             limit_s = GUIDED_LIMIT_S if dataset.posed.all() else LIMIT_S
         answer = ask_colmap(
@@ -48,6 +49,7 @@ def remembered_mapping(
             effort=effort,
             limit_s=limit_s,
             log_folder=remember.parent if remember is not None else None,
+            on_progress=on_progress,
         )
         if remember is not None:
             with whole_file(remember) as temporary:

@@ -19,6 +19,7 @@ from biresnerf.data.match_poses import MatchedPoses, can_match, carry_model
 from biresnerf.data.missing_poses import guess_missing
 from biresnerf.data.named_images import MIN_IMAGES, few_names
 from biresnerf.data.remembered_mapping import remembered_mapping
+from biresnerf.data.seeding_progress import OnSeeding
 from biresnerf.errors import InputError, RefinementError
 from biresnerf.report import PoseSource
 
@@ -99,7 +100,7 @@ def seed_poses(
     effort: SeedingEffort = "full",
     limit_s: float | None = None,
     remember: Path | None = None,
-    on_start: Callable[[], None] = lambda: None,
+    on_progress: OnSeeding = lambda _found: None,
 ) -> Seeding:
     """The set with a pose for every image, and the sets of poses worth starting from.
 
@@ -109,7 +110,8 @@ def seed_poses(
     to the frame of given poses. Images that COLMAP cannot place are guessed from those it can.
 
     COLMAP's threads make its answer differ a little from run to run. A run that is to be continued keeps it in the
-    file ``remember``, with colmap.log beside it. ``on_start`` is called only if COLMAP does run.
+    file ``remember``, with colmap.log beside it. ``on_progress`` is called only
+    if COLMAP does run: at once, then when more is known.
 
     Raises:
         InputError: ``pose_missing``, ``colmap_missing``, ``seed_failed``, ``insufficient_overlap`` or ``seed_timeout``.
@@ -130,7 +132,7 @@ def seed_poses(
             replace(dataset, frames=tuple(replace(f, world_from_cam=None) for f in dataset.frames))
             if start == "colmap"
             else dataset,
-            should_stop, seed, effort, limit_s, remember, on_start,
+            should_stop, seed, effort, limit_s, remember, on_progress,
         )  # fmt: skip
     except (InputError, RefinementError) as error:
         if start == "colmap" or not given.posed.any():

@@ -185,7 +185,7 @@ def test_the_request_is_plain_json(monkeypatch, noisy, tmp_path):
     """What crosses to the child process holds no arrays: a set of several cameras is listed camera by camera."""
     asked = {}
 
-    def keep(request, work, should_stop, limit_s, log_folder):
+    def keep(request, *_):
         asked.update(json.loads(json.dumps(request)))
         return {"models": [], "matches": [], "focals": {}}
 

@@ -13,7 +13,7 @@ from biresnerf.config import RefineOptions
 from biresnerf.wire.jobs import PriorityName
 from tests.workers.conftest import ready_dataset
 from workers.claim import claim_job
-from workers.database import QUEUE, Database, open_database
+from workers.database import QUEUE, Connection, Database, open_database
 from workers.endings import finish
 from workers.errors import Conflict, LimitReached
 from workers.settings import Settings
@@ -203,6 +203,28 @@ async def test_a_janitor_and_an_end_that_offer_at_once_offer_no_more_than_the_li
         await ending
         await end.commit()
     assert [await line.start(), await line.start(), await line.start()] == ["A1", "A2", ""]
+
+
+async def test_a_submit_that_hangs_holds_up_nobody_elses(line: Line, monkeypatch: pytest.MonkeyPatch):
+    await line.submit("A0")
+    await line.submit("B0")
+    real, reached, go_on = Database.enqueue, asyncio.Event(), asyncio.Event()
+
+    async def hang_once(database: Database, connection: Connection, job_id: str) -> int:
+        if not reached.is_set():
+            reached.set()
+            await go_on.wait()
+        return await real(database, connection, job_id)
+
+    monkeypatch.setattr(Database, "enqueue", hang_once)
+    hanging = asyncio.create_task(line.submit("A1"))
+    await reached.wait()
+    async with asyncio.timeout(15):
+        await line.submit("B1")
+    assert not hanging.done()
+    go_on.set()
+    await hanging
+    assert await line.run_all() == ["A0", "B0", "B1", "A1"]
 
 
 async def test_a_raised_limit_holds_at_once(line: Line):

@@ -1,0 +1,66 @@
+"""How far COLMAP is, looked up in its database while it works: features of each image, matched pairs."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+LOOK_EVERY_S = 5.0
+_MOST_IMAGES = 2_147_483_647  # of a pair's number in COLMAP's database, a pair being number * most + number
+
+
+@dataclass(frozen=True)
+class SeedingProgress:
+    """What is known of the images so far, all by their indices.
+
+    Attributes:
+        features: how many each has, of those that were looked at.
+        matches: how many features each pair has in common once that was verified; pairs with any alone.
+    """
+
+    features: dict[int, int] = field(default_factory=dict)
+    matches: dict[tuple[int, int], int] = field(default_factory=dict)
+
+
+OnSeeding = Callable[[SeedingProgress], None]
+
+
+def read_progress(database: Path) -> SeedingProgress | None:
+    """What the database of images called by their numbers holds now; none while it cannot be read."""
+    if not database.is_file():
+        return None
+    try:
+        with closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=0.1)) as opened:
+            names = dict(opened.execute("SELECT image_id, name FROM images"))
+            features = opened.execute("SELECT image_id, rows FROM keypoints").fetchall()
+            pairs = opened.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0").fetchall()
+    except sqlite3.Error:  # it is being made, or written to
+        return None
+    index = {image: int(Path(name).stem) for image, name in names.items()}
+    matches = {}
+    for pair, count in pairs:
+        a, b = sorted((index[pair // _MOST_IMAGES], index[pair % _MOST_IMAGES]))
+        matches[a, b] = count
+    return SeedingProgress({index[image]: count for image, count in features}, matches)
+
+
+class SeedingWatch:
+    """Tells of news in the database, when asked to look, and never more often than every few seconds."""
+
+    def __init__(self, database: Path, tell: OnSeeding) -> None:
+        self._database, self._tell = database, tell
+        self._told, self._next = SeedingProgress(), time.monotonic() + LOOK_EVERY_S
+
+    def look(self) -> None:
+        """Tell if it is time and there is news."""
+        if time.monotonic() < self._next:
+            return
+        found = read_progress(self._database)
+        if found is not None and found != self._told:
+            self._told = found
+            self._tell(found)
+        self._next = time.monotonic() + LOOK_EVERY_S
