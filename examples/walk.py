@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from biresnerf import RefineOptions
-from biresnerf.commands.pose_error import matched_names
+from biresnerf.commands.evaluate import matched_names
 from biresnerf.commands.settings_option import parse_settings
 from biresnerf.config import parse_options
 from biresnerf.data.pose_file import read_poses

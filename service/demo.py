@@ -178,6 +178,6 @@ def _tell(folders: Folders, truth: Path | None, scene: Path) -> None:
 
 def _pose_error(poses: Path, truth: Path) -> tuple[float, float]:
     """Mean rotation error (deg) and centre error (% of the camera distance), after alignment."""
-    values: dict[str, Any] = json.loads(_biresnerf("pose-error", poses, truth, "--json"))
+    values: dict[str, Any] = json.loads(_biresnerf("evaluate", poses, truth, "--json"))
     aligned = values["aligned"]
     return aligned["rotation_deg"]["mean"], aligned["centre_percent"]["mean"]

@@ -53,7 +53,7 @@ def make_scene_command(
 ) -> None:
     """Write images with wrong or missing poses to OUTPUT, and the true poses beside it.
 
-    The true poses are in OUTPUT.truth.json; `biresnerf pose-error` compares a result with them.
+    The true poses are in OUTPUT.truth.json; `biresnerf evaluate` compares a result with them.
     """
     click.echo(make_scene(output, kind, own=own, views=views, size=size, noise=noise, seed=seed))
 

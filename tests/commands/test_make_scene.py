@@ -6,7 +6,7 @@ from pathlib import Path
 from click.testing import CliRunner
 
 from biresnerf.commands.make_scene import make_scene_command
-from biresnerf.commands.pose_error import pose_error_command
+from biresnerf.commands.evaluate import evaluate_command
 from biresnerf.errors import InputError
 
 
@@ -18,7 +18,7 @@ def make(folder: Path, noise: float) -> Path:
 
 
 def rotation_deg(poses: Path, truth: Path) -> float:
-    said = CliRunner().invoke(pose_error_command, [str(poses), str(truth), "--json"])
+    said = CliRunner().invoke(evaluate_command, [str(poses), str(truth), "--json"])
     mean: float = json.loads(said.output)["own_frame"]["rotation_deg"]["mean"]
     return mean
 

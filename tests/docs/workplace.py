@@ -26,7 +26,7 @@ from tests.service.conftest import Running, finished, new_dataset, operator, rea
 
 VIEWS, SIZE = 8, 24
 # They load torch, so they run in this process; all others run as a shell runs them.
-LOCAL = {"refine", "export", "pose-error", "make-scene", "evaluate", "convert", "inspect"}
+LOCAL = {"refine", "export", "make-scene", "evaluate", "convert", "inspect"}
 # What pages call a set of photos with poses, and its true poses.
 SETS = ("photos", "INPUT", "SCENE", "lego_100", "capture")
 TRUTHS = ("TRUTH", "reference")

@@ -1,18 +1,19 @@
-"""`biresnerf pose-error RESULT TRUTH`: how far refined poses are from true ones."""
+"""`biresnerf evaluate RESULT TRUTH`: how far poses are from those of a reference."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from biresnerf.commands.answers import print_json
 from biresnerf.errors import InputError
 
 if TYPE_CHECKING:
     from biresnerf.geometry.pose_error import FrameError, PoseError, Spread
+    from biresnerf.geometry.trajectory_error import TrajectoryError
 
 _ROWS = (
     ("rotation_deg", "rotation (deg)"),
@@ -28,24 +29,26 @@ _TITLES = {
 }
 
 
-@click.command("pose-error")
+@click.command("evaluate")
 @click.argument("result", type=click.Path(path_type=Path))
 @click.argument("truth", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")
 @click.option("--paper-compat", is_flag=True, help="Add the alignment of BARF's and BAA-NGP's code.")
-def pose_error_command(result: Path, truth: Path, as_json: bool, paper_compat: bool) -> None:
-    """Compare the poses of RESULT with those of TRUTH.
+def evaluate_command(result: Path, truth: Path, as_json: bool, paper_compat: bool) -> None:
+    """Measure the poses of RESULT against those of TRUTH.
 
     Both are files with poses, or folders that hold one, in any form that `refine` reads. Images are matched by name,
     with or without extension, else by file name alone where just one has it; they need not be there. "aligned" is after
     the best similarity of the camera centres, as published tables have it; "robust" after one that single lost cameras
     do not drag along; "own frame" without any alignment. --paper-compat adds the alignment of the published code with
-    its flaw on flat rigs.
+    its flaw on flat rigs. ATE and RPE (from each image to the next, in RESULT's order) are after the similarity; AUC is
+    of the relative poses of all pairs, and needs none. docs/conventions.md defines them all.
     """
     import numpy as np
 
     from biresnerf.data.pose_file import read_poses
     from biresnerf.geometry.pose_error import paper_compat_error, pose_error
+    from biresnerf.geometry.trajectory_error import trajectory_error
 
     estimated, true = read_poses(result), read_poses(truth)
     pairs = matched_names(list(estimated), list(true))
@@ -57,7 +60,7 @@ def pose_error_command(result: Path, truth: Path, as_json: bool, paper_compat: b
             mend="Compare files of the same images; file_path decides.",
         )
     both = np.stack([estimated[name] for name, _ in pairs]), np.stack([true[name] for _, name in pairs])
-    error = pose_error(*both)
+    error, further = pose_error(*both), trajectory_error(*both)
     frames = {"aligned": error.aligned, "aligned_robust": error.aligned_robust, "own_frame": error.own_frame}
     if paper_compat:
         frames["paper_compat"] = paper_compat_error(*both)
@@ -65,15 +68,13 @@ def pose_error_command(result: Path, truth: Path, as_json: bool, paper_compat: b
     by_file_name = sum(_bare(name) != _bare(other) for name, other in pairs)
     names = [name for name, _ in pairs]
     if as_json:
-        click.echo(
-            json.dumps({**_as_json(error, frames, names, left_out), "matched_by_file_name": by_file_name})
-        )
-    else:
-        click.echo(_as_table(error, frames, names, left_out))
-        if by_file_name:
-            click.echo(
-                f"\n{by_file_name} images were matched by file name alone, from folders of other names"
-            )
+        named = _as_json(error, frames, names, left_out)
+        print_json({**named, **further.model_dump(), "matched_by_file_name": by_file_name})
+        return
+    click.echo(_as_table(error, frames, names, left_out))
+    click.echo("\n" + _further_lines(further))
+    if by_file_name:
+        click.echo(f"\n{by_file_name} images were matched by file name alone, from folders of other names")
 
 
 def matched_names(estimated: list[str], true: list[str]) -> list[tuple[str, str]]:
@@ -136,4 +137,17 @@ def _as_table(
         for key, label in _ROWS:
             spread: Spread = getattr(frame, key)
             lines.append(f"  {label:<32}{spread.mean:>12.5g}{spread.median:>12.5g}{spread.max:>12.5g}")
+    return "\n".join(lines)
+
+
+def _further_lines(error: TrajectoryError) -> str:
+    lines = [f"ATE {error.ate_rmse:.5g} (RMSE, in the truth's units)"]
+    if error.rpe_translation_rmse is not None:
+        turned = error.rpe_rotation_deg_rmse
+        lines.append(
+            f"RPE {error.rpe_translation_rmse:.5g}, {turned:.5g} deg (RMSE, from each image to the next)"
+        )
+    if error.auc:
+        areas = "  ".join(f"@{limit} {100 * area:.1f} %" for limit, area in error.auc.items())
+        lines.append(f"AUC of relative poses {areas} (degrees)")
     return "\n".join(lines)

@@ -1,8 +1,9 @@
-"""The pose-error command on files written by hand."""
+"""`biresnerf evaluate` on files written by hand."""
 
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from biresnerf.commands.pose_error import matched_names, pose_error_command
+from biresnerf.commands.evaluate import evaluate_command, matched_names
 from biresnerf.errors import InputError
 from tests.data import trajectories
 from tests.geometry.rigs import dome, jitter, similar
@@ -29,7 +30,7 @@ def write(path: Path, world_from_cam: np.ndarray, name: str = "images/{:02}.png"
 
 
 def run(*arguments: object) -> str:
-    result = CliRunner().invoke(pose_error_command, [str(a) for a in arguments], catch_exceptions=False)
+    result = CliRunner().invoke(evaluate_command, [str(a) for a in arguments], catch_exceptions=False)
     assert result.exit_code == 0
     return result.output
 
@@ -49,6 +50,22 @@ def test_a_turned_camera_is_found_in_a_moved_frame_under_names_without_extension
     assert error["aligned"]["centre_percent"]["max"] == pytest.approx(0, abs=1e-9)
     assert error["own_frame"]["rotation_deg"]["median"] == pytest.approx(50)
     assert error["left_out"] == {"result": 0, "truth": 0}
+
+
+def test_ate_rpe_and_auc_are_told_in_json_and_in_words(tmp_path):
+    truth = dome(12, np.random.default_rng(0))
+    estimate = truth.copy()
+    estimate[3, :3, :3] = truth[3, :3, :3] @ Rotation.from_euler("z", 24, degrees=True).as_matrix()
+    files = (
+        write(tmp_path / "a.json", similar(estimate, 2.0, np.eye(3), np.ones(3))),
+        write(tmp_path / "b.json", truth),
+    )
+    error = json.loads(run(*files, "--json"))
+    assert error["ate_rmse"] == pytest.approx(0, abs=1e-9)
+    assert error["rpe_rotation_deg_rmse"] == pytest.approx(24 * np.sqrt(2 / 11))
+    # Of 66 pairs the 11 of the turned camera are wrong; the others are right.
+    assert error["auc"]["10"] == pytest.approx(55 / 66, abs=1e-6)
+    assert re.search(r"AUC of relative poses @1 83\.3 %", run(*files))
 
 
 def test_the_published_alignment_is_added_on_request_only(tmp_path):
@@ -155,7 +172,7 @@ def test_a_file_that_cannot_be_compared_is_named(tmp_path, broken, code, where):
     truth = tmp_path / "truth.json"
     if broken is not None:
         truth.write_text(broken)
-    outcome = CliRunner().invoke(pose_error_command, [str(result), str(truth)])
+    outcome = CliRunner().invoke(evaluate_command, [str(result), str(truth)])
     assert isinstance(outcome.exception, InputError)
     assert outcome.exception.code == code
     assert outcome.exception.where.startswith(str(tmp_path / where))

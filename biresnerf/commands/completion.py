@@ -1,0 +1,24 @@
+"""`biresnerf completion SHELL`: what a shell needs to complete commands and options."""
+
+from __future__ import annotations
+
+import click
+from click.shell_completion import get_completion_class
+
+SHELLS = ("bash", "zsh", "fish")
+
+
+@click.command("completion")
+@click.argument("shell", type=click.Choice(SHELLS))
+@click.pass_context
+def completion_command(context: click.Context, shell: str) -> None:
+    """Print a script that completes commands and options in SHELL.
+
+    bash: `eval "$(biresnerf completion bash)"` in ~/.bashrc; zsh the same in ~/.zshrc; fish:
+    `biresnerf completion fish > ~/.config/fish/completions/biresnerf.fish`.
+    """
+    from biresnerf.command_line import NAME
+
+    kind = get_completion_class(shell)
+    assert kind is not None  # click has these three
+    click.echo(kind(context.find_root().command, {}, NAME, f"_{NAME.upper()}_COMPLETE").source())
