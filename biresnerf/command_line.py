@@ -11,9 +11,9 @@ from importlib.metadata import EntryPoint, entry_points
 import click
 
 from biresnerf.commands import exit_codes
+from biresnerf.commands.completion import NAME
 from biresnerf.errors import BiresnerfError, InputError
 
-NAME = "biresnerf"
 GROUP = "biresnerf.commands"
 # What brings a package that is not installed; all others come with the service.
 _EXTRAS = {

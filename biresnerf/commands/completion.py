@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 from click.shell_completion import get_completion_class
 
+NAME = "biresnerf"
 SHELLS = ("bash", "zsh", "fish")
 
 
@@ -17,8 +18,6 @@ def completion_command(context: click.Context, shell: str) -> None:
     bash: `eval "$(biresnerf completion bash)"` in ~/.bashrc; zsh the same in ~/.zshrc; fish:
     `biresnerf completion fish > ~/.config/fish/completions/biresnerf.fish`.
     """
-    from biresnerf.command_line import NAME
-
     kind = get_completion_class(shell)
     assert kind is not None  # click has these three
     click.echo(kind(context.find_root().command, {}, NAME, f"_{NAME.upper()}_COMPLETE").source())

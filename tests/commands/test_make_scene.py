@@ -5,8 +5,8 @@ from pathlib import Path
 
 from click.testing import CliRunner
 
-from biresnerf.commands.make_scene import make_scene_command
 from biresnerf.commands.evaluate import evaluate_command
+from biresnerf.commands.make_scene import make_scene_command
 from biresnerf.errors import InputError
 
 
