@@ -4,7 +4,8 @@ import { colourOf, css, kindColour, rampColour, scaleOf, signedColour, UNKNOWN }
 import { Choice, ImageStepper, Pick, Switch } from "./Controls";
 import { fixed, short, sourceWords } from "./numbers";
 import { between, centreOf, medianOf, spreadOf, turnDeg } from "./poses";
-import { type Look, SceneDrawing } from "./scene_drawing";
+import { SceneDrawing } from "./scene_drawing";
+import type { Look, Viewpoint } from "./scene_parts";
 import { CameraTable } from "./CameraTable";
 import { hexColour, themeColour, useDark, useStill } from "./theme";
 import type { ColourBy, PointLayer, SceneCamera, SceneViewProps } from "./types";
@@ -31,6 +32,7 @@ export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: S
   const [failed, setFailed] = useState<string | null>(null);
   const host = useRef<HTMLDivElement>(null);
   const drawing = useRef<SceneDrawing | null>(null);
+  const seenFrom = useRef<Viewpoint | null>(null); // kept while a run's cameras move on
 
   const spread = useMemo(() => {
     const centres = cameras.map((camera) => centreOf(camera.after));
@@ -61,12 +63,14 @@ export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: S
       return;
     }
     drawing.current = made;
+    if (seenFrom.current) made.seeFrom(seenFrom.current);
     const observer = new ResizeObserver(([entry]) => {
       if (entry) made.resize(entry.contentRect.width, entry.contentRect.height);
     });
     observer.observe(host.current);
     return () => {
       observer.disconnect();
+      seenFrom.current = made.viewpoint();
       made.dispose();
       drawing.current = null;
     };
@@ -204,7 +208,7 @@ function tellTruth(stage: HTMLElement | null, now: SceneDrawing, selected: numbe
   stage.dataset.share = String(share);
   stage.dataset.selected = selected === null ? "" : String(selected);
   stage.dataset.centre = selected === null ? "" : now.drawnCentre(selected).join(" ");
-  stage.dataset.onScreen = selected === null ? "" : now.onScreen(selected).join(" ");
+  stage.dataset.onScreen = selected === null ? "" : (now.onScreen(selected, 0) ?? []).join(" ");
 }
 
 function Readout({ camera, share }: { camera: SceneCamera; share: number }) {

@@ -122,7 +122,7 @@ function Interval({ difference: d, least, unit }: { difference: PairedDifference
   const x = (value: number) => WIDE / 2 + (value / reach) * (WIDE / 2 - 6);
   const said = `Gain ${signed(d.difference, 2)} ${unit}${d.low !== null && d.high !== null ? `, 95 % interval ${signed(d.low, 2)} to ${signed(d.high, 2)}` : ""}`;
   return (
-    <svg class="interval" viewBox={`0 0 ${WIDE} ${HIGH}`} role="img" aria-label={said}>
+    <svg class="interval" viewBox={`0 0 ${WIDE} ${HIGH}`} preserveAspectRatio="xMinYMid" role="img" aria-label={said}>
       <rect class="interval-band" x={x(-least)} width={x(least) - x(-least)} y={3} height={HIGH - 6} rx={2} />
       <line class="interval-axis" x1={0} x2={WIDE} y1={HIGH / 2} y2={HIGH / 2} />
       <line class="interval-zero" x1={x(0)} x2={x(0)} y1={2} y2={HIGH - 2} />

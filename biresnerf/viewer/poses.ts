@@ -14,6 +14,7 @@ export const axisOf = (pose: Matrix, column: 0 | 1 | 2): Triple => [
 ];
 
 export const minus = (a: Triple, b: Triple): Triple => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+export const plus = (a: Triple, b: Triple): Triple => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
 export const length = (a: Triple): number => Math.hypot(a[0], a[1], a[2]);
 export const mix = (a: Triple, b: Triple, share: number): Triple => [
   a[0] + share * (b[0] - a[0]),

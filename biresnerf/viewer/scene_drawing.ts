@@ -1,6 +1,5 @@
 // The three-dimensional picture itself: what is drawn, from where it is seen, what lies under the pointer.
 import {
-  BufferAttribute,
   BufferGeometry,
   Group,
   LineBasicMaterial,
@@ -8,32 +7,21 @@ import {
   Mesh,
   type MeshBasicMaterial,
   PerspectiveCamera,
-  Points,
-  PointsMaterial,
+  type Points,
+  type PointsMaterial,
   Scene,
   Vector3,
   WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import type { Colour } from "./colours";
-import { Frusta, srgb, VERTICES } from "./frusta";
-import { axisOf, between, centreOf, length, medianOf, minus, spreadOf } from "./poses";
+import { Frusta, VERTICES } from "./frusta";
+import { cloudOf, type Look, overviewOf, pathsOf, upwardsOf, type Viewpoint } from "./scene_parts";
+import { axisOf, between, centreOf, medianOf, minus, plus, spreadOf } from "./poses";
 import type { Matrix, PointLayer, SceneCamera, Triple } from "./types";
 
 const VIEW_DEG = 45;
 const PICK_PX = 14;
 const FLIGHT_MS = 350;
-
-export interface Look {
-  readonly share: number;
-  readonly lines: 0 | 1 | 10;
-  readonly before: boolean;
-  readonly colours: readonly Colour[];
-  readonly beforeColour: Colour;
-  readonly selectedColour: Colour;
-  readonly selected: number | null;
-  readonly layer: PointLayer | null;
-}
 
 export class SceneDrawing {
   private readonly renderer: WebGLRenderer;
@@ -52,6 +40,7 @@ export class SceneDrawing {
   private flight = 0;
   private frame = 0;
   private through: number | null = null;
+  private placed = false;
   readonly origin: Triple;
   readonly spread: number;
 
@@ -87,50 +76,18 @@ export class SceneDrawing {
     this.chosen.lines.renderOrder = 2;
     this.scene.add(this.world);
 
-    const up = this.upwards();
-    this.eye.up.set(...up);
+    this.eye.up.set(...upwardsOf(cameras));
     this.controls = new OrbitControls(this.eye, this.renderer.domElement);
     this.controls.addEventListener("change", this.draw);
     this.controls.addEventListener("start", this.leave);
     this.overview(false);
   }
 
-  /** Which way is up: where most pictures have their top. */
-  private upwards(): Triple {
-    const sum = this.cameras.reduce<Triple>((total, camera) => minus(total, axisOf(camera.after, 1)), [0, 0, 0]);
-    const size = length(sum);
-    return size > 1e-3 * this.cameras.length ? [sum[0] / size, sum[1] / size, sum[2] / size] : [0, 0, 1];
-  }
-
   /** Everything from aside and a little above. */
   overview(animated: boolean): void {
-    const up = this.eye.up.clone();
-    const side = new Vector3(...axisOf(this.cameras[0]?.after ?? IDENTITY, 0));
-    side.addScaledVector(up, -side.dot(up));
-    if (side.lengthSq() < 1e-6) side.set(1, 0, 0);
-    side.normalize();
-    const from = side.clone().multiplyScalar(0.75).addScaledVector(up, 0.5);
-    from.add(new Vector3().crossVectors(up, side).multiplyScalar(0.65)).normalize();
-    const right = new Vector3().crossVectors(up, from).normalize();
-    const above = new Vector3().crossVectors(from, right);
-    const seen = this.shownPoints();
-    const middle = (axis: Vector3): number => {
-      const along = seen.map((p) => p.dot(axis)).sort((a, b) => a - b);
-      const cut = Math.floor(0.02 * along.length);
-      return ((along[cut] ?? 0) + (along[along.length - 1 - cut] ?? 0)) / 2;
-    };
-    const target = new Vector3().addScaledVector(right, middle(right)).addScaledVector(above, middle(above));
-    target.addScaledVector(from, middle(from));
-    // As near as all fit but a few strays.
-    const slope = 0.94 * Math.tan((VIEW_DEG * Math.PI) / 360);
-    const needed = seen.map((p) => {
-      const off = p.clone().sub(target);
-      const across = Math.max(Math.abs(off.dot(above)), Math.abs(off.dot(right)) / (this.eye.aspect || 1));
-      return off.dot(from) + across / slope;
-    });
-    needed.sort((a, b) => a - b);
-    const back = Math.max(0.1, needed[Math.floor(0.98 * (needed.length - 1))] ?? 1);
-    this.fly(target.clone().addScaledVector(from, back), target, VIEW_DEG, animated);
+    const side = new Vector3(...(this.cameras[0] ? axisOf(this.cameras[0].after, 0) : [1, 0, 0]));
+    const { at, target } = overviewOf(this.shownPoints(), this.eye.up, side, this.eye.aspect || 1, VIEW_DEG);
+    this.fly(at, target, VIEW_DEG, animated);
   }
 
   /** Corners of all cameras before and after, in drawn units. */
@@ -246,22 +203,8 @@ export class SceneDrawing {
 
   private drawPaths(look: Look): void {
     this.paths.visible = look.lines > 0;
-    const positions: number[] = [];
-    const colours: number[] = [];
-    this.cameras.forEach((camera, index) => {
-      const colour = look.colours[index];
-      if (!camera.before || !colour || look.lines === 0) return;
-      const from = centreOf(camera.before);
-      const moved = minus(centreOf(camera.after), from);
-      const start = minus(from, this.origin);
-      positions.push(...start);
-      positions.push(...start.map((value, axis) => value + look.lines * (moved[axis] ?? 0)));
-      colours.push(...srgb(...colour), ...srgb(...colour));
-    });
     this.paths.geometry.dispose();
-    this.paths.geometry = new BufferGeometry();
-    this.paths.geometry.setAttribute("position", new BufferAttribute(new Float32Array(positions), 3));
-    this.paths.geometry.setAttribute("color", new BufferAttribute(new Float32Array(colours), 3));
+    this.paths.geometry = pathsOf(this.cameras, look, this.origin);
   }
 
   private drawPoints(layer: PointLayer | null): void {
@@ -273,28 +216,19 @@ export class SceneDrawing {
       this.points = null;
     }
     if (!layer) return;
-    const geometry = new BufferGeometry();
-    const colours = new Float32Array(layer.colours.length);
-    for (let i = 0; i < colours.length; i += 3) {
-      colours.set(srgb(layer.colours[i] ?? 0, layer.colours[i + 1] ?? 0, layer.colours[i + 2] ?? 0), i);
-    }
-    geometry.setAttribute("position", new BufferAttribute(layer.positions, 3));
-    geometry.setAttribute("color", new BufferAttribute(colours, 3));
-    const material = new PointsMaterial({ size: 2.4, sizeAttenuation: false, vertexColors: true });
-    this.points = new Points(geometry, material);
+    this.points = cloudOf(layer);
     this.points.position.set(...minus(layer.origin, this.origin));
-    this.points.frustumCulled = false;
     this.world.add(this.points);
   }
 
   /** Size in CSS pixels. */
   resize(width: number, height: number): void {
     if (width === 0 || height === 0) return;
-    const first = !this.renderer.domElement.style.width;
     this.renderer.setSize(width, height);
     this.eye.aspect = width / height;
     this.eye.updateProjectionMatrix();
-    if (first) this.overview(false);
+    if (!this.placed) this.overview(false);
+    this.placed = true;
     this.draw();
   }
 
@@ -303,33 +237,38 @@ export class SceneDrawing {
     const box = this.renderer.domElement.getBoundingClientRect();
     let best = PICK_PX;
     let found: number | null = null;
-    const at = new Vector3();
-    this.world.updateMatrixWorld();
     this.cameras.forEach((_, index) => {
       for (let vertex = 0; vertex < VERTICES - 1; vertex++) {
-        at.set(...this.after.drawn(index, vertex)).applyMatrix4(this.world.matrixWorld).project(this.eye);
-        if (at.z > 1 || at.z < -1) continue;
-        const x = box.left + ((at.x + 1) / 2) * box.width;
-        const y = box.top + ((1 - at.y) / 2) * box.height;
-        const apart = Math.hypot(x - clientX, y - clientY);
+        const seen = this.onScreen(index, vertex);
+        const apart = seen ? Math.hypot(seen[0] + box.left - clientX, seen[1] + box.top - clientY) : best;
         if (apart < best) [best, found] = [apart, index];
       }
     });
     return found;
   }
 
-  /** Where a camera's centre is drawn, in the world: read back from what the GPU was given. */
-  drawnCentre(index: number): Triple {
-    const [x, y, z] = this.after.drawn(index, 0);
-    return [x + this.origin[0], y + this.origin[1], z + this.origin[2]];
+  /** Where a vertex lies on the drawing, CSS pixels; null where it is behind the eye. */
+  onScreen(index: number, vertex: number): [number, number] | null {
+    const { clientWidth, clientHeight } = this.renderer.domElement;
+    this.eye.updateMatrixWorld();
+    const at = new Vector3(...this.after.drawn(index, vertex)).divideScalar(this.spread).project(this.eye);
+    return Math.abs(at.z) > 1 ? null : [((at.x + 1) / 2) * clientWidth, ((1 - at.y) / 2) * clientHeight];
   }
 
-  /** Where a camera's centre lies on the page, CSS pixels of the drawing. */
-  onScreen(index: number): [number, number] {
-    this.world.updateMatrixWorld();
-    const at = new Vector3(...this.after.drawn(index, 0)).applyMatrix4(this.world.matrixWorld).project(this.eye);
-    const box = this.renderer.domElement.getBoundingClientRect();
-    return [((at.x + 1) / 2) * box.width, ((1 - at.y) / 2) * box.height];
+  /** Where a camera's centre is drawn, in the world: read back from what the GPU was given. */
+  drawnCentre(index: number): Triple {
+    return plus(this.after.drawn(index, 0), this.origin);
+  }
+
+  /** From where it is seen, in the world, so that another drawing can be seen from there. */
+  viewpoint(): Viewpoint {
+    const inWorld = (p: Vector3) => plus(p.clone().multiplyScalar(this.spread).toArray(), this.origin);
+    return { at: inWorld(this.eye.position), target: inWorld(this.controls.target) };
+  }
+
+  seeFrom({ at, target }: Viewpoint): void {
+    this.placed = true;
+    this.fly(this.drawnPoint(at), this.drawnPoint(target), VIEW_DEG, false);
   }
 
   /** At the next frame, once: nothing is drawn while nothing changes. */
@@ -355,9 +294,3 @@ export class SceneDrawing {
     this.renderer.domElement.remove();
   }
 }
-
-const IDENTITY: Matrix = [
-  [1, 0, 0, 0],
-  [0, 1, 0, 0],
-  [0, 0, 1, 0],
-];

@@ -172,3 +172,23 @@ def test_without_webgl_the_cameras_stand_in_a_table(result, browser):
     assert rows.count() == VIEWS
     assert "no WebGL" in page.locator(".scene .notice").text_content()
     blind.close()
+
+
+def test_looking_through_a_camera_puts_it_in_the_middle_and_overview_goes_back(opened):
+    page = opened.page
+    choose(page, 0)
+    overview = stage(page)["onScreen"]
+    page.locator(".scene-stage").focus()
+    page.keyboard.press("Enter")
+    button = page.get_by_role("button", name="Look through")
+    page.wait_for_function("e => e.getAttribute('aria-pressed') === 'true'", arg=button.element_handle())
+    slide(page, 0.5)
+    slide(page, 1)
+    assert stage(page)["onScreen"] == ""  # the eye is where the camera is: it has no place before it
+    page.get_by_role("button", name="Overview").click()
+    slide(page, 0.5)
+    slide(page, 1)
+    seen, before = (
+        np.array([float(v) for v in text.split()]) for text in (stage(page)["onScreen"], overview)
+    )
+    np.testing.assert_allclose(seen, before, atol=2)
