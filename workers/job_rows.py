@@ -11,7 +11,7 @@ from biresnerf.wire.jobs import Job, JobEvent, JobProgress, PriorityName
 from biresnerf.wire.problems import JobError
 from workers.database import Connection
 from workers.errors import Conflict
-from workers.records import priority_name
+from workers.records import PREVIEW_FOLDER, THUMBNAIL_NAME, priority_name
 
 JOB = """
     SELECT jobs.*, CASE WHEN jobs.state = 'queued' THEN
@@ -44,7 +44,15 @@ def job_from_row(row: dict[str, Any]) -> Job:
     progress = JobProgress(**{key: row[key] for key in ("fraction", "step", "steps_total", "eta_s")})
     error = JobError.model_validate(row["error"]) if row["error"] else None
     values = {key: row[key] for key in same + also + life} | {"priority": priority_name(row["priority"])}
-    return Job(**values, progress=progress, error=error)
+    return Job(**values, progress=progress, error=error, thumbnail=_thumbnail(row))
+
+
+def _thumbnail(row: dict[str, Any]) -> str | None:
+    files = [*row["artifacts"], *(row["previews"] or {}).get("artifacts", [])]
+    names = {item["name"] for item in files}
+    return next(
+        (name for name in (THUMBNAIL_NAME, f"{PREVIEW_FOLDER}/{THUMBNAIL_NAME}") if name in names), None
+    )
 
 
 async def one_row(connection: Connection, sql: Any, *parameters: Any) -> dict[str, Any] | None:

@@ -19,6 +19,7 @@ LOG_NAME, POSES_NAME, REPORT_NAME = (
     "poses.json",
     "report.json",
 )  # files of a result that the engine knows
+THUMBNAIL_NAME = "thumbnail.jpg"
 PREVIEW_FOLDER = "preview"  # of files that show how far a job is
 
 FINAL_EVENTS: frozenset[EventType] = frozenset({"succeeded", "failed", "cancelled", "expired"})

@@ -85,6 +85,9 @@ class Job(Record):
         description="Whether refinement helped, once the job has succeeded; the report has the evidence.",
     )
     error: JobError | None = None
+    thumbnail: str | None = Field(
+        None, description="The artifact that is a small picture of it; while it runs, the latest preview's."
+    )
     labels: dict[str, str] = Field({})
     revision: int = 0
 

@@ -1,15 +1,76 @@
-// The page that the service shows at `/`.
+// The page that the service shows at `/`: what is after the `#` of its address says what of it.
 import { render } from "preact";
+import { useEffect, useRef, useState } from "preact/hooks";
+import { JobPage } from "./job/page";
+import { JobsPage } from "./jobs/list";
+import { KeyForm } from "./key_form";
+import { apiKey, forgetKey, keyWanted } from "./service/http";
+import { useStore } from "./service/store";
+import { DatasetPage } from "./upload/dataset_page";
+
+interface Route {
+  name: "jobs" | "job" | "dataset";
+  id: string;
+}
+
+function routeOf(hash: string): Route {
+  const [, kind, id] = hash.replace(/^#/, "").split("/");
+  if (kind === "jobs" && id) return { name: "job", id };
+  if (kind === "datasets" && id) return { name: "dataset", id };
+  return { name: "jobs", id: "" };
+}
 
 function App() {
+  const [route, setRoute] = useState(() => routeOf(location.hash));
+  const wanted = useStore(keyWanted);
+  const key = useStore(apiKey);
+  const main = useRef<HTMLElement>(null);
+  useEffect(() => {
+    const changed = () => {
+      setRoute(routeOf(location.hash));
+      scrollTo(0, 0);
+      main.current?.focus({ preventScroll: true });
+    };
+    addEventListener("hashchange", changed);
+    return () => removeEventListener("hashchange", changed);
+  }, []);
   return (
-    <main>
-      <h1>BiResNeRF</h1>
-      <p>
-        <a href="docs">The HTTP interface</a>
-      </p>
-    </main>
+    <>
+      <a class="skip" href={location.hash || "#/"} onClick={(event) => skip(event, main.current)}>
+        Skip to the content
+      </a>
+      <header class="top">
+        <a class="brand" href="#/" aria-current={route.name === "jobs" ? "page" : undefined}>
+          BiResNeRF
+        </a>
+        <nav aria-label="Main">
+          <a href="#/" aria-current={route.name === "jobs" ? "page" : undefined}>
+            Jobs
+          </a>
+          <a href="docs">HTTP interface</a>
+          {key && (
+            <button class="plain-link" onClick={forgetKey}>
+              Forget the key
+            </button>
+          )}
+        </nav>
+      </header>
+      <main ref={main} tabIndex={-1}>
+        {wanted !== null ? <KeyForm said={wanted} /> : <Shown key={`${route.name} ${route.id} ${key}`} {...route} />}
+      </main>
+    </>
   );
+}
+
+function Shown({ name, id }: Route) {
+  if (name === "job") return <JobPage id={id} />;
+  if (name === "dataset") return <DatasetPage id={id} />;
+  return <JobsPage />;
+}
+
+function skip(event: Event, main: HTMLElement | null): void {
+  event.preventDefault();
+  main?.focus();
 }
 
 const root = document.getElementById("app");

@@ -1,0 +1,197 @@
+// The result, by who it is for.
+import { useState } from "preact/hooks";
+import { bytes, count, percent } from "../format";
+import { ProblemBox } from "../problem_box";
+import type { ArtifactView, JobView, ShareView } from "../service/answers";
+import { address, apiKey, ask, asProblem, call, pause, type Problem } from "../service/http";
+import { direct } from "../service/pictures";
+import { useStore } from "../service/store";
+import { isOver } from "../jobs/state";
+import { CopyButton } from "./copy_button";
+import { CONSUMERS, curlLines, filesFor, pythonLines, type Consumer } from "./consumers";
+import { Zip } from "./zip";
+
+const SHARED_S = 7 * 86_400;
+
+interface Props {
+  job: JobView;
+  artifacts: readonly ArtifactView[];
+  onNewFiles: () => Promise<void>;
+}
+
+export function Downloads({ job, artifacts, onNewFiles }: Props) {
+  const whole = artifacts.filter(({ preview }) => !preview);
+  // Only a whole result, complete or partial, can be written in further forms.
+  const exportable = whole.some(({ name }) => name === "poses.json");
+  const rows = CONSUMERS.map((consumer) => ({ consumer, files: filesFor(consumer, whole) }));
+  const shown = rows.filter(({ consumer, files }) => files.length || (consumer.pack && exportable));
+  return (
+    <ul class="downloads">
+      {shown.map(({ consumer, files }) => (
+        <Row key={consumer.name} job={job} consumer={consumer} files={files} onNewFiles={onNewFiles} />
+      ))}
+    </ul>
+  );
+}
+
+interface RowProps {
+  job: JobView;
+  consumer: Consumer;
+  files: ArtifactView[];
+  onNewFiles: () => Promise<void>;
+}
+
+function Row({ job, consumer, files, onNewFiles }: RowProps) {
+  const [said, setSaid] = useState("");
+  const [problem, setProblem] = useState<Problem | null>(null);
+  const [open, setOpen] = useState(false);
+  const keyed = useStore(apiKey) !== null;
+  const jobUrl = address(`v1/jobs/${job.id}`);
+  const lone = files.length === 1 ? files[0] : undefined;
+  const attempt = async (doing: () => Promise<void>) => {
+    setProblem(null);
+    try {
+      await doing();
+    } catch (error) {
+      setProblem(asProblem(error));
+    }
+    setSaid("");
+  };
+  const size = files.reduce((sum, file) => sum + file.size, 0);
+  return (
+    <li class="download">
+      <div class="download-words">
+        <strong>{consumer.name}</strong>
+        <span class="soft">{consumer.words}</span>
+      </div>
+      <div class="download-act">
+        {files.length > 0 && (
+          <span class="soft number">
+            {lone ? lone.name.split("/").at(-1) : count(files.length, "file")} · {bytes(size)}
+          </span>
+        )}
+        {files.length > 0 && (
+          <button
+            type="button"
+            class="plain-link"
+            aria-expanded={open}
+            aria-label={`curl, Python ${consumer.name}`}
+            onClick={() => setOpen(!open)}
+          >
+            curl, Python
+          </button>
+        )}
+        {files.length === 0 && (
+          <button
+            class="act small"
+            disabled={said !== ""}
+            aria-label={`${said || "Write it"} ${consumer.name}`}
+            onClick={() => attempt(() => exported(job, consumer, setSaid, onNewFiles))}
+          >
+            {said || "Write it"}
+          </button>
+        )}
+        {lone && !keyed && (
+          <a class="act small" href={direct(lone.href)} download={lone.name.split("/").at(-1)} aria-label={`Download ${consumer.name}`}>
+            Download
+          </a>
+        )}
+        {files.length > 0 && (keyed || !lone) && (
+          <button
+            class="act small"
+            disabled={said !== ""}
+            aria-label={`${said || (lone ? "Download" : "Download .zip")} ${consumer.name}`}
+            onClick={() => attempt(() => (lone ? saveOne(lone) : saveAll(job, consumer, files, setSaid)))}
+          >
+            {said || (lone ? "Download" : "Download .zip")}
+          </button>
+        )}
+      </div>
+      {open && (
+        <div class="download-lines">
+          <Lines label="curl" text={curlLines(jobUrl, consumer, files, keyed)} />
+          <Lines label="Python" text={pythonLines(jobUrl, job.id, consumer, keyed)} />
+          {lone && <Share job={job} file={lone} />}
+        </div>
+      )}
+      {problem && <ProblemBox problem={problem} />}
+    </li>
+  );
+}
+
+function Lines({ label, text }: { label: string; text: string }) {
+  return (
+    <div class="lines">
+      <span class="lines-head">
+        <span>{label}</span>
+        <CopyButton text={text} what={`the ${label} lines`} />
+      </span>
+      <pre tabIndex={0} aria-label={label}>
+        {text}
+      </pre>
+    </div>
+  );
+}
+
+function Share({ job, file }: { job: JobView; file: ArtifactView }) {
+  const [link, setLink] = useState("");
+  const [problem, setProblem] = useState<Problem | null>(null);
+  const make = async () => {
+    try {
+      const json = { name: file.name, valid_s: SHARED_S };
+      setLink(address((await call<ShareView>("POST", `v1/jobs/${job.id}/shares`, { json })).href));
+    } catch (error) {
+      setProblem(asProblem(error));
+    }
+  };
+  if (link) return <Lines label="Link, good for 7 days and without a key" text={link} />;
+  return (
+    <>
+      <button class="act" onClick={make}>
+        Make a link that needs no key
+      </button>
+      {problem && <ProblemBox problem={problem} />}
+    </>
+  );
+}
+
+async function exported(
+  job: JobView,
+  consumer: Consumer,
+  say: (text: string) => void,
+  onNewFiles: () => Promise<void>,
+): Promise<void> {
+  say("Writing …");
+  const json = { formats: [consumer.pack] };
+  let made = await call<JobView>("POST", `v1/jobs/${job.id}/exports`, { json });
+  while (!isOver(made)) {
+    if (made.state === "queued" && made.queue_position) say(`Waiting, number ${made.queue_position}`);
+    else say("Writing …");
+    await pause(400);
+    made = await call<JobView>("GET", `v1/jobs/${made.id}`);
+  }
+  if (made.error) throw new Error(`${made.error.detail} ${made.error.mend}`);
+  await onNewFiles();
+}
+
+async function saveOne(file: ArtifactView): Promise<void> {
+  const answer = await ask("GET", `${file.href}?redirect=false`);
+  save(await answer.blob(), file.name.split("/").at(-1) ?? file.name);
+}
+
+async function saveAll(job: JobView, consumer: Consumer, files: ArtifactView[], say: (text: string) => void) {
+  const zip = new Zip();
+  for (const [index, file] of files.entries()) {
+    say(`Fetching ${percent(index / files.length)}`);
+    zip.add(file.name, await (await ask("GET", `${file.href}?redirect=false`)).arrayBuffer());
+  }
+  save(zip.finish(), `${job.labels.name ?? job.id}-${consumer.files.replaceAll("/", "-")}.zip`.replace("-.zip", ".zip"));
+}
+
+function save(content: Blob, name: string): void {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(content);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}

@@ -1,0 +1,152 @@
+// One job: how far it is, what came out, what can be done with it.
+import { useEffect, useMemo, useState } from "preact/hooks";
+import { duration, moment } from "../format";
+import { Chip, isOver, StageBar, titleOf } from "../jobs/state";
+import { ProblemBox } from "../problem_box";
+import type { JobView } from "../service/answers";
+import { pictureUrl } from "../service/pictures";
+import { useStore } from "../service/store";
+import { useTitle } from "../title";
+import { Actions } from "./actions";
+import { Downloads } from "./downloads";
+import { Failure } from "./failure";
+import { LiveJob, type Seen } from "./live";
+import { LogView } from "./log";
+import { Pictures } from "./pictures";
+
+export function JobPage({ id }: { id: string }) {
+  const live = useMemo(() => new LiveJob(id), [id]);
+  useEffect(() => {
+    live.start();
+    return () => live.close();
+  }, [live]);
+  const seen = useStore(live);
+  const { job, problem } = seen;
+  useTitle(job ? `${titleOf(job)} · ${job.verdict ?? job.state}` : "Job");
+  if (!job) return problem ? <ProblemBox problem={problem} /> : <p class="soft">Loading …</p>;
+  return (
+    <article class="job">
+      <Head job={job} seen={seen} />
+      {problem && <ProblemBox problem={problem} />}
+      <Failure job={job} images={seen.poses?.images.map(({ name }) => name) ?? []} />
+      <Announced job={job} />
+      <Shown seen={seen} />
+      <Files live={live} seen={seen} />
+      <Facts job={job} seen={seen} />
+      <LogView job={job} />
+    </article>
+  );
+}
+
+function Head({ job, seen }: { job: JobView; seen: Seen }) {
+  return (
+    <header class="job-header">
+      <div class="page-head">
+        <h1>
+          <bdi>{titleOf(job)}</bdi> <Chip job={job} />
+        </h1>
+        <Actions job={job} />
+      </div>
+      <StageBar job={job} named />
+      {!isOver(job) && <LiveNumbers job={job} linked={seen.linked} />}
+    </header>
+  );
+}
+
+function LiveNumbers({ job, linked }: { job: JobView; linked: boolean }) {
+  const { loss, psnr, moved_deg } = job.metrics;
+  const numbers = [
+    ["Loss", loss?.toExponential(2), ""],
+    ["PSNR", psnr?.toFixed(2), "dB"],
+    ["Cameras turn", moved_deg?.toPrecision(2), "° a check"],
+    ["Attempt", job.attempt > 1 ? String(job.attempt) : undefined, ""],
+  ].filter(([, value]) => value !== undefined);
+  return (
+    <dl class="live-numbers">
+      {numbers.map(([name, value, unit]) => (
+        <div key={name}>
+          <dt>{name}</dt>
+          <dd>
+            {value} {unit}
+          </dd>
+        </div>
+      ))}
+      {!linked && <div class="soft">The connection broke off; trying again …</div>}
+    </dl>
+  );
+}
+
+/** For screen readers: stages and the end, not each step. */
+function Announced({ job }: { job: JobView }) {
+  const text = isOver(job) ? `The job is over: ${job.verdict ?? job.state}` : job.stage ? `Now: ${job.stage}` : "Waiting";
+  return (
+    <p class="unseen" role="status">
+      {text}
+    </p>
+  );
+}
+
+function Shown({ seen }: { seen: Seen }) {
+  const [drawn, redraw] = useState(0);
+  const { artifacts } = seen;
+  const urlOf = useMemo(() => {
+    const byName = new Map(artifacts.map((artifact) => [artifact.name, artifact]));
+    return (file: string) => {
+      const found = byName.get(file);
+      return found ? pictureUrl(found.href, found.sha256, () => redraw((n) => n + 1)) : null;
+    };
+  }, [artifacts, drawn]);
+  return <Pictures seen={seen} urlOf={urlOf} />;
+}
+
+function Files({ live, seen }: { live: LiveJob; seen: Seen }) {
+  const { job, artifacts } = seen;
+  if (!job || !artifacts.some(({ preview, name }) => !preview && name !== "log.txt")) return null;
+  return (
+    <section class="panel" aria-labelledby="downloads-heading">
+      <h2 id="downloads-heading">Downloads</h2>
+      <Downloads job={job} artifacts={artifacts} onNewFiles={() => live.refresh()} />
+    </section>
+  );
+}
+
+function Facts({ job, seen }: { job: JobView; seen: Seen }) {
+  const seconds = Object.entries(seen.report?.seconds ?? {});
+  const warnings = seen.report?.warnings ?? [];
+  return (
+    <details class="panel">
+      <summary>
+        <h2>Options and times</h2>
+      </summary>
+      {warnings.length > 0 && (
+        <ul class="warnings">
+          {warnings.map((warning) => (
+            <li key={warning}>{warning}</li>
+          ))}
+        </ul>
+      )}
+      <dl class="facts">
+        <Fact name="Job" value={job.id} />
+        <Fact name="Images" value={job.dataset_id} link={`#/datasets/${job.dataset_id}`} />
+        {job.forked_from && <Fact name="Forked from" value={job.forked_from} link={`#/jobs/${job.forked_from}`} />}
+        <Fact name="Submitted" value={moment(job.created_at)} />
+        {job.expires_at && <Fact name="Kept until" value={moment(job.expires_at)} />}
+        {seconds.map(([stage, s]) => (
+          <Fact key={stage} name={`Time: ${stage}`} value={duration(s)} />
+        ))}
+        {Object.entries({ ...job.options, ...job.smaller }).map(([name, value]) => (
+          <Fact key={name} name={name} value={typeof value === "string" ? value : JSON.stringify(value)} />
+        ))}
+      </dl>
+    </details>
+  );
+}
+
+function Fact({ name, value, link }: { name: string; value: string; link?: string }) {
+  return (
+    <div>
+      <dt>{name}</dt>
+      <dd>{link ? <a href={link}>{value}</a> : value}</dd>
+    </div>
+  );
+}

@@ -1,0 +1,143 @@
+// What there is to see of a job, with one image chosen in all of it; while it runs, its previews.
+import type { ComponentChildren } from "preact";
+import { useEffect, useMemo, useState } from "preact/hooks";
+import { camerasOf, cellsOf, centresOf, rowsOf } from "../../../biresnerf/viewer/job_data";
+import type { PosesFile, UrlOf } from "../../../biresnerf/viewer/types";
+import { isOver } from "../jobs/state";
+import { asProblem, type Problem } from "../service/http";
+import { ProblemBox } from "../problem_box";
+import type { ArtifactView, JobView } from "../service/answers";
+import type { Seen } from "./live";
+
+type Widgets = typeof import("./widgets");
+
+function useWidgets(): { widgets: Widgets | null; problem: Problem | null } {
+  const [widgets, setWidgets] = useState<Widgets | null>(null);
+  const [problem, setProblem] = useState<Problem | null>(null);
+  useEffect(() => {
+    import("./widgets").then(setWidgets, (error) => setProblem(asProblem(error)));
+  }, []);
+  return { widgets, problem };
+}
+
+export function Pictures({ seen, urlOf }: { seen: Seen; urlOf: UrlOf }) {
+  const { widgets, problem } = useWidgets();
+  const job = seen.job!;
+  if (problem) return <ProblemBox problem={problem} />;
+  const nothing = isOver(job) && !seen.poses && !seen.history.length;
+  if (nothing) return null;
+  return (
+    <>
+      {widgets && seen.report && isOver(job) && (
+        <widgets.VerdictSentence
+          verdict={seen.report.verdict}
+          state={seen.report.state}
+          asked={seen.report.options.verdict !== false}
+        />
+      )}
+      <Views seen={seen} urlOf={urlOf} widgets={widgets} />
+    </>
+  );
+}
+
+function Views({ seen, urlOf, widgets }: { seen: Seen; urlOf: UrlOf; widgets: Widgets | null }) {
+  const { poses, report, view, points } = seen;
+  const job = seen.job!;
+  const [chosen, setChosen] = useState<number | null | undefined>(undefined);
+  const first = view?.views[0]?.image ?? (poses?.images.length ? 0 : null);
+  const selected = chosen === undefined ? first : chosen;
+  const choice = { selected, onSelect: setChosen };
+  const names = useMemo(() => poses?.images.map(({ name }) => name) ?? [], [poses]);
+  const cameras = useMemo(() => (poses ? camerasOf(poses, report) : []), [poses, report]);
+  const centres = useMemo(() => (poses ? centresOf(poses) : []), [poses]);
+  const rows = useMemo(() => (report ? rowsOf(report) : []), [report]);
+  const cellOf = useMemo(() => cellsOf(view, names.length, urlOf), [view, names, urlOf]);
+  return (
+    <>
+      <div class="job-pictures">
+        <Panel name="Cameras" kind="panel-scene">
+          {widgets && poses ? (
+            <widgets.SceneView cameras={cameras} points={points} {...choice} />
+          ) : (
+            <Waiting job={job} for="cameras" />
+          )}
+        </Panel>
+        <Panel name={view ? "Photo and render" : "Preview"} kind="panel-compare">
+          {widgets && view ? (
+            <widgets.ImageCompare {...{ names, centres, urlOf, ...choice }} views={view.views} />
+          ) : (
+            <Preview seen={seen} poses={poses} urlOf={urlOf} />
+          )}
+        </Panel>
+      </div>
+      <Panel name="The run" kind="panel-curves">
+        {widgets && seen.history.length > 1 ? (
+          <widgets.Curves
+            lines={seen.history}
+            switchStep={report?.switch_step ?? null}
+            switchReason={report?.switch_reason ?? null}
+            steps={isOver(job) ? (report?.steps_done ?? null) : job.progress.steps_total || null}
+          />
+        ) : (
+          <Waiting job={job} for="curves" />
+        )}
+      </Panel>
+      {widgets && rows.length > 0 && (
+        <Panel name="Images" kind="panel-table">
+          <widgets.ImageTable rows={rows} cellOf={cellOf} {...choice} />
+        </Panel>
+      )}
+    </>
+  );
+}
+
+function Panel({ name, kind, children }: { name: string; kind: string; children: ComponentChildren }) {
+  return (
+    <section class={`panel ${kind}`} aria-label={name}>
+      <h2>{name}</h2>
+      {children}
+    </section>
+  );
+}
+
+/** Holds the place of what is still to come. */
+function Waiting({ job, for: what }: { job: JobView; for: string }) {
+  const words = isOver(job)
+    ? `There are no ${what} of this job.`
+    : job.state === "queued"
+      ? `The ${what} appear soon after the job starts.`
+      : `The ${what} appear as soon as the poses begin to move.`;
+  return <p class="waiting soft">{words}</p>;
+}
+
+const KINDS = ["render", "photo", "difference", "depth"] as const;
+
+/** One view as the field has it now. */
+function Preview({ seen, poses, urlOf }: { seen: Seen; poses: PosesFile | null; urlOf: UrlOf }) {
+  const pictures = previewPictures(seen.artifacts);
+  if (!pictures.size) return <Waiting job={seen.job!} for="pictures" />;
+  const lens = poses?.cameras[0];
+  const frame = lens && { aspectRatio: `${lens.width} / ${lens.height}` };
+  return (
+    <ul class="preview">
+      {KINDS.map((kind) => {
+        const url = pictures.has(kind) ? urlOf(pictures.get(kind)!) : null;
+        return (
+          <li key={kind}>
+            <figure>
+              <div class="preview-frame" style={frame}>
+                {url && <img src={url} alt={`${kind} of one view, as the field has it now`} />}
+              </div>
+              <figcaption>{kind}</figcaption>
+            </figure>
+          </li>
+        );
+      })}
+    </ul>
+  );
+}
+
+function previewPictures(artifacts: readonly ArtifactView[]): Map<string, string> {
+  const found = artifacts.map(({ name }) => /^preview\/.*_(render|photo|difference|depth)\.png$/.exec(name));
+  return new Map(found.flatMap((match) => (match ? [[match[1]!, match[0]] as const] : [])));
+}

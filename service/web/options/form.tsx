@@ -1,0 +1,171 @@
+// Preset and options, made from what the service says of them.
+import { useEffect, useMemo, useState } from "preact/hooks";
+import type { OptionsView } from "../service/answers";
+import { asProblem, call, type FieldProblem, type Problem } from "../service/http";
+import { ProblemBox } from "../problem_box";
+import { fieldsOf, parsed, presetValue, words, type Field, type Values } from "./schema";
+
+const PRESET_WORDS: Record<string, string> = {
+  fast: "A look within minutes",
+  balanced: "For most sets",
+  quality: "Larger images, more steps",
+  paper: "The published configuration",
+};
+
+interface Props {
+  values: Values;
+  onChange: (change: (values: Values) => Values) => void;
+  /** What holds where nothing is changed; without it, what the preset says. */
+  base?: Values;
+  problems?: readonly FieldProblem[];
+}
+
+let known: Promise<OptionsView> | null = null;
+
+/** What may be asked for; asked of the service once. */
+export function useOptions(): { view: OptionsView | null; problem: Problem | null } {
+  const [view, setView] = useState<OptionsView | null>(null);
+  const [problem, setProblem] = useState<Problem | null>(null);
+  useEffect(() => {
+    known ??= call<OptionsView>("GET", "v1/options");
+    known.then(setView, (error) => {
+      known = null;
+      setProblem(asProblem(error));
+    });
+  }, []);
+  return { view, problem };
+}
+
+export function OptionsForm({ values, onChange, base, problems = [] }: Props) {
+  const { view, problem } = useOptions();
+  const fields = useMemo(() => view && fieldsOf(view.json_schema), [view]);
+  if (problem) return <ProblemBox problem={problem} />;
+  if (!view || !fields) return <p class="soft">Loading the options …</p>;
+  const preset = String(values.preset ?? base?.preset ?? "balanced");
+  const fallback = (name: string) => (base && !values.preset ? words(base[name]) : presetValue(view, preset, name));
+  const set = (name: string, value: unknown) => {
+    onChange(({ [name]: _, ...others }) => (value === undefined ? others : { ...others, [name]: value }));
+  };
+  const row = (field: Field) => (
+    <FieldRow
+      key={field.name}
+      field={field}
+      value={values[field.name]}
+      fallback={fallback(field.name)}
+      problem={problems.find(({ pointer }) => pointer.split("/").includes(field.name))?.detail}
+      onChange={(value) => set(field.name, value)}
+    />
+  );
+  const changed = fields.rest.filter(({ name }) => name in values).length;
+  return (
+    <div class="options">
+      <fieldset class="presets">
+        <legend>Preset</legend>
+        {Object.entries(view.presets).map(([name, filled]) => (
+          <label key={name} class={name === preset ? "preset chosen" : "preset"}>
+            <input type="radio" name="preset" checked={name === preset} onChange={() => set("preset", name)} />
+            <strong>{name}</strong>
+            <span>{PRESET_WORDS[name]}</span>
+            <span class="soft">
+              {String(filled.steps)} steps at {String(filled.max_image_size)} px
+            </span>
+          </label>
+        ))}
+      </fieldset>
+      <div class="fields">{fields.first.map(row)}</div>
+      <details>
+        <summary>
+          Method and schedule <span class="soft">{changed ? `${changed} changed` : "as the preset says"}</span>
+        </summary>
+        <div class="fields">{fields.rest.map(row)}</div>
+      </details>
+    </div>
+  );
+}
+
+interface RowProps {
+  field: Field;
+  value: unknown;
+  fallback: string;
+  problem?: string | undefined;
+  onChange: (value: unknown) => void;
+}
+
+function FieldRow(props: RowProps) {
+  const { field, value, problem } = props;
+  const id = `option-${field.name}`;
+  const grouped = field.kind === "several";
+  const described = `${id}-help${problem ? ` ${id}-problem` : ""}`;
+  return (
+    <div class={value === undefined ? "field" : "field changed"}>
+      {grouped ? <span class="field-name">{field.name}</span> : <label for={id}>{field.name}</label>}
+      {grouped ? <Several {...props} /> : <Control {...props} id={id} described={described} />}
+      <p class="soft" id={`${id}-help`}>
+        {field.help}
+      </p>
+      {problem && (
+        <p class="bad" id={`${id}-problem`} role="alert">
+          {problem}
+        </p>
+      )}
+    </div>
+  );
+}
+
+function Control({ field, value, fallback, id, described, onChange }: RowProps & { id: string; described: string }) {
+  const text = value === undefined ? "" : Array.isArray(value) ? value.join(", ") : String(value);
+  if (field.choices.length) {
+    return (
+      <select
+        id={id}
+        value={text}
+        aria-describedby={described}
+        onChange={(event) => onChange(parsed(field, event.currentTarget.value))}
+      >
+        <option value="">{fallback}</option>
+        {field.choices.map((choice) => (
+          <option key={choice} value={choice}>
+            {field.kind === "yes-no" ? (choice === "true" ? "yes" : "no") : choice}
+          </option>
+        ))}
+      </select>
+    );
+  }
+  const common = {
+    ...{ id, value: text, placeholder: fallback, "aria-describedby": described },
+    onInput: (event: { currentTarget: HTMLInputElement }) => onChange(parsed(field, event.currentTarget.value)),
+  };
+  if (field.kind !== "number") return <input type="text" {...common} />;
+  return (
+    <input
+      type="number"
+      inputMode={field.whole ? "numeric" : "decimal"}
+      step={field.whole ? 1 : "any"}
+      min={field.least ?? undefined}
+      max={field.most ?? undefined}
+      {...common}
+    />
+  );
+}
+
+function Several({ field, value, onChange }: RowProps) {
+  const chosen = Array.isArray(value) ? value.map(String) : [];
+  const toggle = (choice: string, on: boolean) => {
+    const next = on ? [...chosen, choice] : chosen.filter((one) => one !== choice);
+    onChange(next.length ? next : undefined);
+  };
+  return (
+    <div class="several" role="group" aria-label={field.name}>
+      {field.choices.map((choice) => (
+        <label key={choice}>
+          <input
+            type="checkbox"
+            checked={chosen.includes(choice)}
+            onChange={(event) => toggle(choice, event.currentTarget.checked)}
+          />
+          {choice}
+        </label>
+      ))}
+    </div>
+  );
+}

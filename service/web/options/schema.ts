@@ -1,0 +1,71 @@
+// The options' JSON Schema as fields of a form.
+import type { OptionsView, Schema } from "../service/answers";
+
+export type Values = Record<string, unknown>;
+
+export interface Field {
+  name: string;
+  help: string;
+  kind: "choice" | "yes-no" | "number" | "several" | "words";
+  /** Of a choice, or of several. */
+  choices: string[];
+  whole: boolean;
+  least: number | null;
+  most: number | null;
+}
+
+/** Those that people change; all others are in a second group, in the schema's order. */
+const FIRST = [
+  ...["max_image_size", "steps", "start", "background", "exposure", "refine_intrinsics", "holdout"],
+  ...["fixed", "packs", "device", "seed"],
+];
+
+export function fieldsOf(schema: Schema): { first: Field[]; rest: Field[] } {
+  const properties = schema.properties ?? {};
+  const fields = Object.entries(properties)
+    .filter(([name]) => name !== "preset")
+    .map(([name, said]) => fieldOf(name, said));
+  const first = FIRST.flatMap((name) => fields.filter((field) => field.name === name));
+  return { first, rest: fields.filter((field) => !FIRST.includes(field.name)) };
+}
+
+function fieldOf(name: string, said: Schema): Field {
+  // `T | null`: null is "as the preset says".
+  const type = said.anyOf?.find((one) => one.type !== "null") ?? said;
+  const items = type.items?.enum?.map(String);
+  const field: Field = {
+    ...{ name, help: said.description ?? "", kind: "words", choices: [] },
+    whole: type.type === "integer",
+    least: type.minimum ?? type.exclusiveMinimum ?? null,
+    most: type.maximum ?? type.exclusiveMaximum ?? null,
+  };
+  if (type.enum) return { ...field, kind: "choice", choices: type.enum.map(String) };
+  if (type.type === "boolean") return { ...field, kind: "yes-no", choices: ["true", "false"] };
+  if (type.type === "integer" || type.type === "number") return { ...field, kind: "number" };
+  if (type.type === "array" && items) return { ...field, kind: "several", choices: items };
+  return field;
+}
+
+/** What holds where a field is left empty. */
+export function presetValue(view: OptionsView, preset: string, name: string): string {
+  return words(view.presets[preset]?.[name] ?? view.json_schema.properties?.[name]?.default);
+}
+
+export function words(value: unknown): string {
+  if (value === null || value === undefined) return "decided by the run";
+  if (Array.isArray(value)) return value.length ? value.join(", ") : "none";
+  return typeof value === "boolean" ? (value ? "yes" : "no") : String(value);
+}
+
+/** What the form's text means; undefined: left to the preset. */
+export function parsed(field: Field, text: string): unknown {
+  const trimmed = text.trim();
+  if (!trimmed) return undefined;
+  if (field.kind === "number") return Number(trimmed);
+  if (field.kind === "yes-no") return trimmed === "true";
+  if (field.kind === "words") {
+    const words = trimmed.split(/[\n,]/).map((word) => word.trim());
+    return words.filter(Boolean);
+  }
+  return trimmed;
+}

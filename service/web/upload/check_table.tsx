@@ -1,0 +1,104 @@
+// What the service's check of a set says, line by line, as it comes to know it.
+import type { ComponentChildren } from "preact";
+import type { DatasetView } from "../service/answers";
+import { bytes, count } from "../format";
+
+type Mark = "good" | "note" | "bad" | "wait";
+const MARKS: Record<Mark, [string, string]> = {
+  good: ["✓", "good"],
+  note: ["!", "note"],
+  bad: ["✕", "wrong"],
+  wait: ["…", "not known yet"],
+};
+const INTRINSICS: Record<string, string> = {
+  given: "given",
+  exif: "from EXIF",
+  colmap: "from COLMAP",
+  guessed: "guessed; refined with the poses",
+};
+
+export function CheckTable({ dataset }: { dataset: DatasetView }) {
+  const { report } = dataset;
+  const checking = dataset.state === "finalizing";
+  const rejected = dataset.state === "rejected";
+  return (
+    <section class="card" aria-label="Check of the set">
+      <h2>
+        Check{" "}
+        <span class={`chip chip-${rejected ? "bad" : report ? "good" : "plain"}`} role="status">
+          {rejected ? "not accepted" : report ? "ready" : checking ? "checking every image …" : "waiting for files"}
+        </span>
+      </h2>
+      <table class="checks">
+        <tbody>
+          <Line mark={dataset.missing.length ? "wait" : "good"} name="Files">
+            {count(dataset.files, "file")}, {bytes(dataset.bytes)}
+            {dataset.missing.length > 0 && `; ${dataset.missing.length} to come`}
+          </Line>
+          {rejected && dataset.error && (
+            <Line mark="bad" name={dataset.error.where || "The set"}>
+              {dataset.error.detail}
+            </Line>
+          )}
+          {report ? <Found dataset={dataset} /> : !rejected && <Unknown />}
+        </tbody>
+      </table>
+    </section>
+  );
+}
+
+function Found({ dataset }: { dataset: DatasetView }) {
+  const report = dataset.report!;
+  const posed = report.with_pose;
+  return (
+    <>
+      <Line mark="good" name="Images">
+        {count(report.images, "image")}, each decoded in full; {report.format}
+      </Line>
+      <Line mark={report.without_pose ? "note" : "good"} name="Poses">
+        {posed} of {report.images} given
+        {posed === 0 && "; COLMAP looks for them first"}
+        {posed > 0 && report.without_pose > 0 && "; the others are looked for"}
+      </Line>
+      <Line mark="good" name="Cameras">
+        {count(report.cameras, "camera")}: {report.camera_models.join(", ")}; intrinsics{" "}
+        {report.intrinsics.map((source) => INTRINSICS[source] ?? source).join(", ")}
+      </Line>
+      <Line mark="good" name="Masks">
+        {report.masks ? count(report.masks, "mask") : "none"}
+        {report.transparency && "; transparent images, taken on white"}
+      </Line>
+      {report.warnings.map((warning) => (
+        <Line key={warning} mark="note" name="Warning">
+          {warning}
+        </Line>
+      ))}
+    </>
+  );
+}
+
+function Unknown() {
+  return (
+    <>
+      {["Images", "Poses", "Cameras", "Masks"].map((name) => (
+        <Line key={name} mark="wait" name={name}>
+          <span class="soft">not known yet</span>
+        </Line>
+      ))}
+    </>
+  );
+}
+
+function Line({ mark, name, children }: { mark: Mark; name: string; children: ComponentChildren }) {
+  const [sign, word] = MARKS[mark];
+  return (
+    <tr>
+      <td class={`mark ${mark}`}>
+        <span aria-hidden="true">{sign}</span>
+        <span class="unseen">{word}</span>
+      </td>
+      <th scope="row">{name}</th>
+      <td>{children}</td>
+    </tr>
+  );
+}

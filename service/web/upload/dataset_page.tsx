@@ -1,0 +1,146 @@
+// A set of images: on its way, checked, and what to do with it.
+import { useCallback, useEffect, useState } from "preact/hooks";
+import type { DatasetView, JobView } from "../service/answers";
+import { asProblem, call, pause, type Problem } from "../service/http";
+import { Store, useStore } from "../service/store";
+import { bytes, count, duration, percent } from "../format";
+import { OptionsForm } from "../options/form";
+import type { Values } from "../options/schema";
+import { ProblemBox } from "../problem_box";
+import { useTitle } from "../title";
+import { CheckTable } from "./check_table";
+import { DropZone } from "./drop";
+import { goOn, sendings, type Sending } from "./send";
+
+const LOOK_EVERY_MS = 700;
+const NOBODY = new Store<Sending | null>(null);
+
+export function DatasetPage({ id }: { id: string }) {
+  const { dataset, problem, look } = useDataset(id);
+  const [, redraw] = useState(0);
+  const sending = useStore<Sending | null>((sendings.get(id) as Store<Sending | null> | undefined) ?? NOBODY);
+  useTitle(dataset ? `${dataset.name} · new job` : "New job");
+  useEffect(look, [sending?.phase]);
+  if (problem) return <ProblemBox problem={problem} />;
+  if (!dataset) return <p class="soft">Loading …</p>;
+  const interrupted = dataset.state === "open" && (!sending || sending.phase === "stopped");
+  return (
+    <div class="dataset">
+      <header class="page-head">
+        <p class="soft">New job</p>
+        <h1>{dataset.name}</h1>
+      </header>
+      {sending && dataset.state === "open" && <Progress sending={sending} />}
+      {sending?.problem && <ProblemBox problem={sending.problem} />}
+      {interrupted && (
+        <section class="card">
+          <h2>Some files are still to come</h2>
+          <p>
+            {count(dataset.files, "file")} arrived
+            {dataset.missing.length > 0 && `, ${count(dataset.missing.length, "file")} are missing`}. Choose the same
+            folder again: only what is missing is sent.
+          </p>
+          <DropZone
+            compact
+            onChosen={async (chosen) => {
+              await goOn(dataset, chosen);
+              redraw((n) => n + 1);
+            }}
+          />
+        </section>
+      )}
+      <CheckTable dataset={dataset} />
+      {dataset.state === "rejected" && dataset.error && (
+        <ProblemBox problem={dataset.error} heading="The set was not accepted" />
+      )}
+      {dataset.state === "rejected" && <DropZone compact />}
+      {dataset.state === "ready" && <Submit dataset={dataset} />}
+    </div>
+  );
+}
+
+function useDataset(id: string) {
+  const [dataset, setDataset] = useState<DatasetView | null>(null);
+  const [problem, setProblem] = useState<Problem | null>(null);
+  const [asked, setAsked] = useState(0);
+  useEffect(() => {
+    let gone = false;
+    void (async () => {
+      while (!gone) {
+        try {
+          const seen = await call<DatasetView>("GET", `v1/datasets/${id}`);
+          if (gone) return;
+          setDataset(seen);
+          setProblem(null);
+          if (seen.state !== "finalizing" && seen.state !== "open") return;
+        } catch (error) {
+          const told = asProblem(error);
+          if (gone) return;
+          setProblem(told);
+          if (!told.passing) return;
+        }
+        await pause(LOOK_EVERY_MS);
+      }
+    })();
+    return () => {
+      gone = true;
+    };
+  }, [id, asked]);
+  return { dataset, problem, look: useCallback(() => setAsked((n) => n + 1), []) };
+}
+
+function Progress({ sending }: { sending: Sending }) {
+  const share = sending.bytes ? Math.min(1, sending.bytesDone / sending.bytes) : 1;
+  const seconds = (Date.now() - sending.startedAt) / 1000;
+  const rate = seconds > 1 ? sending.bytesDone / seconds : 0;
+  const left = rate && sending.phase === "sending" ? (sending.bytes - sending.bytesDone) / rate : null;
+  return (
+    <section class="card" aria-label="Upload">
+      <div class="meter-head">
+        <strong>{sending.phase === "stopped" ? "Stopped" : sending.phase === "sending" ? "Sending" : "Sent"}</strong>
+        <span>
+          {bytes(Math.min(sending.bytesDone, sending.bytes))} of {bytes(sending.bytes)} · {sending.filesDone} of{" "}
+          {count(sending.files, "file")}
+          {left !== null && ` · ${duration(left)} left`}
+        </span>
+      </div>
+      <progress max={1} value={share} aria-label="Upload">
+        {percent(share)}
+      </progress>
+      <p class="soft" role="status">
+        {sending.waiting && `${sending.waiting}; trying again`}
+        {!sending.waiting && sending.known > 0 && `${count(sending.known, "file")} the service had already`}
+      </p>
+    </section>
+  );
+}
+
+function Submit({ dataset }: { dataset: DatasetView }) {
+  const [values, setValues] = useState<Values>({ preset: "balanced" });
+  const [problem, setProblem] = useState<Problem | null>(null);
+  const [busy, setBusy] = useState(false);
+  const submit = async (event: Event) => {
+    event.preventDefault();
+    setBusy(true);
+    setProblem(null);
+    try {
+      const json = { dataset_id: dataset.id, options: values, labels: { name: dataset.name.slice(0, 100) } };
+      location.hash = `#/jobs/${(await call<JobView>("POST", "v1/jobs", { json })).id}`;
+    } catch (error) {
+      setProblem(asProblem(error));
+      setBusy(false);
+    }
+  };
+  return (
+    <form class="card" onSubmit={submit} aria-label="Options">
+      <h2>What to do</h2>
+      <OptionsForm values={values} onChange={setValues} problems={problem?.errors ?? []} />
+      {problem && <ProblemBox problem={problem} />}
+      <p class="submit">
+        <button class="act primary" disabled={busy}>
+          {busy ? "Submitting …" : "Refine the poses"}
+        </button>
+      </p>
+    </form>
+  );
+}

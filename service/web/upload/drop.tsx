@@ -1,0 +1,87 @@
+// Where sets are dropped or chosen.
+import { useEffect, useRef, useState } from "preact/hooks";
+import { asProblem, type Problem } from "../service/http";
+import { percent } from "../format";
+import { ProblemBox } from "../problem_box";
+import { fromDrop, fromInput, type Chosen, type Gathered } from "./gather";
+import { begin } from "./send";
+
+interface Props {
+  /** What becomes of the files; tells how far it is while it takes time. */
+  onChosen?: (chosen: Chosen[]) => Promise<void>;
+  compact?: boolean;
+}
+
+export function DropZone({ onChosen, compact = false }: Props) {
+  const [over, setOver] = useState(false);
+  const [said, setSaid] = useState("");
+  const [problem, setProblem] = useState<Problem | null>(null);
+  const take = async (gathered: Promise<Gathered>) => {
+    setOver(false);
+    setProblem(null);
+    setSaid("Reading …");
+    try {
+      const chosen = await gathered;
+      if (!chosen.files.length) setSaid("There are no files in it.");
+      else if (onChosen) await onChosen(chosen.files);
+      else location.hash = `#/datasets/${await begin(chosen, (share) => setSaid(`Reading … ${percent(share)}`))}`;
+    } catch (error) {
+      setSaid("");
+      setProblem(asProblem(error));
+    }
+  };
+  return (
+    <section
+      class={`drop ${over ? "over" : ""} ${compact ? "compact" : ""}`}
+      aria-label="New set of images"
+      onDragOver={(event) => {
+        event.preventDefault();
+        setOver(true);
+      }}
+      onDragLeave={() => setOver(false)}
+      onDrop={(event) => {
+        event.preventDefault();
+        if (event.dataTransfer) void take(fromDrop(event.dataTransfer));
+      }}
+    >
+      <div class="drop-words">
+        <p class="drop-lead">Drop a folder of images, a COLMAP model with its images, or an archive</p>
+        <p class="soft">
+          transforms.json (nerfstudio, instant-ngp, Blender), COLMAP, LLFF, TUM, KITTI, Bundler, Metashape; zip, tar,
+          tar.gz. Without poses, COLMAP looks for them.
+        </p>
+      </div>
+      <div class="drop-buttons">
+        <FileButton label="Choose a folder" folder onFiles={(files) => void take(Promise.resolve(fromInput(files)))} />
+        <FileButton label="Choose files" onFiles={(files) => void take(Promise.resolve(fromInput(files)))} />
+      </div>
+      <p class="drop-said" role="status">
+        {said}
+      </p>
+      {problem && <ProblemBox problem={problem} />}
+    </section>
+  );
+}
+
+function FileButton(props: { label: string; folder?: boolean; onFiles: (files: FileList) => void }) {
+  const input = useRef<HTMLInputElement>(null);
+  useEffect(() => {
+    if (props.folder) input.current?.setAttribute("webkitdirectory", "");
+  }, [props.folder]);
+  return (
+    <label class={props.folder ? "act primary" : "act"}>
+      {props.label}
+      <input
+        ref={input}
+        class="unseen"
+        type="file"
+        multiple
+        onChange={(event) => {
+          const { files } = event.currentTarget;
+          if (files?.length) props.onFiles(files);
+          event.currentTarget.value = "";
+        }}
+      />
+    </label>
+  );
+}

@@ -1,0 +1,176 @@
+// Brings files to the service: only those it has not, several at a time, each again where the connection breaks.
+import type { DatasetView } from "../service/answers";
+import { address, asProblem, call, noteRefusal, pause, Problem, withKey } from "../service/http";
+import { Store } from "../service/store";
+import { isArchive, type Chosen, type Gathered } from "./gather";
+import { sendArchive } from "./resumable";
+
+const AT_ONCE = 4;
+const TRIES = 6;
+/** Beyond this a file is not held in memory to be hashed; it is sent without its digest. */
+const HASHED_MAX_BYTES = 256 * 2 ** 20;
+
+export interface Sending {
+  phase: "hashing" | "sending" | "checking" | "done" | "stopped";
+  files: number;
+  filesDone: number;
+  /** Files that the service had already. */
+  known: number;
+  bytes: number;
+  bytesDone: number;
+  startedAt: number;
+  /** A passing fault: the page tries again. */
+  waiting: string;
+  problem: Problem | null;
+}
+
+/** What is on its way from this tab, by dataset. */
+export const sendings = new Map<string, Store<Sending>>();
+
+const NOTHING: Sending = {
+  ...{ phase: "hashing", files: 0, filesDone: 0, known: 0, bytes: 0, bytesDone: 0 },
+  ...{ startedAt: 0, waiting: "", problem: null },
+};
+
+interface Entry extends Chosen {
+  sha256: string | null;
+}
+
+/** Makes a dataset and sends the files in the background; returns its id once it is there. Throws `Problem`. */
+export async function begin(gathered: Gathered, onHashing: (share: number) => void): Promise<string> {
+  const chosen = gathered.files;
+  const name = gathered.name.slice(0, 200) || "dataset";
+  const bytes = chosen.reduce((sum, { file }) => sum + file.size, 0);
+  const state = new Store<Sending>({ ...NOTHING, files: chosen.length, bytes, startedAt: Date.now() });
+  if (isArchive(chosen)) {
+    const file = chosen[0]!.file;
+    return keep(await sendArchive(file, name, state), state);
+  }
+  const entries = await hashed(chosen, bytes, onHashing);
+  const manifest = entries.map(({ path, file, sha256 }) => ({ path, size: file.size, ...(sha256 && { sha256 }) }));
+  const dataset = await call<DatasetView>("POST", "v1/datasets", { json: { name, manifest } });
+  return keep({ dataset: dataset.id, sent: sendMissing(dataset, entries, state) }, state);
+}
+
+/** Goes on with a dataset of which some files never arrived. Throws `Problem` where these are other files. */
+export async function goOn(dataset: DatasetView, chosen: Chosen[]): Promise<void> {
+  const bytes = chosen.reduce((sum, { file }) => sum + file.size, 0);
+  const state = new Store<Sending>({ ...NOTHING, files: chosen.length, bytes, startedAt: Date.now() });
+  const have = new Set(chosen.map(({ path }) => path));
+  const lacking = dataset.missing.filter((path) => !have.has(path));
+  if (lacking.length) {
+    const detail = `${lacking.length} of the missing files are not among these, for example ${lacking[0]}.`;
+    throw new Problem(0, "other_files", "These are other files", detail, "Choose the folder that was sent before.");
+  }
+  const entries = chosen.map((item) => ({ ...item, sha256: null }));
+  keep({ dataset: dataset.id, sent: sendMissing(dataset, entries, state) }, state);
+}
+
+function keep(begun: { dataset: string; sent: Promise<void> }, state: Store<Sending>): string {
+  sendings.set(begun.dataset, state);
+  begun.sent
+    .then(() => finalize(begun.dataset, state))
+    .catch((error) => state.change({ phase: "stopped", problem: asProblem(error) }));
+  return begun.dataset;
+}
+
+async function finalize(dataset: string, state: Store<Sending>): Promise<void> {
+  state.change({ phase: "checking", waiting: "" });
+  try {
+    await call("POST", `v1/datasets/${dataset}/finalize`, { headers: { Prefer: "respond-async" } });
+  } catch (error) {
+    // What is wrong with the set stands in the dataset; the page shows it from there.
+    if (asProblem(error).status !== 422) throw error;
+  }
+  state.change({ phase: "done" });
+}
+
+async function hashed(chosen: Chosen[], bytes: number, onHashing: (share: number) => void): Promise<Entry[]> {
+  // Browsers have no digests on pages that came over plain HTTP from another machine.
+  const subtle = globalThis.crypto?.subtle;
+  const entries: Entry[] = [];
+  let done = 0;
+  for (const item of chosen) {
+    const digest = subtle && item.file.size <= HASHED_MAX_BYTES;
+    entries.push({ ...item, sha256: digest ? hex(await subtle.digest("SHA-256", await item.file.arrayBuffer())) : null });
+    done += item.file.size;
+    onHashing(bytes ? done / bytes : 1);
+  }
+  return entries;
+}
+
+async function sendMissing(dataset: DatasetView, entries: Entry[], state: Store<Sending>): Promise<void> {
+  const missing = new Set(dataset.missing);
+  const queue = entries.filter(({ path }) => missing.has(path));
+  const known = entries.length - queue.length;
+  const atHand = entries.filter(({ path }) => !missing.has(path)).reduce((sum, { file }) => sum + file.size, 0);
+  state.change({ phase: "sending", filesDone: known, known, bytesDone: atHand });
+  const lane = async () => {
+    for (let entry = queue.shift(); entry; entry = queue.shift()) await sendFile(dataset.id, entry, state);
+  };
+  await Promise.all(Array.from({ length: AT_ONCE }, lane));
+}
+
+async function sendFile(dataset: string, entry: Entry, state: Store<Sending>): Promise<void> {
+  const path = entry.path.split("/").map(encodeURIComponent).join("/");
+  const headers: Record<string, string> = entry.sha256 ? { "Repr-Digest": `sha-256=:${base64(entry.sha256)}:` } : {};
+  let told = 0;
+  const onSent = (sent: number) => {
+    state.change({ bytesDone: state.value.bytesDone + sent - told });
+    told = sent;
+  };
+  await persistently(state, async () => {
+    onSent(0);
+    await put("PUT", `v1/datasets/${dataset}/files/${path}`, headers, entry.file, onSent);
+  });
+  onSent(entry.file.size);
+  state.change({ filesDone: state.value.filesDone + 1 });
+}
+
+/** Tries again while the fault is one that passes. */
+export async function persistently(state: Store<Sending>, attempt: () => Promise<void>): Promise<void> {
+  for (let tried = 1; ; tried += 1) {
+    try {
+      await attempt();
+      if (state.value.waiting) state.change({ waiting: "" });
+      return;
+    } catch (error) {
+      const problem = asProblem(error);
+      if (!problem.passing || tried === TRIES) throw problem;
+      state.change({ waiting: problem.title });
+      await pause(Math.max(1000 * problem.waitS, Math.min(15000, 500 * 2 ** tried)));
+    }
+  }
+}
+
+/** Sends a body and tells how much of it is on its way, which fetch cannot. */
+export function put(
+  method: string,
+  path: string,
+  headers: Record<string, string>,
+  body: Blob,
+  onSent: (bytes: number) => void,
+): Promise<XMLHttpRequest> {
+  return new Promise((done, failed) => {
+    const request = new XMLHttpRequest();
+    request.open(method, address(path));
+    for (const [name, value] of Object.entries(withKey(headers))) request.setRequestHeader(name, value);
+    if (!("Content-Type" in headers)) request.setRequestHeader("Content-Type", "application/octet-stream");
+    request.upload.onprogress = (event) => onSent(event.loaded);
+    request.onerror = () => failed(Problem.unreachable());
+    request.onload = () => {
+      if (request.status < 300) return done(request);
+      const problem = Problem.of(request.status, request.responseText, request.getResponseHeader("Retry-After"));
+      failed(noteRefusal(problem));
+    };
+    request.send(body);
+  });
+}
+
+function hex(digest: ArrayBuffer): string {
+  return [...new Uint8Array(digest)].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+function base64(sha256: string): string {
+  return btoa(sha256.replace(/../g, (pair) => String.fromCharCode(parseInt(pair, 16))));
+}

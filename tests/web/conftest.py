@@ -1,0 +1,186 @@
+"""A real browser on a real service with one real, small job, shared by all tests here."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from click.testing import CliRunner
+from playwright.sync_api import Browser, BrowserContext, Locator, Page, Route, expect, sync_playwright
+
+import hatch_build
+from biresnerf.commands.make_scene import make_scene_command
+from tests.service.conftest import Running, running_service, short_folder
+
+ROOT = Path(__file__).resolve().parents[2]
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+SCREENSHOTS = ROOT / "build" / "screenshots"
+AXE = ROOT / "node_modules" / "axe-core" / "axe.min.js"
+ARGUMENTS = [
+    *("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+]
+DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 360, "height": 740}
+# On a machine that others use as well.
+PATIENCE_MS = 480_000
+expect.set_options(timeout=PATIENCE_MS)
+# What of a page's accessibility may not be wrong.
+SERIOUS = {"serious", "critical"}
+
+
+# Of this folder, not of the session: its event loop runs in the main thread, where other tests want their own.
+@pytest.fixture(scope="package")
+def browser() -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip(
+            "There is no Chromium (Debian: apt install chromium): the page is not tested in a browser."
+        )
+    if not hatch_build.is_built(ROOT):
+        pytest.skip("The page is not built, or of other sources; make web builds it.")
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="package")
+def service(browser: Browser) -> Iterator[Running]:
+    """`biresnerf up`, with the real job program. Without a browser it is not started."""
+    with short_folder() as folder, running_service(folder) as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of images with poses that are wrong by a known amount."""
+    folder = tmp_path_factory.mktemp("sets") / "kitchen"
+    said = CliRunner().invoke(
+        make_scene_command, [str(folder), "--views", "10", "--size", "40", "--noise", "0.1", "--seed", "1"]
+    )
+    assert said.exit_code == 0, said.output
+    return folder
+
+
+@dataclass
+class Watched:
+    """A page, and what it asked for and complained of."""
+
+    page: Page
+    outside: list[str] = field(default_factory=list)
+    complaints: list[str] = field(default_factory=list)
+
+    def screenshot(self, name: str, *, full: bool = True) -> None:
+        SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+        self.page.screenshot(path=SCREENSHOTS / f"{name}.png", full_page=full)
+
+    def serious_findings(self) -> list[str]:
+        """What axe finds wrong here, by rule and place."""
+        # A script tag would be against the page's own policy.
+        self.page.evaluate(AXE.read_text())
+        found: dict[str, Any] = self.page.evaluate("axe.run(document, {resultTypes: ['violations']})")
+        return [
+            f"{one['id']}: {node['target']} {node['failureSummary']}"
+            for one in found["violations"]
+            if one["impact"] in SERIOUS
+            for node in one["nodes"]
+        ]
+
+    def overflows(self) -> bool:
+        """Whether one would have to scroll sideways."""
+        width = "document.documentElement.scrollWidth > document.documentElement.clientWidth"
+        return bool(self.page.evaluate(width))
+
+
+def watched_page(context: BrowserContext, origin: str) -> Watched:
+    """A page that reaches the service alone; what else it asks for is refused and noted."""
+    watched = Watched(context.new_page())
+
+    def decide(route: Route) -> None:
+        url = route.request.url
+        if url.startswith((origin, "blob:", "data:")):
+            route.continue_()
+        else:
+            watched.outside.append(url)
+            route.abort()
+
+    context.route("**/*", decide)
+    watched.page.on("pageerror", lambda error: watched.complaints.append(str(error)))
+    watched.page.on(
+        "console", lambda said: watched.complaints.append(said.text) if said.type == "error" else None
+    )
+    watched.page.set_default_timeout(PATIENCE_MS)
+    return watched
+
+
+@pytest.fixture(scope="package")
+def desktop(browser: Browser, service: Running) -> Iterator[Watched]:
+    """One tab for the whole walk, as a user has it."""
+    context = browser.new_context(viewport=DESKTOP, accept_downloads=True)
+    yield watched_page(context, service.url)
+    context.close()
+
+
+@pytest.fixture(scope="package")
+def phone(browser: Browser, service: Running) -> Iterator[Watched]:
+    context = browser.new_context(viewport=PHONE, has_touch=True, is_mobile=True, color_scheme="dark")
+    yield watched_page(context, service.url)
+    context.close()
+
+
+@pytest.fixture(scope="package")
+def api(service: Running) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=f"{service.url}/v1", timeout=60.0) as client:
+        yield client
+
+
+def check_row(page: Page, name: str) -> Locator:
+    """A line of the check's table."""
+    return page.locator(".checks tr", has=page.get_by_role("rowheader", name=name, exact=True))
+
+
+@pytest.fixture(scope="package")
+def job_url(desktop: Watched, service: Running, kitchen: Path) -> str:
+    """The address of a job that was sent through the page; it runs."""
+    page = desktop.page
+    page.goto(service.url)
+    expect(page.get_by_text("No jobs yet")).to_be_visible()
+    desktop.screenshot("start")
+    page.locator("input[type=file]").first.set_input_files(kitchen)
+    submit = page.get_by_role("button", name="Refine the poses")
+    expect(submit).to_be_visible()
+    expect(check_row(page, "Poses")).to_contain_text("10 of 10 given")
+    assert desktop.serious_findings() == []
+    page.get_by_text("A look within minutes").click()
+    page.get_by_label("steps", exact=True).fill("500")
+    page.get_by_label("start", exact=True).select_option("given")
+    page.get_by_text("Method and schedule").click()
+    for name, value in (
+        ("checkpoint_every_s", 2),
+        ("coarse_steps_min", 100),
+        ("coarse_steps_max", 200),
+        ("check_every", 10),
+        ("samples_per_step", 4096),
+        ("trial_steps", 20),
+        ("orbit_frames", 4),
+    ):
+        page.get_by_label(name, exact=True).fill(str(value))
+    desktop.screenshot("new-job")
+    submit.click()
+    page.wait_for_url("**/#/jobs/*")
+    return page.url
+
+
+@pytest.fixture(scope="package")
+def done(desktop: Watched, job_url: str, api: httpx.Client) -> dict[str, Any]:
+    """The same job, over; the tab shows it."""
+    page = desktop.page
+    page.goto(job_url)
+    expect(page.get_by_role("heading", name="Downloads")).to_be_visible()
+    job: dict[str, Any] = api.get(f"/jobs/{job_url.rpartition('/')[2]}").json()
+    assert job["state"] == "succeeded", job
+    return job

@@ -1,0 +1,216 @@
+"""What a user does: sends a set, watches the job, looks at the result, takes it away."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import shlex
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import httpx
+from playwright.sync_api import Page, expect
+
+from tests.service.conftest import Running
+from tests.web.conftest import Watched
+
+
+def curve_end(page: Page) -> int:
+    """The last step that the curves have reached."""
+    chart = page.get_by_role("img", name="PSNR of the training views")
+    expect(chart).to_be_visible()
+    return int((chart.get_attribute("aria-label") or "").rpartition("step ")[2].rstrip("."))
+
+
+def test_progress_is_live_and_a_reload_keeps_the_curves(desktop: Watched, job_url: str) -> None:
+    page = desktop.page
+    expect(page.get_by_role("img", name="render of one view")).to_be_visible()
+    bar = page.get_by_role("progressbar", name="Progress of kitchen")
+    before = curve_end(page)
+    share = int(bar.get_attribute("aria-valuenow") or 0)
+    desktop.screenshot("job-running")
+    page.wait_for_function(
+        "was => Number(document.querySelector('[role=progressbar]').getAttribute('aria-valuenow')) > was",
+        arg=share,
+    )
+    page.reload()
+    assert curve_end(page) >= before
+
+
+def test_the_slider_goes_from_the_inputs_poses_to_the_refined_ones(
+    desktop: Watched, done: dict[str, Any]
+) -> None:
+    page = desktop.page
+    slider = page.get_by_role("slider", name="From the input's poses to the refined ones")
+    stage = page.get_by_role("application")
+    slider.press("End")
+    refined = stage.screenshot()
+    slider.press("Home")
+    assert slider.input_value() != ""
+    assert stage.screenshot() != refined
+    slider.press("End")
+
+
+def test_the_swipe_uncovers_the_photo(desktop: Watched, done: dict[str, Any]) -> None:
+    page = desktop.page
+    swipe = page.get_by_role("slider", name="Swipe between photo and render")
+    frame = page.locator(".compare-frame")
+    swipe.press("Home")
+    all_render = frame.screenshot()
+    swipe.press("End")
+    assert frame.screenshot() != all_render
+    for mode in ("difference", "depth"):
+        page.get_by_role("radio", name=mode).check()
+        picture = page.locator(".compare-figure img").first
+        expect(picture).to_be_visible()
+        page.wait_for_function("() => document.querySelector('.compare-figure img').naturalWidth > 0")
+
+
+def test_the_table_sorts_and_chooses(desktop: Watched, done: dict[str, Any]) -> None:
+    page = desktop.page
+    table = page.get_by_role("region", name="Table of images")
+    turned = table.get_by_role("columnheader").filter(has_text="turned")
+    turned.get_by_role("button").click()
+    turned.get_by_role("button").click()
+    place = [text.strip() for text in table.get_by_role("columnheader").all_inner_texts()]
+    column = next(n for n, text in enumerate(place) if text.startswith("turned"))
+    values = [
+        float(row.locator("td, th").nth(column).inner_text()) for row in table.get_by_role("row").all()[1:]
+    ]
+    assert len(values) == 10
+    assert values in (sorted(values), sorted(values, reverse=True))
+    table.get_by_role("row").nth(4).get_by_role("button").click()
+    expect(table.locator("tr[aria-current]")).to_have_count(1)
+
+
+def test_the_verdict_is_the_reports(desktop: Watched, done: dict[str, Any], api: httpx.Client) -> None:
+    said = api.get(f"/jobs/{done['id']}/report").json()["verdict"]
+    assert said["verdict"] == done["verdict"]
+    shown = desktop.page.get_by_role("region", name="Verdict").inner_text()
+    assert {"improved": "improved", "kept_input": "kept"}.get(
+        said["verdict"], said["verdict"]
+    ).lower() in shown.lower()
+    desktop.screenshot("job-done")
+
+
+def test_downloads_are_the_artifacts_to_the_byte(
+    desktop: Watched, done: dict[str, Any], api: httpx.Client
+) -> None:
+    page = desktop.page
+    digests = {
+        item["name"]: item["sha256"] for item in api.get(f"/jobs/{done['id']}/artifacts").json()["items"]
+    }
+    with page.expect_download() as coming:
+        page.get_by_role("link", name="Download For nerfstudio").click()
+    sent = Path(coming.value.path()).read_bytes()
+    assert coming.value.suggested_filename == "transforms.json"
+    assert hashlib.sha256(sent).hexdigest() == digests["transforms.json"]
+    with page.expect_download() as coming:
+        page.get_by_role("button", name="Download .zip For COLMAP", exact=True).click()
+    with zipfile.ZipFile(io.BytesIO(Path(coming.value.path()).read_bytes())) as archive:
+        assert archive.testzip() is None
+        found = {name: hashlib.sha256(archive.read(name)).hexdigest() for name in archive.namelist()}
+    assert found == {name: sha for name, sha in digests.items() if name.startswith("colmap/sparse/")}
+    assert found
+
+
+def test_the_lines_beside_a_download_bring_the_same(
+    desktop: Watched, done: dict[str, Any], api: httpx.Client, tmp_path: Path
+) -> None:
+    page = desktop.page
+    row = page.get_by_role("listitem").filter(has_text="For COLMAP").first
+    row.get_by_role("button", name="curl, Python").click()
+    python = row.get_by_label("Python", exact=True).inner_text()
+    subprocess.run([sys.executable, "-c", python], cwd=tmp_path, check=True)
+    digests = {
+        item["name"]: item["sha256"] for item in api.get(f"/jobs/{done['id']}/artifacts").json()["items"]
+    }
+    brought = tmp_path / "result"
+    found = {
+        path.relative_to(brought).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in brought.rglob("*")
+        if path.is_file()
+    }
+    assert found == {name: sha for name, sha in digests.items() if name.startswith("colmap/sparse/")}
+    row = page.get_by_role("listitem").filter(has_text="For nerfstudio")
+    row.get_by_role("button", name="curl, Python").click()
+    curl = row.get_by_label("curl", exact=True).inner_text()
+    subprocess.run(shlex.split(curl), cwd=tmp_path, check=True, capture_output=True)
+    sent = (tmp_path / "transforms.json").read_bytes()
+    assert hashlib.sha256(sent).hexdigest() == digests["transforms.json"]
+
+
+def test_a_form_that_is_not_there_is_written_on_demand(desktop: Watched, done: dict[str, Any]) -> None:
+    row = desktop.page.get_by_role("listitem").filter(has_text="For odometry tools")
+    row.get_by_role("button", name="Write it").click()
+    expect(row.get_by_role("link", name="Download For odometry tools")).to_be_visible()
+    row.get_by_role("button", name="curl, Python").click()
+    expect(row.get_by_label("curl", exact=True)).to_contain_text("/artifacts/kitti.txt")
+
+
+def test_the_list_shows_the_job_with_its_picture_and_verdict(desktop: Watched, done: dict[str, Any]) -> None:
+    page = desktop.page
+    page.get_by_role("link", name="Jobs").click()
+    card = page.get_by_role("link").filter(has_text="kitchen")
+    page.wait_for_function("() => document.querySelector('.job-card img')?.naturalWidth > 0")
+    expect(card.locator(".chip")).to_be_visible()
+    desktop.screenshot("jobs")
+    assert desktop.serious_findings() == []
+
+
+def test_all_of_it_can_be_reached_by_keyboard(desktop: Watched, done: dict[str, Any]) -> None:
+    page = desktop.page
+    page.get_by_role("link", name="Jobs").focus()
+    reached = []
+    for _ in range(12):
+        page.keyboard.press("Tab")
+        reached.append(page.evaluate("document.activeElement.textContent"))
+        if "kitchen" in reached[-1]:
+            break
+    assert "kitchen" in reached[-1], reached
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", name="Downloads")).to_be_visible()
+    assert page.evaluate("document.activeElement.tagName") == "MAIN"
+    names = set()
+    for _ in range(120):
+        page.keyboard.press("Tab")
+        names.add(
+            page.evaluate("document.activeElement.ariaLabel || document.activeElement.textContent.trim()")
+        )
+    wanted = {
+        "Run again …",
+        "Delete",
+        "From the input's poses to the refined ones",
+        "Swipe between photo and render",
+    }
+    assert wanted <= names, names
+    page.get_by_role("button", name="Delete").press("Enter")
+    expect(page.get_by_role("dialog", name="Delete this job?")).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("dialog", name="Delete this job?")).to_be_hidden()
+
+
+def test_the_result_is_accessible_and_stayed_at_home(desktop: Watched, done: dict[str, Any]) -> None:
+    assert desktop.serious_findings() == []
+    assert desktop.outside == []
+    assert desktop.complaints == []
+
+
+def test_a_phone_shows_the_same_without_scrolling_sideways(
+    phone: Watched, job_url: str, done: dict[str, Any], service: Running
+) -> None:
+    page = phone.page
+    for name, url in (("phone-job", job_url), ("phone-jobs", service.url)):
+        page.goto(url)
+        expect(page.get_by_text("kitchen").first).to_be_visible()
+        if name == "phone-job":
+            expect(page.get_by_role("slider", name="Swipe between photo and render")).to_be_visible()
+            expect(page.locator(".curves canvas").first).to_be_visible()
+        phone.screenshot(name)
+        assert not phone.overflows(), name
+        assert phone.serious_findings() == []
+    assert phone.outside == []
+    assert phone.complaints == []
