@@ -70,7 +70,8 @@ def result(tmp_path_factory) -> Result:
     return Result(folder, report, json.loads((folder / view["poses"]).read_text()), view)
 
 
-@pytest.fixture(scope="session")
+# Not of the session: its event loop runs in the main thread, where other folders' tests want their own.
+@pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
     if not BUILT:
         pytest.skip("The viewer is not built; make web builds it.")
