@@ -16,6 +16,7 @@ import psutil
 import psycopg
 import pytest
 
+from tests.workers.buckets import environment_of, fresh_bucket, moto_server
 from tests.workers.conftest import (
     ROOT,
     Counting,
@@ -144,6 +145,29 @@ async def test_the_next_backup_takes_what_is_new_and_drops_what_was_deleted(home
         )
         assert [path.name for path in backup.glob("*.dump")] == [new.database]
         assert backup.stat().st_mode & 0o077 == 0
+
+
+async def test_what_lies_in_a_bucket_comes_back_into_another_one(home: Path):
+    backup, content = home / "backup", {"a.png": b"a" * 100_000, "b/c d.txt": b"c"}
+    with moto_server() as address:
+        buckets = [environment_of(fresh_bucket(address)) for _ in range(2)]
+        async with running(home / "old") as base:
+            settings = base.model_copy(update=buckets[0])
+            async with open_stores(settings) as stores:
+                dataset = await ready_dataset(stores, content)
+                made = await make_backup(settings, settings.require_database_url(), backup)
+                again = await make_backup(settings, settings.require_database_url(), backup)
+                assert again.files == made.files, "nothing is new, by the bucket's ETags"
+        async with empty(home / "new") as base:
+            settings = base.model_copy(update=buckets[1])
+            await restore_backup(settings, settings.require_database_url(), backup)
+            async with open_stores(settings) as stores:
+                assert (await stores.datasets.get(dataset)).state == "ready"
+                found = (await stores.datasets.files(dataset)).items
+                assert {
+                    file.path: b"".join([chunk async for chunk in stores.files.read(file.key)])
+                    for file in found
+                } == content
 
 
 async def test_a_damaged_backup_or_a_place_that_is_taken_is_refused_and_left_as_it_was(home: Path):
