@@ -27,7 +27,8 @@ export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: S
   const [before, setBefore] = useState(true);
   const [by, setBy] = useState<ColourBy>("moved_deg");
   const [caps, setCaps] = useState<Partial<Record<ColourBy, number>>>({});
-  const [layer, setLayer] = useState<string>(() => bestLayer(points));
+  const [chosenLayer, setLayer] = useState<string | null>(null);
+  const layer = chosenLayer ?? bestLayer(points); // points may come later than the cameras
   const [through, setThrough] = useState(false);
   const [failed, setFailed] = useState<string | null>(null);
   const host = useRef<HTMLDivElement>(null);

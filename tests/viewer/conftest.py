@@ -44,6 +44,7 @@ BUILT = (BUNDLE / "report.js").is_file()
 class Result:
     """A finished run."""
 
+    scene: Path
     folder: Path
     report: Report
     poses: dict[str, Any]
@@ -67,7 +68,7 @@ def result(tmp_path_factory) -> Result:
     write_transforms(dataset, perturb_poses(synthetic_cameras(VIEWS, seed=1), 0.15, seed=6), path)
     report = refine_poses(scene, folder, OPTIONS)
     view = json.loads((folder / "view.json").read_text())
-    return Result(folder, report, json.loads((folder / view["poses"]).read_text()), view)
+    return Result(scene, folder, report, json.loads((folder / view["poses"]).read_text()), view)
 
 
 # Not of the session: its event loop runs in the main thread, where other folders' tests want their own.

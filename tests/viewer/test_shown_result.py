@@ -9,10 +9,13 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.synthetic import synthetic_cameras
+from biresnerf.data.view_file import read_view_file
+from biresnerf.errors import Interrupted
+from biresnerf.pipeline import refine_poses
 from biresnerf.refine.shown_views import spread_views
 from biresnerf.viewer import report_html
 from biresnerf.viewer.report_html import read_report, write_report_html
-from tests.viewer.conftest import BUILT, SHOWN
+from tests.viewer.conftest import BUILT, OPTIONS, SHOWN
 
 built = pytest.mark.skipif(not BUILT, reason="The viewer is not built; make web builds it.")
 
@@ -110,3 +113,15 @@ def test_a_line_of_stage_1_says_what_the_detector_saw(result):
 
 def copy_of(folder, tmp_path):
     return shutil.copytree(folder, tmp_path / "out")
+
+
+def test_a_stopped_run_leaves_a_page_of_what_there_is(result, tmp_path):
+    steps = iter(range(30))
+    with pytest.raises(Interrupted):
+        refine_poses(result.scene, tmp_path / "out", OPTIONS, should_stop=lambda: next(steps, None) is None)
+    view = read_view_file(tmp_path / "out")
+    assert view.views == ()
+    assert (tmp_path / "out" / view.thumbnail).is_file()
+    assert view.contact_sheet is not None
+    if BUILT:
+        assert '"state":"partial"' in (tmp_path / "out" / "report.html").read_text()
