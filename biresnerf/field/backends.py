@@ -31,7 +31,7 @@ def choose_device(device: Device) -> torch.device:
     """
     if device == "cpu":
         return torch.device("cpu")
-    problem = _cuda_problem()
+    problem = cuda_problem()
     if problem is None:
         return torch.device("cuda")
     if device == "cuda":
@@ -46,7 +46,7 @@ def choose_device(device: Device) -> torch.device:
     return torch.device("cpu")
 
 
-def _cuda_problem() -> str | None:
+def cuda_problem() -> str | None:
     """Why the CUDA backend cannot run here."""
     if not torch.cuda.is_available():
         return "torch finds no CUDA device"
