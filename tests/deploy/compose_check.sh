@@ -93,7 +93,7 @@ PY
 build() { # image, arguments…
   local image=$1; shift
   # shellcheck disable=SC2046 # lists
-  nice -n 10 buildah bud --isolation chroot --format docker --layers $(build_mounts) -t "$image" "$@" \
+  buildah bud --isolation chroot --format docker --layers $(build_mounts) -t "$image" "$@" \
     >"$work/build-${image##*/}.log" 2>&1 || { tail -20 "$work/build-${image##*/}.log"; fail "building $image"; }
 }
 
@@ -104,7 +104,7 @@ base_images() {
     say "base image: $(podman image inspect "$python_image" --format '{{.Id}} {{.Created}}')"
   else
     say "no registry: base image from Debian's packages"
-    nice -n 10 debootstrap --variant=minbase --include=python3,python3-venv,python3-pip,ca-certificates bookworm \
+    debootstrap --variant=minbase --include=python3,python3-venv,python3-pip,ca-certificates bookworm \
       "$work/root" >"$work/debootstrap.log" 2>&1 || skip "debootstrap failed ($work/debootstrap.log)"
     ln -sf /usr/bin/python3 "$work/root/usr/local/bin/python"
     rm -rf "$work/root"/var/cache/apt/archives/*.deb "$work/root"/var/lib/apt/lists/*
