@@ -36,7 +36,7 @@ LIMITS = {
     "max_unpacked_bytes": 40 * MIB,
     "max_dataset_bytes": 48 * MIB,
 }
-PATIENCE_S = 40.0
+PATIENCE_S = 90.0
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def running_service(folder: Path, **settings: Any) -> Iterator[Running]:
     """`biresnerf up` on a free port; ended by SIGINT, as Ctrl-C does."""
     values = {
         "beat_s": 0.5,
-        "stall_s": 3.0,
+        "stall_s": 10.0,  # a worker that gets no processor for seconds is not dead
         "poll_s": 0.3,
         "janitor_s": 0.5,
         "data_dir": folder / "data",

@@ -55,7 +55,7 @@ def test_a_stream_tells_the_whole_story_and_ends(http: httpx.Client, dataset: st
     fractions = [job["progress"]["fraction"] for job in progress]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
-    assert 0 < fractions[len(fractions) // 2] < 1
+    assert any(0 < fraction < 1 for fraction in fractions)
     assert progress[-1]["state"] == "succeeded"
 
 
@@ -119,18 +119,19 @@ def web_process(service: Running) -> psutil.Process:
 def test_a_stopping_service_does_not_wait_for_its_followers(
     http: httpx.Client, service: Running, dataset: str
 ) -> None:
-    job = submit(http, dataset, steps=400, step_ms=50)
+    job = submit(http, dataset, steps=2000, step_ms=50)
     following = events(http, job)
     next(following)
     server = web_process(service)
-    began = time.monotonic()
     server.send_signal(signal.SIGTERM)
     for _ in following:
         pass
-    server.wait(10)
-    assert time.monotonic() - began < 4.0
+    server.wait(PATIENCE_S)
     with Client(service.url) as client:
         until_ready(client)
+    assert http.get(job["links"]["self"]).json()["state"] in {"queued", "running"}, (
+        "it did not wait for the end"
+    )
     http.post(job["links"]["cancel"])
     finished(http, job["id"])
 

@@ -11,7 +11,7 @@ import httpx
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
-from tests.service.conftest import ready_dataset, submit, until
+from tests.service.conftest import PATIENCE_S, ready_dataset, submit, until
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -59,7 +59,7 @@ def test_requests_are_counted_by_route_and_status_and_never_by_what_strangers_ma
 
 def test_a_job_is_told_from_queue_to_end(http: httpx.Client, scene: Path) -> None:
     before = figures(http)
-    job = submit(http, ready_dataset(http, scene), steps=300, step_ms=5)["id"]
+    job = submit(http, ready_dataset(http, scene), steps=300, step_ms=20)["id"]
     until(http, job, lambda found: found["state"] == "running")
     during = figures(http)
     assert at(during, "biresnerf_jobs", state="running") == 1
@@ -99,7 +99,7 @@ def test_counts_outlive_the_job_they_are_of(http: httpx.Client, scene: Path) -> 
 
 
 def test_listeners_are_counted_while_they_listen(http: httpx.Client, scene: Path) -> None:
-    job = submit(http, ready_dataset(http, scene), steps=400, step_ms=10)["id"]
+    job = submit(http, ready_dataset(http, scene), steps=4000, step_ms=10)["id"]
     opened, leave = threading.Event(), threading.Event()
 
     def listen() -> None:
@@ -107,15 +107,15 @@ def test_listeners_are_counted_while_they_listen(http: httpx.Client, scene: Path
             lines = stream.iter_lines()
             next(lines)
             opened.set()
-            leave.wait(20)
+            leave.wait(PATIENCE_S)
 
     listener = threading.Thread(target=listen)
     listener.start()
-    assert opened.wait(20)
+    assert opened.wait(PATIENCE_S)
     assert at(figures(http), "biresnerf_event_listeners") == 1
     leave.set()
     listener.join()
-    end = time.monotonic() + 20
+    end = time.monotonic() + PATIENCE_S
     while at(figures(http), "biresnerf_event_listeners"):
         assert time.monotonic() < end
         time.sleep(0.1)

@@ -29,7 +29,7 @@ from workers.stores import Stores, open_stores
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("counting_program.py")
-PATIENCE_S = 30.0
+PATIENCE_S = 90.0
 
 
 @pytest.fixture
