@@ -13,9 +13,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import httpx
 from playwright.sync_api import Browser, Page, Route, expect
 
-from tests.service.conftest import Running, operator
+from tests.service.conftest import LIMITS, Running, operator
 from tests.web.conftest import DESKTOP, check_row, watched_page
 
 
@@ -59,6 +60,24 @@ def test_an_archive_goes_on_after_the_connection_broke(
         expect(check_row(page, "Images")).to_contain_text("10 images")
 
 
+def test_files_that_are_too_large_are_named_before_anything_is_sent(
+    browser: Browser, service: Running, tmp_path: Path, api: httpx.Client
+) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "small.png").write_bytes(bytes(100))
+    (folder / "huge.png").write_bytes(bytes(LIMITS["max_file_bytes"] + 1))
+    before = api.get("/datasets").json()["items"]
+    with closing(browser.new_context(viewport=DESKTOP)) as context:
+        page = watched_page(context, service.url).page
+        page.goto(service.url)
+        drop(page, folder)
+        refusal = page.get_by_role("alert")
+        expect(refusal).to_contain_text("huge.png")
+        assert "small.png" not in refusal.inner_text()
+    assert [item["id"] for item in api.get("/datasets").json()["items"]] == [item["id"] for item in before]
+
+
 def test_a_job_that_fails_says_what_and_what_to_do(
     browser: Browser, service: Running, kitchen: Path, tmp_path: Path, done: dict[str, Any]
 ) -> None:
@@ -78,6 +97,33 @@ def test_a_job_that_fails_says_what_and_what_to_do(
         watched.screenshot("job-failed")
         assert watched.serious_findings() == []
         expect(page.get_by_role("button", name="Run again …")).to_be_visible()
+
+
+def test_a_job_is_run_again_ended_and_deleted(
+    browser: Browser, service: Running, job_url: str, done: dict[str, Any], api: httpx.Client
+) -> None:
+    with closing(browser.new_context(viewport=DESKTOP)) as context:
+        watched = watched_page(context, service.url)
+        page = watched.page
+        page.goto(job_url)
+        page.get_by_role("button", name="Run again …").click()
+        dialog = page.get_by_role("dialog", name="Run again with other options")
+        steps = dialog.get_by_label("steps", exact=True)
+        assert steps.get_attribute("placeholder") == "500"
+        steps.fill("20000")
+        assert watched.serious_findings() == []
+        dialog.get_by_role("button", name="Run from the start").click()
+        page.wait_for_url(lambda url: "#/jobs/" in url and url != job_url)
+        job = page.url.rpartition("/")[2]
+        options = api.get(f"/jobs/{job}").json()["options"]
+        assert options == {**done["options"], "steps": 20000}
+        page.get_by_role("button", name="Cancel", exact=True).click()
+        page.get_by_role("button", name="End it, keep nothing").click()
+        expect(page.get_by_role("heading", level=1)).to_contain_text("cancelled")
+        page.get_by_role("button", name="Delete", exact=True).click()
+        page.get_by_role("button", name="Delete it").click()
+        page.wait_for_url("**/#/")
+        assert api.get(f"/jobs/{job}").status_code == 404
 
 
 # Last: from then on the service asks everybody for a key.

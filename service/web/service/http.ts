@@ -44,6 +44,12 @@ export class Problem extends Error {
     return this.status === 0 || this.status === 429 || this.status >= 500;
   }
 
+  /** The same of a place, unless it names one. */
+  at(place: string): Problem {
+    const { status, code, title, detail, mend, where, errors, waitS } = this;
+    return new Problem(status, code, title, detail, mend, where || place, errors, waitS);
+  }
+
   static unreachable(): Problem {
     return new Problem(
       0,

@@ -1,7 +1,8 @@
 // Brings files to the service: only those it has not, several at a time, each again where the connection breaks.
-import type { DatasetView } from "../service/answers";
+import type { DatasetView, Info, SizeLimits } from "../service/answers";
 import { address, asProblem, call, noteRefusal, pause, Problem, withKey } from "../service/http";
 import { Store } from "../service/store";
+import { bytes as inBytes, count } from "../format";
 import { isArchive, type Chosen, type Gathered } from "./gather";
 import { sendArchive } from "./resumable";
 
@@ -32,6 +33,31 @@ const NOTHING: Sending = {
   ...{ startedAt: 0, waiting: "", problem: null },
 };
 
+/** What the service would refuse anyway is said before anything is sent, file by file. */
+function refuseTooMuch(chosen: readonly Chosen[], bytes: number, limits: SizeLimits): void {
+  const refuse = (detail: string, errors: { pointer: string; detail: string }[] = []) => {
+    const mend = "Send fewer or smaller files, or ask who runs the service for more.";
+    throw new Problem(0, "too_much", "It is more than this service takes", detail, mend, "", errors);
+  };
+  if (isArchive(chosen)) {
+    if (bytes > limits.max_archive_bytes) {
+      refuse(`The archive has ${inBytes(bytes)}; ${inBytes(limits.max_archive_bytes)} are taken.`);
+    }
+    return;
+  }
+  const large = chosen.filter(({ file }) => file.size > limits.max_file_bytes);
+  if (large.length) {
+    const told = large.slice(0, 20).map(({ path, file }) => ({ pointer: path, detail: inBytes(file.size) }));
+    refuse(`${count(large.length, "file")} of more than ${inBytes(limits.max_file_bytes)}.`, told);
+  }
+  if (chosen.length > limits.max_files) {
+    refuse(`There are ${count(chosen.length, "file")}; ${limits.max_files} are taken.`);
+  }
+  if (bytes > limits.max_dataset_bytes) {
+    refuse(`The set has ${inBytes(bytes)}; ${inBytes(limits.max_dataset_bytes)} are taken.`);
+  }
+}
+
 interface Entry extends Chosen {
   sha256: string | null;
 }
@@ -42,6 +68,7 @@ export async function begin(gathered: Gathered, onHashing: (share: number) => vo
   const name = gathered.name.slice(0, 200) || "dataset";
   const bytes = chosen.reduce((sum, { file }) => sum + file.size, 0);
   const state = new Store<Sending>({ ...NOTHING, files: chosen.length, bytes, startedAt: Date.now() });
+  refuseTooMuch(chosen, bytes, (await call<Info>("GET", "v1/info")).limits);
   if (isArchive(chosen)) {
     const file = chosen[0]!.file;
     return keep(await sendArchive(file, name, state), state);
@@ -106,7 +133,14 @@ async function sendMissing(dataset: DatasetView, entries: Entry[], state: Store<
   const atHand = entries.filter(({ path }) => !missing.has(path)).reduce((sum, { file }) => sum + file.size, 0);
   state.change({ phase: "sending", filesDone: known, known, bytesDone: atHand });
   const lane = async () => {
-    for (let entry = queue.shift(); entry; entry = queue.shift()) await sendFile(dataset.id, entry, state);
+    for (let entry = queue.shift(); entry; entry = queue.shift()) {
+      try {
+        await sendFile(dataset.id, entry, state);
+      } catch (error) {
+        queue.length = 0; // the other lanes end with what they are at
+        throw error;
+      }
+    }
   };
   await Promise.all(Array.from({ length: AT_ONCE }, lane));
 }
@@ -119,10 +153,14 @@ async function sendFile(dataset: string, entry: Entry, state: Store<Sending>): P
     state.change({ bytesDone: state.value.bytesDone + sent - told });
     told = sent;
   };
-  await persistently(state, async () => {
-    onSent(0);
-    await put("PUT", `v1/datasets/${dataset}/files/${path}`, headers, entry.file, onSent);
-  });
+  try {
+    await persistently(state, async () => {
+      onSent(0);
+      await put("PUT", `v1/datasets/${dataset}/files/${path}`, headers, entry.file, onSent);
+    });
+  } catch (error) {
+    throw asProblem(error).at(entry.path);
+  }
   onSent(entry.file.size);
   state.change({ filesDone: state.value.filesDone + 1 });
 }
