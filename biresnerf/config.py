@@ -49,7 +49,7 @@ class RefineOptions(BaseModel):
     preset: PresetName = Field("balanced", description="Fills every option that is left out.")
     method: MethodName = Field(
         "biresnerf",
-        description="biresnerf, the two stages as published (biresnerf-paper), or a method it is compared with.",
+        description="biresnerf; the two stages as published, biresnerf-paper; or what it is compared with.",
     )
     device: Device = Field("auto", description="Where to compute; auto takes CUDA where there is one.")
     seed: int = Field(0, ge=0, lt=2**31, description="Same seed, same machine, same result on the CPU.")
@@ -97,7 +97,8 @@ class RefineOptions(BaseModel):
 
     refine_intrinsics: RefineIntrinsics = Field(
         "auto",
-        description="What of the lenses is refined too; auto: focal lengths that were guessed or read from EXIF.",
+        description="What of the lenses is refined too; auto: focal lengths that were guessed or read from EXIF; all: "
+        "principal point and distortion as well.",
     )
 
     steps: int | None = Field(None, ge=20, le=1_000_000, description="Steps of both stages together.")

@@ -6,9 +6,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import pytest
+
+import biresnerf.commands.make_scene
 import biresnerf.pipeline
 from biresnerf.config import RefineOptions, parse_options
 
+VIEWS, SIZE = 8, 24
 # Choices are kept, sizes are not.
 KEPT = (
     *("method", "seed", "background", "exposure", "start", "fixed", "refine_intrinsics", "detector"),
@@ -28,6 +32,7 @@ SMALL = {
     "holdout": 0,
     "trial_steps": 0,
     "orbit_frames": 0,
+    "shown_views": 0,
 }
 
 
@@ -39,14 +44,17 @@ def made_small(options: RefineOptions) -> RefineOptions:
 
 @contextmanager
 def small_runs() -> Iterator[None]:
-    """While it lasts, every refinement of this process is a small one."""
-    real: Callable[..., Any] = biresnerf.pipeline.refine_poses
+    """While it lasts, every refinement of this process is a small one, and every scene that is made."""
+    refine: Callable[..., Any] = biresnerf.pipeline.refine_poses
+    make: Callable[..., Any] = biresnerf.commands.make_scene.make_scene
 
     def small(scene: Any, output: Any, options: RefineOptions, *more: Any, **named: Any) -> Any:
-        return real(scene, output, made_small(options), *more, **named)
+        return refine(scene, output, made_small(options), *more, **named)
 
-    biresnerf.pipeline.refine_poses = small
-    try:
+    def few(output: Any, kind: str = "dome", **named: Any) -> Any:
+        return make(output, kind, **{**named, "views": VIEWS, "size": SIZE})
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(biresnerf.pipeline, "refine_poses", small)
+        patch.setattr(biresnerf.commands.make_scene, "make_scene", few)
         yield
-    finally:
-        biresnerf.pipeline.refine_poses = real

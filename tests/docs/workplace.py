@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shutil
 import signal
 import subprocess
@@ -18,17 +19,18 @@ from typing import Any
 import httpx
 from click.testing import CliRunner
 
+import biresnerf.pipeline
 from biresnerf.command_line import cli
 from biresnerf.commands.make_scene import make_scene
+from biresnerf.config import RefineOptions
 from tests.docs.forms_of_commands import command_context, words_of
-from tests.docs.small_runs import small_runs
+from tests.docs.small_runs import SIZE, VIEWS, small_runs
 from tests.service.conftest import Running, finished, new_dataset, operator, ready_dataset
 
-VIEWS, SIZE = 8, 24
 # They load torch, so they run in this process; all others run as a shell runs them.
 LOCAL = {"refine", "export", "make-scene", "evaluate", "convert", "inspect"}
 # What pages call a set of photos with poses, and its true poses.
-SETS = ("photos", "INPUT", "SCENE", "lego_100", "capture")
+SETS = ("photos", "INPUT", "SCENE", "lego_100")
 TRUTHS = ("TRUTH", "reference")
 
 
@@ -54,13 +56,15 @@ class Workplace:
             self._make_room(words[1:])
             if words[1] in LOCAL and not variables:
                 return self._run_here(words[1:])
+        if words and words[0] == "python":
+            return self._run_script(Path(words[1]), words[2:])
         self._run_in_shell(text)
 
     def run_python(self, text: str) -> None:
         """Runs a block of Python where the page's files are. Raises what it raises."""
         shutil.rmtree(self.folder / "out", ignore_errors=True)  # as in `_make_room`
         with chdir(self.folder), small_runs():
-            exec(compile(text, "documented.py", "exec"), {"__name__": "documented"})
+            exec(compile(self._with_real_names(text), "documented.py", "exec"), {"__name__": "documented"})
 
     def _run_here(self, words: list[str]) -> None:
         handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -72,6 +76,17 @@ class Workplace:
                 signal.signal(number, handler)
         assert done.exit_code == 0, done.output
         assert done.return_value in (None, 0), done.output
+
+    def _run_script(self, script: Path, words: list[str]) -> None:
+        """A script in this process, which makes its refinement small."""
+        before = sys.argv, list(sys.path)
+        try:
+            sys.argv = [str(script), *words]
+            sys.path.insert(0, str(script.parent))
+            with chdir(self.folder), small_runs():
+                runpy.run_path(str(script), run_name="__main__")
+        finally:
+            sys.argv, sys.path[:] = before
 
     def _run_in_shell(self, text: str) -> None:
         (self.folder / ".curlrc").write_text("silent\nshow-error\nfail-with-body\nmax-time = 60\n")
@@ -98,7 +113,7 @@ class Workplace:
     def _make_room(self, words: list[str]) -> None:
         """Another command of the page may have written to the same place, which is refused."""
         output = command_context(words).params.get("output")
-        if output is not None and words[0] != "export":
+        if output is not None and words[0] not in {"export", "make-scene"}:
             shutil.rmtree(self.folder / output, ignore_errors=True)
 
     def _with_real_names(self, text: str) -> str:
@@ -170,6 +185,12 @@ def furnish(folder: Path) -> Path:
         for path in sorted((folder / "photos").rglob("*")):
             archive.write(path, path.relative_to(folder))
     return folder
+
+
+def make_result(folder: Path) -> None:
+    """A finished refinement of the photos, which pages call OUT."""
+    with small_runs():
+        biresnerf.pipeline.refine_poses(folder / "photos", folder / "OUT", RefineOptions(preset="fast"))
 
 
 def done_job(service: Running, photos: Path) -> str:
