@@ -7,6 +7,8 @@ from typing import get_args
 
 import click
 
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.service_options import json_option
 from biresnerf.config import PackName
 
 
@@ -24,8 +26,9 @@ from biresnerf.config import PackName
     type=click.Path(path_type=Path),
     help="Folder for the files. Default: the result's own.",
 )
+@json_option
 def export_command(
-    result: Path, forms: tuple[PackName, ...], photos: Path | None, output: Path | None
+    result: Path, forms: tuple[PackName, ...], photos: Path | None, output: Path | None, as_json: bool
 ) -> None:
     """Write a finished RESULT in the given forms beside those it has.
 
@@ -35,6 +38,10 @@ def export_command(
     from biresnerf.data.packs.write_packs import ON_REQUEST
 
     refined = read_result(result, photos)
+    folder = output or result
     for form in forms:
-        ON_REQUEST[form](refined, output or result, lambda: False)
-        click.echo(f"{form} written to {output or result}")
+        ON_REQUEST[form](refined, folder, lambda: False)
+        if not as_json:
+            click.echo(f"{form} written to {folder}")
+    if as_json:
+        print_json({"folder": str(folder), "forms": list(forms)})

@@ -14,6 +14,9 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as ProgressBar
 
+from biresnerf.commands import exit_codes
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.service_options import json_option
 from biresnerf.commands.settings_option import settings_option
 from biresnerf.config import PRESETS, parse_options
 from biresnerf.errors import Interrupted
@@ -101,6 +104,7 @@ def describe(progress: Progress) -> str:
 @click.option("--seed", type=int, default=None, help="Default: 0.")
 @settings_option
 @click.option("--verbose", "-v", is_flag=True, help="Log what happens.")
+@json_option
 def refine_command(
     input_path: Path,
     output: Path,
@@ -109,11 +113,12 @@ def refine_command(
     seed: int | None,
     settings: dict[str, Any],
     verbose: bool,
+    as_json: bool,
 ) -> int:
     """Refine the camera poses of INPUT: a folder of images, with poses in any form that is read or without.
 
     Results go to OUT: transforms.json and colmap/sparse/0 in the input's own frame and scale, report.json,
-    renders/ and config.json. The same command goes on where an interrupted one stopped.
+    renders/ and config.json. --json prints report.json. The same command goes on where an interrupted one stopped.
     """
     named = {"preset": preset, "device": device, "seed": seed}
     options = parse_options({**settings, **{key: value for key, value in named.items() if value is not None}})
@@ -131,8 +136,11 @@ def refine_command(
     except Interrupted as interrupted:
         click.echo(str(interrupted), err=True)
         return 128 + (stop.signal or signal.SIGINT)
-    click.echo(summary(report, output))
-    return 0
+    if as_json:
+        print_json(report)
+    else:
+        click.echo(summary(report, output))
+    return exit_codes.DONE
 
 
 def summary(report: Report, output: Path) -> str:

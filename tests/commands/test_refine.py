@@ -193,8 +193,10 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(scene, tmp_path):
     kept = load_checkpoint(tmp_path / "out")[1]["optimiser"]["step_index"]
     assert kept > 0
     # What changes neither result nor effort may differ when going on.
-    result = run(scene, tmp_path / "out", checkpoint_every_s=100, orbit_frames=1)
+    again = command(scene, tmp_path / "out", checkpoint_every_s=100, orbit_frames=1)
+    result = subprocess.run([*again, "--json"], capture_output=True, text=True, check=False, timeout=300)
     assert result.returncode == 0, result.stderr
+    assert Report.model_validate_json(result.stdout) == report_of(tmp_path / "out")
     assert (tmp_path / "out/renders/orbit.mp4").is_file()
     report = report_of(tmp_path / "out")
     assert (report.state, report.steps_done, report.resumed) == ("complete", STEPS, 1)

@@ -63,6 +63,7 @@ class Workplace:
     def run_python(self, text: str) -> None:
         """Runs a block of Python where the page's files are. Raises what it raises."""
         shutil.rmtree(self.folder / "out", ignore_errors=True)  # as in `_make_room`
+        text = text.replace("http://127.0.0.1:8000", self.service.url)
         with chdir(self.folder), small_runs():
             exec(compile(self._with_real_names(text), "documented.py", "exec"), {"__name__": "documented"})
 
