@@ -23,8 +23,8 @@ from biresnerf.report import Report
 
 REPORT_HTML, HISTORY = "report.html", "history.jsonl"
 BUNDLE = Path(__file__).parent / "dist"
-# Of pictures, points and video before base64; what more there is lies beside the page.
-MOST_BYTES = 9_000_000
+# Of pictures, points and video before base64, for a page of 12 MB; what more there is lies beside it.
+MOST_BYTES = 8_000_000
 MOST_VIDEO_BYTES = 2_000_000
 PICTURE_PX, QUALITY = 640, 82  # long side and JPEG's quality of a picture in the page
 _MEDIA = {".jpg": "image/jpeg", ".mp4": "video/mp4", ".bin": "application/octet-stream"}
