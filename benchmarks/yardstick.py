@@ -15,7 +15,7 @@ from biresnerf.field import reference
 from biresnerf.field.grid_levels import GridLevels
 
 SOURCE = Path(__file__).with_name("hashgrid_yardstick.cpp")
-FLAGS = ["-O3", "-march=native", "-mprefer-vector-width=512", "-ffast-math", "-fopenmp", "-shared", "-fPIC"]
+FLAGS = ["-O3", "-march=native", "-mprefer-vector-width=512", "-ffast-math", "-fopenmp", "-fPIC"]
 
 
 def _pointer(array: np.ndarray) -> ctypes.c_void_p:
@@ -70,8 +70,10 @@ def build_yardstick() -> ctypes.CDLL | None:
         return None
     folder = Path(tempfile.mkdtemp(prefix="biresnerf-yardstick-"))
     try:
-        target = folder / "yardstick.so"
-        subprocess.run([compiler, *FLAGS, str(SOURCE), "-o", str(target)], check=True)
+        compiled, target = folder / "yardstick.o", folder / "yardstick.so"
+        subprocess.run([compiler, *FLAGS, "-c", str(SOURCE), "-o", str(compiled)], check=True)
+        # Linked with -ffast-math, it would flush subnormal numbers to zero in the whole process.
+        subprocess.run([compiler, "-fopenmp", "-shared", str(compiled), "-o", str(target)], check=True)
         return ctypes.CDLL(str(target))
     finally:
         shutil.rmtree(folder)

@@ -63,6 +63,7 @@ def test_the_yardstick_in_cpp_computes_what_the_definition_does(grid):
     library = build_yardstick()
     assert library is not None
     check_yardstick(library, grid)
+    assert np.float32(1e-45) * 1 > 0, "loading it must not flush subnormal numbers to zero"
 
 
 @pytest.mark.parametrize("form", [UnrolledField, VectorisedField])

@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.atomic_file import whole_file
-from biresnerf.geometry.camera import Intrinsics, directions_in_cam
 
 WRITTEN = "matches.npz"  # in the work folder of `colmap_child`
 KEPT = "matches.npz"  # beside what else is kept of COLMAP's answer
@@ -55,18 +53,6 @@ class FeatureMatches:
     def kept(self) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """Arrays to keep, [m, 2] and [m, 4]."""
         return self.images.astype(np.int32), self.xy.reshape(-1, 4).astype(np.float32)
-
-    def rays(self, intrinsics: Intrinsics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Viewing directions in the first and the second camera of each match, float64 [m, 3] each.
-
-        Args:
-            intrinsics: of all images of the set, at full size.
-        """
-        first, second = (
-            directions_in_cam(intrinsics, torch.from_numpy(image.copy()), torch.from_numpy(xy.copy())).numpy()
-            for image, xy in zip(self.images.T, self.xy.transpose(1, 0, 2), strict=True)
-        )
-        return first, second
 
 
 def keep_matches(work: Path, names: tuple[str, ...], path: Path) -> None:

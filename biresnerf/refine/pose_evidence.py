@@ -18,6 +18,7 @@ from biresnerf.geometry.epipolar import epipolar_angles
 from biresnerf.geometry.focus import focus_point
 from biresnerf.refine.frozen_trials import FrozenTrials, TrialScores, joined
 from biresnerf.refine.left_out_views import unseen_rounds
+from biresnerf.refine.match_rays import match_rays
 from biresnerf.refine.verdict import EPIPOLAR_MATTERS, PSNR_MATTERS, SSIM_MATTERS, paired
 from biresnerf.report import EpipolarEvidence, HeldOutEvidence
 
@@ -131,7 +132,7 @@ def compare_on_matches(
 def _image_errors(rig: Rig, matches: FeatureMatches) -> Array:
     intrinsics = Intrinsics.from_cameras(rig.cameras)
     a, b = matches.images.T
-    ray_a, ray_b = matches.rays(intrinsics)
+    ray_a, ray_b = match_rays(intrinsics, matches)
     focal = ((intrinsics.fx + intrinsics.fy) / 2).numpy()
     errors = epipolar_angles(rig.world_from_cam, a, b, ray_a, ray_b) * (focal[a] + focal[b]) / 2
     medians = np.full(len(rig.cameras), np.nan)

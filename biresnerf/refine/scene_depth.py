@@ -9,6 +9,7 @@ from biresnerf.data.dataset import Dataset
 from biresnerf.data.feature_matches import FeatureMatches
 from biresnerf.geometry.camera import Intrinsics
 from biresnerf.geometry.epipolar import epipolar_angles, match_depths
+from biresnerf.refine.match_rays import match_rays
 
 AGREE_DEG = 1.0  # matches off by more say nothing: the poses or they are wrong
 LEAST_PARALLAX_DEG = 1.0  # between the rays of a match; below, noise makes the depth
@@ -26,7 +27,7 @@ def matched_depth(
         return None
     intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
     a, b = matches.images.T
-    ray_a, ray_b = matches.rays(intrinsics)
+    ray_a, ray_b = match_rays(intrinsics, matches)
     errors = np.degrees(epipolar_angles(world_from_cam, a, b, ray_a, ray_b))
     world_a = np.einsum("mij,mj->mi", world_from_cam[a, :3, :3], ray_a)
     world_b = np.einsum("mij,mj->mi", world_from_cam[b, :3, :3], ray_b)
