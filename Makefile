@@ -3,6 +3,8 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 EXTRAS ?= service,otel,colmap,compare,dev
+# Test files side by side; 0: one after the other, in this process.
+TEST_PROCESSES ?= logical
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 TOOLS := $(VENV)/tools
@@ -23,7 +25,7 @@ web: setup  ## build the page and what report.html is made of, after a change of
 	$(BIN)/python hatch_build.py
 
 test: web  ## all tests; PYTEST="-k name" chooses
-	$(BIN)/python -m pytest $(PYTEST)
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile $(PYTEST)
 
 lint: setup  ## format, style, types and the direction of imports
 	$(BIN)/ruff format --check . && $(BIN)/ruff check .
