@@ -17,9 +17,13 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 async def read_json(
-    content_type: str, content_length: str | None, stream: AsyncIterator[bytes], model: type[Model]
+    content_type: str,
+    content_length: str | None,
+    stream: AsyncIterator[bytes],
+    model: type[Model],
+    limit: int = JSON_BYTES_MAX,
 ) -> Model:
-    """The body as the model.
+    """The body, of ``limit`` bytes at most, as the model.
 
     Raises:
         ProblemError: ``unsupported_media``, ``body_too_large``, ``malformed_json``, ``invalid_request``,
@@ -31,8 +35,8 @@ async def read_json(
             f"The Content-Type {content_type!r} is not application/json.",
             where="Content-Type",
         )
-    refuse_announced_excess(content_length, JSON_BYTES_MAX)
-    body = b"".join([chunk async for chunk in capped(stream, JSON_BYTES_MAX)])
+    refuse_announced_excess(content_length, limit)
+    body = b"".join([chunk async for chunk in capped(stream, limit)])
     return fit(load_json(body), model)
 
 

@@ -24,14 +24,15 @@ from biresnerf.wire.datasets import (
 )
 from biresnerf.wire.safe_paths import NameSet, checked_path
 from service.access import Caller, CallerHere, DatasetWriterHere
-from service.dependencies import DatasetId, next_link
+from service.dependencies import DatasetId, next_link, service_of
 from service.intake import settle_uploads, take_archive
-from service.json_body import json_content, read_json
+from service.json_body import JSON_BYTES_MAX, json_content, read_json
 from service.problems import ProblemError, declared
 from service.uploads import capped, refuse_announced_excess, staging_folder, write_stream
 from service.views import file_view
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
+ENTRY_BYTES = 2048  # of a manifest, for each file that a dataset may have
 _ALWAYS = ("database_unavailable", "internal_error")
 _WRITES = ("cross_site", *_ALWAYS)
 _RAW_BODY: dict[str, Any] = {
@@ -45,8 +46,9 @@ _DIGEST = re.compile(r"sha-256=:([A-Za-z0-9+/=]+):")
 
 async def _new_dataset(request: Request) -> NewDataset:
     headers = request.headers
+    limit = JSON_BYTES_MAX + ENTRY_BYTES * service_of(request).settings.max_files
     return await read_json(
-        headers.get("content-type", ""), headers.get("content-length"), request.stream(), NewDataset
+        headers.get("content-type", ""), headers.get("content-length"), request.stream(), NewDataset, limit
     )
 
 

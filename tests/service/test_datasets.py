@@ -12,7 +12,10 @@ import httpx
 import pytest
 from PIL import Image
 
+from service.json_body import JSON_BYTES_MAX
+from service.routes.datasets import ENTRY_BYTES
 from tests.service.conftest import (
+    LIMITS,
     Running,
     dataset_ids,
     new_dataset,
@@ -50,6 +53,15 @@ def test_files_sent_one_by_one_make_a_ready_dataset(http: httpx.Client, scene: P
     assert again == found
     problem(put(http, dataset, "more.png", b"x"), 409, "dataset_not_open")
     problem(upload(http, dataset, zip_of({"more.png": b"x"})), 409, "dataset_not_open")
+
+
+def test_a_manifest_may_be_as_long_as_a_dataset_may_have_files(http: httpx.Client) -> None:
+    body = json.dumps({"name": "long", "manifest": []})
+    room = JSON_BYTES_MAX + ENTRY_BYTES * LIMITS["max_files"]
+    headers = {"Content-Type": "application/json"}
+    taken = http.post("/v1/datasets", content=body.ljust(room), headers=headers)
+    assert taken.status_code == 201, taken.text
+    problem(http.post("/v1/datasets", content=body.ljust(room + 1), headers=headers), 413, "body_too_large")
 
 
 def test_a_manifest_tells_what_is_missing(http: httpx.Client) -> None:

@@ -40,7 +40,7 @@ BAD_JSON: dict[str, tuple[bytes, int, str]] = {
         "invalid_request",
     ),
     "a size below nothing": (b'{"manifest": [{"path": "a", "size": -1}]}', 422, "invalid_request"),
-    "more than is taken": (b'{"name": "' + b"a" * 2**20 + b'"}', 413, "body_too_large"),
+    "more than is taken": (b'{"name": "' + b"a" * 2**21 + b'"}', 413, "body_too_large"),
     "a prototype": (b'{"__proto__": {"admin": true}}', 422, "invalid_request"),
 }
 
