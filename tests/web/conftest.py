@@ -11,7 +11,16 @@ from typing import Any
 import httpx
 import pytest
 from click.testing import CliRunner
-from playwright.sync_api import Browser, BrowserContext, Locator, Page, Route, expect, sync_playwright
+from playwright.sync_api import (
+    Browser,
+    BrowserContext,
+    ConsoleMessage,
+    Locator,
+    Page,
+    Route,
+    expect,
+    sync_playwright,
+)
 
 import hatch_build
 from biresnerf.commands.make_scene import make_scene_command
@@ -96,6 +105,12 @@ class Watched:
         return bool(self.page.evaluate(width))
 
 
+def complaint(said: ConsoleMessage) -> list[str]:
+    """What the browser says is wrong; a preview that another one replaced meanwhile is not."""
+    replaced = "/artifacts/preview/" in said.location["url"] and "404" in said.text
+    return [said.text] if said.type == "error" and not replaced else []
+
+
 def watched_page(context: BrowserContext, origin: str) -> Watched:
     """A page that reaches the service alone; what else it asks for is refused and noted."""
     watched = Watched(context.new_page())
@@ -110,9 +125,7 @@ def watched_page(context: BrowserContext, origin: str) -> Watched:
 
     context.route("**/*", decide)
     watched.page.on("pageerror", lambda error: watched.complaints.append(str(error)))
-    watched.page.on(
-        "console", lambda said: watched.complaints.append(said.text) if said.type == "error" else None
-    )
+    watched.page.on("console", lambda said: watched.complaints.extend(complaint(said)))
     watched.page.set_default_timeout(PATIENCE_MS)
     return watched
 
