@@ -1,0 +1,123 @@
+// What of the three-dimensional picture can be chosen, and what its colours mean.
+import { css, kindColour, rampColour, scaleOf, signedColour, UNKNOWN } from "./colours";
+import { Choice, Pick, Switch } from "./Controls";
+import { sourceWords } from "./numbers";
+import type { ColourBy, PointLayer } from "./types";
+
+/** What the reader has chosen. */
+export interface SceneChoice {
+  readonly lines: 0 | 1 | 10;
+  readonly before: boolean;
+  readonly by: ColourBy;
+  /** Of each scale, where its colours end. */
+  readonly caps: Readonly<Partial<Record<ColourBy, number>>>;
+  /** Null until chosen: points may come later than the cameras. */
+  readonly layer: string | null;
+}
+
+export const FIRST_CHOICE: SceneChoice = { lines: 1, before: true, by: "moved_deg", caps: {}, layer: null };
+
+const COLOURS: readonly { value: ColourBy; text: string }[] = [
+  { value: "moved_deg", text: "turned (°)" },
+  { value: "moved_units", text: "moved (units)" },
+  { value: "delta_psnr", text: "PSNR gain (dB)" },
+  { value: "source", text: "where the pose is from" },
+];
+
+const LAYERS: Readonly<Record<PointLayer["source"], string>> = {
+  given: "the input's points",
+  features: "feature matches",
+  tracks: "the input's tracks",
+  moved: "the input's points, moved",
+  field: "surface in the field",
+};
+
+/** The points to show: those chosen, else the densest. */
+export function layerOf(points: readonly PointLayer[], chosen: string | null): PointLayer | null {
+  if (chosen !== null) return points.find((layer) => layer.source === chosen) ?? null;
+  return points.find((layer) => layer.source === "field") ?? points[0] ?? null;
+}
+
+export const capOf = (choice: SceneChoice, spread: number): number =>
+  choice.caps[choice.by] ?? scaleOf(choice.by, spread).caps[0] ?? 1;
+
+export function SceneControls(props: {
+  choice: SceneChoice;
+  onChange: (changed: Partial<SceneChoice>) => void;
+  points: readonly PointLayer[];
+  spread: number;
+}) {
+  const { choice, onChange, points, spread } = props;
+  const scale = scaleOf(choice.by, spread);
+  const caps = [...scale.caps].sort((a, b) => a - b);
+  return (
+    <div class="scene-controls">
+      <Pick label="Colour" value={choice.by} onChange={(by) => onChange({ by })} options={COLOURS} />
+      {caps.length > 0 && (
+        <Pick
+          label="up to"
+          value={capOf(choice, spread)}
+          onChange={(cap) => onChange({ caps: { ...choice.caps, [choice.by]: cap } })}
+          options={caps.map((value) => ({ value, text: `${value} ${scale.unit}` }))}
+        />
+      )}
+      <Choice
+        label="Lines"
+        value={choice.lines}
+        onChange={(lines) => onChange({ lines })}
+        options={[
+          { value: 0, text: "off" },
+          { value: 1, text: "×1" },
+          { value: 10, text: "×10" },
+        ]}
+      />
+      {points.length > 0 && (
+        <Pick
+          label="Points"
+          value={layerOf(points, choice.layer)?.source ?? ""}
+          onChange={(layer) => onChange({ layer })}
+          options={[
+            { value: "", text: "none" },
+            ...points.map((layer) => ({ value: layer.source, text: LAYERS[layer.source] })),
+          ]}
+        />
+      )}
+      <Switch label="Input" on={choice.before} onChange={(before) => onChange({ before })} />
+    </div>
+  );
+}
+
+export function Legend(props: { by: ColourBy; cap: number; kinds: readonly string[]; dark: boolean; unknown: boolean }) {
+  const { by, cap, kinds, dark } = props;
+  const scale = scaleOf(by, 1);
+  if (by === "source") {
+    return (
+      <ul class="legend">
+        {kinds.map((kind) => (
+          <li key={kind}>
+            <i style={{ background: css(kindColour(kind, kinds)) }} /> {sourceWords(kind)}
+          </li>
+        ))}
+      </ul>
+    );
+  }
+  const stops = Array.from({ length: 17 }, (_, i) => i / 16);
+  const colours = stops.map((at) => css(scale.signed ? signedColour(2 * at - 1, dark) : rampColour(at, dark)));
+  return (
+    <div class="legend">
+      <span class="legend-title">
+        {scale.label} ({scale.unit})
+      </span>
+      <span class="legend-ramp" style={{ background: `linear-gradient(to right, ${colours.join(", ")})` }} />
+      <span class="legend-ends">
+        <span>{scale.signed ? `≤ −${cap}` : "0"}</span>
+        <span>≥ {cap}</span>
+      </span>
+      {by === "delta_psnr" && props.unknown && (
+        <span class="legend-note">
+          <i style={{ background: css(UNKNOWN) }} /> not measured
+        </span>
+      )}
+    </div>
+  );
+}
