@@ -22,6 +22,7 @@ SMALL = {
     "preset": "fast",
     "device": "cpu",
     "threads": 1,
+    "start": "none",  # where nothing is asked for; feature matches have tests of their own
     "steps": 20,
     "max_image_size": 24,
     "samples_per_step": 1024,
@@ -39,7 +40,8 @@ SMALL = {
 def made_small(options: RefineOptions) -> RefineOptions:
     """The same choices, small. The options must be good as they stand."""
     options.resolved()
-    return parse_options({**{key: getattr(options, key) for key in KEPT}, **SMALL})
+    chosen = {key: getattr(options, key) for key in KEPT}
+    return parse_options({**SMALL, **{key: value for key, value in chosen.items() if value is not None}})
 
 
 @contextmanager
