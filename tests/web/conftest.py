@@ -1,4 +1,4 @@
-"""A real browser on a real service with one real, small job, shared by all tests here."""
+"""A real browser on a real service with one real, small job, shared by the tests of a module."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ expect.set_options(timeout=PATIENCE_MS)
 SERIOUS = {"serious", "critical"}
 
 
-# Of this folder, not of the session: its event loop runs in the main thread, where other tests want their own.
-@pytest.fixture(scope="package")
+# Of a module, not of the session: its event loop runs in the main thread, where other tests want their own.
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     if CHROMIUM is None:
         pytest.skip(
@@ -57,7 +57,7 @@ def browser() -> Iterator[Browser]:
         opened.close()
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def service(browser: Browser) -> Iterator[Running]:
     """`biresnerf up`, with the real job program. Without a browser it is not started."""
     with short_folder() as folder, running_service(folder) as running:
@@ -130,7 +130,7 @@ def watched_page(context: BrowserContext, origin: str) -> Watched:
     return watched
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def desktop(browser: Browser, service: Running) -> Iterator[Watched]:
     """One tab for the whole walk, as a user has it."""
     context = browser.new_context(viewport=DESKTOP, accept_downloads=True)
@@ -138,14 +138,14 @@ def desktop(browser: Browser, service: Running) -> Iterator[Watched]:
     context.close()
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def phone(browser: Browser, service: Running) -> Iterator[Watched]:
     context = browser.new_context(viewport=PHONE, has_touch=True, is_mobile=True, color_scheme="dark")
     yield watched_page(context, service.url)
     context.close()
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def api(service: Running) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=f"{service.url}/v1", timeout=60.0) as client:
         yield client
@@ -156,7 +156,7 @@ def check_row(page: Page, name: str) -> Locator:
     return page.locator(".checks tr", has=page.get_by_role("rowheader", name=name, exact=True))
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def job_url(desktop: Watched, service: Running, kitchen: Path) -> str:
     """The address of a job that was sent through the page; it runs."""
     page = desktop.page
@@ -188,7 +188,7 @@ def job_url(desktop: Watched, service: Running, kitchen: Path) -> str:
     return page.url
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def done(desktop: Watched, job_url: str, api: httpx.Client) -> dict[str, Any]:
     """The same job, over; the tab shows it."""
     page = desktop.page

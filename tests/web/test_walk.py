@@ -8,14 +8,16 @@ import shlex
 import subprocess
 import sys
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import httpx
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
 
-from tests.service.conftest import Running
-from tests.web.conftest import Watched
+from tests.service.conftest import Running, operator
+from tests.web.conftest import DESKTOP, Watched, watched_page
 
 
 def curve_end(page: Page) -> int:
@@ -214,3 +216,58 @@ def test_a_phone_shows_the_same_without_scrolling_sideways(
         assert phone.serious_findings() == []
     assert phone.outside == []
     assert phone.complaints == []
+
+
+def test_a_job_is_run_again_ended_and_deleted(
+    browser: Browser, service: Running, job_url: str, done: dict[str, Any], api: httpx.Client
+) -> None:
+    with closing(browser.new_context(viewport=DESKTOP)) as context:
+        watched = watched_page(context, service.url)
+        page = watched.page
+        page.goto(job_url)
+        page.get_by_role("button", name="Run again …").click()
+        dialog = page.get_by_role("dialog", name="Run again with other options")
+        steps = dialog.get_by_label("steps", exact=True)
+        assert steps.get_attribute("placeholder") == "500"
+        steps.fill("20000")
+        assert watched.serious_findings() == []
+        dialog.get_by_role("button", name="Run from the start").click()
+        page.wait_for_url(lambda url: "#/jobs/" in url and url != job_url)
+        job = page.url.rpartition("/")[2]
+        options = api.get(f"/jobs/{job}").json()["options"]
+        assert options == {**done["options"], "steps": 20000}
+        page.get_by_role("button", name="Cancel", exact=True).click()
+        page.get_by_role("button", name="End it, keep nothing").click()
+        expect(page.get_by_role("heading", level=1)).to_contain_text("cancelled")
+        page.get_by_role("button", name="Delete", exact=True).click()
+        page.get_by_role("button", name="Delete it").click()
+        page.wait_for_url("**/#/")
+        assert api.get(f"/jobs/{job}").status_code == 404
+
+
+# Last: from then on the service asks everybody for a key.
+def test_a_service_with_keys_is_used_with_one(
+    browser: Browser, service: Running, job_url: str, done: dict[str, Any]
+) -> None:
+    with ThreadPoolExecutor(1) as aside:  # Playwright's own loop runs in this thread
+        made = aside.submit(operator, service.data_dir, "keys", "create", "page", "--tenant", "local")
+        key = made.result()["key"]
+    with closing(browser.new_context(viewport=DESKTOP)) as context:
+        watched = watched_page(context, service.url)
+        page = watched.page
+        page.goto(job_url)
+        field = page.get_by_label("API key")
+        field.fill("brn_wrong")
+        field.press("Enter")
+        expect(page.get_by_role("alert")).to_contain_text("unknown, expired or revoked")
+        watched.screenshot("key")
+        field.fill(key)
+        field.press("Enter")
+        page.wait_for_function("() => document.querySelector('.compare-frame img')?.naturalWidth > 0")
+        assert page.locator(".compare-frame img").first.get_attribute("src").startswith("blob:")
+        with page.expect_download() as coming:
+            page.get_by_role("button", name="Download For nerfstudio").click()
+        assert coming.value.suggested_filename == "transforms.json"
+        page.reload()
+        expect(page.get_by_role("heading", name="Downloads")).to_be_visible()
+        assert watched.outside == []
