@@ -16,6 +16,7 @@ import uuid
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 
+import psutil
 import psycopg
 import pytest
 
@@ -220,3 +221,12 @@ class Counting:
 @pytest.fixture
 def counting(stores: Stores, tmp_path: Path) -> Counting:
     return Counting(stores, tmp_path / "journal")
+
+
+async def died(process: psutil.Process) -> None:
+    """Until the process is gone, or waits for nothing but its parent to notice."""
+    end = time.monotonic() + PATIENCE_S
+    with contextlib.suppress(psutil.NoSuchProcess):
+        while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
+            assert time.monotonic() < end, process
+            await asyncio.sleep(0.05)

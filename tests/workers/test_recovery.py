@@ -9,7 +9,7 @@ import signal
 import psutil
 import pytest
 
-from tests.workers.conftest import Counting, Slots, quick_settings
+from tests.workers.conftest import Counting, Slots, died, quick_settings
 from workers.settings import Settings
 from workers.stores import Stores
 
@@ -53,8 +53,7 @@ async def test_kill_9_of_the_worker_moves_the_job_to_another_one(
     child = psutil.Process(int(counting.starts()[0]["pid"]))
     slots.start(settings, "b")
     first.kill()
-    psutil.wait_procs([child], timeout=2)
-    assert not child.is_running(), "the job's process dies with its worker"
+    await died(child)  # the job's process, with its worker
     job = await counting.until_final()
     assert (job.state, job.attempt) == ("succeeded", 2)
     starts = counting.starts()
