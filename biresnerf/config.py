@@ -222,7 +222,8 @@ class RefineOptions(BaseModel):
                 if given[key] is None:
                     filled[key] = max(10, round(preset[key] * ratio))
             if self.trial_steps is None:
-                filled["trial_steps"] = max(10, round(preset["trial_steps"] * min(1.0, ratio)))
+                # In proportion they would be too short to tell good poses from better ones.
+                filled["trial_steps"] = max(10, min(preset["trial_steps"], self.steps // 4))
         return parse_options({**given, **filled})
 
 

@@ -16,9 +16,7 @@ from walk import arguments, pose_table, show_progress
 from biresnerf import refine_poses
 from biresnerf.commands.make_scene import make_scene
 
-here = arguments(
-    "phone_capture", views=40, size=200, preset="fast", steps=1200, trial_steps=200, orbit_frames=0
-)
+here = arguments("phone_capture", views=40, size=200, preset="fast", steps=1200, orbit_frames=0)
 print(make_scene(here.scene, "phone", own=here.of, views=here.views, size=here.size, seed=1))
 print(pose_table(here.truth, given=here.scene))
 

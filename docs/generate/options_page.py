@@ -25,7 +25,7 @@ JSON Schema.
 - Which to start with: [quick start](quick-start.md). What they do, with the paper's symbols: [method](method.md).
 - A key that is left out takes the method's value, else the preset's, else its own.
 - With `steps` alone the preset's proportions are kept: `coarse_steps_min`, `coarse_steps_max`, `check_every`,
-  `warmup_steps` and (never above the preset's) `trial_steps` are scaled.
+  `warmup_steps` are scaled. `trial_steps` becomes a quarter of `steps` where the preset has more.
 """
 
 

@@ -25,6 +25,17 @@ def largest_jump(values) -> float:
     return float(np.abs(np.diff(values, axis=0)).max() / max(np.abs(values).max(), 1e-12))
 
 
+def test_a_shorter_run_shortens_its_stages_but_not_what_it_is_judged_by():
+    def of(steps):
+        options = RefineOptions(preset="fast", steps=steps).resolved()
+        return options.coarse_steps_max, options.trial_steps
+
+    full = PRESETS["fast"]
+    assert of(full["steps"]) == (full["coarse_steps_max"], full["trial_steps"])
+    assert of(full["steps"] // 2) == (full["coarse_steps_max"] // 2, full["trial_steps"])
+    assert of(400) == (round(full["coarse_steps_max"] * 400 / full["steps"]), 100)
+
+
 def test_the_smooth_ramp_is_flat_at_both_ends_and_half_in_the_middle():
     assert [smooth_ramp(q) for q in (-1, 0, 1, 2)] == pytest.approx([0, 0, 1, 1])
     assert smooth_ramp(0.5) == pytest.approx(0.5)
