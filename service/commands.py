@@ -93,7 +93,7 @@ def _announcer(host: str, port: int) -> Callable[[str], Coroutine[None, None, No
         url = f"http://{'127.0.0.1' if host in {'0.0.0.0', '::'} else shown}:{port}"
         while not await asyncio.to_thread(_answers, url):
             await asyncio.sleep(0.1)
-        click.echo(f"ready at {url}  (API docs: {url}/docs)")
+        click.echo(f"ready at {url}  (the page; API docs: {url}/docs)")
 
     return announce
 

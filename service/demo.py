@@ -67,7 +67,7 @@ def run_demo(scene: Path | None, output: Path, options: RefineOptions, views: in
     _clear(folders.output)
     given = scene or _made_scene(folders, views, size)
     with _service() as url:
-        click.echo(f"service: {url}  (API docs while this runs: {url}/docs)")
+        click.echo(f"service, while this runs: {url}  (its page; API docs: {url}/docs)")
         _send_and_fetch(url, given, folders.result, options)
     _tell(folders, None if scene else folders.truth, given)
 
@@ -170,10 +170,10 @@ def _tell(folders: Folders, truth: Path | None, scene: Path) -> None:
             f"held-out views ({held_out.count}): PSNR {held_out.psnr:.2f} dB, SSIM {held_out.ssim:.3f}"
         )
     click.echo(f"\nfiles: {os.path.relpath(folders.result)}")
-    for name in ("transforms.json", "colmap/sparse/0", "renders", "report.json"):
+    for name in ("report.html", "transforms.json", "colmap/sparse/0", "renders", "report.json"):
         if (folders.result / name).exists():
             click.echo(f"  {name}")
-    click.echo("API docs: run `biresnerf up` and open http://127.0.0.1:8000/docs")
+    click.echo("the service's page, for sets of your own: run `biresnerf up` and open http://127.0.0.1:8000")
 
 
 def _pose_error(poses: Path, truth: Path) -> tuple[float, float]:
