@@ -61,7 +61,9 @@ def test_each_answer_is_one_json_document(service: Running, done_job: dict[str, 
     job = done_job["id"]
     assert document(run(service, "status", job, "--json"))["state"] == "succeeded"
     assert document(run(service, "wait", job, "--json"))["id"] == job
-    assert job in [item["id"] for item in document(run(service, "list", "--json"))["items"]]
+    assert job in [
+        item["id"] for item in document(run(service, "list", "--limit", 10_000, "--json"))["items"]
+    ]
     assert [line["n"] for line in document(run(service, "logs", job, "--json"))["items"]] == [1, 2]
     got = document(run(service, "download", job, "report.json", "-o", tmp_path, "--json"))
     assert got["files"] == [str(tmp_path / "report.json")]
@@ -75,7 +77,7 @@ def test_people_read_lines(service: Running, done_job: dict[str, Any], tmp_path:
     assert "verdict: kept_input" in said
     assert run(service, "logs", job).stdout == "images read\nline 2\n"
     assert run(service, "logs", job, "--after", 1, "--follow").stdout == "line 2\n"
-    assert re.search(rf"{job}  succeeded +100 %  \d{{4}}-", run(service, "list").stdout)
+    assert re.search(rf"{job}  succeeded +100 %  \d{{4}}-", run(service, "list", "--limit", 10_000).stdout)
     assert run(service, "list", "--label", "no=such").stdout == "no jobs\n"
     assert "files in" in run(service, "download", job, "-o", tmp_path / "out").stdout
     assert (tmp_path / "out" / "colmap/sparse/0/images.bin").is_file()
