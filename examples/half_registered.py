@@ -13,7 +13,7 @@ The notebook is made of this file (`make docs`).
 # %%
 from collections import Counter
 
-from walk import arguments, pose_table, show_progress
+from walk import arguments, in_words, pose_table, show_progress
 
 from biresnerf import refine_poses
 from biresnerf.commands.make_scene import make_scene
@@ -29,11 +29,7 @@ print(pose_table(here.truth, given=here.scene))
 
 # %%
 report = refine_poses(here.scene, here.refined, here.options, show_progress)
-print()
-for line in report.verdict.in_words() if report.verdict else ():
-    print(line)
-for warning in report.warnings:
-    print("warning:", warning)
+print(in_words(report))
 print("poses began from:", Counter(image.pose_source for image in report.images))
 
 # %% [markdown]

@@ -11,7 +11,7 @@ The notebook is made of this file (`make docs`).
 # with the truth beside it, and take the errors out again.
 
 # %%
-from walk import arguments, pose_table, show_progress
+from walk import arguments, in_words, pose_table, show_progress
 
 from biresnerf import refine_poses
 from biresnerf.commands.make_scene import make_scene
@@ -28,11 +28,7 @@ print(pose_table(here.truth, given=here.scene))
 
 # %%
 report = refine_poses(here.scene, here.refined, here.options, show_progress)
-print()
-for line in report.verdict.in_words() if report.verdict else ():
-    print(line)
-for warning in report.warnings:
-    print("warning:", warning)
+print(in_words(report))
 
 # %% [markdown]
 # ## Before and after, against the truth

@@ -17,6 +17,7 @@ from biresnerf.data.pose_file import read_poses
 from biresnerf.errors import InputError
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.progress import Progress
+from biresnerf.report import Report
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,12 @@ def arguments(name: str, *, views: int, size: int, **settings: object) -> Argume
 def show_progress(progress: Progress) -> None:
     """One line that changes."""
     print(f"\r{progress.stage:<10} {100 * progress.fraction:3.0f} %", end="", file=sys.stderr, flush=True)
+
+
+def in_words(report: Report) -> str:
+    """The verdict and the warnings, a line each, below the line of progress."""
+    verdict = report.verdict.in_words() if report.verdict else ()
+    return "\n".join(["", *verdict, *(f"warning: {warning}" for warning in report.warnings)])
 
 
 def pose_table(truth: Path, **sets: Path) -> str:

@@ -5,9 +5,13 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from biresnerf.errors import InputError
+
+Model = TypeVar("Model", bound=BaseModel)
 
 MAX_JSON_BYTES = 64 * 2**20  # some 100 000 frames; a larger file is no pose file
 _CODE = "pose_file_invalid"
@@ -88,6 +92,20 @@ def read_json_object(path: Path) -> dict[str, Any]:
             mend="Remove the frame, or its transform_matrix, or export it again.",
         )
     return document
+
+
+def read_model(model: type[Model], path: Path, *, code: str, mend: str) -> Model:
+    """The object in the JSON file ``path``, checked against ``model``.
+
+    Raises:
+        InputError: ``code`` with ``mend`` and the first wrong field, or a code of `read_json_object`.
+    """
+    try:
+        return model.model_validate(read_json_object(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        raise InputError(code, f"{first['msg']}.", where=f"{path.name} {field}", mend=mend) from None
 
 
 def _read_text(path: Path) -> str:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.data.atomic_file import whole_file
-from biresnerf.data.json_document import read_json_object
-from biresnerf.errors import InputError
+from biresnerf.data.json_document import read_model
 
 _FROZEN = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 VIEW, THUMBNAIL = "view.json", "thumbnail.jpg"
@@ -96,13 +95,9 @@ def read_view_file(folder: Path) -> ViewFile:
     Raises:
         InputError: ``view_file_invalid``, or a code of `read_json_object`.
     """
-    try:
-        return ViewFile.model_validate(read_json_object(folder / VIEW))
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise InputError(
-            "view_file_invalid",
-            f"{first['msg']}.",
-            where=f"{VIEW} {'.'.join(str(part) for part in first['loc'])}",
-            mend="Leave the files of a result together, as they were written.",
-        ) from None
+    return read_model(
+        ViewFile,
+        folder / VIEW,
+        code="view_file_invalid",
+        mend="Leave the files of a result together, as they were written.",
+    )

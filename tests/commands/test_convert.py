@@ -86,19 +86,10 @@ def test_there_and_back_keeps_poses_and_names(tmp_path_factory, form: str, seed:
     assert list(back.file_names) == list(given_set.file_names)
 
 
-@pytest.mark.parametrize("form", ["colmap", "llff", "tum", "kitti", "bundler", "metashape"])
+@pytest.mark.parametrize("form", trajectories.FORMS)
 def test_every_form_that_is_read_becomes_every_form_that_is_written(tmp_path: Path, form: str) -> None:
     scene = tmp_path / "scene"
-    {
-        "colmap": trajectories.colmap_set,
-        "llff": trajectories.llff_set,
-        "tum": lambda folder: trajectories.tum_set(folder, ["0", "1", "2", "3"]),
-        "kitti": trajectories.kitti_set,
-        "bundler": trajectories.bundler_set,
-        "metashape": trajectories.write_images,
-    }[form](scene)
-    if form == "metashape":
-        (scene / "cameras.xml").write_text(trajectories.metashape_xml())
+    trajectories.write_set(form, scene)
     given_set = read_dataset(scene)
     # Bundler knows one focal length, in the middle of the image.
     forms = [name for name in FORMS if name != "bundler" or form in ("llff", "bundler")]

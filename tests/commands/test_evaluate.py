@@ -124,20 +124,11 @@ def test_names_match_by_file_name_alone_only_where_one_file_alone_has_it():
     assert matched_names(["a.png", "x/a.png"], ["a.png"]) == [("a.png", "a.png")]
 
 
-@pytest.mark.parametrize("form", ["colmap", "llff", "tum", "kitti", "bundler", "metashape"])
+@pytest.mark.parametrize("form", trajectories.FORMS)
 @pytest.mark.parametrize("with_images", [True, False])
 def test_poses_in_every_form_compare_with_a_transforms_file(tmp_path, form, with_images):
     scene = tmp_path / "scene"
-    {
-        "colmap": trajectories.colmap_set,
-        "llff": trajectories.llff_set,
-        "tum": lambda folder: trajectories.tum_set(folder, ["0", "1", "2", "3"]),
-        "kitti": trajectories.kitti_set,
-        "bundler": trajectories.bundler_set,
-        "metashape": trajectories.write_images,
-    }[form](scene)
-    if form == "metashape":
-        (scene / "cameras.xml").write_text(trajectories.metashape_xml())
+    trajectories.write_set(form, scene)
     named = with_images or form in ("colmap", "bundler", "metashape")
     if not with_images:
         shutil.rmtree(scene / "images")

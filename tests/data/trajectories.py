@@ -128,6 +128,20 @@ def metashape_xml(lens: str = "", cameras: str | None = None) -> str:
     )
 
 
+FORMS = ("colmap", "llff", "tum", "kitti", "bundler", "metashape")
+
+
+def write_set(form: str, folder: Path) -> None:
+    """The four images with their true poses, in the form of that name."""
+    if form == "metashape":
+        write_images(folder)
+        (folder / "cameras.xml").write_text(metashape_xml())
+    elif form == "tum":
+        tum_set(folder, ["0", "1", "2", "3"])
+    else:
+        {"colmap": colmap_set, "llff": llff_set, "kitti": kitti_set, "bundler": bundler_set}[form](folder)
+
+
 def npy_bytes(header: str, content: bytes) -> bytes:
     """A file of the npy format, version 1.0, with any header."""
     padded = header.encode().ljust(118 - len(header) % 64) + b"\n"

@@ -11,12 +11,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.data.atomic_file import whole_file
-from biresnerf.data.json_document import read_json_object
+from biresnerf.data.json_document import read_model
 from biresnerf.data.refined_set import PointsSource, RefinedSet
-from biresnerf.errors import InputError
 
 _FROZEN = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 POSES = "poses.json"
@@ -126,16 +125,12 @@ def read_poses_json(path: Path) -> PosesDocument:
     Raises:
         InputError: ``pose_file_invalid``, or a code of `read_json_object`.
     """
-    try:
-        return PosesDocument.model_validate(read_json_object(path))
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise InputError(
-            "pose_file_invalid",
-            f"{first['msg']}.",
-            where=f"{path.name} {'.'.join(str(part) for part in first['loc'])}",
-            mend="Give the poses.json of a finished result, as it was written.",
-        ) from None
+    return read_model(
+        PosesDocument,
+        path,
+        code="pose_file_invalid",
+        mend="Give the poses.json of a finished result, as it was written.",
+    )
 
 
 def matrix_of(rows: Matrix) -> NDArray[np.float64]:
