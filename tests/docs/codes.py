@@ -46,14 +46,14 @@ def codes_in_use() -> dict[str, str]:
 
 
 def _functions_that_take_a_code(tree: ast.Module) -> dict[str, int]:
-    """By name, and which of its arguments it is."""
-    return {
-        node.name: [argument.arg for argument in node.args.args].index("code")
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        and not node.name.startswith("__")
-        and "code" in [argument.arg for argument in node.args.args]
-    }
+    """By name, and which of its arguments it is; one that is only given by name stands behind the others."""
+    found = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not node.name.startswith("__"):
+            names = [argument.arg for argument in (*node.args.args, *node.args.kwonlyargs)]
+            if "code" in names:
+                found[node.name] = names.index("code")
+    return found
 
 
 def _codes(tree: ast.Module, places: dict[str, int]) -> Iterator[str]:
