@@ -9,6 +9,7 @@ from biresnerf.geometry.pose_interpolation import interpolate_pose
 from tests.viewer.conftest import ARGUMENTS, CHROMIUM, HOSTILE, HOSTILE_IMAGE, SCREENSHOTS, VIEWS, open_report
 
 STAGE = "document.querySelector('.scene-stage').dataset"  # what is really drawn
+CHOSEN = "(document.querySelector('.images tr[aria-current]')?.dataset.image ?? '')"  # what the table says
 WIDGETS = (".verdict", ".scene canvas", ".compare", ".images tbody tr", ".curve canvas")
 
 
@@ -20,6 +21,8 @@ def choose(page, image: int) -> None:
     """By the keyboard, as someone without a mouse does."""
     page.locator(".scene-stage").focus()
     for _ in range(VIEWS + 1):
+        # The picture is drawn after the page: what it still shows of the last choice is not where a key begins.
+        page.wait_for_function(f"() => {STAGE}.selected === {CHOSEN}")
         before = stage(page)["selected"]
         if before == str(image):
             return
