@@ -28,7 +28,7 @@ from biresnerf.data.read import read_dataset
 from biresnerf.data.seed_poses import PoseCandidate, seed_poses
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import camera_errors
-from biresnerf.geometry.similarity import align_umeyama
+from biresnerf.geometry.similarity import align_by_spread
 
 
 def all_taken_away(truth: Dataset) -> Dataset:
@@ -85,7 +85,7 @@ def errors_of(candidate: PoseCandidate, truth: Dataset, which: np.ndarray) -> st
         return "none"
     poses = candidate.world_from_cam
     errors = camera_errors(
-        align_umeyama(poses, truth.world_from_cam).apply_to_poses(poses), truth.world_from_cam
+        align_by_spread(poses, truth.world_from_cam).apply_to_poses(poses), truth.world_from_cam
     )
     turned = errors.rotation_deg[which]
     return f"{turned.mean():.2f} deg, at most {turned.max():.2f}"

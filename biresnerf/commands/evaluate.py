@@ -39,10 +39,11 @@ def evaluate_command(result: Path, truth: Path, as_json: bool, paper_compat: boo
 
     Both are files with poses, or folders that hold one, in any form that `refine` reads. Images are matched by name,
     with or without extension, else by file name alone where just one has it; they need not be there. "aligned" is after
-    the best similarity of the camera centres, as published tables have it; "robust" after one that single lost cameras
-    do not drag along; "own frame" without any alignment. --paper-compat adds the alignment of the published code with
-    its flaw on flat rigs. ATE and RPE (from each image to the next, in RESULT's order) are after the similarity; AUC is
-    of the relative poses of all pairs, and needs none. docs/conventions.md defines them all.
+    BARF's similarity of the camera centres, as published tables have it: the least-squares rotation, and the ratio of
+    the rigs' sizes for scale; "robust" after one that single lost cameras do not drag along; "own frame" without any
+    alignment. --paper-compat adds the alignment of the published code with its flaw on flat rigs. ATE and RPE (from
+    each image to the next, in RESULT's order) are after the least-squares similarity (Umeyama's); AUC is of the
+    relative poses of all pairs, and needs none. docs/conventions.md defines them all.
     """
     import numpy as np
 

@@ -25,7 +25,7 @@ from biresnerf.data.dataset import Dataset
 from biresnerf.data.pose_file import read_poses
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.pose_error import camera_errors, pose_error
-from biresnerf.geometry.similarity import align_robust, align_umeyama
+from biresnerf.geometry.similarity import align_by_spread, align_robust
 from biresnerf.pipeline import refine_poses
 from biresnerf.refine.checkpoint import CHECKPOINT
 from biresnerf.refine.history import Observer
@@ -60,9 +60,9 @@ class TruthObserver:
         self.seconds = 0.0
 
     def at_check(self, optimiser: JointOptimiser) -> dict[str, float]:
-        """Errors after least-squares alignment, as tables have them: mean rotation and mean centre."""
+        """Errors after BARF's alignment, as tables have them: mean rotation and mean centre."""
         poses = optimiser.poses.poses().numpy()
-        errors = camera_errors(align_umeyama(poses, self.truth).apply_to_poses(poses), self.truth)
+        errors = camera_errors(align_by_spread(poses, self.truth).apply_to_poses(poses), self.truth)
         return {
             "rotation_deg": float(errors.rotation_deg.mean()),
             "rotation_median_deg": float(np.median(errors.rotation_deg)),

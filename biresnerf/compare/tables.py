@@ -31,7 +31,7 @@ def _most(values: Sequence[float]) -> float:
     return float(max(values))
 
 
-# Rotation and translation as BARF and BAA-NGP define them, after least-squares alignment.
+# Rotation and translation as BARF and BAA-NGP define them, after BARF's alignment.
 METRICS = (
     Metric("start_deg", "start °", 2, lambda o: o.before.aligned.rotation_deg.mean),
     Metric("rotation_deg", "rotation °", 3, lambda o: o.after.aligned.rotation_deg.mean, tested=True),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.geometry.focus import focus_point, rms_spread
-from biresnerf.geometry.similarity import Similarity, align_robust, align_row_flip, align_umeyama
+from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust, align_row_flip
 
 Array = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class PoseError(BaseModel):
 
     cameras: int
     aligned: FrameError = Field(
-        description="After the least-squares similarity of the centres (BARF's protocol)."
+        description="After BARF's similarity of the centres: least-squares rotation, ratio of the spreads as scale."
     )
     aligned_robust: FrameError = Field(description="After a similarity that outliers do not drag along.")
     own_frame: FrameError = Field(description="Without any alignment.")
@@ -118,7 +118,7 @@ def pose_error(estimate: Array, truth: Array) -> PoseError:
         ValueError: if shapes differ, there is no camera, or a number is not finite.
     """
     estimate, truth = np.asarray(estimate, dtype=np.float64), np.asarray(truth, dtype=np.float64)
-    truth_from_estimate = align_umeyama(estimate, truth)
+    truth_from_estimate = align_by_spread(estimate, truth)
     robust_truth_from_estimate = align_robust(estimate, truth)
     _, distance, reference = _reference(truth)
     return PoseError(

@@ -75,14 +75,15 @@ class Similarity:
         return self.compose(b_from_a)
 
 
-def align_umeyama(a_from_cam: Array, b_from_cam: Array) -> Similarity:
+def align_by_spread(a_from_cam: Array, b_from_cam: Array) -> Similarity:
     """The ``b_from_a`` that carries the camera centres of a rig in a onto those in b, as BARF's evaluation
     does.
 
-    Scale is the ratio of the root-mean-square spreads; the rotation comes from the singular value
-    decomposition of the correlation with the determinant kept at +1 (Umeyama 1991), so flat rigs are safe
-    however they are tilted. What the centres leave free is fixed by the cameras' rotations: the turn about
-    the line of collinear centres, the whole rotation where all centres are one point (scale is 1 then).
+    Scale is the ratio of the root-mean-square spreads, which is not the least-squares one (`trajectory_error`
+    has that); the rotation comes from the singular value decomposition of the correlation with the determinant
+    kept at +1 (Umeyama 1991), so flat rigs are safe however they are tilted. What the centres leave free is
+    fixed by the cameras' rotations: the turn about the line of collinear centres, the whole rotation where all
+    centres are one point (scale is 1 then).
 
     Args:
         a_from_cam, b_from_cam: poses [n, 4, 4] of the same n >= 1 cameras in the same order.
@@ -96,16 +97,16 @@ def align_umeyama(a_from_cam: Array, b_from_cam: Array) -> Similarity:
 
 
 def align_row_flip(a_from_cam: Array, b_from_cam: Array) -> Similarity:
-    """As `align_umeyama` with the published code's way out of a reflection: the third row of the rotation negated.
+    """As `align_by_spread` with the published code's way out of a reflection: the third row of the rotation negated.
 
     It is no best rotation then: on flat rigs that are tilted in b it is wrong by tens of degrees. Only to compare with
     figures made by BARF's or BAA-NGP's evaluation.
 
     Raises:
-        ValueError: as `align_umeyama`.
+        ValueError: as `align_by_spread`.
     """
     a, b = _rig_pair(a_from_cam, b_from_cam)
-    best = align_umeyama(a, b)
+    best = align_by_spread(a, b)
     from_middle_a = a[:, :3, 3] - a[:, :3, 3].mean(0)
     from_middle_b = b[:, :3, 3] - b[:, :3, 3].mean(0)
     left, _, right_t = np.linalg.svd(from_middle_b.T @ from_middle_a)
@@ -119,7 +120,7 @@ def align_row_flip(a_from_cam: Array, b_from_cam: Array) -> Similarity:
 def align_robust(
     a_from_cam: Array, b_from_cam: Array, *, with_rotations: bool = False, with_scale: bool = True
 ) -> Similarity:
-    """As `align_umeyama`, with cameras that do not follow the others weighed down.
+    """As `align_by_spread`, with cameras that do not follow the others weighed down.
 
     ``with_rotations`` lets the cameras' rotations have their say in the turn beside the centres: not BARF's
     metric, but the better estimate of a frame from noisy poses. Without ``with_scale`` the scale is 1.
@@ -128,7 +129,7 @@ def align_robust(
     round, for centres and for rotations apart.
 
     Raises:
-        ValueError: as `align_umeyama`.
+        ValueError: as `align_by_spread`.
     """
     a, b = _rig_pair(a_from_cam, b_from_cam)
     weights_centre = weights_rotation = np.ones(len(a))

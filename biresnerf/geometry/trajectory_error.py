@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.geometry.pose_error import rotation_angle_deg
 from biresnerf.geometry.rigid import rigid_inverse
-from biresnerf.geometry.similarity import Similarity, align_umeyama
+from biresnerf.geometry.similarity import Similarity, align_by_spread
 
 Array = NDArray[np.float64]
 THRESHOLDS_DEG = (1, 3, 5, 10)
@@ -61,7 +61,7 @@ def _least_squares(estimate: Array, truth: Array) -> Similarity:
 
     BARF's protocol takes the ratio of the rigs' sizes for the scale; its rotation is the same.
     """
-    barf = align_umeyama(estimate, truth)
+    barf = align_by_spread(estimate, truth)
     a, b = estimate[:, :3, 3], truth[:, :3, 3]
     from_middle = (a - a.mean(axis=0)) @ barf.rotation.T
     along = float(np.sum((b - b.mean(axis=0)) * from_middle))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from biresnerf.data.dataset import Dataset
-from biresnerf.geometry.similarity import Similarity, align_robust, align_umeyama
+from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
 from biresnerf.refine.joint_optimiser import JointOptimiser
 
 
@@ -23,6 +23,6 @@ def poses_in_input_frame(dataset: Dataset, optimiser: JointOptimiser) -> tuple[n
     if input_from_optimised is None and optimiser.method.robust_frame:
         input_from_optimised = align_robust(optimised[tied], given[tied], with_rotations=True)
     elif input_from_optimised is None:
-        input_from_optimised = align_umeyama(optimised[tied], given[tied])
+        input_from_optimised = align_by_spread(optimised[tied], given[tied])
     carried = input_from_optimised.apply_to_poses(optimised)
     return optimiser.bodies.restored(carried, given), input_from_optimised

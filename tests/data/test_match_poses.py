@@ -19,7 +19,7 @@ from biresnerf.data.synthetic import synthetic_focal
 from biresnerf.errors import Interrupted, RefinementError
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import rotation_angle_deg, turned_deg
-from biresnerf.geometry.similarity import Similarity, align_umeyama
+from biresnerf.geometry.similarity import Similarity, align_by_spread
 from tests.data.scenes import plain_features, textured_arc
 
 pytest.importorskip("pycolmap", reason="needs pycolmap (pip install 'biresnerf[colmap]')")
@@ -33,7 +33,7 @@ def with_poses(dataset: Dataset, poses: np.ndarray) -> Dataset:
 
 
 def errors_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    aligned = align_umeyama(found, truth).apply_to_poses(found)
+    aligned = align_by_spread(found, truth).apply_to_poses(found)
     return turned_deg(aligned, truth)
 
 
@@ -94,7 +94,7 @@ def test_matches_bring_noisy_poses_near_the_truth(found, noisy, truth):
 
 def test_the_result_lies_in_the_frame_of_the_given_poses(found, noisy):
     best = found.candidates[1]
-    between = align_umeyama(best.world_from_cam, noisy.world_from_cam)
+    between = align_by_spread(best.world_from_cam, noisy.world_from_cam)
     assert between.scale == pytest.approx(1, abs=0.1)
     assert rotation_angle_deg(between.rotation[None])[0] < 15
 

@@ -11,7 +11,7 @@ import torch
 from biresnerf.data.images import ImageSet
 from biresnerf.field.radiance_field import Rendering
 from biresnerf.geometry.pose_error import camera_errors
-from biresnerf.geometry.similarity import align_umeyama
+from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.exposure import MOST, Exposure, brightness_spread, compensates
 from tests.refine.scene import CPU, photos_set, tiny_optimiser, tiny_options, tiny_set
 
@@ -46,7 +46,7 @@ def runs(tmp_path_factory) -> dict:
             optimiser = tiny_optimiser(dataset, images, options)
             error = [optimiser.step().mean_squared_error for _ in range(STEPS)]
             poses = optimiser.poses.poses().numpy()
-            turned = camera_errors(align_umeyama(poses, truth).apply_to_poses(poses), truth).rotation_deg
+            turned = camera_errors(align_by_spread(poses, truth).apply_to_poses(poses), truth).rotation_deg
             results[photos, choice] = (
                 float(turned.mean()),
                 optimiser.exposure.gains(),
