@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.service_options import json_option
 from biresnerf.commands.settings_option import settings_option
 from biresnerf.errors import InputError
 
@@ -132,18 +134,28 @@ def worker_command(slot: str) -> None:
 
 
 @click.command("migrate")
-def migrate_command() -> None:
+@json_option
+def migrate_command(as_json: bool) -> None:
     """Bring the database at BIRESNERF_DATABASE_URL up to date."""
     from workers.migrate import migrate
 
     with setup_problems():
         applied = migrate(settings_with().require_database_url())
-    click.echo("\n".join(f"applied {name}" for name in applied) or "The database is up to date.")
+    if as_json:
+        print_json({"applied": applied})
+    else:
+        click.echo("\n".join(f"applied {name}" for name in applied) or "The database is up to date.")
 
 
 @click.command("demo")
 @click.option("--scene", type=click.Path(path_type=Path), help="Your own folder or transforms.json.")
-@click.option("--output", type=click.Path(path_type=Path), default=Path("demo-output"), show_default=True)
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("demo-output"),
+    show_default=True,
+    help="For all of its files.",
+)
 @click.option("--preset", default="fast", show_default=True, help="fast, balanced, quality or paper.")
 @click.option(
     "--views", type=click.IntRange(6, 400), default=60, show_default=True, help="Of the made scene."

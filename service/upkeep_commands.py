@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.service_options import json_option
 from service.commands import settings_with, setup_problems
 
 if TYPE_CHECKING:
@@ -33,7 +35,8 @@ def dispatcher_command() -> None:
 @click.command("backup")
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--data-dir", type=click.Path(path_type=Path), help="Default: BIRESNERF_DATA_DIR.")
-def backup_command(folder: Path, data_dir: Path | None) -> None:
+@json_option
+def backup_command(folder: Path, data_dir: Path | None, as_json: bool) -> None:
     """Bring FOLDER up to date with the database and all files, while the service runs or not.
 
     The same folder again takes only what is new. It holds secrets: keep it as safe as the service.
@@ -45,15 +48,16 @@ def backup_command(folder: Path, data_dir: Path | None) -> None:
         settings = settings_with(data_dir=data_dir)
         with reached_database(settings) as url:
             index = asyncio.run(make_backup(settings, url, folder))
-    click.echo(_told(index))
-    if index.gone:
+    _tell(index, as_json)
+    if index.gone and not as_json:
         click.echo(f"Deleted by the service meanwhile: {len(index.gone)} files.")
 
 
 @click.command("restore")
 @click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--data-dir", type=click.Path(path_type=Path), help="Default: BIRESNERF_DATA_DIR.")
-def restore_command(folder: Path, data_dir: Path | None) -> None:
+@json_option
+def restore_command(folder: Path, data_dir: Path | None, as_json: bool) -> None:
     """Put the backup in FOLDER into an empty installation; nothing of the service may run yet.
 
     Every file is checked against its digest. Jobs that were running go on from their last checkpoints.
@@ -67,9 +71,13 @@ def restore_command(folder: Path, data_dir: Path | None) -> None:
         read_index(folder)  # before a database is made for it
         with reached_database(settings, migrated=False) as url:
             index = asyncio.run(restore_backup(settings, url, folder))
-    click.echo(_told(index))
+    _tell(index, as_json)
 
 
-def _told(index: BackupIndex) -> str:
-    size = index.bytes / MIB
-    return f"Backup of {index.made_at:%Y-%m-%d %H:%M:%S} UTC: database and {len(index.files)} files, {size:.1f} MiB."
+def _tell(index: BackupIndex, as_json: bool) -> None:
+    made_at, files, gone = index.made_at, len(index.files), len(index.gone)
+    if as_json:
+        print_json({"made_at": made_at.isoformat(), "files": files, "bytes": index.bytes, "gone": gone})
+    else:
+        size = f"{index.bytes / MIB:.1f} MiB"
+        click.echo(f"Backup of {made_at:%Y-%m-%d %H:%M:%S} UTC: database and {files} files, {size}.")

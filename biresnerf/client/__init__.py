@@ -10,9 +10,18 @@ Needs the extra ``client`` (httpx). Answers are the models of `biresnerf.wire`, 
 
 from biresnerf.client.asynchronous import AsyncClient
 from biresnerf.client.blocking import Client
-from biresnerf.client.errors import JobFailed, ServiceError
+from biresnerf.client.errors import JobFailed, JobNotOver, ServiceError
 from biresnerf.client.events import Happening
 from biresnerf.client.sending import LocalFile
 from biresnerf.client.submitting import Sending
 
-__all__ = ["AsyncClient", "Client", "Happening", "JobFailed", "LocalFile", "Sending", "ServiceError"]
+__all__ = [
+    "AsyncClient",
+    "Client",
+    "Happening",
+    "JobFailed",
+    "JobNotOver",
+    "LocalFile",
+    "Sending",
+    "ServiceError",
+]

@@ -120,12 +120,17 @@ class AsyncClient:
     delivery = _method(service_calls.delivery)
     redeliver = _method(service_calls.redeliver)
 
-    async def events(self, job_id: str, *, after: int = 0) -> AsyncIterator[Happening]:
+    async def events(
+        self, job_id: str, *, after: int = 0, timeout_s: float | None = None
+    ) -> AsyncIterator[Happening]:
         """What happens to the job until it is over: each event after that number once, and how far it is.
 
         Lost connections are taken up again where they broke off, and a service that is away is waited for.
+
+        Raises:
+            JobNotOver: it is not over after ``timeout_s``.
         """
-        following = Following(self.session, job_id, after)
+        following = Following(self.session, job_id, after, timeout_s)
         while not following.over:
             call = following.connect()
             try:
@@ -133,6 +138,8 @@ class AsyncClient:
                     async for chunk in response.aiter_raw():
                         for happening in following.take(chunk):
                             yield happening
+                        if following.connect_again:
+                            break
                 pause_s = following.ended()
             except httpx.TransportError as error:
                 pause_s = following.broken(broken(self.url, call, error))
@@ -140,9 +147,19 @@ class AsyncClient:
                 pause_s = following.broken(error)
             await anyio.sleep(pause_s)
 
-    async def wait(self, job_id: str, on_progress: Callable[[JobView], None] | None = None) -> JobView:
-        """The job once it is over, however it ended; ``on_progress`` hears how far it is."""
-        async for happening in self.events(job_id):
+    async def wait(
+        self,
+        job_id: str,
+        on_progress: Callable[[JobView], None] | None = None,
+        *,
+        timeout_s: float | None = None,
+    ) -> JobView:
+        """The job once it is over, however it ended; ``on_progress`` hears how far it is.
+
+        Raises:
+            JobNotOver: it is not over after ``timeout_s``.
+        """
+        async for happening in self.events(job_id, timeout_s=timeout_s):
             if on_progress is not None and (job := happening.job) is not None:
                 on_progress(job)
         return await self.job(job_id)

@@ -120,18 +120,23 @@ class Client:
     delivery = _method(service_calls.delivery)
     redeliver = _method(service_calls.redeliver)
 
-    def events(self, job_id: str, *, after: int = 0) -> Iterator[Happening]:
+    def events(self, job_id: str, *, after: int = 0, timeout_s: float | None = None) -> Iterator[Happening]:
         """What happens to the job until it is over: each event after that number once, and how far it is.
 
         Lost connections are taken up again where they broke off, and a service that is away is waited for.
+
+        Raises:
+            JobNotOver: it is not over after ``timeout_s``.
         """
-        following = Following(self.session, job_id, after)
+        following = Following(self.session, job_id, after, timeout_s)
         while not following.over:
             call = following.connect()
             try:
                 with self._opened(call) as response:
                     for chunk in response.iter_raw():
                         yield from following.take(chunk)
+                        if following.connect_again:
+                            break
                 pause_s = following.ended()
             except httpx.TransportError as error:
                 pause_s = following.broken(broken(self.url, call, error))
@@ -139,9 +144,19 @@ class Client:
                 pause_s = following.broken(error)
             time.sleep(pause_s)
 
-    def wait(self, job_id: str, on_progress: Callable[[JobView], None] | None = None) -> JobView:
-        """The job once it is over, however it ended; ``on_progress`` hears how far it is."""
-        for happening in self.events(job_id):
+    def wait(
+        self,
+        job_id: str,
+        on_progress: Callable[[JobView], None] | None = None,
+        *,
+        timeout_s: float | None = None,
+    ) -> JobView:
+        """The job once it is over, however it ended; ``on_progress`` hears how far it is.
+
+        Raises:
+            JobNotOver: it is not over after ``timeout_s``.
+        """
+        for happening in self.events(job_id, timeout_s=timeout_s):
             if on_progress is not None and (job := happening.job) is not None:
                 on_progress(job)
         return self.job(job_id)

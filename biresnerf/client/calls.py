@@ -13,7 +13,7 @@ from pathlib import Path
 from threading import Event
 from typing import Any, Literal, Protocol, TypeAlias, TypeVar
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from biresnerf.client.errors import ServiceError
 
@@ -57,8 +57,11 @@ class Answer:
     content: bytes
 
     def model(self, kind: type[Model]) -> Model:
-        """The body. A newer service may say more than this client knows."""
-        return kind.model_validate_json(self.content, extra="ignore")
+        """The body; raises `ServiceError`. A newer service may say more than this client knows."""
+        try:
+            return kind.model_validate_json(self.content, extra="ignore")
+        except ValidationError:
+            raise ServiceError.of_stranger(self.status) from None
 
 
 class Sink(Protocol):

@@ -72,14 +72,7 @@ class ServiceError(BiresnerfError):
         try:
             problem = Problem.model_validate_json(content, extra="ignore")
         except ValidationError:
-            return cls(
-                "unexpected_answer",
-                f"The answer has status {status} and is none that a BiResNeRF service gives.",
-                status=status,
-                mend="Look whether the address is right.",
-                request_id=headers.get("x-request-id"),
-                retry_after_s=wait_s,
-            )
+            return cls.of_stranger(status, request_id=headers.get("x-request-id"), retry_after_s=wait_s)
         return cls(
             problem.code,
             problem.detail,
@@ -89,6 +82,20 @@ class ServiceError(BiresnerfError):
             errors=tuple(problem.errors),
             request_id=problem.request_id,
             retry_after_s=wait_s,
+        )
+
+    @classmethod
+    def of_stranger(
+        cls, status: int, *, request_id: str | None = None, retry_after_s: float | None = None
+    ) -> ServiceError:
+        """An answer that no service of this project gives: of a proxy, a portal, another program."""
+        return cls(
+            "unexpected_answer",
+            f"The answer has status {status} and is none that a BiResNeRF service gives.",
+            status=status,
+            mend="Look whether the address is right.",
+            request_id=request_id,
+            retry_after_s=retry_after_s,
         )
 
     @classmethod
@@ -108,6 +115,14 @@ class JobFailed(BiresnerfError):
             return
         parts = (f"The job {job.id} failed ({error.code}):", f"{error.where}:" if error.where else "")
         super().__init__(" ".join(part for part in (*parts, error.detail, error.mend) if part))
+
+
+class JobNotOver(BiresnerfError, TimeoutError):
+    """The job ``job_id`` was not over after ``timeout_s``. It goes on."""
+
+    def __init__(self, job_id: str, timeout_s: float) -> None:
+        self.job_id, self.timeout_s = job_id, timeout_s
+        super().__init__(f"The job {job_id} is not over after {timeout_s:g} s; it goes on.")
 
 
 def retry_after_s(header: str | None) -> float | None:

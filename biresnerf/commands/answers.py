@@ -29,6 +29,12 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def with_code(error: Exception) -> str:
+    """What went wrong, with the code by which docs/troubleshooting.md has it."""
+    code = getattr(error, "code", None)
+    return f"{error} [{code}]" if code else str(error)
+
+
 def table(rows: Sequence[Sequence[str]]) -> str:
     """Rows in columns as wide as they need, the last one without filling."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))] if rows else []

@@ -14,8 +14,16 @@ from biresnerf.config import PRESETS, RefineOptions
 
 
 @click.command("bench")
-@click.option("--preset", type=click.Choice(list(PRESETS)), default="fast", show_default=True)
-@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
+@click.option(
+    "--preset", type=click.Choice(list(PRESETS)), default="fast", show_default=True, help="Whose steps."
+)
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    show_default=True,
+    help="auto: the GPU where there is one.",
+)
 @click.option("--threads", type=click.IntRange(0, 256), default=0, help="0 takes all cores.")
 @click.option("--steps", type=click.IntRange(4, 10_000), default=60, show_default=True, help="Of each stage.")
 @click.option(

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.service_options import json_option
 from biresnerf.commands.settings_option import parse_settings, settings_option
 from biresnerf.config import PRESETS
 from biresnerf.errors import InputError
@@ -77,6 +79,7 @@ def comparison_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Score at most so many views of transforms_test.json, where there is one.",
         ),
         click.option("--retry-failed", is_flag=True, help="Run recorded failures again."),
+        json_option,
     ]  # fmt: skip
     for option in reversed(options):
         command = option(command)
@@ -150,7 +153,7 @@ def _start(given: dict[str, Any], noise: float, seed: int) -> Perturbation:
 
 
 def run_and_write(plan: Plan, given: dict[str, Any]) -> list[Entry]:
-    """Run what is not finished, write tables.md and tables.json, print the Markdown."""
+    """Run what is not finished, write tables.md and tables.json, print one of them."""
     from biresnerf.compare.markdown import as_markdown
     from biresnerf.compare.plan import Runner, run_plan
     from biresnerf.compare.tables import make_tables
@@ -169,7 +172,10 @@ def run_and_write(plan: Plan, given: dict[str, Any]) -> list[Entry]:
     ):
         with whole_file(output / name) as temporary:
             temporary.write_text(text, "utf-8")
-    click.echo(as_markdown(tables))
+    if given["as_json"]:
+        print_json(tables)
+    else:
+        click.echo(as_markdown(tables))
     return entries
 
 

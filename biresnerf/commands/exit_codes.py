@@ -14,6 +14,7 @@ JOB = 3  # the job failed, was cancelled, or has expired
 NOT_FOUND = 4  # no such job, dataset or file
 KEY = 5  # the API key is missing, refused, or may not do that
 AWAY = 6  # the service cannot be reached, or asks to come back later
+NOT_OVER = 7  # the job goes on: it was not over after --timeout
 SIGINT = 128 + signal.SIGINT
 SIGTERM = 128 + signal.SIGTERM
 

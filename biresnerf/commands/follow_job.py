@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,13 +19,22 @@ if TYPE_CHECKING:
     from biresnerf.wire.jobs import JobView
 
 
+timeout_option = click.option(
+    "--timeout",
+    "timeout_s",
+    type=click.FloatRange(0, min_open=True),
+    metavar="SECONDS",
+    help="Wait no longer; the job goes on, and the exit status is 7.",
+)
+
+
 def follow_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a click command `--wait` and `--output`."""
+    """Give a click command `--wait`, `--timeout` and `--output`."""
     wait = click.option("--wait", is_flag=True, help="Show progress until the job is over.")
     output = click.option(
         "--output", "-o", type=click.Path(path_type=Path), help="Download the result here; implies --wait."
     )
-    return wait(output(command))
+    return wait(timeout_option(output(command)))
 
 
 def require_empty(folder: Path | None) -> None:
@@ -39,12 +48,14 @@ def require_empty(folder: Path | None) -> None:
         )
 
 
-def see_through(client: Client, job: JobView, *, wait: bool, output: Path | None, as_json: bool) -> None:
+def see_through(
+    client: Client, job: JobView, *, wait: bool, timeout_s: float | None, output: Path | None, as_json: bool
+) -> None:
     """Print where the job is; wait for it and fetch its files where that is wanted. Raises `JobFailed`."""
     if not as_json:
         click.echo(f"{client.url}{job.links.self}")
-    if wait or output is not None:
-        job = waited_for(client, job)
+    if wait or timeout_s is not None or output is not None:
+        job = waited_for(client, job, timeout_s, as_json=as_json)
         if as_json:
             print_json(job)
         require_success(job)
@@ -55,21 +66,34 @@ def see_through(client: Client, job: JobView, *, wait: bool, output: Path | None
         print_json(job)
 
 
-def waited_for(client: Client, job: JobView) -> JobView:
-    """The job once it is over, with its progress on standard error. Ctrl-C ends the waiting, not the job."""
+def waited_for(client: Client, job: JobView, timeout_s: float | None, *, as_json: bool) -> JobView:
+    """The job once it is over, with its progress on standard error.
+
+    Ctrl-C, ``timeout_s`` and a service that stays away end the waiting, not the job: it is said how to come back to it.
+    """
+    from biresnerf.client import JobNotOver, ServiceError
+
     try:
         with JobProgressView() as view:
-            return watch(client, job, view)
+            return watch(client, job, view, timeout_s)
     except KeyboardInterrupt:
-        leave_running(client, job)
+        _tell_how_to_come_back(client, job)
+        raise click.exceptions.Exit(exit_codes.SIGINT) from None
+    except JobNotOver:
+        if as_json:
+            print_json(client.job(job.id))
+        _tell_how_to_come_back(client, job)
+        raise click.exceptions.Exit(exit_codes.NOT_OVER) from None
+    except ServiceError as error:
+        if error.retryable:
+            _tell_how_to_come_back(client, job)
+        raise
 
 
-def leave_running(client: Client, job: JobView) -> NoReturn:
-    """Say that the job goes on, and how to come back to it."""
+def _tell_how_to_come_back(client: Client, job: JobView) -> None:
     address = f"{client.url}{job.links.self}"
     click.echo(f"The job goes on. To wait again: biresnerf wait {address}", err=True)
     click.echo(f"To end it: biresnerf cancel {address}", err=True)
-    raise click.exceptions.Exit(exit_codes.SIGINT)
 
 
 def require_success(job: JobView) -> None:

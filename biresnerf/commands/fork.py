@@ -30,6 +30,7 @@ def fork_command(
     settings: dict[str, Any],
     from_stage: WantedStage,
     wait: bool,
+    timeout_s: float | None,
     output: Path | None,
     labels: dict[str, str],
     url: str | None,
@@ -43,4 +44,4 @@ def fork_command(
     options = parse_options(settings)
     with service_at(url, api_key, job) as client:
         made = client.fork(job.id, options, from_stage=from_stage, labels=labels)
-        see_through(client, made, wait=wait, output=output, as_json=as_json)
+        see_through(client, made, wait=wait, timeout_s=timeout_s, output=output, as_json=as_json)

@@ -123,10 +123,10 @@ class SendingView(BytesView):
         self._show(sending.bytes_missing)
 
 
-def watch(client: Client, job: JobView, view: JobProgressView) -> JobView:
-    """Shows the job until it is over; returns it. Raises `ServiceError`."""
+def watch(client: Client, job: JobView, view: JobProgressView, timeout_s: float | None = None) -> JobView:
+    """Shows the job until it is over; returns it. Raises `ServiceError`, `JobNotOver`."""
     view.job(job)
-    for happening in client.events(job.id):
+    for happening in client.events(job.id, timeout_s=timeout_s):
         if (now := happening.job) is not None:
             view.job(now)
         elif (text := _worth_a_line(happening)) is not None:

@@ -9,7 +9,7 @@ import click
 
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import print_json, table
-from biresnerf.commands.follow_job import require_success, waited_for
+from biresnerf.commands.follow_job import require_success, timeout_option, waited_for
 from biresnerf.commands.job_progress import left_of, numbers_of, stage_of
 from biresnerf.commands.service_options import JOB, JobName, json_option, service_at, service_options
 from biresnerf.wire.jobs import JobState, JobView
@@ -94,15 +94,18 @@ def list_command(
 
 @click.command("wait")
 @click.argument("job", type=JOB)
+@timeout_option
 @service_options
 @json_option
-def wait_command(job: JobName, url: str | None, api_key: str | None, as_json: bool) -> None:
+def wait_command(
+    job: JobName, timeout_s: float | None, url: str | None, api_key: str | None, as_json: bool
+) -> None:
     """Show the progress of JOB until it is over. Exit status 0: it succeeded; 3: it did not.
 
     Ctrl-C ends the waiting, not the job.
     """
     with service_at(url, api_key, job) as client:
-        over = waited_for(client, client.job(job.id))
+        over = waited_for(client, client.job(job.id), timeout_s, as_json=as_json)
         if as_json:
             print_json(over)
         require_success(over)
@@ -151,16 +154,23 @@ def _sleep_or_leave(client: Client, job: JobName) -> None:
 @click.argument("job", type=JOB)
 @click.option("--keep-partial", is_flag=True, help="Keep the best poses so far as its result.")
 @click.option("--wait", is_flag=True, help="Until it has ended.")
+@timeout_option
 @service_options
 @json_option
 def cancel_command(
-    job: JobName, keep_partial: bool, wait: bool, url: str | None, api_key: str | None, as_json: bool
+    job: JobName,
+    keep_partial: bool,
+    wait: bool,
+    timeout_s: float | None,
+    url: str | None,
+    api_key: str | None,
+    as_json: bool,
 ) -> None:
     """End JOB. One that is over already stays as it is."""
     with service_at(url, api_key, job) as client:
         found = client.cancel(job.id, keep_partial=keep_partial)
-        if wait and not found.final:
-            found = waited_for(client, found)
+        if (wait or timeout_s is not None) and not found.final:
+            found = waited_for(client, found, timeout_s, as_json=as_json)
     if as_json:
         print_json(found)
     else:

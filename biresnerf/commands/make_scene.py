@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.service_options import json_option
 from biresnerf.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,6 +23,21 @@ KINDS = {
     "vase": "a plain vase without background; each pose is turned at random",
 }
 _FOCAL_TOO_LONG = 1.01
+
+
+@dataclass(frozen=True)
+class MadeScene:
+    """What was written: a set of so many images, of which so many have a pose, and the file of their true poses."""
+
+    folder: Path
+    images: int
+    with_pose: int
+    truth: Path
+
+    def __str__(self) -> str:
+        said = f", of which the COLMAP model in sparse/0 has {self.with_pose}"
+        without = said if self.with_pose < self.images else ""
+        return f"{self.images} views in {self.folder}{without}, true poses in {self.truth}"
 
 
 @click.command("make-scene")
@@ -47,15 +64,29 @@ _FOCAL_TOO_LONG = 1.01
     show_default=True,
     help="BARF's sigma, for dome and vase.",
 )
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
+@click.option(
+    "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of scene and noise."
+)
+@json_option
 def make_scene_command(
-    output: Path, kind: str, own: Path | None, views: int, size: int, noise: float, seed: int
+    output: Path, kind: str, own: Path | None, views: int, size: int, noise: float, seed: int, as_json: bool
 ) -> None:
     """Write images with wrong or missing poses to OUTPUT, and the true poses beside it.
 
     The true poses are in OUTPUT.truth.json; `biresnerf evaluate` compares a result with them.
     """
-    click.echo(make_scene(output, kind, own=own, views=views, size=size, noise=noise, seed=seed))
+    made = make_scene(output, kind, own=own, views=views, size=size, noise=noise, seed=seed)
+    if as_json:
+        print_json(
+            {
+                "folder": str(made.folder),
+                "images": made.images,
+                "with_pose": made.with_pose,
+                "truth": str(made.truth),
+            }
+        )
+    else:
+        click.echo(str(made))
 
 
 def make_scene(
@@ -67,8 +98,8 @@ def make_scene(
     size: int = 100,
     noise: float = 0.15,
     seed: int = 0,
-) -> str:
-    """Writes a set of a kind of `KINDS` to `output`, and its true poses to OUTPUT.truth.json; says what it has written.
+) -> MadeScene:
+    """Writes a set of a kind of `KINDS` to `output`, and its true poses to OUTPUT.truth.json.
 
     Args:
         own: a set with poses, in any form that is read, to make wrong instead of rendering one.
@@ -89,11 +120,9 @@ def make_scene(
     shutil.copyfile(path, truth)
     dataset = read_transforms(path)
     if kind == "half":
-        said = _keep_half(dataset, path)
-    else:
-        said = ""
-        _make_wrong(dataset, path, kind, noise, seed)
-    return f"{len(dataset)} views in {output}{said}, true poses in {truth}"
+        return MadeScene(output, len(dataset), _keep_half(dataset, path), truth)
+    _make_wrong(dataset, path, kind, noise, seed)
+    return MadeScene(output, len(dataset), len(dataset), truth)
 
 
 def _made(output: Path, kind: str, views: int, size: int, seed: int) -> Path:
@@ -160,8 +189,8 @@ def _make_wrong(dataset: Dataset, path: Path, kind: str, noise: float, seed: int
     path.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
 
 
-def _keep_half(dataset: Dataset, path: Path) -> str:
-    """Replaces the transforms file by a COLMAP model of the first half of the images; says so."""
+def _keep_half(dataset: Dataset, path: Path) -> int:
+    """Replaces the transforms file by a COLMAP model of the first half of the images; gives how many these are."""
     from biresnerf.data.colmap_result import model_of_poses
     from biresnerf.data.image_order import natural_order
     from biresnerf.data.packs.colmap_binary import write_colmap_binary
@@ -176,4 +205,4 @@ def _keep_half(dataset: Dataset, path: Path) -> str:
     )
     write_colmap_binary(model, path.parent / "sparse" / "0")
     path.unlink()
-    return f", of which the COLMAP model in sparse/0 has {len(kept)}"
+    return len(kept)

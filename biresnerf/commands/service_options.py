@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from biresnerf.commands import exit_codes
+from biresnerf.commands.answers import with_code
 from biresnerf.commands.exit_codes import CommandFailed
 from biresnerf.errors import InputError
 
@@ -74,7 +75,7 @@ def service_at(url: str | None, api_key: str | None, job: JobName | None = None)
         with Client(chosen, api_key=api_key, on_pause=_tell_pause) as client:
             yield client
     except ServiceError as error:
-        raise CommandFailed(str(error), exit_code_of(error)) from None
+        raise CommandFailed(with_code(error), exit_code_of(error)) from None
     except JobFailed as error:
         raise CommandFailed(str(error), exit_codes.JOB) from None
 
@@ -86,6 +87,8 @@ def _tell_pause(error: ServiceError, seconds: float) -> None:
 
 def exit_code_of(error: ServiceError) -> int:
     """The exit status for what a service answered."""
+    if error.code == "unexpected_answer" and error.status < 500 and not error.retryable:
+        return exit_codes.INPUT  # another program answers there: the address is wrong
     if error.status in {404, 410}:
         return exit_codes.NOT_FOUND
     if error.status in {401, 403}:

@@ -41,7 +41,10 @@ label_option = click.option(
 @click.option("--preset", help="fast, balanced, quality or paper.")
 @settings_option
 @follow_options
-@click.option("--priority", type=click.Choice(["low", "normal", "high"]), default="normal", show_default=True)
+@click.option(
+    "--priority", type=click.Choice(["low", "normal", "high"]), default="normal", show_default=True,
+    help="Jobs of a higher one run first; your tenant may be allowed less.",
+)  # fmt: skip
 @label_option
 @click.option("--resume", metavar="DATASET", help="Go on with the dataset of an interrupted submission.")
 @service_options
@@ -51,6 +54,7 @@ def submit_command(
     preset: str | None,
     settings: dict[str, Any],
     wait: bool,
+    timeout_s: float | None,
     output: Path | None,
     url: str | None,
     api_key: str | None,
@@ -67,7 +71,7 @@ def submit_command(
     require_empty(output)
     with service_at(url, api_key) as client:
         job = submitted(client, path, options, **how)
-        see_through(client, job, wait=wait, output=output, as_json=as_json)
+        see_through(client, job, wait=wait, timeout_s=timeout_s, output=output, as_json=as_json)
 
 
 def submitted(client: Client, path: Path, options: RefineOptions, **how: Any) -> JobView:

@@ -7,15 +7,18 @@ import inspect
 import itertools
 import json
 import time
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from biresnerf.client import AsyncClient, Client, ServiceError
-from biresnerf.client.calls import Patience, Session
+import biresnerf
+from biresnerf.client import AsyncClient, Client, JobNotOver, ServiceError
+from biresnerf.client.calls import Answer, Patience, Session
 from biresnerf.client.errors import retry_after_s
-from biresnerf.client.events import Following
+from biresnerf.client.events import SILENCE_S, Following
+from biresnerf.wire.jobs import JobView
 
 
 def public(kind: type) -> set[str]:
@@ -28,6 +31,14 @@ def test_both_clients_have_the_same_methods_with_the_same_arguments() -> None:
         one, other = (inspect.signature(getattr(kind, name)) for kind in (Client, AsyncClient))
         assert list(one.parameters.values())[1:] == list(other.parameters.values())[1:], name
         assert getattr(Client, name).__doc__, name
+
+
+def test_a_type_checker_finds_the_type_of_every_argument_and_answer() -> None:
+    assert (Path(biresnerf.__file__).parent / "py.typed").is_file()
+    for kind, name in itertools.product((Client, AsyncClient), public(Client)):
+        signature = inspect.signature(getattr(kind, name))
+        untyped = [p.name for p in list(signature.parameters.values())[1:] if p.annotation is p.empty]
+        assert (untyped, signature.return_annotation is signature.empty) == ([], False), name
 
 
 def test_a_method_shows_its_own_arguments() -> None:
@@ -99,6 +110,13 @@ def test_what_is_tried_again(error: ServiceError, again: str, worth_it: bool) ->
             patience.after(error, again=again)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("content", [b"<!doctype html>", b'{"detail": "Not here"}', b"null"])
+def test_what_another_program_answers_is_no_answer(content: bytes) -> None:
+    with pytest.raises(ServiceError) as caught:
+        Answer(200, {}, content).model(JobView)
+    assert (caught.value.code, caught.value.retryable) == ("unexpected_answer", False)
+
+
 STREAM = (
     "retry: 700\n\n"
     ": still here\n\n"
@@ -134,3 +152,40 @@ def test_a_stream_that_breaks_before_its_last_event_is_taken_up_again() -> None:
     # Ended in order, there was no event left to come.
     list(following.take(f"event: progress\ndata: {data}\n\n".encode()))
     assert (following.ended(), following.over) == (0.0, True)
+
+
+def test_following_with_a_time_limit_never_waits_longer_for_a_silent_service() -> None:
+    def following(timeout_s: float | None) -> Following:
+        return Following(Session("http://x", 60.0, met=True), "job_1", 0, timeout_s)
+
+    assert following(None).connect().answer_s == following(1000.0).connect().answer_s == SILENCE_S
+    assert 19.0 < following(20.0).connect().answer_s <= 20.0
+    soon = following(0.05)
+    assert soon.connect().answer_s <= 0.05
+    assert soon.ended() <= 0.05
+    time.sleep(0.05)
+    for happens in (soon.connect, soon.ended, lambda: soon.broken(ServiceError("unreachable", "x"))):
+        with pytest.raises(JobNotOver, match=r"job_1 is not over after 0\.05 s") as caught:
+            happens()
+    assert isinstance(caught.value, TimeoutError)
+
+
+def test_a_job_that_ended_in_time_is_over_however_late_that_is_read() -> None:
+    following = Following(Session("http://x", 60.0, met=True), "job_1", 0, 0.05)
+    following.connect()
+    time.sleep(0.05)
+    assert [h.kind for h in following.take(STREAM)][-1] == "succeeded"
+    assert (following.connect_again, following.ended()) == (False, 0.0)
+
+
+def test_a_connection_that_may_be_silent_for_too_long_is_made_anew_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = time.monotonic()
+    following = Following(Session("http://x", 60.0, met=True), "job_1", 0, 60.0)
+    following.connect()
+    assert not following.connect_again
+    monkeypatch.setattr(time, "monotonic", lambda: now + 50.0)
+    assert following.connect_again
+    assert following.connect().answer_s <= 10.01
+    assert not following.connect_again

@@ -16,10 +16,10 @@ import httpx
 import pytest
 
 from benchmarks.upload import Relay
-from biresnerf.client import AsyncClient, Client, Happening, Sending, ServiceError
+from biresnerf.client import AsyncClient, Client, Happening, JobNotOver, Sending, ServiceError
 from biresnerf.errors import InputError
 from biresnerf.wire.jobs import JobView
-from tests.service.conftest import Running, finished, scene_files
+from tests.service.conftest import Running, finished, scene_files, submit
 
 QUICK = {"preset": "fast", "steps": 20, "seed": 5}
 
@@ -140,6 +140,19 @@ def test_an_error_says_everything_the_service_said(client: Any, done_job: dict[s
     with pytest.raises(ServiceError) as refused:
         client.fork(done_job["id"], {"warmup_steps": 50})
     assert refused.value.code == "fork_not_possible"
+
+
+def test_waiting_ends_when_its_time_is_up_and_the_job_goes_on(
+    client: Any, http: httpx.Client, done_job: dict[str, Any]
+) -> None:
+    job = submit(http, done_job["dataset_id"], steps=4000, step_ms=20)["id"]
+    seen: list[JobView] = []
+    with pytest.raises(JobNotOver) as caught:
+        client.wait(job, seen.append, timeout_s=0.4)
+    assert caught.value.job_id == job
+    assert seen
+    assert client.cancel(job).state in {"queued", "running", "cancelled"}
+    assert client.wait(job, timeout_s=60.0).state == "cancelled"
 
 
 def test_nobody_at_the_address_is_said_at_once(tmp_path: Path) -> None:

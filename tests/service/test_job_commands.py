@@ -9,7 +9,9 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -131,10 +133,40 @@ def test_what_goes_wrong_is_one_line_and_its_own_exit_status(
     assert run(service, "list", BIRESNERF_URL=closed.url, BIRESNERF_API_KEY=tenants[0].key).exit_code == 0
 
 
-def test_a_page_that_is_no_service_is_said_to_be_none(service: Running) -> None:
-    result = run(service, "status", "job_1", BIRESNERF_URL=f"{service.url}/docs")
-    assert result.exit_code in {exit_codes.NOT_FOUND, exit_codes.FAILED}
+@pytest.mark.parametrize("status", [200, 404])
+def test_another_program_at_the_address_is_said_to_be_none_of_ours(service: Running, status: int) -> None:
+    class Stranger(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(status)
+            self.end_headers()
+            self.wfile.write(b"<!doctype html><title>Welcome</title>")
+
+        def log_message(self, *_: object) -> None:
+            """Quiet."""
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Stranger)
+    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+    result = run(service, "status", "job_1", BIRESNERF_URL=f"http://127.0.0.1:{server.server_port}")
+    server.shutdown()
+    server.server_close()
+    assert (result.exit_code, result.stdout) == (exit_codes.INPUT, "")
+    assert "Look whether the address is right." in result.stderr
     assert len(result.stderr.splitlines()) == 1
+
+
+def test_waiting_ends_when_its_time_is_up_with_a_status_of_its_own(
+    service: Running, http: httpx.Client, scene: Path
+) -> None:
+    result = run(service, "submit", scene, "--set", "steps=4000", "--timeout", 0.1, "--json")
+    assert result.exit_code == exit_codes.NOT_OVER, result.output
+    job = json.loads(result.stdout)
+    result = run(service, "wait", job["id"], "--timeout", 0.1, "--json")
+    assert result.exit_code == exit_codes.NOT_OVER, result.output
+    assert json.loads(result.stdout)["state"] in {"queued", "running"}
+    assert f"biresnerf wait {service.url}/v1/jobs/{job['id']}" in result.stderr
+    assert run(service, "wait", job["id"], "--timeout", 0).exit_code == exit_codes.INPUT
+    http.post(job["links"]["cancel"])
+    finished(http, job["id"])
 
 
 def test_ctrl_c_while_sending_says_how_to_go_on(
