@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,7 @@ class MappedModel:
         points: how many points the matches made.
         observations: in how many images, in sum.
         reprojection_px: mean distance of the points from their features.
+        focal_ratios: by index of the camera, the focal length that matches clearly prefer, over the given one.
     """
 
     mapper: str
@@ -73,19 +74,15 @@ class MappedModel:
     points: int
     observations: int
     reprojection_px: float
+    focal_ratios: dict[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class Mapping:
-    """The models found, and how many features [n, n] any two images have in common.
-
-    Attributes:
-        focal_ratios: by index of the camera, the focal length that matches clearly prefer, over the given one.
-    """
+    """The models found, and how many features [n, n] any two images have in common."""
 
     models: tuple[MappedModel, ...]
     matches: NDArray[np.int64]
-    focal_ratios: dict[int, float]
 
 
 def known_intrinsics(dataset: Dataset) -> list[bool]:
@@ -223,11 +220,14 @@ def read_mapping(dataset: Dataset, answer: dict[str, Any]) -> Mapping:
     """
     index = {name: i for i, name in enumerate(_numbered(dataset))}
     models = [_model(model, index) for model in answer["models"]]
+    if models:  # the focal lengths are those of the first of the largest
+        asked = max(range(len(models)), key=lambda i: len(models[i].rows))
+        models[asked] = replace(models[asked], focal_ratios=_focal_ratios(answer["focals"]))
     matches = np.zeros((len(dataset), len(dataset)), dtype=np.int64)
     for a, b, count in answer["matches"]:
         matches[index[a], index[b]] = matches[index[b], index[a]] = count
     best_first = sorted(models, key=lambda m: (-len(m.rows), -m.observations / max(m.reprojection_px, 0.1)))
-    return Mapping(tuple(best_first), matches, _focal_ratios(answer["focals"]))
+    return Mapping(tuple(best_first), matches)
 
 
 def _focal_ratios(found: dict[str, Any]) -> dict[int, float]:
