@@ -30,6 +30,7 @@ from biresnerf.commands.service_options import service_at
 from biresnerf.config import RefineOptions
 from biresnerf.errors import BiresnerfError, InputError
 from biresnerf.report import Report
+from workers.tether import tethered
 
 # By this file a later run knows that it may clear the folder.
 _MARK = ".made-by-biresnerf-demo"
@@ -110,9 +111,13 @@ def _service() -> Iterator[str]:
     log = home / "service.log"
     command = [sys.executable, "-m", "biresnerf.command_line", "up", "--port", "0", "--slots", "1"]
     with log.open("wb") as errors:
-        # Its own session: Ctrl-C reaches us alone, and we end it in order.
+        # Its own session: Ctrl-C reaches us alone, and we end it in order. Where we are killed it ends by itself.
         process = subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=errors, start_new_session=True
+            tethered(command, signal_number=signal.SIGINT),
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            start_new_session=True,
         )
     try:
         found = _READY.match(process.stdout.readline().decode()) if process.stdout else None

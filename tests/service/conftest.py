@@ -26,6 +26,7 @@ from click.testing import CliRunner
 from biresnerf.data.synthetic import write_synthetic_scene
 from service.keys_command import keys_command
 from service.tenants_command import tenants_command
+from workers.tether import tethered
 
 PROGRAM = Path(__file__).with_name("quick_program.py")
 MIB = 2**20
@@ -89,7 +90,11 @@ def running_service(folder: Path, **settings: Any) -> Iterator[Running]:
     command = [sys.executable, "-m", "biresnerf.command_line", "up", "--port", "0", "--slots", "1"]
     with log.open("wb") as output:
         process = subprocess.Popen(
-            command, env={**os.environ, **said}, stdout=subprocess.PIPE, stderr=output, start_new_session=True
+            tethered(command, signal_number=signal.SIGINT),
+            env={**os.environ, **said},
+            stdout=subprocess.PIPE,
+            stderr=output,
+            start_new_session=True,
         )
     try:
         assert process.stdout is not None

@@ -80,6 +80,23 @@ def test_a_second_run_replaces_the_first_and_foreign_files_are_safe(output: Path
     assert (output / "result" / "report.json").is_file()
 
 
+def test_a_killed_demo_takes_its_service_with_it(tmp_path: Path, scene: Path) -> None:
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1", "TMPDIR": str(tmp_path)}
+    tmp_path.chmod(0o711)  # the database runs as another user where root starts it
+    process = subprocess.Popen(
+        [*COMMAND, "--output", str(tmp_path / "out"), "--scene", str(scene)],
+        stdout=subprocess.PIPE,
+        env=environment,
+    )
+    assert process.stdout is not None
+    assert b"http://" in process.stdout.readline()
+    below = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    process.communicate()
+    _, alive = psutil.wait_procs(below, timeout=PATIENCE_S)
+    assert alive == []
+
+
 def test_ctrl_c_leaves_no_process_and_no_folder(tmp_path: Path, scene: Path) -> None:
     homes = set(Path(tempfile.gettempdir()).glob("biresnerf-demo-*"))
     process = subprocess.Popen(
