@@ -12,6 +12,7 @@ import hmac
 import ipaddress
 import logging
 import re
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -61,10 +62,14 @@ class Identity:
 
 @dataclass(frozen=True)
 class Caller:
-    """The identified client of a request; its stores hold what belongs to its tenant, and nothing else."""
+    """The identified client of a request; its stores hold what belongs to its tenant, and nothing else.
+
+    ``client`` is what limits are counted by: the key, or the address where none is shown; none on loopback.
+    """
 
     service: Service
     identity: Identity
+    client: str | None
 
     @property
     def tenant(self) -> str:
@@ -83,6 +88,10 @@ class Caller:
             raise ProblemError(
                 "scope_required", f"The key lacks the scope {scope}.", headers={"WWW-Authenticate": challenge}
             )
+
+    def sending(self) -> AbstractContextManager[None]:
+        """A place to send files from; raises ``ProblemError`` (``too_many_uploads``) where all are taken."""
+        return self.service.sending.taken(self.client)
 
     @property
     def jobs(self) -> JobStore:
@@ -119,10 +128,12 @@ class Access:
             return
         request = Request(scope)
         request.state.identity = identity = await self._identified(request)
-        allowance = self._allowance(request, identity)
-        if allowance is None:
+        nameless = None if on_loopback(self._settings.host) else _address(request)
+        request.state.client = client = identity.key_id or nameless
+        if client is None:
             await self._app(scope, receive, send)
             return
+        allowance = self._keys.take(client)
         _require_allowed(allowance)
 
         async def send_with_allowance(message: Message) -> None:
@@ -142,11 +153,6 @@ class Access:
             if refusal.status == 401:
                 _require_allowed(self._strangers.take(_address(request)))
             raise
-
-    def _allowance(self, request: Request, identity: Identity) -> Allowance | None:
-        if identity.key_id is not None:
-            return self._keys.take(identity.key_id)
-        return None if on_loopback(self._settings.host) else self._keys.take(_address(request))
 
 
 def _require_allowed(allowance: Allowance) -> None:
@@ -272,7 +278,7 @@ _bearer = HTTPBearer(
 async def _caller(
     request: Request, needed: SecurityScopes, _documented: Annotated[Any, Security(_bearer)]
 ) -> Caller:
-    caller = Caller(service_of(request), request.state.identity)
+    caller = Caller(service_of(request), request.state.identity, request.state.client)
     for scope in needed.scopes:
         caller.require(scope)  # type: ignore[arg-type]
     return caller

@@ -13,10 +13,14 @@ from fastapi import Path as PathParameter
 
 from service.metrics import WebMetrics
 from service.problems import ProblemError
+from service.upload_places import UploadPlaces
 from workers.room import Room, room_for_uploads
 from workers.settings import Settings
 from workers.stores import Stores
+from workers.turns import Turns
 
+# Archives that one process unpacks at the same time; each takes a core, and memory of its own.
+UNPACKED_AT_ONCE = 4
 _ID = re.compile(r"^[a-z]{2,3}_[0-9A-Za-z]{1,40}$", re.ASCII)
 
 
@@ -30,6 +34,11 @@ class Service:
     started: asyncio.Event = field(default_factory=asyncio.Event)
     closing: asyncio.Event = field(default_factory=asyncio.Event)
     background: set[asyncio.Task[Any]] = field(default_factory=set)
+    unpacking: Turns = field(default_factory=lambda: Turns(UNPACKED_AT_ONCE))
+    sending: UploadPlaces = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.sending = UploadPlaces(self.settings.key_uploads)
 
     @property
     def staging_dir(self) -> Path:

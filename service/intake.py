@@ -66,7 +66,8 @@ async def take_archive(
         file_bytes=settings.max_file_bytes + 2**20,
     )
     try:
-        await run_confined("service.unpack", request, limits)
+        async with service.unpacking.turn(dataset.tenant):
+            await run_confined("service.unpack", request, limits)
     except ProblemError as error:
         if error.code == "archive_too_large" and room < allowed:
             raise ProblemError("storage_full", "There is no room to unpack the archive.") from None

@@ -11,10 +11,10 @@ from fastapi import Request
 from biresnerf.wire.jobs import Job, JobTexts
 from biresnerf.wire.problems import FieldProblem
 from service.access import Caller
+from service.finalizing import begin_check, finish_check
 from service.intake import file_sha256, take_archive
 from service.json_body import fit, load_json
 from service.problems import ProblemError
-from service.routes.datasets import begin_check, finish_check
 from service.uploads import Form, refuse_announced_excess, staging_folder
 from workers.errors import EngineError
 from workers.webhook_records import request_with
@@ -36,6 +36,13 @@ async def submit_form(caller: Caller, request: Request, idempotency_key: str | N
     caller.require("datasets:write")
     limit = caller.service.settings.max_archive_bytes + _FORM_BYTES
     refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.room)
+    with caller.sending():
+        return await _taken(caller, request, idempotency_key, limit)
+
+
+async def _taken(
+    caller: Caller, request: Request, idempotency_key: str | None, limit: int
+) -> tuple[Job, bool]:
     async with staging_folder(caller.service.staging_dir) as folder:
         archive = folder / "archive"
         form = Form("archive", TEXTS, archive, limit, caller.service.room)

@@ -68,6 +68,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "queue_full": (429, "Too many jobs are waiting"),
     "quota_exhausted": (429, "The tenant has all that it may have"),
     "rate_limited": (429, "Too many requests came in a short time"),
+    "too_many_uploads": (429, "Too many uploads came at the same time"),
     "internal_error": (500, "Something is wrong with the service"),
     "unavailable": (503, "The service is not ready"),
     "queue_unavailable": (503, "The queue does not work"),

@@ -25,6 +25,7 @@ from workers.database import Database
 from workers.errors import Unavailable
 from workers.files import FileStore
 from workers.settings import Settings
+from workers.turns import Turns
 
 log = logging.getLogger(__name__)
 
@@ -44,17 +45,25 @@ class Verdict:
 
 
 class Checker:
-    """Checks ``finalizing`` datasets, one at a time in this process and each by one process only."""
+    """Checks ``finalizing`` datasets, one at a time in this process and each by one process only.
+
+    Tenants take turns: many datasets of one hold up another's by one check.
+    """
 
     def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:
         self._database, self._files, self._settings = database, files, settings
-        self._turn = asyncio.Semaphore(1)  # decoding a thousand photos is enough work for one machine
+        self._turns = Turns(1)  # decoding a thousand photos is enough work for one machine
 
     async def check(self, dataset_id: str) -> None:
         """Until the dataset is not ``finalizing`` any more, through our check or another process's."""
         token = uuid.uuid4()
+        owned = await insist(
+            lambda: self._database.fetch("SELECT tenant FROM datasets WHERE id = %s", dataset_id)
+        )
+        if not owned:
+            return
         while True:
-            async with self._turn:
+            async with self._turns.turn(owned[0]["tenant"]):
                 if await insist(lambda: self._take(dataset_id, token)):
                     await self._check(dataset_id, token)
             rows = await insist(

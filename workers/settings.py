@@ -47,6 +47,9 @@ class Settings(BaseSettings):
         50.0, gt=0, description="Requests with one API key, on average, that each web process takes."
     )
     key_requests_burst: int = Field(500, ge=1, description="Requests with one API key at once.")
+    key_uploads: int = Field(
+        32, ge=0, description="Uploads with one API key at once that each web process takes; 0: no limit."
+    )
     log_format: Literal["plain", "json"] = Field("plain", description="Lines for people, or JSON lines.")
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = Field(
         "INFO", description="What is logged at the least."

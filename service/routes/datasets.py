@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import binascii
 import re
@@ -11,10 +10,8 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Header, Query, Request
 from fastapi.responses import JSONResponse, Response
 
-from biresnerf.errors import InputError
 from biresnerf.wire.datasets import (
     DatasetList,
-    DatasetRecord,
     DatasetState,
     DatasetView,
     FileList,
@@ -22,10 +19,11 @@ from biresnerf.wire.datasets import (
     NewDataset,
     dataset_url,
 )
-from biresnerf.wire.safe_paths import NameSet, checked_path
-from service.access import Caller, CallerHere, DatasetWriterHere
+from biresnerf.wire.safe_paths import checked_path
+from service.access import CallerHere, DatasetWriterHere
 from service.dependencies import DatasetId, next_link, service_of
-from service.intake import settle_uploads, take_archive
+from service.finalizing import begin_check, finish_check
+from service.intake import take_archive
 from service.json_body import JSON_BYTES_MAX, json_content, read_json
 from service.problems import ProblemError, declared
 from service.uploads import capped, refuse_announced_excess, staging_folder, write_stream
@@ -141,6 +139,7 @@ _TAKES = (
     "unsafe_path",
     "storage_full",
     "quota_exhausted",
+    "too_many_uploads",
 )
 
 
@@ -170,13 +169,14 @@ async def put_file(
     refuse_announced_excess(
         None if content_length is None else str(content_length), limit, caller.service.room
     )
-    file, new = await caller.datasets.add_file(
-        dataset_id,
-        safe,
-        capped(request.stream(), limit, room=caller.service.room),
-        sha256=_announced_digest(repr_digest),
-        overwrite=(if_none_match or "").strip() != "*",
-    )
+    with caller.sending():
+        file, new = await caller.datasets.add_file(
+            dataset_id,
+            safe,
+            capped(request.stream(), limit, room=caller.service.room),
+            sha256=_announced_digest(repr_digest),
+            overwrite=(if_none_match or "").strip() != "*",
+        )
     if not new:
         return Response(status_code=204)
     return JSONResponse(file_view(file).model_dump(mode="json"), status_code=201)
@@ -224,11 +224,12 @@ async def upload_archive(dataset_id: DatasetId, request: Request, caller: Datase
     limit = caller.service.settings.max_archive_bytes
     refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.room)
     await caller.datasets.get(dataset_id)
-    async with staging_folder(caller.service.staging_dir) as folder:
-        await write_stream(request.stream(), folder / "archive", limit, caller.service.room)
-        into = folder / "content"
-        into.mkdir()
-        return DatasetView.of(await take_archive(caller.service, dataset_id, folder / "archive", into))
+    with caller.sending():
+        async with staging_folder(caller.service.staging_dir) as folder:
+            await write_stream(request.stream(), folder / "archive", limit, caller.service.room)
+            into = folder / "content"
+            into.mkdir()
+            return DatasetView.of(await take_archive(caller.service, dataset_id, folder / "archive", into))
 
 
 @router.post(
@@ -261,42 +262,3 @@ async def finalize_dataset(
         return JSONResponse(body, status_code=202, headers=headers)
     checked = await finish_check(caller, dataset_id)
     return JSONResponse(DatasetView.of(checked).model_dump(mode="json"))
-
-
-async def begin_check(caller: Caller, dataset_id: str) -> DatasetRecord:
-    """Freezes the dataset and starts its check, which goes on when the client is gone.
-
-    Raises:
-        ProblemError: ``name_collision``; then the dataset stays open.
-    """
-    store = caller.datasets
-    await store.get(dataset_id)  # the caller's own, before anything is done to it
-    await settle_uploads(caller.service, dataset_id)
-    names, cursor = NameSet(), None
-    while True:
-        page = await store.files(dataset_id, cursor=cursor)
-        for file in page.items:
-            try:
-                names.add(file.path)
-            except InputError as error:
-                raise ProblemError.from_input_error(error) from None
-        if (cursor := page.next_cursor) is None:
-            break
-    dataset = await store.finalize(dataset_id)
-    if dataset.state == "finalizing":
-        caller.service.keep_running(asyncio.create_task(store.check(dataset_id), name=f"check {dataset_id}"))
-    return dataset
-
-
-async def finish_check(caller: Caller, dataset_id: str) -> DatasetRecord:
-    """Waits for the check's outcome; raises ``ProblemError`` with what it found wrong."""
-    for task in list(caller.service.background):
-        if task.get_name() == f"check {dataset_id}":
-            await asyncio.shield(task)
-    dataset = await caller.datasets.check(dataset_id)
-    if dataset.state == "rejected":
-        error = dataset.error
-        if error is None:
-            raise ProblemError("dataset_invalid", "The check rejected the dataset.")
-        raise ProblemError(error.code, error.detail, where=error.where or None, mend=error.mend or None)
-    return dataset

@@ -65,6 +65,7 @@ _BODY = {
             ),
             *(
                 "storage_full",
+                "too_many_uploads",
                 "body_timeout",
                 "webhook_url_refused",
                 "priority_not_allowed",

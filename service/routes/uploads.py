@@ -161,7 +161,7 @@ _APPENDS: dict[str, Any] = {
     operation_id="appendUpload",
     responses=declared(
         *("not_found", "offset_mismatch", "body_too_large", "unsupported_media", "invalid_request"),
-        *("body_timeout", "storage_full", "cross_site", *_ALWAYS),
+        *("body_timeout", "storage_full", "too_many_uploads", "cross_site", *_ALWAYS),
     ),
     dependencies=[SameVersion],
     openapi_extra=_APPENDS,
@@ -184,7 +184,8 @@ async def append_upload(
     room = upload.size - upload_offset
     refuse_announced_excess(request.headers.get("content-length"), max(room, 0))
     body = capped(request.stream(), max(room, 0), room=caller.service.room)
-    upload = await uploads.append(upload_id, upload_offset, body)
+    with caller.sending():
+        upload = await uploads.append(upload_id, upload_offset, body)
     if upload.state == "received":
         begin_taking(caller.service, upload_id)
     return Response(status_code=204, headers=_where(upload))

@@ -168,6 +168,28 @@ async def test_two_checks_at_once_run_the_program_once(database_url: str, tmp_pa
     assert marks.read_text() == "x"
 
 
+async def test_many_checks_of_one_tenant_do_not_hold_up_anothers(database_url: str, tmp_path):
+    marks = tmp_path / "marks"
+    mark = f"open({str(marks)!r}, 'a').write(open(sys.argv[1] + '/a').read())"
+    program = f"import sys; {mark}; print('{{\"report\": {{}}}}')"
+    settings = quick_settings(
+        tmp_path / "data", database_url=database_url, check_command=(sys.executable, "-c", program)
+    )
+    async with open_stores(settings) as stores:
+        checks = []
+        for tenant in "aaaaaab":
+            await stores.keys.create(tenant, "key", ["admin"])
+            mine = stores.datasets.of(tenant)
+            dataset = await mine.create("fox")
+            await mine.add_file(dataset.id, "a", chunks(tenant.encode()))
+            await mine.finalize(dataset.id)
+            checks.append(asyncio.create_task(mine.check(dataset.id)))
+        await asyncio.gather(*checks)
+    order = marks.read_text()
+    assert sorted(order) == sorted("aaaaaab")
+    assert order[-1] != "b", order
+
+
 async def checking(database_url: str, folder: Path, program: str) -> DatasetRecord:
     """The outcome of a check by this program."""
     settings = quick_settings(

@@ -1,0 +1,61 @@
+"""Uploads at the same time, counted for each key."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from service.dependencies import Service
+from tests.service.conftest import problem, zip_of
+from tests.service.in_process import serving
+from tests.workers.conftest import anyio_backend, database_url, quick_settings, server
+
+__all__ = ["anyio_backend", "database_url", "server"]
+pytestmark = pytest.mark.anyio
+
+
+async def test_beyond_its_places_a_key_is_told_to_wait_whichever_way_it_sends(
+    database_url: str, tmp_path: Path
+):
+    settings = quick_settings(
+        tmp_path / "data", database_url=database_url, auth="required", key_uploads=1, max_file_bytes=10
+    )
+    async with serving(settings) as http:
+        service: Service = http._transport.app.state.service
+        keys = [await service.stores.keys.create("anna", name, ["admin"]) for name in ("mine", "other")]
+        mine, other = ({"Authorization": f"Bearer {text}"} for _, text in keys)
+        http.headers.update(mine)
+        dataset = (await http.post("/v1/datasets", json={})).json()["id"]
+        files = f"/v1/datasets/{dataset}/files"
+        tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "5", "Upload-Offset": "0"}
+        begun = await http.post(f"/v1/datasets/{dataset}/uploads", headers=tus)
+        more = {**tus, "Content-Type": "application/offset+octet-stream"}
+        archive = zip_of({"a": b"x"})
+        go_on, under_way = asyncio.Event(), asyncio.Event()
+
+        async def slowly():
+            under_way.set()
+            yield b"x"
+            await go_on.wait()
+
+        first = asyncio.create_task(http.put(f"{files}/first", content=slowly()))
+        await under_way.wait()
+        for answer in [
+            await http.put(f"{files}/a", content=b"x"),
+            await http.post(f"/v1/datasets/{dataset}/archive", content=archive),
+            await http.post("/v1/jobs", files={"archive": archive}),
+            await http.patch(begun.headers["location"], headers=more, content=b"12345"),
+        ]:
+            told = problem(answer, 429, "too_many_uploads")
+            assert (told["retryable"], "retry-after" in answer.headers) == (True, True)
+        assert (await http.put(f"{files}/b", content=b"x", headers=other)).status_code == 201
+        assert (await http.get(files)).status_code == 200
+        go_on.set()
+        assert (await first).status_code == 201
+        # Each place comes back, also where the body was refused.
+        problem(await http.put(f"{files}/large", content=b"x" * 11), 413, "body_too_large")
+        problem(await http.post(f"/v1/datasets/{dataset}/archive", content=b"?"), 422, "archive_rejected")
+        sent = await http.patch(begun.headers["location"], headers=more, content=b"12345")
+        assert sent.status_code == 204
