@@ -14,6 +14,7 @@ from biresnerf.client.errors import ServiceError
 from biresnerf.client.job_calls import OptionsLike, chosen, create_job
 from biresnerf.client.scene import look_at
 from biresnerf.client.sending import LocalFile, send_missing
+from biresnerf.wire.base import LABEL_LENGTH, LABELS_MOST
 from biresnerf.wire.datasets import DatasetView
 from biresnerf.wire.jobs import JobView, PriorityName
 from biresnerf.wire.webhooks import JobWebhook
@@ -53,7 +54,7 @@ def submit(
     this, the dataset stays: the same submission again sends what still lacks, with ``resume`` into the same dataset.
 
     Args:
-        name: of the dataset. Default: the folder's.
+        name: of the dataset, and of the job where ``labels`` has no ``name``. Default: the folder's.
         resume: the dataset of a submission that was interrupted.
 
     Raises:
@@ -64,7 +65,7 @@ def submit(
     on_progress(Sending("reading"))
     files: list[LocalFile] = yield Work(lambda: local_files(path))
     if resume is None:
-        title = (name or path.resolve().name or "scene")[:200]
+        title = (name or _called(path.resolve()) or "scene")[:200]
         target = yield from create_dataset(session, title, [file.entry for file in files])
     else:
         target = yield from dataset(session, resume)
@@ -76,7 +77,7 @@ def submit(
                 session,
                 ready.id,
                 wanted,
-                labels=labels,
+                labels=_named(labels, target.name),
                 priority=priority,
                 webhook=webhook,
                 idempotency_key=idempotency_key,
@@ -86,6 +87,17 @@ def submit(
         if error.users_fault and resume is None:
             yield from _forget(session, target, error)
         raise
+
+
+def _called(path: Path) -> str:
+    """The folder's name; that of a file with poses is the same in every set."""
+    return (path.parent if path.is_file() else path).name
+
+
+def _named(labels: Mapping[str, str] | None, name: str) -> dict[str, str]:
+    """The labels with what people know the job by in lists, where that is not said and there is room for it."""
+    said = dict(labels or {})
+    return said if len(said) >= LABELS_MOST else {"name": name[:LABEL_LENGTH], **said}
 
 
 def local_files(path: Path) -> list[LocalFile]:

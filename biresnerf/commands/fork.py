@@ -43,5 +43,6 @@ def fork_command(
     require_empty(output)
     options = parse_options(settings)
     with service_at(url, api_key, job) as client:
-        made = client.fork(job.id, options, from_stage=from_stage, labels=labels)
+        name = {"name": called} if (called := client.job(job.id).labels.get("name")) else {}
+        made = client.fork(job.id, options, from_stage=from_stage, labels={**name, **labels})
         see_through(client, made, wait=wait, timeout_s=timeout_s, output=output, as_json=as_json)

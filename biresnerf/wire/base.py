@@ -13,5 +13,6 @@ class Record(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-Label = Annotated[str, StringConstraints(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f]*$")]
-Labels = Annotated[dict[Label, Label], Field(max_length=20)]
+LABELS_MOST, LABEL_LENGTH = 20, 100
+Label = Annotated[str, StringConstraints(min_length=1, max_length=LABEL_LENGTH, pattern=r"^[^\x00-\x1f]*$")]
+Labels = Annotated[dict[Label, Label], Field(max_length=LABELS_MOST)]

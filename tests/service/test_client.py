@@ -66,7 +66,9 @@ def test_a_folder_becomes_a_job_and_its_result_a_folder(
     assert list(dict.fromkeys(step.step for step in steps)) == ["reading", "sending", "checking", "queueing"]
     assert steps[-2].bytes_sent == steps[-2].bytes_missing
     over = client.wait(job.id, seen.append)
-    assert (over.state, over.labels, over.options["steps"]) == ("succeeded", {"run": "client"}, 20)
+    assert (over.state, over.labels, over.options["steps"]) == (
+        *("succeeded", {"name": scene.name, "run": "client"}, 20),
+    )
     assert [job.progress.fraction for job in seen] == sorted(job.progress.fraction for job in seen)
     kinds = [happening.kind for happening in client.events(job.id)]
     assert (kinds[0], kinds[-1]) == ("queued", "succeeded")
