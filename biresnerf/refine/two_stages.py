@@ -77,6 +77,7 @@ class TwoStages:
         self._errors: list[float] = []
         self._losses: list[float] = []
         self._moved_deg = 0.0
+        self._signal: dict[str, float] = {}
         self._poses_at_check = optimiser.poses.poses()
         self._snapshot: tuple[float, dict[str, Tensor]] | None = None
         self._reusable: dict[ReusableStage, tuple[str, ...]] = {}
@@ -143,12 +144,13 @@ class TwoStages:
         self._poses_at_check = now
         optimiser.camera_errors.close_block()
         if optimiser.switch is not None:
-            self._write_history(error, last, {})
+            self._write_history(error, last)
             self._repair_if_due()
             return
         still_deg = self.detector.still_deg(optimiser.pose_rate(), int(optimiser.options.check_every or 1))
         verdict = self.detector.check(optimiser.step_index, error, self._moved_deg, still_deg)
-        self._write_history(error, last, {"still_deg": still_deg, **self.detector.signal()})
+        self._signal = {"still_deg": still_deg, **self.detector.signal()}
+        self._write_history(error, last)
         if verdict == "diverging":
             self._roll_back()
             return
@@ -158,7 +160,7 @@ class TwoStages:
             self._repair(switching=True)
             self.record.switch_reason = "stable" if verdict == "stable" else "cap"
             logger.info("stage 2 begins at step %d (%s)", optimiser.step_index, verdict)
-            self._snapshot = None
+            self._snapshot, self._signal = None, {}
             self._save(COARSE)
             self._reusable = {"coarse": (COARSE.as_posix(),)}
             optimiser.start_reconstruction()
@@ -174,7 +176,7 @@ class TwoStages:
         self.repair.run(switching=switching)
         self._poses_at_check = self.optimiser.poses.poses()
 
-    def _write_history(self, mean_squared_error: float, last: StepResult, signal: dict[str, float]) -> None:
+    def _write_history(self, mean_squared_error: float, last: StepResult) -> None:
         optimiser = self.optimiser
         # The error is the mean since the last check; loss, rays and samples are the last step's, rates the next's.
         rates = optimiser.schedule.field_rates(optimiser.step_index, optimiser.switch)
@@ -192,7 +194,7 @@ class TwoStages:
                 "field_rate": rates.pose,
                 "reconstruction_rate": max(rates.reconstruction, default=0.0),
                 "seconds": round(sum(self.record.seconds[stage] for stage in ("coarse", "fine")), 3),
-                **signal,
+                **self._signal,
                 **self.observer.at_check(optimiser),
             }
         )
@@ -221,7 +223,7 @@ class TwoStages:
         self._fraction = max(self._fraction, FIRST_FRACTION + (LAST_FRACTION - FIRST_FRACTION) * share)
         losses, self._losses = self._losses, []
         reusable, self._reusable = self._reusable, {}
-        metrics = {"moved_deg": self._moved_deg}
+        metrics = {"moved_deg": self._moved_deg, **self._signal}
         if losses:
             metrics["loss"] = float(np.mean(losses))
         if self._errors:

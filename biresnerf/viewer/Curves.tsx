@@ -22,6 +22,9 @@ interface Chart {
   readonly second?: string;
   readonly curves: readonly Curve[];
   readonly summary: (lines: readonly HistoryLine[]) => string;
+  /** Whether there is, or will be, something to show of it; and what is said until then. */
+  readonly of?: (line: HistoryLine) => boolean;
+  readonly later?: string;
 }
 
 const CHARTS: readonly Chart[] = [
@@ -48,6 +51,8 @@ const CHARTS: readonly Chart[] = [
   {
     title: "Stability signal",
     axis: "dB over the window",
+    of: (line) => line.still_deg !== undefined,
+    later: "begins with the detector's 10th look",
     curves: [
       { label: "trend of the error, dB", colour: "--curve-1", value: (line) => line.trend_db },
       { label: "level within ±", colour: "--curve-3", value: (line) => line.level_db, dashed: true },
@@ -79,13 +84,15 @@ export function Curves({ lines, switchStep = null, switchReason = null, steps = 
       </section>
     );
   }
-  const shown = CHARTS.filter((chart) => chart.curves.some((curve) => lines.some((line) => curve.value(line) !== undefined)));
+  const shown = CHARTS.filter((chart) => !chart.of || lines.some(chart.of));
   const began = switchStep ?? switchOf(lines);
   return (
     <section class="curves" aria-label="Curves of the run">
-      {shown.map((chart) => (
-        <Plot key={chart.title} chart={chart} lines={lines} switchStep={began} steps={steps} />
-      ))}
+      <div class="curves-charts">
+        {shown.map((chart) => (
+          <Plot key={chart.title} chart={chart} lines={lines} switchStep={began} steps={steps} />
+        ))}
+      </div>
       <p class="curves-stages soft">
         <i class="stage-1" /> stage 1, low resolution: poses{" "}
         {began !== null && began > 0 ? (
@@ -147,6 +154,7 @@ function Plot(props: { chart: Chart; lines: readonly HistoryLine[]; switchStep: 
               <i class={curve.dashed ? "dash dash-dashed" : "dash"} style={{ color: `var(${curve.colour})` }} /> {curve.label}
             </span>
           ))}
+        {chart.later && !lines.some((line) => line.trend_db !== undefined) && <span class="soft">({chart.later})</span>}
       </figcaption>
       <div ref={host} role="img" aria-label={`${chart.title}. ${chart.summary(lines)}.`} />
     </figure>

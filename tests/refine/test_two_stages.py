@@ -8,7 +8,7 @@ import torch
 from biresnerf.errors import RefinementError
 from biresnerf.progress import Progress
 from biresnerf.refine.checkpoint import CHECKPOINT, load_checkpoint
-from biresnerf.refine.history import read_history
+from biresnerf.refine.history import HISTORY, read_history
 from biresnerf.refine.two_stages import TwoStages
 from tests.refine.scene import tiny_optimiser, tiny_options, tiny_set
 
@@ -72,6 +72,21 @@ def test_stage_2_begins_at_the_cap_though_no_check_falls_on_it(scene, tmp_path):
     stages = start(scene, tmp_path, tiny_options(check_every=50, coarse_steps_max=17, steps=20))
     assert stages.run()
     assert stages.optimiser.switch == 17
+
+
+def test_progress_carries_what_the_detector_saw_last_and_in_stage_2_nothing_of_it(scene, tmp_path):
+    told: list[Progress] = []
+    assert not start(scene, tmp_path, tiny_options(), 13, told).run()
+    line = read_history(tmp_path / HISTORY)[-1]
+    assert line["step"] == 10
+    assert {name: told[-1].metrics[name] for name in ("still_deg", "confirmed")} == {
+        name: line[name] for name in ("still_deg", "confirmed")
+    }
+    resumed = start(scene, tmp_path, tiny_options(), told=told)
+    resumed.resume(*load_checkpoint(tmp_path))
+    assert resumed.run()
+    assert told[-1].stage == "fine"
+    assert "still_deg" not in told[-1].metrics
 
 
 def test_a_stable_error_begins_stage_2_before_the_cap(scene, tmp_path):

@@ -6,6 +6,7 @@ import type { ArtifactList, ArtifactView, JobView } from "../service/answers";
 import { follow, type JobEvent } from "../service/events";
 import { ask, asProblem, call, pause, type Problem } from "../service/http";
 import { Store } from "../service/store";
+import type { SeedingFile } from "./seeding";
 
 export interface Seen {
   job: JobView | null;
@@ -17,6 +18,8 @@ export interface Seen {
   report: ReportFile | null;
   view: ViewFile | null;
   points: PointLayer[];
+  /** What COLMAP has found, while it works. */
+  seeding: SeedingFile | null;
   /** Whether progress comes as it happens. */
   linked: boolean;
   problem: Problem | null;
@@ -24,7 +27,7 @@ export interface Seen {
 
 const NOTHING: Seen = {
   ...{ job: null, events: [], artifacts: [], history: [], poses: null, report: null, view: null, points: [] },
-  ...{ linked: true, problem: null },
+  ...{ seeding: null, linked: true, problem: null },
 };
 
 export class LiveJob extends Store<Seen> {
@@ -95,15 +98,11 @@ export class LiveJob extends Store<Seen> {
   private readonly link = (linked: boolean) => this.change({ linked });
 
   private readonly progress = (job: JobView) => {
-    const { loss, psnr, moved_deg } = job.metrics;
-    const { step } = job.progress;
+    // An attempt that begins at a checkpoint takes back what the one before told.
+    if (stepping(job)) this.told = this.told.filter((line) => line.step <= job.progress.step);
     const last = this.told.at(-1) ?? this.recorded.at(-1);
-    const stepping = job.stage === "coarse" || job.stage === "fine";
-    if (stepping && loss !== undefined && psnr !== undefined && last && step > last.step) {
-      const stage = job.stage as "coarse" | "fine";
-      const seconds = job.started_at ? (Date.now() - Date.parse(job.started_at)) / 1000 : last.seconds;
-      this.told.push({ ...{ step, stage, loss, psnr, seconds }, moved_deg: moved_deg ?? 0, pose_rate: last.pose_rate });
-    }
+    const line = lineOf(job, last);
+    if (line) this.told.push(line);
     const ended = isOver(job) && this.value.job !== null && !isOver(this.value.job);
     this.change({ job, history: [...this.recorded, ...this.told] });
     if (ended) void this.refresh();
@@ -129,10 +128,11 @@ export class LiveJob extends Store<Seen> {
 
   private async readFiles(): Promise<void> {
     const view = (await this.json<ViewFile>("view.json")) ?? this.value.view;
-    const [history, report, poses] = await Promise.all([
+    const [history, report, poses, seeding] = await Promise.all([
       this.text("history.jsonl"),
       this.json<ReportFile>("report.json"),
       this.json<PosesFile>(view?.poses ?? "poses.json"),
+      this.json<SeedingFile>("seeding.json"),
     ]);
     if (history !== null) {
       this.recorded = historyOf(history);
@@ -144,6 +144,7 @@ export class LiveJob extends Store<Seen> {
       history: [...this.recorded, ...this.told],
       report: report ?? this.value.report,
       poses: poses ?? this.value.poses,
+      seeding: seeding ?? this.value.seeding,
     });
     if (view && !this.value.points.length) this.change({ points: await this.points(view) });
   }
@@ -178,4 +179,21 @@ export class LiveJob extends Store<Seen> {
       throw error;
     }
   }
+}
+
+const SIGNAL = ["still_deg", "trend_db", "level_db", "confirmed"] as const;
+
+const stepping = ({ stage }: JobView) => (stage === "coarse" || stage === "fine" ? stage : null);
+
+/** A line of the curve from a progress event, where it is of a later step than the last one. */
+function lineOf(job: JobView, last: HistoryLine | undefined): HistoryLine | null {
+  const { loss, psnr, moved_deg } = job.metrics;
+  const { step } = job.progress;
+  const stage = stepping(job);
+  if (!stage || loss === undefined || psnr === undefined || !last || step <= last.step) return null;
+  const seconds = job.started_at ? (Date.now() - Date.parse(job.started_at)) / 1000 : last.seconds;
+  const line = { step, stage, loss, psnr, seconds, moved_deg: moved_deg ?? 0, pose_rate: last.pose_rate };
+  // The detector looks at stage 1 alone; what it saw last stays in the job.
+  const signal = stage === "coarse" ? SIGNAL.filter((name) => job.metrics[name] !== undefined) : [];
+  return { ...line, ...Object.fromEntries(signal.map((name) => [name, job.metrics[name]])) };
 }

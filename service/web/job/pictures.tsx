@@ -8,6 +8,7 @@ import { asProblem, type Problem } from "../service/http";
 import { ProblemBox } from "../problem_box";
 import type { ArtifactView, JobView } from "../service/answers";
 import type { Seen } from "./live";
+import { Seeding } from "./seeding";
 
 type Widgets = typeof import("./widgets");
 
@@ -62,7 +63,7 @@ function Views({ seen, urlOf, widgets }: { seen: Seen; urlOf: UrlOf; widgets: Wi
             <Waiting job={job} for="cameras" />
           )}
         </Panel>
-        <Panel name={view ? "Photo and render" : "Preview"} kind="panel-compare">
+        <Panel name={view ? "Photo and render" : seen.job!.stage === "seeding" ? "Feature matches" : "Preview"} kind="panel-compare">
           {widgets && view ? (
             <widgets.ImageCompare {...{ names, centres, urlOf, ...choice }} views={view.views} />
           ) : (
@@ -115,6 +116,7 @@ const KINDS = ["render", "photo", "difference", "depth"] as const;
 /** One view as the field has it now. */
 function Preview({ seen, poses, urlOf }: { seen: Seen; poses: PosesFile | null; urlOf: UrlOf }) {
   const pictures = previewPictures(seen.artifacts);
+  if (!pictures.size && seen.seeding && !isOver(seen.job!)) return <Seeding seeding={seen.seeding} urlOf={urlOf} />;
   if (!pictures.size) return <Waiting job={seen.job!} for="pictures" />;
   const lens = poses?.cameras[0];
   const frame = lens && { aspectRatio: `${lens.width} / ${lens.height}` };
