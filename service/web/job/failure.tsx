@@ -12,15 +12,12 @@ export function Failure({ job, images }: { job: JobView; images: readonly string
       </section>
     );
   }
+  if (job.partial) return null; // the verdict's sentence says so
   if (job.state === "cancelled") {
     return (
       <section class="card">
-        <h2>{job.partial ? "Ended on request; these are the best poses until then" : "Ended on request"}</h2>
-        <p>
-          {job.partial
-            ? "They were not compared with the input's: no verdict was reached."
-            : "It left its log alone. Run it again, or fork it, to go on."}
-        </p>
+        <h2>Ended on request</h2>
+        <p>It left its log alone. Run it again, or fork it, to go on.</p>
       </section>
     );
   }

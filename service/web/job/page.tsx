@@ -1,9 +1,9 @@
 // One job: how far it is, what came out, what can be done with it.
 import { useEffect, useMemo, useState } from "preact/hooks";
 import { duration, moment } from "../format";
-import { Chip, isOver, StageBar, titleOf } from "../jobs/state";
+import { Chip, isOver, STAGE_WORDS, StageBar, titleOf } from "../jobs/state";
 import { ProblemBox } from "../problem_box";
-import type { JobView } from "../service/answers";
+import type { JobView, Stage } from "../service/answers";
 import { pictureUrl } from "../service/pictures";
 import { useStore } from "../service/store";
 import { useTitle } from "../title";
@@ -113,6 +113,7 @@ function Files({ live, seen }: { live: LiveJob; seen: Seen }) {
 function Facts({ job, seen }: { job: JobView; seen: Seen }) {
   const seconds = Object.entries(seen.report?.seconds ?? {});
   const warnings = seen.report?.warnings ?? [];
+  const options = Object.entries({ ...job.options, ...job.smaller }).sort(([a], [b]) => (a < b ? -1 : 1));
   return (
     <details class="panel">
       <summary>
@@ -132,9 +133,9 @@ function Facts({ job, seen }: { job: JobView; seen: Seen }) {
         <Fact name="Submitted" value={moment(job.created_at)} />
         {job.expires_at && <Fact name="Kept until" value={moment(job.expires_at)} />}
         {seconds.map(([stage, s]) => (
-          <Fact key={stage} name={`Time: ${stage}`} value={duration(s)} />
+          <Fact key={stage} name={`Time: ${STAGE_WORDS[stage as Stage] ?? stage}`} value={duration(s)} />
         ))}
-        {Object.entries({ ...job.options, ...job.smaller }).map(([name, value]) => (
+        {options.map(([name, value]) => (
           <Fact key={name} name={name} value={typeof value === "string" ? value : JSON.stringify(value)} />
         ))}
       </dl>

@@ -1,56 +1,98 @@
 // All jobs, newest first, as they are now.
-import { useEffect, useRef, useState } from "preact/hooks";
-import type { JobList, JobView } from "../service/answers";
+import { useEffect, useState } from "preact/hooks";
+import { Pick } from "../../../biresnerf/viewer/Controls";
+import type { JobList, JobState, JobView } from "../service/answers";
 import { asProblem, call, type Problem } from "../service/http";
 import { usePicture } from "../service/pictures";
-import { moment } from "../format";
+import { count, moment } from "../format";
 import { ProblemBox } from "../problem_box";
 import { useTitle } from "../title";
 import { DropZone } from "../upload/drop";
-import { Chip, isOver, StageBar, titleOf } from "./state";
+import { Chip, isOver, StageBar, STATE_WORDS, titleOf } from "./state";
 
+/** How many more are shown at a time, and how many the service gives at once. */
 const PAGE = 24;
+const GIVEN_MAX = 200;
 /** While something runs, and while nothing does. */
 const BUSY_MS = 1500;
 const IDLE_MS = 8000;
 
+/** What of the list was looked at, for who comes back to it from a job. */
+const looked = { state: "" as JobState | "", wanted: PAGE, scroll: 0 };
+
 export function JobsPage() {
-  const { jobs, next, problem, older } = useJobs();
+  const [state, setState] = useState(looked.state);
+  const [wanted, setWanted] = useState(looked.wanted);
+  const { found, problem } = useJobs(state, wanted);
   useTitle("Jobs");
+  useEffect(() => {
+    Object.assign(looked, { state, wanted });
+  }, [state, wanted]);
+  useEffect(() => {
+    if (found) scrollTo(0, looked.scroll);
+    looked.scroll = 0;
+  }, [found !== null]);
+  const choose = (chosen: JobState | "") => {
+    setState(chosen);
+    setWanted(PAGE);
+  };
   return (
     <>
       <h1 class="unseen">Jobs</h1>
       <DropZone />
       {problem && <ProblemBox problem={problem} />}
-      {!jobs && !problem && <div class="cards" aria-busy="true" />}
-      {jobs && jobs.length === 0 && <p class="soft empty">No jobs yet. Drop a set of images above to begin.</p>}
-      {jobs && jobs.length > 0 && (
+      {!found && !problem && <div class="cards" aria-busy="true" />}
+      {found && (found.jobs.length > 0 || state) && (
         <section aria-labelledby="jobs-heading">
-          <h2 id="jobs-heading">Jobs</h2>
-          <ul class="cards">
-            {jobs.map((job) => (
-              <li key={job.id}>
-                <JobCard job={job} />
-              </li>
-            ))}
-          </ul>
-          {next && (
-            <p class="more">
-              <button class="act" onClick={older}>
-                Older jobs
-              </button>
-            </p>
-          )}
+          <div class="jobs-head">
+            <h2 id="jobs-heading">Jobs</h2>
+            <Pick label="Show" value={state} onChange={choose} options={CHOICES} />
+            <span class="soft" role="status">
+              {found.more ? `the newest ${found.jobs.length}` : count(found.jobs.length, "job")}
+            </span>
+          </div>
+          <Cards {...found} onOlder={() => setWanted(found.jobs.length + PAGE)} />
         </section>
+      )}
+      {found && found.jobs.length === 0 && (
+        <p class="soft empty">
+          {found.state ? `No job is ${STATE_WORDS[found.state]}.` : "No jobs yet. Drop a set of images above to begin."}
+        </p>
       )}
     </>
   );
 }
 
+function Cards({ jobs, more, onOlder }: Found & { onOlder: () => void }) {
+  return (
+    <>
+      <ul class="cards">
+        {jobs.map((job) => (
+          <li key={job.id}>
+            <JobCard job={job} />
+          </li>
+        ))}
+      </ul>
+      {more && (
+        <p class="more">
+          <button class="act" onClick={onOlder}>
+            Older jobs
+          </button>
+        </p>
+      )}
+    </>
+  );
+}
+
+const CHOICES: readonly { value: JobState | ""; text: string }[] = [
+  { value: "", text: "all" },
+  ...Object.entries(STATE_WORDS).map(([value, text]) => ({ value: value as JobState, text })),
+];
+
 function JobCard({ job }: { job: JobView }) {
   const picture = usePicture(job.thumbnail && `v1/jobs/${job.id}/artifacts/${job.thumbnail}`, job.stage ?? "");
   return (
-    <a class="card job-card" href={`#/jobs/${job.id}`}>
+    <a class="card job-card" href={`#/jobs/${job.id}`} onClick={() => (looked.scroll = scrollY)}>
       <span class="thumbnail">{picture && <img src={picture} alt="" width={96} height={72} loading="lazy" />}</span>
       <span class="job-lines">
         <span class="job-head">
@@ -66,11 +108,31 @@ function JobCard({ job }: { job: JobView }) {
   );
 }
 
-function useJobs() {
-  const [jobs, setJobs] = useState<JobView[] | null>(null);
-  const [next, setNext] = useState<string | null>(null);
+interface Found {
+  state: JobState | "";
+  jobs: JobView[];
+  /** Whether there are older ones. */
+  more: boolean;
+}
+
+/** So many of the newest jobs in a state (all: ""). */
+async function newest(state: JobState | "", wanted: number): Promise<Found> {
+  const jobs: JobView[] = [];
+  let cursor: string | null = null;
+  do {
+    const limit = String(Math.min(GIVEN_MAX, wanted - jobs.length));
+    const asked = new URLSearchParams({ limit, ...(state && { state }), ...(cursor && { cursor }) });
+    const page: JobList = await call<JobList>("GET", `v1/jobs?${asked}`);
+    jobs.push(...page.items);
+    cursor = page.next_cursor;
+  } while (cursor && jobs.length < wanted);
+  return { state, jobs, more: cursor !== null };
+}
+
+/** All that are shown are looked at again and again: the one that runs may be older than many that wait. */
+function useJobs(state: JobState | "", wanted: number) {
+  const [found, setFound] = useState<Found | null>(null);
   const [problem, setProblem] = useState<Problem | null>(null);
-  const paged = useRef(false);
   useEffect(() => {
     let timer = 0;
     let gone = false;
@@ -78,12 +140,12 @@ function useJobs() {
       let wait = IDLE_MS;
       try {
         if (!document.hidden) {
-          const page = await call<JobList>("GET", `v1/jobs?limit=${PAGE}`);
+          const now = await newest(state, wanted);
           if (gone) return;
-          setJobs((seen) => merged(page, seen ?? [], paged.current));
-          if (!paged.current) setNext(page.next_cursor);
+          setFound(now);
           setProblem(null);
-          if (page.items.some((job) => !isOver(job))) wait = BUSY_MS;
+          // A long list is looked at as much less often.
+          if (now.jobs.some((job) => !isOver(job))) wait = BUSY_MS * Math.ceil(now.jobs.length / PAGE);
         }
       } catch (error) {
         if (!gone) setProblem(asProblem(error));
@@ -102,27 +164,6 @@ function useJobs() {
       window.clearTimeout(timer);
       document.removeEventListener("visibilitychange", shown);
     };
-  }, []);
-  const older = async () => {
-    try {
-      const page = await call<JobList>("GET", `v1/jobs?limit=${PAGE}&cursor=${encodeURIComponent(next ?? "")}`);
-      paged.current = true;
-      setJobs((seen) => [...(seen ?? []), ...page.items.filter(refines)]);
-      setNext(page.next_cursor);
-    } catch (error) {
-      setProblem(asProblem(error));
-    }
-  };
-  return { jobs, next, problem, older };
-}
-
-// An export belongs to its job, and is seen there.
-const refines = (job: JobView) => job.kind === "refine";
-
-/** The newest page over what was seen before; without older pages it is all there is to show. */
-function merged(page: JobList, seen: JobView[], paged: boolean): JobView[] {
-  const fresh = page.items.filter(refines);
-  if (!paged) return fresh;
-  const oldest = fresh.at(-1)?.created_at ?? "";
-  return [...fresh, ...seen.filter((job) => job.created_at < oldest)];
+  }, [state, wanted]);
+  return { found, problem };
 }

@@ -2,7 +2,7 @@
 import { STAGES, type JobView, type Stage } from "../service/answers";
 import { duration, percent } from "../format";
 
-const STAGE_WORDS: Record<Stage, string> = {
+export const STAGE_WORDS: Record<Stage, string> = {
   preparing: "Preparing",
   seeding: "Seeding",
   coarse: "Stage 1: poses",
@@ -10,7 +10,7 @@ const STAGE_WORDS: Record<Stage, string> = {
   evaluating: "Evaluating",
   exporting: "Writing",
 };
-const STATE_WORDS = {
+export const STATE_WORDS = {
   queued: "waiting",
   running: "running",
   succeeded: "done",
@@ -34,6 +34,11 @@ const VERDICT_TONES = {
 } as const;
 
 export const isOver = (job: JobView) => !["queued", "running"].includes(job.state);
+
+/** What a job is called after its set; labels are no longer than this. */
+export function nameLabel(name: string): { name: string } {
+  return { name: [...name].slice(0, 100).join("") };
+}
 
 export function titleOf(job: JobView): string {
   return job.labels.name ?? job.id.replace(/^job_/, "Job ").slice(0, 16);

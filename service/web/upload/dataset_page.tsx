@@ -3,6 +3,7 @@ import { useCallback, useEffect, useState } from "preact/hooks";
 import type { DatasetView, JobView } from "../service/answers";
 import { asProblem, call, pause, type Problem } from "../service/http";
 import { Store, useStore } from "../service/store";
+import { nameLabel } from "../jobs/state";
 import { bytes, count, duration, percent } from "../format";
 import { OptionsForm } from "../options/form";
 import type { Values } from "../options/schema";
@@ -10,7 +11,8 @@ import { ProblemBox } from "../problem_box";
 import { useTitle } from "../title";
 import { CheckTable } from "./check_table";
 import { DropZone } from "./drop";
-import { goOn, sendings, type Sending } from "./send";
+import { sendings, type Sending } from "./send";
+import { StillToCome } from "./still_to_come";
 
 const LOOK_EVERY_MS = 700;
 const NOBODY = new Store<Sending | null>(null);
@@ -32,23 +34,7 @@ export function DatasetPage({ id }: { id: string }) {
       </header>
       {sending && dataset.state === "open" && <Progress sending={sending} />}
       {sending?.problem && <ProblemBox problem={sending.problem} />}
-      {interrupted && (
-        <section class="card">
-          <h2>Some files are still to come</h2>
-          <p>
-            {count(dataset.files, "file")} arrived
-            {dataset.missing.length > 0 && `, ${count(dataset.missing.length, "file")} are missing`}. Choose the same
-            folder again: only what is missing is sent.
-          </p>
-          <DropZone
-            compact
-            onChosen={async (chosen) => {
-              await goOn(dataset, chosen);
-              redraw((n) => n + 1);
-            }}
-          />
-        </section>
-      )}
+      {interrupted && <StillToCome dataset={dataset} onBegun={() => redraw((n) => n + 1)} />}
       <CheckTable dataset={dataset} />
       {dataset.state === "rejected" && dataset.error && (
         <ProblemBox problem={dataset.error} heading="The set was not accepted" />
@@ -124,7 +110,7 @@ function Submit({ dataset }: { dataset: DatasetView }) {
     setBusy(true);
     setProblem(null);
     try {
-      const json = { dataset_id: dataset.id, options: values, labels: { name: dataset.name.slice(0, 100) } };
+      const json = { dataset_id: dataset.id, options: values, labels: nameLabel(dataset.name) };
       location.hash = `#/jobs/${(await call<JobView>("POST", "v1/jobs", { json })).id}`;
     } catch (error) {
       setProblem(asProblem(error));

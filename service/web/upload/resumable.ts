@@ -1,6 +1,6 @@
 // Archives go by tus 1.0: in pieces, on from the last byte that arrived, also after the page was loaded anew.
 import type { DatasetView, UploadView } from "../service/answers";
-import { ask, asProblem, call } from "../service/http";
+import { ask, asProblem, call, Problem } from "../service/http";
 import type { Store } from "../service/store";
 import { persistently, put, type Sending } from "./send";
 
@@ -12,17 +12,26 @@ interface Begun {
   upload: string;
 }
 
-/** Begins, or goes on with what was begun for the same file; the promise `sent` ends with the last byte. */
+export interface ArchiveSent {
+  dataset: string;
+  upload: string;
+  /** Ends with the last byte. */
+  sent: Promise<void>;
+}
+
+/** Begins, or goes on with what was begun for the same file; `dataset`: the one that it has to go into. */
 export async function sendArchive(
   file: File,
   name: string,
   state: Store<Sending>,
-): Promise<{ dataset: string; sent: Promise<void> }> {
+  dataset?: string,
+): Promise<ArchiveSent> {
   const place = `biresnerf-upload ${file.name} ${file.size} ${file.lastModified}`;
-  const begun = (await remembered(place)) ?? (await fresh(file, name));
+  const known = await remembered(place);
+  const begun = known && (dataset ?? known.dataset) === known.dataset ? known : await fresh(file, name, dataset);
   localStorage.setItem(place, JSON.stringify(begun));
   const sent = sendPieces(begun.upload, file, state).then(() => localStorage.removeItem(place));
-  return { dataset: begun.dataset, sent };
+  return { ...begun, sent };
 }
 
 async function remembered(place: string): Promise<Begun | null> {
@@ -38,11 +47,19 @@ async function remembered(place: string): Promise<Begun | null> {
   }
 }
 
-async function fresh(file: File, name: string): Promise<Begun> {
-  const dataset = await call<DatasetView>("POST", "v1/datasets", { json: { name } });
+async function fresh(file: File, name: string, known?: string): Promise<Begun> {
+  const dataset = known ?? (await call<DatasetView>("POST", "v1/datasets", { json: { name } })).id;
   const headers = { ...TUS, "Upload-Length": String(file.size) };
-  const upload = await call<UploadView>("POST", `v1/datasets/${dataset.id}/uploads`, { headers });
-  return { dataset: dataset.id, upload: upload.id };
+  const upload = await call<UploadView>("POST", `v1/datasets/${dataset}/uploads`, { headers });
+  return { dataset, upload: upload.id };
+}
+
+/** Gives an archive up that the service could not take, so that another can take its place; why it could not. */
+export async function giveUpRejected(upload: string): Promise<Problem | null> {
+  const { state, error } = await call<UploadView>("GET", `v1/uploads/${upload}`);
+  if (state !== "rejected" || !error) return null;
+  await call("DELETE", `v1/uploads/${upload}`, { headers: TUS });
+  return new Problem(422, error.code, "The archive was not accepted", error.detail, error.mend, error.where);
 }
 
 async function sendPieces(upload: string, file: File, state: Store<Sending>): Promise<void> {

@@ -4,7 +4,7 @@ import { address, asProblem, call, noteRefusal, pause, Problem, withKey } from "
 import { Store } from "../service/store";
 import { bytes as inBytes, count } from "../format";
 import { isArchive, type Chosen, type Gathered } from "./gather";
-import { sendArchive } from "./resumable";
+import { giveUpRejected, sendArchive } from "./resumable";
 
 const AT_ONCE = 4;
 const TRIES = 6;
@@ -79,10 +79,15 @@ export async function begin(gathered: Gathered, onHashing: (share: number) => vo
   return keep({ dataset: dataset.id, sent: sendMissing(dataset, entries, state) }, state);
 }
 
-/** Goes on with a dataset of which some files never arrived. Throws `Problem` where these are other files. */
+/** Goes on with a dataset of which not all arrived. Throws `Problem` where these are other files. */
 export async function goOn(dataset: DatasetView, chosen: Chosen[]): Promise<void> {
   const bytes = chosen.reduce((sum, { file }) => sum + file.size, 0);
   const state = new Store<Sending>({ ...NOTHING, files: chosen.length, bytes, startedAt: Date.now() });
+  const unlisted = dataset.missing.length === 0; // an archive, or a folder in the place of one
+  if (unlisted && isArchive(chosen)) {
+    keep(await sendArchive(chosen[0]!.file, dataset.name, state, dataset.id), state);
+    return;
+  }
   const have = new Set(chosen.map(({ path }) => path));
   const lacking = dataset.missing.filter((path) => !have.has(path));
   if (lacking.length) {
@@ -90,24 +95,34 @@ export async function goOn(dataset: DatasetView, chosen: Chosen[]): Promise<void
     throw new Problem(0, "other_files", "These are other files", detail, "Choose the folder that was sent before.");
   }
   const entries = chosen.map((item) => ({ ...item, sha256: null }));
-  keep({ dataset: dataset.id, sent: sendMissing(dataset, entries, state) }, state);
+  const wanted = unlisted ? { ...dataset, missing: [...have] } : dataset;
+  keep({ dataset: dataset.id, sent: sendMissing(wanted, entries, state) }, state);
 }
 
-function keep(begun: { dataset: string; sent: Promise<void> }, state: Store<Sending>): string {
+/** Has a dataset checked of which everything arrived, but nobody was there to say so. */
+export function checkArrived(dataset: DatasetView): void {
+  const { files, bytes } = dataset;
+  const state = new Store<Sending>({ ...NOTHING, files, filesDone: files, bytes, bytesDone: bytes });
+  keep({ dataset: dataset.id, sent: Promise.resolve() }, state);
+}
+
+function keep(begun: { dataset: string; upload?: string; sent: Promise<void> }, state: Store<Sending>): string {
   sendings.set(begun.dataset, state);
   begun.sent
-    .then(() => finalize(begun.dataset, state))
+    .then(() => finalize(begun.dataset, begun.upload, state))
     .catch((error) => state.change({ phase: "stopped", problem: asProblem(error) }));
   return begun.dataset;
 }
 
-async function finalize(dataset: string, state: Store<Sending>): Promise<void> {
+async function finalize(dataset: string, upload: string | undefined, state: Store<Sending>): Promise<void> {
   state.change({ phase: "checking", waiting: "" });
   try {
     await call("POST", `v1/datasets/${dataset}/finalize`, { headers: { Prefer: "respond-async" } });
   } catch (error) {
-    // What is wrong with the set stands in the dataset; the page shows it from there.
     if (asProblem(error).status !== 422) throw error;
+    // What is wrong with a set that was checked stands in it; the page shows it from there.
+    const seen = await call<DatasetView>("GET", `v1/datasets/${dataset}`);
+    if (seen.state === "open") throw (upload && (await giveUpRejected(upload))) || error;
   }
   state.change({ phase: "done" });
 }
