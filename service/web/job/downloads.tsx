@@ -3,13 +3,13 @@ import { useState } from "preact/hooks";
 import { bytes, count, percent } from "../format";
 import { ProblemBox } from "../problem_box";
 import type { ArtifactView, JobView, ShareView } from "../service/answers";
-import { address, apiKey, ask, asProblem, call, pause, type Problem } from "../service/http";
+import { address, apiKey, ask, asProblem, call, pause, Problem } from "../service/http";
 import { direct } from "../service/pictures";
 import { useStore } from "../service/store";
 import { isOver } from "../jobs/state";
 import { CopyButton } from "./copy_button";
 import { CONSUMERS, curlLines, filesFor, pythonLines, type Consumer } from "./consumers";
-import { Zip } from "./zip";
+import { fitsOneZip, Zip } from "./zip";
 
 const SHARED_S = 7 * 86_400;
 
@@ -54,6 +54,7 @@ function Row({ job, consumer, files, onNewFiles }: RowProps) {
       await doing();
     } catch (error) {
       setProblem(asProblem(error));
+      setOpen(files.length > 0); // the lines bring what the page cannot
     }
     setSaid("");
   };
@@ -180,10 +181,14 @@ async function saveOne(file: ArtifactView): Promise<void> {
 }
 
 async function saveAll(job: JobView, consumer: Consumer, files: ArtifactView[], say: (text: string) => void) {
+  if (!fitsOneZip(files.map(({ size }) => size))) {
+    const detail = "The browser packs the files, and it can pack no more than 4 GB.";
+    throw new Problem(0, "too_much", "It is too much for one download", detail, "Fetch them by the lines below.");
+  }
   const zip = new Zip();
   for (const [index, file] of files.entries()) {
     say(`Fetching ${percent(index / files.length)}`);
-    zip.add(file.name, await (await ask("GET", `${file.href}?redirect=false`)).arrayBuffer());
+    await zip.add(file.name, await (await ask("GET", `${file.href}?redirect=false`)).blob());
   }
   save(zip.finish(), `${job.labels.name ?? job.id}-${consumer.files.replaceAll("/", "-")}.zip`.replace("-.zip", ".zip"));
 }

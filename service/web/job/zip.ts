@@ -1,4 +1,5 @@
-// Several files as one zip, stored as they are: pictures and binary models gain nothing from packing.
+// Several files as one zip, stored as they are: pictures and binary models gain nothing from packing. What is in it is
+// held as blobs, which browsers keep on disk where they are large: of a folder of photos one is in memory at a time.
 
 const TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
   let c = n;
@@ -31,6 +32,11 @@ const DAY = 0x0021;
 const BYTES_MAX = 0xfffffffe;
 const FILES_MAX = 0xfffe;
 
+/** What `Zip` makes of such files; none: they are too much for it. */
+export function fitsOneZip(sizes: readonly number[]): boolean {
+  return sizes.length <= FILES_MAX && sizes.reduce((sum, size) => sum + size, 0) <= BYTES_MAX;
+}
+
 export class Zip {
   private readonly parts: BlobPart[] = [];
   private readonly directory: BlobPart[] = [];
@@ -38,19 +44,19 @@ export class Zip {
   private files = 0;
 
   /** Throws where there is too much for one zip. */
-  add(name: string, content: ArrayBuffer): void {
-    const bytes = new Uint8Array(content);
+  async add(name: string, content: Blob): Promise<void> {
     const path = new TextEncoder().encode(name);
+    const crc = crc32(new Uint8Array(await content.arrayBuffer()));
     const common: [number, 2 | 4][] = [
       ...([[20, 2], [UTF8_NAMES, 2], [0, 2], [0, 2], [DAY, 2]] as [number, 2][]),
-      ...([[crc32(bytes), 4], [bytes.length, 4], [bytes.length, 4]] as [number, 4][]),
+      ...([[crc, 4], [content.size, 4], [content.size, 4]] as [number, 4][]),
       ...([[path.length, 2], [0, 2]] as [number, 2][]),
     ];
-    if (this.at + bytes.length > BYTES_MAX || this.files >= FILES_MAX) throw new Error("Too much for one zip.");
+    if (this.at + content.size > BYTES_MAX || this.files >= FILES_MAX) throw new Error("Too much for one zip.");
     const head = packed([0x04034b50, 4], ...common);
     this.directory.push(packed([0x02014b50, 4], [20, 2], ...common, [0, 2], [0, 2], [0, 2], [0, 4], [this.at, 4]), path);
     this.parts.push(head, path, content);
-    this.at += head.length + path.length + bytes.length;
+    this.at += head.length + path.length + content.size;
     this.files += 1;
   }
 
