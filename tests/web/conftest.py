@@ -145,10 +145,35 @@ def phone(browser: Browser, service: Running) -> Iterator[Watched]:
     context.close()
 
 
+@pytest.fixture
+def tab(browser: Browser, service: Running) -> Iterator[Watched]:
+    """Another tab, for one test."""
+    context = browser.new_context(viewport=DESKTOP, accept_downloads=True)
+    yield watched_page(context, service.url)
+    context.close()
+
+
+@pytest.fixture(scope="module")
+def digests(api: httpx.Client, done: dict[str, Any]) -> dict[str, str]:
+    """SHA-256 of each artifact of the job, by name."""
+    return {item["name"]: item["sha256"] for item in api.get(f"/jobs/{done['id']}/artifacts").json()["items"]}
+
+
 @pytest.fixture(scope="module")
 def api(service: Running) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=f"{service.url}/v1", timeout=60.0) as client:
         yield client
+
+
+def drop(page: Page, *paths: Path) -> None:
+    """Drops files and folders onto the page, as a file manager does."""
+    place = page.locator(".drop").bounding_box()
+    assert place is not None
+    wire = page.context.new_cdp_session(page)
+    data = {"items": [], "files": [str(path) for path in paths], "dragOperationsMask": 1}
+    for kind in ("dragEnter", "dragOver", "drop"):
+        where = {"x": place["x"] + 20, "y": place["y"] + 20}
+        wire.send("Input.dispatchDragEvent", {"type": kind, **where, "data": data})
 
 
 def check_row(page: Page, name: str) -> Locator:

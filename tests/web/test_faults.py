@@ -9,21 +9,10 @@ from contextlib import closing
 from pathlib import Path
 
 import httpx
-from playwright.sync_api import Browser, Page, Route, expect
+from playwright.sync_api import Browser, Route, expect
 
 from tests.service.conftest import LIMITS, Running
-from tests.web.conftest import DESKTOP, check_row, watched_page
-
-
-def drop(page: Page, *paths: Path) -> None:
-    """Drops files and folders onto the page, as a file manager does."""
-    place = page.locator(".drop").bounding_box()
-    assert place is not None
-    wire = page.context.new_cdp_session(page)
-    data = {"items": [], "files": [str(path) for path in paths], "dragOperationsMask": 1}
-    for kind in ("dragEnter", "dragOver", "drop"):
-        where = {"x": place["x"] + 20, "y": place["y"] + 20}
-        wire.send("Input.dispatchDragEvent", {"type": kind, **where, "data": data})
+from tests.web.conftest import DESKTOP, check_row, drop, watched_page
 
 
 def test_an_archive_goes_on_after_the_connection_broke(

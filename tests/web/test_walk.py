@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import shlex
 import subprocess
 import sys
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import httpx
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Locator, Page, expect
 
 from tests.service.conftest import Running, operator
-from tests.web.conftest import DESKTOP, Watched, watched_page
+from tests.web.conftest import Watched
 
 
 def curve_end(page: Page) -> int:
@@ -98,13 +98,8 @@ def test_the_verdict_is_the_reports(desktop: Watched, done: dict[str, Any], api:
     desktop.screenshot("job-done")
 
 
-def test_downloads_are_the_artifacts_to_the_byte(
-    desktop: Watched, done: dict[str, Any], api: httpx.Client
-) -> None:
+def test_downloads_are_the_artifacts_to_the_byte(desktop: Watched, digests: dict[str, str]) -> None:
     page = desktop.page
-    digests = {
-        item["name"]: item["sha256"] for item in api.get(f"/jobs/{done['id']}/artifacts").json()["items"]
-    }
     with page.expect_download() as coming:
         page.get_by_role("link", name="Download For nerfstudio").click()
     sent = Path(coming.value.path()).read_bytes()
@@ -120,16 +115,13 @@ def test_downloads_are_the_artifacts_to_the_byte(
 
 
 def test_the_lines_beside_a_download_bring_the_same(
-    desktop: Watched, done: dict[str, Any], api: httpx.Client, tmp_path: Path
+    desktop: Watched, digests: dict[str, str], tmp_path: Path
 ) -> None:
     page = desktop.page
     row = page.get_by_role("listitem").filter(has_text="For COLMAP").first
     row.get_by_role("button", name="curl, Python").click()
     python = row.get_by_label("Python", exact=True).inner_text()
     subprocess.run([sys.executable, "-c", python], cwd=tmp_path, check=True)
-    digests = {
-        item["name"]: item["sha256"] for item in api.get(f"/jobs/{done['id']}/artifacts").json()["items"]
-    }
     brought = tmp_path / "result"
     found = {
         path.relative_to(brought).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -218,56 +210,91 @@ def test_a_phone_shows_the_same_without_scrolling_sideways(
     assert phone.complaints == []
 
 
+def again(page: Page, job_url: str) -> Locator:
+    """The dialog that asks for other options."""
+    page.goto(job_url)
+    page.get_by_role("button", name="Run again …").click()
+    return page.get_by_role("dialog", name="Run again with other options")
+
+
+def another_job(page: Page, job_url: str) -> str:
+    """The id of the job that the page went to."""
+    page.wait_for_url(lambda url: "#/jobs/" in url and url != job_url)
+    return page.url.rpartition("/")[2]
+
+
 def test_a_job_is_run_again_ended_and_deleted(
-    browser: Browser, service: Running, job_url: str, done: dict[str, Any], api: httpx.Client
+    tab: Watched, job_url: str, done: dict[str, Any], api: httpx.Client
 ) -> None:
-    with closing(browser.new_context(viewport=DESKTOP)) as context:
-        watched = watched_page(context, service.url)
-        page = watched.page
-        page.goto(job_url)
-        page.get_by_role("button", name="Run again …").click()
-        dialog = page.get_by_role("dialog", name="Run again with other options")
-        steps = dialog.get_by_label("steps", exact=True)
-        assert steps.get_attribute("placeholder") == "500"
-        steps.fill("20000")
-        assert watched.serious_findings() == []
-        dialog.get_by_role("button", name="Run from the start").click()
-        page.wait_for_url(lambda url: "#/jobs/" in url and url != job_url)
-        job = page.url.rpartition("/")[2]
-        options = api.get(f"/jobs/{job}").json()["options"]
-        assert options == {**done["options"], "steps": 20000}
-        page.get_by_role("button", name="Cancel", exact=True).click()
-        page.get_by_role("button", name="End it, keep nothing").click()
-        expect(page.get_by_role("heading", level=1)).to_contain_text("cancelled")
-        page.get_by_role("button", name="Delete", exact=True).click()
-        page.get_by_role("button", name="Delete it").click()
-        page.wait_for_url("**/#/")
-        assert api.get(f"/jobs/{job}").status_code == 404
+    page = tab.page
+    dialog = again(page, job_url)
+    steps = dialog.get_by_label("steps", exact=True)
+    assert steps.get_attribute("placeholder") == "500"
+    steps.fill("20000")
+    assert tab.serious_findings() == []
+    dialog.get_by_role("button", name="Run from the start").click()
+    job = another_job(page, job_url)
+    options = api.get(f"/jobs/{job}").json()["options"]
+    assert options == {**done["options"], "steps": 20000}
+    page.get_by_role("button", name="Cancel", exact=True).click()
+    page.get_by_role("button", name="End it, keep nothing").click()
+    expect(page.get_by_role("heading", level=1)).to_contain_text("cancelled")
+    page.get_by_role("button", name="Delete", exact=True).click()
+    page.get_by_role("button", name="Delete it").click()
+    page.wait_for_url("**/#/")
+    assert api.get(f"/jobs/{job}").status_code == 404
+
+
+def test_a_fork_goes_on_after_stage_1_and_its_end_on_request_leaves_a_partial_result(
+    tab: Watched, job_url: str, done: dict[str, Any], api: httpx.Client
+) -> None:
+    page = tab.page
+    dialog = again(page, job_url)
+    dialog.get_by_text("Method and schedule").click()
+    dialog.get_by_label("trial_steps", exact=True).fill("100000")  # it would take hours
+    dialog.get_by_role("button", name="Fork: go on").click()
+    fork = another_job(page, job_url)
+    made = api.get(f"/jobs/{fork}").json()
+    assert (made["forked_from"], made["forked_stage"]) == (done["id"], "coarse")
+    assert made["options"] == {**done["options"], "trial_steps": 100_000}
+    expect(page.get_by_role("img", name="render of one view")).to_be_visible()
+    page.get_by_role("button", name="Cancel", exact=True).click()
+    page.get_by_role("button", name="End it, keep the poses so far").click()
+    expect(page.get_by_role("heading", level=1)).to_contain_text("partial result")
+    expect(page.get_by_role("region", name="Verdict")).to_contain_text("nobody has compared them")
+    ended = api.get(f"/jobs/{fork}").json()
+    assert (ended["state"], ended["partial"], ended["verdict"]) == ("cancelled", True, None)
+    with page.expect_download() as coming:
+        page.get_by_role("link", name="Download For nerfstudio").click()
+    assert len(json.loads(Path(coming.value.path()).read_text())["frames"]) == 10
+    page.get_by_text("Options and times").click()
+    expect(page.get_by_role("link", name=done["id"])).to_be_visible()
+    tab.screenshot("job-partial")
+    assert tab.serious_findings() == []
+    assert tab.complaints == []
 
 
 # Last: from then on the service asks everybody for a key.
 def test_a_service_with_keys_is_used_with_one(
-    browser: Browser, service: Running, job_url: str, done: dict[str, Any]
+    tab: Watched, service: Running, job_url: str, done: dict[str, Any]
 ) -> None:
     with ThreadPoolExecutor(1) as aside:  # Playwright's own loop runs in this thread
         made = aside.submit(operator, service.data_dir, "keys", "create", "page", "--tenant", "local")
         key = made.result()["key"]
-    with closing(browser.new_context(viewport=DESKTOP)) as context:
-        watched = watched_page(context, service.url)
-        page = watched.page
-        page.goto(job_url)
-        field = page.get_by_label("API key")
-        field.fill("brn_wrong")
-        field.press("Enter")
-        expect(page.get_by_role("alert")).to_contain_text("unknown, expired or revoked")
-        watched.screenshot("key")
-        field.fill(key)
-        field.press("Enter")
-        page.wait_for_function("() => document.querySelector('.compare-frame img')?.naturalWidth > 0")
-        assert page.locator(".compare-frame img").first.get_attribute("src").startswith("blob:")
-        with page.expect_download() as coming:
-            page.get_by_role("button", name="Download For nerfstudio").click()
-        assert coming.value.suggested_filename == "transforms.json"
-        page.reload()
-        expect(page.get_by_role("heading", name="Downloads")).to_be_visible()
-        assert watched.outside == []
+    page = tab.page
+    page.goto(job_url)
+    field = page.get_by_label("API key")
+    field.fill("brn_wrong")
+    field.press("Enter")
+    expect(page.get_by_role("alert")).to_contain_text("unknown, expired or revoked")
+    tab.screenshot("key")
+    field.fill(key)
+    field.press("Enter")
+    page.wait_for_function("() => document.querySelector('.compare-frame img')?.naturalWidth > 0")
+    assert page.locator(".compare-frame img").first.get_attribute("src").startswith("blob:")
+    with page.expect_download() as coming:
+        page.get_by_role("button", name="Download For nerfstudio").click()
+    assert coming.value.suggested_filename == "transforms.json"
+    page.reload()
+    expect(page.get_by_role("heading", name="Downloads")).to_be_visible()
+    assert tab.outside == []

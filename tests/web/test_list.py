@@ -1,0 +1,188 @@
+"""Many jobs, uploads that a reload broke off, archives that cannot be taken: what needs no result."""
+
+from __future__ import annotations
+
+import re
+import sys
+import zipfile
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import httpx
+import pytest
+from playwright.sync_api import Browser, Page, Route, expect
+
+from biresnerf.client import Client
+from tests.service.conftest import Running, running_service, short_folder
+from tests.web.conftest import DESKTOP, PHONE, check_row, drop, watched_page
+
+PROGRAM = Path(__file__).with_name("matching_program.py")
+WAITING = 55
+
+
+@pytest.fixture(scope="module")
+def service(browser: Browser) -> Iterator[Running]:
+    """With jobs that go on until they are ended."""
+    with (
+        short_folder() as folder,
+        running_service(folder, job_command=(sys.executable, str(PROGRAM))) as running,
+    ):
+        yield running
+
+
+@pytest.fixture
+def page(browser: Browser, service: Running) -> Iterator[Page]:
+    with closing(browser.new_context(viewport=DESKTOP)) as context:
+        yield watched_page(context, service.url).page
+
+
+@pytest.fixture(scope="module")
+def busy(service: Running, kitchen: Path, api: httpx.Client) -> str:
+    """A job sent by a program, that runs, and many that wait for it."""
+    with Client(service.url) as client:
+        first = client.submit(kitchen, {"preset": "fast"})
+    for number in range(WAITING):
+        body = {"dataset_id": first.dataset_id, "labels": {"name": f"job {number:02}"}}
+        assert api.post("/jobs", json=body).status_code == 202
+    return first.id
+
+
+def names(page: Page) -> list[str]:
+    return page.locator(".job-card strong").all_inner_texts()
+
+
+def test_a_dropped_folder_goes_on_after_a_reload_with_what_is_missing(
+    page: Page, service: Running, kitchen: Path
+) -> None:
+    sent: list[str] = []
+
+    def some(route: Route) -> None:
+        sent.append(route.request.url)
+        if len(sent) <= 4:
+            route.continue_()  # the others never get an answer
+
+    page.route("**/v1/datasets/*/files/**", some)
+    page.goto(service.url)
+    drop(page, kitchen)
+    files = len([path for path in kitchen.rglob("*") if path.is_file()])
+    expect(check_row(page, "Files")).to_contain_text(f"; {files - 4} to come")
+    page.unroute_all(behavior="ignoreErrors")
+    page.reload()
+    expect(page.get_by_role("heading", name=f"{files - 4} files still to come")).to_be_visible()
+    again: list[str] = []
+    page.on("request", lambda request: again.append(request.url) if request.method == "PUT" else None)
+    drop(page, kitchen)
+    expect(page.get_by_role("button", name="Refine the poses")).to_be_visible()
+    assert len(again) == files - 4
+    assert not {*again} & {*sent[:4]}
+
+
+def test_an_archive_goes_on_after_a_reload_from_its_last_byte(
+    page: Page, service: Running, kitchen: Path, tmp_path: Path
+) -> None:
+    archive = zip_of(kitchen, tmp_path / "set.zip")
+    half = archive.stat().st_size // 2
+    offsets: list[int] = []
+
+    def first_half(route: Route) -> None:
+        offsets.append(int(route.request.headers["upload-offset"]))
+        if len(offsets) == 1:
+            route.continue_(post_data=archive.read_bytes()[:half])
+
+    page.route(
+        "**/v1/uploads/*",
+        lambda route: first_half(route) if route.request.method == "PATCH" else route.continue_(),
+    )
+    page.goto(service.url)
+    page.locator("input[type=file]").nth(1).set_input_files(archive)
+    page.wait_for_url("**/#/datasets/*")
+    while len(offsets) < 2:
+        page.wait_for_timeout(50)
+    page.unroute_all(behavior="ignoreErrors")
+    page.reload()
+    expect(page.get_by_role("heading", name="Nothing has arrived in whole")).to_be_visible()
+    with page.expect_request(lambda request: request.method == "PATCH") as going_on:
+        page.locator("input[type=file]").nth(1).set_input_files(archive)
+    assert int(going_on.value.headers["upload-offset"]) == half
+    expect(check_row(page, "Images")).to_contain_text("10 images")
+
+
+def test_an_archive_that_cannot_be_taken_says_why_and_another_takes_its_place(
+    page: Page, service: Running, kitchen: Path, tmp_path: Path
+) -> None:
+    broken = zip_of(kitchen, tmp_path / "broken.zip")
+    broken.write_bytes(broken.read_bytes()[:-100])
+    page.goto(service.url)
+    page.locator("input[type=file]").nth(1).set_input_files(broken)
+    expect(page.get_by_role("alert")).to_contain_text("The archive was not accepted")
+    expect(page.get_by_role("alert")).to_contain_text("archive_rejected")
+    page.locator("input[type=file]").nth(1).set_input_files(zip_of(kitchen, tmp_path / "whole.zip"))
+    expect(page.get_by_role("button", name="Refine the poses")).to_be_visible()
+
+
+def zip_of(folder: Path, path: Path) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in sorted(folder.rglob("*")):
+            archive.write(file, file.relative_to(folder))
+    return path
+
+
+def test_a_long_list_is_shown_piece_by_piece_and_all_of_it_is_live(
+    page: Page, service: Running, busy: str
+) -> None:
+    page.goto(service.url)
+    newest = [f"job {number:02}" for number in reversed(range(WAITING))]
+    expect(page.locator(".job-card")).to_have_count(24)
+    assert names(page) == newest[:24]
+    page.get_by_role("button", name="Older jobs").click()
+    expect(page.locator(".job-card")).to_have_count(48)
+    page.get_by_role("button", name="Older jobs").click()
+    expect(page.locator(".job-card")).to_have_count(WAITING + 1)
+    # What a program sent is called after its folder.
+    assert names(page) == [*newest, "kitchen"]
+    expect(page.get_by_role("button", name="Older jobs")).to_be_hidden()
+    # The oldest of all runs, and is seen to.
+    words = page.locator(".job-card", has_text="kitchen").locator(".stage-words")
+    expect(words).to_contain_text("look")
+    looked = words.inner_text()
+    expect(words).not_to_have_text(looked)
+    expect(page.locator(".job-card", has_text="job 00").locator(".stage-words")).to_contain_text(
+        "Number 1 in the queue"
+    )
+
+
+def test_the_list_is_narrowed_to_a_state_and_stays_so_on_the_way_back(
+    page: Page, service: Running, busy: str
+) -> None:
+    page.goto(service.url)
+    page.get_by_label("Show").select_option("running")
+    expect(page.locator(".job-card")).to_have_count(1)
+    page.locator(".job-card").click()
+    expect(page.get_by_role("heading", level=1)).to_contain_text("kitchen")
+    page.go_back()
+    expect(page.locator(".job-card")).to_have_count(1)
+    expect(page.get_by_label("Show")).to_have_value("running")
+    page.get_by_label("Show").select_option("failed")
+    expect(page.get_by_text("No job is failed.")).to_be_visible()
+    page.get_by_label("Show").select_option("")
+    expect(page.locator(".job-card")).to_have_count(24)
+
+
+@pytest.mark.parametrize(("name", "viewport"), [("seeding", DESKTOP), ("phone-seeding", PHONE)])
+def test_what_feature_matches_say_is_seen_while_they_are_looked_for(
+    browser: Browser, service: Running, busy: str, kitchen: Path, name: str, viewport: dict[str, int]
+) -> None:
+    with closing(browser.new_context(viewport=viewport)) as context:
+        watched = watched_page(context, service.url)
+        page = watched.page
+        page.goto(f"{service.url}/#/jobs/{busy}")
+        said = page.get_by_text(re.compile(r"Features of 10 of 10 photos found; \d+ pairs of photos match"))
+        expect(said).to_be_visible()
+        page.wait_for_function("() => document.querySelector('.seeding-photos')?.naturalWidth > 0")
+        expect(page.get_by_role("img", name="Each photo matches 0 to")).to_be_visible()
+        expect(page.get_by_text("no other so far")).to_contain_text("r_9")
+        watched.screenshot(name)
+        assert watched.serious_findings() == []
+        assert not watched.overflows()
+        assert watched.complaints == []
