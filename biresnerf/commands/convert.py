@@ -23,6 +23,7 @@ FORMS = (
     "tum",
     "kitti",
     "bundler",
+    "llff",
     "pinhole",
     "poses",
     "scene",
@@ -39,9 +40,18 @@ FORMS = (
     "--photos", type=click.Choice(["link", "copy", "none"]), default="link", show_default=True,
     help="How images and masks come into OUTPUT.",
 )  # fmt: skip
+@click.option(
+    "--bounds", nargs=2, type=click.FloatRange(0, min_open=True), metavar="NEAR FAR",
+    help="Of depth, in the set's units, for llff. Default: of the points that each image sees.",
+)  # fmt: skip
 @json_option
 def convert_command(
-    input_path: Path, output: Path, forms: tuple[FormName, ...], photos: Photos, as_json: bool
+    input_path: Path,
+    output: Path,
+    forms: tuple[FormName, ...],
+    photos: Photos,
+    bounds: tuple[float, float] | None,
+    as_json: bool,
 ) -> None:
     """Write the poses of INPUT, in any form that `refine` reads, into the new folder OUTPUT in other forms.
 
@@ -49,11 +59,13 @@ def convert_command(
     each form holds. For the result of `refine` there is `export`.
     """
     require_empty(output)
+    if bounds is not None and bounds[0] >= bounds[1]:
+        raise click.BadParameter("NEAR must be less than FAR.", param_hint="--bounds")
     from biresnerf.data.packs.converted import convert
     from biresnerf.data.read import read_dataset
 
     dataset = read_dataset(input_path)
-    done = convert(dataset, tuple(dict.fromkeys(forms)), output, photos)
+    done = convert(dataset, tuple(dict.fromkeys(forms)), output, photos, bounds)
     warnings = [*dataset.warnings, *done.notes]
     if as_json:
         print_json(_document(done.places, len(dataset) - len(done.left_out), done.left_out, warnings))

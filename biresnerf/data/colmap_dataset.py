@@ -10,12 +10,15 @@ import numpy as np
 
 from biresnerf.data.colmap_reader import ColmapModel, read_colmap_model, world_from_cam_of
 from biresnerf.data.dataset import Dataset, SourceFormat
-from biresnerf.data.folder import IMAGE_FOLDER, images_below, images_in
+from biresnerf.data.folder import IMAGE_FOLDER, images_below, images_in, visible
 from biresnerf.data.given_images import GivenImage, dataset_of, match_files
 from biresnerf.data.image_files import read_header
 from biresnerf.data.named_images import few_names
 from biresnerf.data.orientation import same_shape
 from biresnerf.errors import InputError
+
+# Folders beside the poses whose pictures are not the set's photos; `biresnerf convert` writes pinhole/.
+_NO_PHOTOS = frozenset({"masks", "depth", "pinhole"})
 
 
 def read_colmap_dataset(root: Path, model_folder: Path, within: Path | None = None) -> Dataset:
@@ -65,12 +68,21 @@ def read_colmap_dataset(root: Path, model_folder: Path, within: Path | None = No
 def image_files(root: Path) -> dict[str, Path]:
     """The images in ``root``/images, else in ``root``, by their path there, with forward slashes.
 
+    Where there are none: those in the one other folder of ``root`` that has images (rgb/ of TUM's sets, train/ of
+    NeRF-synthetic ones), by their path in ``root``.
+
     Raises:
         InputError: ``no_images``.
     """
-    files = images_beside(root)
+    files = images_beside(root) or _images_of_only_folder(root)
     refuse_no_images(files, root)
     return files
+
+
+def _images_of_only_folder(root: Path) -> dict[str, Path]:
+    folders = [path for path in visible(root) if path.is_dir() and path.name not in _NO_PHOTOS]
+    found = [paths for paths in map(images_below, folders) if paths]
+    return {path.relative_to(root).as_posix(): path for path in found[0]} if len(found) == 1 else {}
 
 
 def refuse_no_images(files: dict[str, Path], root: Path) -> None:

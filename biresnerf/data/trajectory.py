@@ -19,6 +19,7 @@ from biresnerf.data.poses import rigid_matrix
 from biresnerf.data.text_file import read_text
 from biresnerf.errors import InputError
 
+TIMES_OF_IMAGES = "rgb.txt"  # of TUM's sets
 MAX_POSES = 100_000
 MAX_TIME_APART_S = 0.02  # between an image and its pose, as in TUM's own tools
 _QUAT_LENGTH_ERROR = 1e-2
@@ -101,7 +102,8 @@ def read_trajectory(root: Path, file: Path, within: Path | None = None) -> Datas
         pose = None if index is None else trajectory.poses[index]
         time = trajectory.times_s[index] if index is not None and trajectory.times_s else None
         given.append(GivenImage(name, files[name], camera(files[name], name), pose, where, time))
-    source = SourceFormat(trajectory.dialect, None, {}, np.eye(4), files=(file, *camera_files))
+    table = (path for path in (root / TIMES_OF_IMAGES,) if path.is_file())
+    source = SourceFormat(trajectory.dialect, None, {}, np.eye(4), files=(file, *camera_files, *table))
     return dataset_of(root, given, source, [f"{file.name}: images and poses were matched {how}"], within)
 
 
@@ -147,7 +149,7 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
 def _times_of_images(names: Sequence[str], root: Path) -> tuple[dict[str, float], str]:
     """When each image was taken, s, where rgb.txt or its own name says so."""
     times: dict[str, float] = {}
-    table = root / "rgb.txt"
+    table = root / TIMES_OF_IMAGES
     if table.is_file():
         by_base = {PurePosixPath(name).name: name for name in names}
         for line in read_text(table).splitlines():

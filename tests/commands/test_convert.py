@@ -33,7 +33,9 @@ PLACES = {
     "tum": "tum.txt",
     "kitti": "kitti.txt",
     "bundler": "bundle.out",
+    "llff": "poses_bounds.npy",
 }
+BOUNDS = ("--bounds", 0.5, 9)  # for sets without points
 
 
 def run(*arguments: object) -> Result:
@@ -57,15 +59,17 @@ def assert_same(found: Dataset, given: Dataset) -> None:
         np.testing.assert_allclose(ours[name], pose, rtol=0, atol=1e-9, err_msg=name)
 
 
-def write_set(folder: Path, seed: int, count: int) -> None:
+def write_set(folder: Path, seed: int, count: int, k1: float = 0.01) -> None:
     poses = random_poses(np.random.default_rng(seed), count)
+    photos = "images" if seed % 2 else "train"
     frames = []
     for index, pose in enumerate(poses):
-        write_image(folder / "images" / f"{index:02}.png", index)
+        name = f"{(7 * index + 5) % 13}.png"  # the file's order is not that of names
+        write_image(folder / photos / name, index)
         frames.append(
-            {"file_path": f"images/{index:02}.png", "transform_matrix": (pose @ OPENCV_FROM_OPENGL).tolist()}
+            {"file_path": f"{photos}/{name}", "transform_matrix": (pose @ OPENCV_FROM_OPENGL).tolist()}
         )
-    lens = {"fl_x": 18.0, "fl_y": 18.0, "cx": 10.0, "cy": 8.0, "w": 20, "h": 16, "k1": 0.01}
+    lens = {"fl_x": 18.0, "fl_y": 18.0, "cx": 10.0, "cy": 8.0, "w": 20, "h": 16, "k1": k1}
     (folder / "transforms.json").write_text(json.dumps({"camera_model": "OPENCV", **lens, "frames": frames}))
 
 
@@ -74,16 +78,17 @@ def write_set(folder: Path, seed: int, count: int) -> None:
 @given(seed=st.integers(0, 2**31), count=st.integers(3, 6))
 def test_there_and_back_keeps_poses_and_names(tmp_path_factory, form: str, seed: int, count: int) -> None:
     folder = tmp_path_factory.mktemp("set")
-    write_set(folder / "given", seed, count)
+    write_set(folder / "given", seed, count, 0.0 if form == "llff" else 0.01)
     given_set = read_dataset(folder / "given")
-    there = converted(folder / "given", folder / "there", "--to", form)
+    there = converted(folder / "given", folder / "there", "--to", form, *(BOUNDS if form == "llff" else ()))
     assert there["forms"] == {form: str(folder / "there" / PLACES[form])}
     between = read_dataset(folder / "there" / PLACES[form])
     assert_same(between, given_set)
     converted(folder / "there" / PLACES[form], folder / "back", "--to", "transforms")
     back = read_dataset(folder / "back")
     assert_same(back, given_set)
-    assert list(back.file_names) == list(given_set.file_names)
+    if form in ("transforms", "instant-ngp", "bundler"):  # the others are read in the order of names
+        assert list(back.file_names) == list(given_set.file_names)
 
 
 @pytest.mark.parametrize("form", trajectories.FORMS)
@@ -91,8 +96,9 @@ def test_every_form_that_is_read_becomes_every_form_that_is_written(tmp_path: Pa
     scene = tmp_path / "scene"
     trajectories.write_set(form, scene)
     given_set = read_dataset(scene)
-    # Bundler knows one focal length, in the middle of the image.
-    forms = [name for name in FORMS if name != "bundler" or form in ("llff", "bundler")]
+    # Bundler knows one focal length, in the middle of the image; LLFF that without distortion.
+    fitting = {"bundler": ("llff", "bundler"), "llff": ("llff",)}
+    forms = [name for name in FORMS if form in fitting.get(name, (form,))]
     wanted = [word for name in forms for word in ("--to", name)]
     done = converted(scene, tmp_path / "all", *wanted, "--photos", "copy")
     assert list(done["forms"]) == forms
@@ -137,3 +143,26 @@ def test_photos_alone_and_a_folder_with_files_are_refused(tmp_path: Path) -> Non
     full = run(tmp_path / "scene", tmp_path / "scene", "--to", "tum")
     assert isinstance(full.exception, InputError)
     assert full.exception.code == "output_not_empty"
+
+
+def test_llff_has_the_bounds_of_the_points_that_each_image_sees_unless_they_are_given(tmp_path: Path) -> None:
+    write_set(tmp_path / "bare", seed=1, count=4, k1=0.0)
+    missing = run(tmp_path / "bare", tmp_path / "out", "--to", "llff")
+    assert isinstance(missing.exception, InputError)
+    assert missing.exception.code == "bounds_missing"
+    converted(tmp_path / "bare", tmp_path / "given", "--to", "llff", *BOUNDS)
+    rows = np.load(tmp_path / "given" / "poses_bounds.npy")
+    np.testing.assert_array_equal(rows[:, 15:], np.tile([0.5, 9.0], (4, 1)))
+    # An input of that form keeps its own.
+    converted(tmp_path / "given", tmp_path / "kept", "--to", "llff")
+    kept = np.load(tmp_path / "kept" / "poses_bounds.npy")
+    np.testing.assert_allclose(kept, rows, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(kept[:, 15:], rows[:, 15:])
+    assert run(tmp_path / "given", tmp_path / "no", "--to", "llff", "--bounds", 2, 1).exit_code == 2
+
+
+def test_a_distorted_lens_is_not_written_where_distortion_cannot_be(tmp_path: Path) -> None:
+    write_set(tmp_path / "scene", seed=1, count=4)
+    refused = run(tmp_path / "scene", tmp_path / "out", "--to", "llff", *BOUNDS)
+    assert isinstance(refused.exception, InputError)
+    assert "it is distorted" in str(refused.exception)

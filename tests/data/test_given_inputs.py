@@ -9,8 +9,9 @@ from PIL import Image
 from biresnerf.data.dataset import Camera
 from biresnerf.data.read import read_dataset
 from biresnerf.data.refined_set import refined_set
+from biresnerf.errors import InputError
 from tests.data import trajectories
-from tests.data.scenes import HEIGHT, WIDTH
+from tests.data.scenes import HEIGHT, WIDTH, write_image
 from tests.data.test_real_sets import ROOT
 from tests.data.trajectories import GIVEN_CAMERA, NAMES, assert_at_truth, truth
 
@@ -80,6 +81,23 @@ def test_a_trajectorys_own_comments_and_rgb_txt_go_before_the_order(tmp_path):
         dataset = read_dataset(tmp_path / folder)
         assert_at_truth(dataset, truth()[::-1])
         assert said in dataset.warnings[0]
+
+
+def test_tums_own_layout_is_read_and_its_table_of_times_belongs_to_it(tmp_path):
+    (tmp_path / "groundtruth.txt").write_text("\n".join(trajectories.tum_lines(TIMES)))
+    table = []
+    for index, (time, name) in enumerate(zip(TIMES, NAMES, strict=True)):
+        write_image(tmp_path / "rgb" / name, index)
+        write_image(tmp_path / "depth" / name, index)
+        table.append(f"{time} rgb/{name}")
+    (tmp_path / "rgb.txt").write_text("\n".join(reversed(table)))
+    dataset = read_dataset(tmp_path)
+    assert_at_truth(dataset)
+    assert list(dataset.file_names) == [f"rgb/{name}" for name in NAMES]
+    assert [path.name for path in dataset.source.files] == ["groundtruth.txt", "rgb.txt"]
+    write_image(tmp_path / "left" / NAMES[0], 0)  # which folder is meant is not guessed
+    with pytest.raises(InputError, match="no images"):
+        read_dataset(tmp_path)
 
 
 def test_images_without_a_pose_near_in_time_have_none(tmp_path):

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+import numpy as np
+
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.lens_json import lens_values
@@ -19,6 +21,7 @@ from biresnerf.data.packs.bundler import write_bundler
 from biresnerf.data.packs.colmap_binary import write_colmap_binary
 from biresnerf.data.packs.colmap_text import write_colmap_text
 from biresnerf.data.packs.instant_ngp import TRANSFORMS_NGP, write_transforms_ngp
+from biresnerf.data.packs.llff import POSES_BOUNDS, given_bounds, write_llff
 from biresnerf.data.packs.pinhole import PINHOLE, write_pinhole
 from biresnerf.data.packs.poses_json import POSES, write_poses_json
 from biresnerf.data.packs.scene_glb import SCENE, write_scene
@@ -29,7 +32,7 @@ from biresnerf.data.write import transforms_notes, write_transforms
 from biresnerf.errors import InputError
 
 FormName = Literal[
-    "transforms", "colmap", "colmap-text", "instant-ngp", "tum", "kitti", "bundler", "pinhole", "poses", "scene"
+    "transforms", "colmap", "colmap-text", "instant-ngp", "tum", "kitti", "bundler", "llff", "pinhole", "poses", "scene"
 ]  # fmt: skip
 Photos = Literal["link", "copy", "none"]
 CAMERA = "camera.json"
@@ -45,16 +48,23 @@ class Written:
     notes: tuple[str, ...]
 
 
-def convert(dataset: Dataset, forms: Sequence[FormName], folder: Path, photos: Photos = "link") -> Written:
+def convert(
+    dataset: Dataset,
+    forms: Sequence[FormName],
+    folder: Path,
+    photos: Photos = "link",
+    bounds: tuple[float, float] | None = None,
+) -> Written:
     """Writes the set into ``folder`` (new, or empty) in each of the forms; nothing is optimised.
 
     Images without a pose are left out.
 
     Args:
         photos: whether images and masks are linked or copied there, under the names that they have in the set's folder.
+        bounds: nearest and farthest depth, for LLFF's form; where left out, of the points that each image sees.
 
     Raises:
-        InputError: ``no_poses``, ``pack_not_possible``: a form cannot hold this set.
+        InputError: ``no_poses``, ``pack_not_possible``: a form cannot hold this set; ``bounds_missing``.
     """
     posed = [frame for frame in dataset.frames if frame.world_from_cam is not None]
     left_out = tuple(frame.name for frame in dataset.frames if frame.world_from_cam is None)
@@ -70,7 +80,8 @@ def convert(dataset: Dataset, forms: Sequence[FormName], folder: Path, photos: P
     if dataset.source.colmap is not None:
         refined = with_given_points(refined, dataset.source.colmap)
     with _whole_folder(folder) as staging:
-        places = {form: _WRITERS[form](chosen, refined, staging).relative_to(staging) for form in forms}
+        writers = {**_WRITERS, "llff": _llff_writer(bounds)}
+        places = {form: writers[form](chosen, refined, staging).relative_to(staging) for form in forms}
         if photos != "none":
             _bring_photos(chosen, staging, photos)
     return Written({form: folder / place for form, place in places.items()}, left_out, _notes(chosen, forms))
@@ -127,6 +138,19 @@ def _trajectory(write: Callable[[RefinedSet, Path], None], name: str) -> Writer:
             with whole_file(folder / CAMERA) as temporary:
                 temporary.write_text(json.dumps(lens_values(dataset.cameras[0]), indent=2) + "\n", "utf-8")
         return folder / name
+
+    return written
+
+
+def _llff_writer(bounds: tuple[float, float] | None) -> Writer:
+    """LLFF's form, with these bounds, or those of the input where it has that form, or of the points."""
+
+    def written(dataset: Dataset, refined: RefinedSet, folder: Path) -> Path:
+        depths = None if bounds is None else np.tile(bounds, (len(refined), 1))
+        if depths is None and dataset.source.dialect == "llff":
+            depths = given_bounds(dataset.source.files[0], len(refined))
+        write_llff(refined, folder / POSES_BOUNDS, depths)
+        return folder / POSES_BOUNDS
 
     return written
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.conventions import quat_wxyz_from_rotation
+from biresnerf.data.packs.llff import rows_by_name
 from biresnerf.data.refined_set import RefinedSet
 
 _TUM_HEAD = (
@@ -29,11 +30,12 @@ def write_tum(refined: RefinedSet, path: Path) -> None:
 
 
 def write_kitti(refined: RefinedSet, path: Path) -> None:
-    """One line an image, in the input's order: the 12 numbers of [R | t], row by row. The form knows no comments."""
-    _write_lines(
-        path,
-        [" ".join(repr(value) for value in pose[:3].ravel().tolist()) for pose in refined.world_from_cam],
-    )
+    """One line an image: the 12 numbers of [R | t], row by row.
+
+    The form knows neither names nor comments, so lines are in the order of the files' names, as readers take them.
+    """
+    poses = refined.world_from_cam[rows_by_name(refined)]
+    _write_lines(path, [" ".join(repr(value) for value in pose[:3].ravel().tolist()) for pose in poses])
 
 
 def _write_lines(path: Path, lines: list[str]) -> None:

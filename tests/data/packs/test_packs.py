@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from biresnerf.config import RefineOptions
 from biresnerf.data.packs.bundler import write_bundler
 from biresnerf.data.packs.instant_ngp import write_transforms_ngp
+from biresnerf.data.packs.llff import write_llff
 from biresnerf.data.packs.poses_json import matrix_of, read_poses_json, write_poses_json
 from biresnerf.data.packs.scene_glb import write_scene
 from biresnerf.data.packs.trajectories import write_kitti, write_tum
@@ -95,6 +96,28 @@ def test_a_damaged_poses_json_is_refused_with_the_field(tmp_path, damage):
     assert where in caught.value.where
 
 
+def test_llff_holds_every_pose_by_name_and_the_depths_that_its_image_sees(tmp_path):
+    refined = centred(random_result(4, model="SIMPLE_PINHOLE"))
+    write_llff(refined, tmp_path / "poses_bounds.npy")
+    rows = np.load(tmp_path / "poses_bounds.npy")
+    for index, row in enumerate(rows):
+        down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
+        pose, camera = refined.world_from_cam[index], refined.camera_of(index)
+        np.testing.assert_array_equal(np.stack([right, down, -back, centre], axis=1), pose[:3])
+        assert (height, width, focal) == (camera.height, camera.width, camera.full().fx)
+        seen = [
+            refined.model.points.xyz[k]
+            for k in range(len(refined.model.points))
+            for element in range(
+                refined.model.points.track_starts[k], refined.model.points.track_starts[k + 1]
+            )
+            if refined.model.points.track_image_ids[element] == refined.image_ids[index]
+        ]
+        depths = (refined.cam_from_world[index, :3, :3] @ np.transpose(seen)).T[:, 2]
+        depths = depths + refined.cam_from_world[index, 2, 3]
+        np.testing.assert_allclose(row[15:], np.percentile(depths, [0.1, 99.9]))
+
+
 def test_trajectories_hold_every_pose_in_order(tmp_path):
     refined = random_result(2)
     write_tum(refined, tmp_path / "tum.txt")
@@ -105,7 +128,9 @@ def test_trajectories_hold_every_pose_in_order(tmp_path):
     assert tum_poses(tmp_path / "tum.txt")[0].tolist() == [1305031098.6659, 2.5, 3.0, 4.0, 5.25]
     write_kitti(refined, tmp_path / "kitti.txt")
     rows = np.loadtxt(tmp_path / "kitti.txt").reshape(-1, 3, 4)
-    np.testing.assert_array_equal(rows, refined.world_from_cam[:, :3])
+    # It has no names: whoever reads it takes the images by the order of theirs.
+    by_name = sorted(range(len(refined)), key=lambda index: refined.images[index].file_name)
+    np.testing.assert_array_equal(rows, refined.world_from_cam[by_name][:, :3])
 
 
 @pytest.mark.parametrize("model", NGP_MODELS)
