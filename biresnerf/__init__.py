@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from biresnerf.config import RefineOptions
 from biresnerf.errors import BiresnerfError, InputError, Interrupted, RefinementError
+from biresnerf.openmp import let_waiting_threads_sleep
 from biresnerf.progress import Progress
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "refine_poses":
+        let_waiting_threads_sleep()
         from biresnerf.pipeline import refine_poses
 
         return refine_poses

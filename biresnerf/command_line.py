@@ -15,6 +15,7 @@ from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import with_code
 from biresnerf.commands.completion import NAME
 from biresnerf.errors import BiresnerfError, InputError
+from biresnerf.openmp import let_waiting_threads_sleep
 
 GROUP = "biresnerf.commands"
 # What brings a package that is not installed; all others come with the service.
@@ -120,6 +121,7 @@ def cli() -> None:
 
 def main() -> None:
     """Entry point; `exit_codes` says what the exit status means."""
+    let_waiting_threads_sleep()
     try:
         status = cli.main(prog_name=NAME, standalone_mode=False)
         sys.exit(status if isinstance(status, int) else exit_codes.DONE)

@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from biresnerf.config import PackName, RefineOptions, parse_options
 from biresnerf.errors import InputError, Interrupted, RefinementError
+from biresnerf.openmp import let_waiting_threads_sleep
 from biresnerf.progress import Progress, Stage
 
 EXIT_BUG = 1
@@ -45,6 +46,7 @@ class Order(BaseModel):
 
 def main(folder: Path) -> int:
     """Run the job in ``folder``; returns the exit status."""
+    let_waiting_threads_sleep()
     protocol = _protocol_only()
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s %(message)s")
     stop = _Stop()

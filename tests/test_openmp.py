@@ -1,0 +1,42 @@
+"""Jobs side by side do not take each other's cores by waiting."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+ENTRANCES = {
+    "library": "import biresnerf; biresnerf.refine_poses",
+    "command line": "from biresnerf.command_line import main\ntry: main()\nexcept SystemExit: import torch",
+    "job": "from pathlib import Path; from workers.run import main; main(Path('no-such-job')); import torch",
+}
+
+
+def spins(program: str, **variables: str) -> list[int]:
+    """How often the threads of each libgomp that ``program`` loads look for work before they sleep."""
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))
+    }
+    ran = subprocess.run(
+        [sys.executable, "-c", program], env={**environment, "OMP_DISPLAY_ENV": "verbose", **variables},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return [int(count) for count in re.findall(r"GOMP_SPINCOUNT = '(\d+)'", ran.stderr)]
+
+
+@pytest.mark.parametrize("entrance", ENTRANCES)
+def test_waiting_threads_sleep(entrance):
+    if not spins("import torch"):
+        pytest.skip("torch's OpenMP is not libgomp here")
+    assert set(spins(ENTRANCES[entrance])) == {0}
+
+
+def test_what_the_user_says_of_threads_holds():
+    said = spins(ENTRANCES["library"], OMP_WAIT_POLICY="active")
+    if not said:
+        pytest.skip("torch's OpenMP is not libgomp here")
+    assert min(said) > 0
