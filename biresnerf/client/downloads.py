@@ -90,9 +90,9 @@ def download(
 ) -> Flow[None]:
     """Writes one file of a result to ``target``. Does not ask whether something is there already."""
     part = PartialFile(artifact, target, on_bytes)
-    yield Work(part.open)
-    patience, before = Patience(session), part.size
     try:
+        yield Work(part.open)
+        patience, before = Patience(session), part.size
         while part.size < artifact.size:
             try:
                 yield Stream(part.rest(), part)

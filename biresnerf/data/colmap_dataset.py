@@ -66,17 +66,19 @@ def read_colmap_dataset(root: Path, model_folder: Path, within: Path | None = No
 
 
 def image_files(root: Path) -> dict[str, Path]:
-    """The images in ``root``/images, else in ``root``, by their path there, with forward slashes.
-
-    Where there are none: those in the one other folder of ``root`` that has images (rgb/ of TUM's sets, train/ of
-    NeRF-synthetic ones), by their path in ``root``.
-
-    Raises:
-        InputError: ``no_images``.
-    """
-    files = images_beside(root) or _images_of_only_folder(root)
+    """As `photos_beside`. Raises InputError ``no_images`` where there are none."""
+    files = photos_beside(root)
     refuse_no_images(files, root)
     return files
+
+
+def photos_beside(root: Path) -> dict[str, Path]:
+    """The images beside poses that do not say where theirs are, by path with forward slashes; perhaps none.
+
+    Those of `images_beside`, else those in the one other folder of ``root`` that has images (rgb/ of TUM's sets,
+    train/ of NeRF-synthetic ones), by their path in ``root``.
+    """
+    return images_beside(root) or _images_of_only_folder(root)
 
 
 def _images_of_only_folder(root: Path) -> dict[str, Path]:
@@ -97,7 +99,7 @@ def refuse_no_images(files: dict[str, Path], root: Path) -> None:
 
 
 def images_beside(root: Path) -> dict[str, Path]:
-    """As `image_files`; empty where there are none."""
+    """The images in ``root``/images, else in ``root``, by their path there; empty where there are none."""
     folder = root / IMAGE_FOLDER
     paths = images_below(folder)
     if not paths:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.bundler import names_of_cameras, read_cameras
-from biresnerf.data.colmap_dataset import images_beside
+from biresnerf.data.colmap_dataset import photos_beside
 from biresnerf.data.colmap_reader import read_colmap_model, world_from_cam_of
 from biresnerf.data.conventions import world_from_cam_of_file
 from biresnerf.data.folder import PoseForm
@@ -68,7 +68,7 @@ def _colmap(_root: Path, folder: Path) -> Poses:
 
 def _trajectory(root: Path, file: Path) -> Poses:
     trajectory = Trajectory(file)
-    beside = sorted(images_beside(root))
+    beside = sorted(photos_beside(root))
     if beside:
         try:
             return {
@@ -80,7 +80,7 @@ def _trajectory(root: Path, file: Path) -> Poses:
 
 
 def _llff(root: Path, file: Path) -> Poses:
-    poses, names = read_llff_poses(file), sorted(images_beside(root))
+    poses, names = read_llff_poses(file), sorted(photos_beside(root))
     if len(names) != len(poses):
         names = [str(index) for index in range(len(poses))]
     return dict(zip(names, poses, strict=True))
@@ -88,7 +88,7 @@ def _llff(root: Path, file: Path) -> Poses:
 
 def _bundler(root: Path, file: Path) -> Poses:
     entries = read_cameras(file)
-    in_order = sorted(images_beside(root))
+    in_order = sorted(photos_beside(root))
     if len(in_order) != len(entries):
         in_order = [str(index) for index in range(len(entries))]
     names, _, _ = names_of_cameras(root, file, in_order, len(entries))

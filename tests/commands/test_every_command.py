@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
+import re
+
 import click
 import pytest
+from click.testing import CliRunner
 
-from docs.generate.commands_page import all_commands
+from biresnerf.command_line import cli
+from docs.generate.commands_page import ROOT, all_commands
 
 COMMANDS = all_commands()
 # They run until they are stopped; or what they print is a script, or a story.
 WITHOUT_JSON = {"api", "dispatcher", "up", "worker", "completion", "demo"}
+
+
+def test_the_page_of_commands_and_the_help_have_a_place_for_each() -> None:
+    page = (ROOT / "docs/command-line.md").read_text("utf-8")
+    named = set(re.findall(r"`([a-z-]+)[` ]", page))
+    assert {name.split()[0] for name in COMMANDS} <= named
+    said = CliRunner().invoke(cli, ["--help"]).stdout
+    assert "Run a service:" in said
+    assert "Others:" not in said
+
+
+def test_a_mistyped_command_is_answered_with_the_nearest() -> None:
+    said = CliRunner().invoke(cli, ["inspct"])
+    assert said.exit_code == 2
+    assert "Did you mean 'inspect'?" in said.stderr
 
 
 @pytest.mark.parametrize("name", COMMANDS)

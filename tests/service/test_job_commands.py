@@ -14,13 +14,17 @@ import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx
 import pytest
 from click.testing import CliRunner, Result
 
+from benchmarks.upload import Relay
+from biresnerf.client import Client, ServiceError
 from biresnerf.commands import exit_codes
 from biresnerf.commands.download import download_command
+from biresnerf.commands.follow_job import waited_for
 from biresnerf.commands.fork import fork_command
 from biresnerf.commands.jobs import (
     cancel_command,
@@ -30,6 +34,7 @@ from biresnerf.commands.jobs import (
     status_command,
     wait_command,
 )
+from biresnerf.commands.service_options import exit_code_of
 from biresnerf.commands.submit import submit_command
 from service.commands import free_port
 from tests.service.conftest import Running, Tenant, finished, submit, until
@@ -202,6 +207,24 @@ def test_ctrl_c_while_sending_says_how_to_go_on(
     kept = http.get(f"/v1/datasets/{again[2]}").json()
     assert kept["state"] in {"open", "finalizing", "ready"}
     http.delete(f"/v1/datasets/{again[2]}")
+
+
+def test_a_service_that_stays_away_while_a_job_is_waited_for_leaves_the_way_back(
+    service: Running, http: httpx.Client, done_job: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    job = submit(http, done_job["dataset_id"], steps=4000, step_ms=20)["id"]
+    port = urlsplit(service.url).port
+    assert port is not None
+    relay = Relay(port)
+    with Client(f"http://127.0.0.1:{relay.port}", patience_s=0.1) as client:
+        found = client.job(job)
+        threading.Timer(0.2, relay.close).start()
+        with pytest.raises(ServiceError) as caught:
+            waited_for(client, found, None, as_json=False)
+        assert (caught.value.code, exit_code_of(caught.value)) == ("unreachable", exit_codes.AWAY)
+        assert f"biresnerf wait {client.url}/v1/jobs/{job}" in capsys.readouterr().err
+    http.post(found.links.cancel)
+    finished(http, job)
 
 
 def test_colour_is_left_out_where_it_is_not_wanted_and_bars_where_nobody_looks(
