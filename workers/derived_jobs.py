@@ -52,20 +52,21 @@ class DerivedJobs(JobStore):
         """
         async with self._database.transaction() as connection:
             parent = await self._required(connection, job_id)
-        if parent["kind"] != "refine":
-            raise Conflict("fork_not_possible", f"{job_id} is an export.")
-        options, stage = plan_fork(parent, changes, wanted)
-        resolved = options.resolved().model_dump(mode="json")
-        fingerprint = fingerprint_of(f"fork {job_id} {stage}", resolved, labels)
+            if parent["kind"] != "refine":
+                raise Conflict("fork_not_possible", f"{job_id} is an export.")
+            options, stage = plan_fork(parent, changes, wanted)
+            resolved = options.resolved().model_dump(mode="json")
+            fingerprint = fingerprint_of(f"fork {job_id} {stage}", resolved, labels)
+            # Before anything is copied, which no quota counts until the fork is there.
+            known = await self._known_or_room(connection, parent, idempotency_key, fingerprint)
+            if known is not None:
+                return known, False
         fork_id = new_id("job")
         taken = await self._copied(parent["reusable"], stage, fork_id)
         async with self._database.transaction() as connection:
-            await submitting_for(connection, parent["dataset_id"], self._tenant)
-            if idempotency_key is not None:
-                known = await known_job(connection, parent["tenant"], idempotency_key, fingerprint)
-                if known is not None:
-                    return known, False
-            await require_room(connection, parent["dataset_id"], NORMAL, self._settings.max_queued)
+            known = await self._known_or_room(connection, parent, idempotency_key, fingerprint)
+            if known is not None:
+                return known, False
             values = {
                 "options": Jsonb(resolved),
                 "asked": Jsonb(options.model_dump(mode="json", exclude_unset=True)),
@@ -78,6 +79,22 @@ class DerivedJobs(JobStore):
             }
             await connection.execute("DELETE FROM trash WHERE prefix = %s", (f"jobs/{fork_id}",))
             return await self._insert_below(connection, parent, fork_id, values), True
+
+    async def _known_or_room(
+        self,
+        connection: Connection,
+        parent: Mapping[str, Any],
+        idempotency_key: str | None,
+        fingerprint: str,
+    ) -> Job | None:
+        """The job of an earlier request with this key; none where there is room for a new one."""
+        await submitting_for(connection, parent["dataset_id"], self._tenant)
+        if idempotency_key is not None:
+            known = await known_job(connection, parent["tenant"], idempotency_key, fingerprint)
+            if known is not None:
+                return known
+        await require_room(connection, parent["dataset_id"], NORMAL, self._settings.max_queued)
+        return None
 
     async def _copied(
         self, reusable: Mapping[str, Any], stage: ReusableStage, fork_id: str

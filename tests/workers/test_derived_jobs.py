@@ -13,7 +13,7 @@ from biresnerf.data.synthetic import write_synthetic_scene
 from biresnerf.wire.jobs import Job
 from tests.workers.conftest import Counting, Slots, quick_settings, ready_dataset
 from workers.derived_jobs import DerivedJobs
-from workers.errors import Conflict, NotFound
+from workers.errors import Conflict, LimitReached, NotFound
 from workers.forks import plan_fork
 from workers.stores import Stores, open_stores
 
@@ -37,6 +37,22 @@ async def read(stores: Stores, job_id: str, name: str) -> bytes:
     return b"".join([chunk async for chunk in stores.files.read(found.key)])
 
 
+async def no_copy_is_made_for_a_fork_that_is_there_or_has_no_room(
+    stores: Stores, derived: DerivedJobs, first: Job, fork: Job
+) -> None:
+    async def copies() -> set[str]:
+        return {file.key.split("/")[1] for file in await stores.files.list("jobs") if "/taken/" in file.key}
+
+    assert await copies() == {fork.id}
+    again = await derived.fork(first.id, {"warmup_steps": 5}, labels={"n": "2"}, idempotency_key="fork")
+    assert (again[0].id, again[1]) == (fork.id, False)
+    await stores.tenants.set(first.tenant, max_stored_bytes=1)
+    with pytest.raises(LimitReached):
+        await derived.fork(first.id, {"warmup_steps": 6})
+    await stores.tenants.set(first.tenant, max_stored_bytes=0)
+    assert await copies() == {fork.id}
+
+
 @pytest.mark.anyio
 async def test_a_real_job_is_forked_and_exported(database_url: str, tmp_path: Path, slots: Slots):
     settings = quick_settings(
@@ -54,7 +70,8 @@ async def test_a_real_job_is_forked_and_exported(database_url: str, tmp_path: Pa
         first, _ = await stores.jobs.submit(await ready_dataset(stores, files), SMALL, labels={"n": "1"})
         first = await over(stores, first, tmp_path)
 
-        fork, _ = await derived.fork(first.id, {"warmup_steps": 5}, labels={"n": "2"})
+        fork, _ = await derived.fork(first.id, {"warmup_steps": 5}, labels={"n": "2"}, idempotency_key="fork")
+        await no_copy_is_made_for_a_fork_that_is_there_or_has_no_room(stores, derived, first, fork)
         assert (fork.forked_from, fork.forked_stage, fork.options["warmup_steps"]) == (first.id, "coarse", 5)
         export, new = await derived.export(first.id, ["pinhole", "kitti"])
         assert (new, export.kind, export.parent) == (True, "export", first.id)
