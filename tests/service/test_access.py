@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import json
 import re
 from collections.abc import Iterator
@@ -166,6 +167,19 @@ def test_a_cursor_or_label_of_another_tenant_opens_nothing(tenants: tuple[Tenant
     assert cursor is not None
     seen = bert.http.get("/v1/jobs", params={"cursor": cursor}).json()["items"]
     assert {item["tenant"] for item in seen} <= {"bert"}
+
+
+def test_whoever_knows_a_digest_gets_no_bytes_of_others_by_it(tenants: tuple[Tenant, Tenant]):
+    anna, bert = tenants
+    content = b"anna's alone"
+    own = anna.http.post("/v1/datasets", json={}).json()["id"]
+    assert anna.http.put(f"/v1/datasets/{own}/files/a.png", content=content).status_code == 201
+    entry = {"path": "b.png", "size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    missing = [
+        tenant.http.post("/v1/datasets", json={"manifest": [entry]}).json()["missing"]
+        for tenant in (anna, bert)
+    ]
+    assert missing == [[], ["b.png"]]
 
 
 def test_nobody_runs_a_job_on_anothers_dataset(tenants: tuple[Tenant, Tenant]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -80,6 +81,16 @@ def test_a_second_run_replaces_the_first_and_foreign_files_are_safe(output: Path
     assert (output / "result" / "report.json").is_file()
 
 
+def _below(process: subprocess.Popen[bytes]) -> list[psutil.Process]:
+    return psutil.Process(process.pid).children(recursive=True)
+
+
+def _command(process: psutil.Process) -> str:
+    with contextlib.suppress(psutil.Error):  # gone since
+        return " ".join(process.cmdline())
+    return ""
+
+
 def test_a_killed_demo_takes_its_service_with_it(tmp_path: Path, scene: Path) -> None:
     environment = {**os.environ, "PYTHONUNBUFFERED": "1", "TMPDIR": str(tmp_path)}
     tmp_path.chmod(0o711)  # the database runs as another user where root starts it
@@ -90,7 +101,8 @@ def test_a_killed_demo_takes_its_service_with_it(tmp_path: Path, scene: Path) ->
     )
     assert process.stdout is not None
     assert b"http://" in process.stdout.readline()
-    below = psutil.Process(process.pid).children(recursive=True)
+    below = _below(process)
+    assert len(below) >= 4  # supervisor, database, API, worker
     process.kill()
     process.communicate()
     _, alive = psutil.wait_procs(below, timeout=PATIENCE_S)
@@ -108,9 +120,13 @@ def test_ctrl_c_leaves_no_process_and_no_folder(tmp_path: Path, scene: Path) -> 
     )
     assert process.stdout is not None
     assert b"http://" in process.stdout.readline()
-    time.sleep(3)  # into the job
-    below = psutil.Process(process.pid).children(recursive=True)
-    assert len(below) >= 4  # supervisor, database, API, worker
+    end = time.monotonic() + PATIENCE_S
+    below = _below(process)
+    while not any("workers.run" in said for said in map(_command, below)):
+        assert time.monotonic() < end, "the job did not start"
+        time.sleep(0.1)
+        below = _below(process)
+    assert len(below) >= 5  # supervisor, database, API, worker, job
     os.killpg(process.pid, signal.SIGINT)
     _, said = process.communicate(timeout=PATIENCE_S + 30)
     assert process.returncode == 130, said

@@ -1,13 +1,15 @@
-"""Uploads at the same time, counted for each key."""
+"""Uploads at the same time: how many a key may send, and how those that arrived wait for each other."""
 
 from __future__ import annotations
 
 import asyncio
+import uuid
+from contextlib import AsyncExitStack
 from pathlib import Path
 
 import pytest
 
-from service.dependencies import Service
+from service.dependencies import UNPACKED_AT_ONCE, Service
 from tests.service.conftest import problem, zip_of
 from tests.service.in_process import serving
 from tests.workers.conftest import anyio_backend, database_url, quick_settings, server
@@ -59,3 +61,31 @@ async def test_beyond_its_places_a_key_is_told_to_wait_whichever_way_it_sends(
         problem(await http.post(f"/v1/datasets/{dataset}/archive", content=b"?"), 422, "archive_rejected")
         sent = await http.patch(begun.headers["location"], headers=more, content=b"12345")
         assert sent.status_code == 204
+
+
+async def test_an_archive_that_waits_for_its_turn_longer_than_its_lease_is_unpacked_once(
+    database_url: str, tmp_path: Path
+):
+    settings = quick_settings(tmp_path / "data", database_url=database_url, beat_s=0.4, stall_s=2)
+    archive = zip_of({"a": b"x"})
+    async with serving(settings) as http:
+        service: Service = http._transport.app.state.service
+        dataset = (await http.post("/v1/datasets", json={})).json()["id"]
+        tus = {"Tus-Resumable": "1.0.0", "Upload-Length": str(len(archive)), "Upload-Offset": "0"}
+        begun = await http.post(f"/v1/datasets/{dataset}/uploads", headers=tus)
+        address = begun.headers["location"]
+        async with AsyncExitStack() as busy:
+            for _ in range(UNPACKED_AT_ONCE):
+                await busy.enter_async_context(service.unpacking.turn("other"))
+            more = {**tus, "Content-Type": "application/offset+octet-stream"}
+            assert (await http.patch(address, headers=more, content=archive)).status_code == 204
+            upload = begun.json()["id"]
+            while await service.stores.uploads.untaken():
+                await asyncio.sleep(0.02)
+            for _ in range(5):  # together longer than two leases
+                await asyncio.sleep(settings.beat_s)
+                assert not await service.stores.uploads.take(upload, uuid.uuid4())
+            assert (await http.get(f"/v1/datasets/{dataset}")).json()["files"] == 0
+        while (await http.get(address)).json()["state"] != "stored":
+            await asyncio.sleep(0.05)
+        assert (await http.get(f"/v1/datasets/{dataset}")).json()["files"] == 1

@@ -77,6 +77,15 @@ async def test_a_late_receipt_leaves_a_row_that_another_worker_has_alone(
     assert row["status"] == "succeeded"
 
 
+async def test_a_job_whose_cancellation_was_answered_is_not_claimed_again(stores: Stores, database: Database):
+    job_id = await queued(stores)
+    assert await claim_job(database, job_id, max_attempts=3) is not None
+    assert (await stores.jobs.cancel(job_id)).state == "running"
+    assert await claim_job(database, job_id, max_attempts=3) is None
+    job = await stores.jobs.get(job_id)
+    assert (job.state, job.attempt) == ("cancelled", 1)
+
+
 async def test_a_claim_whose_acknowledgement_was_lost_counts_once(
     stores: Stores, database: Database, monkeypatch: pytest.MonkeyPatch
 ):
