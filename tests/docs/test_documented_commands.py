@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import shutil
 import sys
 from collections.abc import Iterator
@@ -11,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.docs.documented import PYTHON, Command, all_commands
-from tests.docs.forms_of_commands import check_shell
-from tests.docs.workplace import Workplace, done_job, furnish, make_result
+from tests.docs.forms_of_commands import check_shell, command_context, words_of
+from tests.docs.workplace import SETS, Workplace, done_job, furnish, make_result
 from tests.service.conftest import running_service, short_folder
 
 COMMANDS = all_commands()
@@ -57,6 +58,28 @@ def why_not_run(command: Command) -> str | None:
 @pytest.mark.parametrize("command", [c for c in COMMANDS if c.language != PYTHON], ids=str)
 def test_a_documented_command_could_be_run_as_it_is_written(command, tmp_path):
     check_shell(command.text.replace("/backups/biresnerf", str(tmp_path)))
+
+
+@pytest.mark.parametrize("page", dict.fromkeys(command.page for command in COMMANDS))
+def test_a_page_can_be_followed_from_its_top(page):
+    """Nothing is used before the page says what it is, and no result goes where an earlier one lies."""
+    taken, said = set(), False
+    for command in (c for c in COMMANDS if c.page == page):
+        said = said or command.text.startswith("api=")
+        assert said or "$api" not in command.text, f"what is $api in {command}?"
+        for output in outputs_of(command):
+            assert output.isupper() or output not in taken, f"{command} writes to {output}, as one before"
+            taken.add(output)  # in capitals it stands for a name of the reader's
+
+
+def outputs_of(command: Command) -> list[str]:
+    if command.language == PYTHON:
+        return [name for name in re.findall(r'Path\("(\w+)"\)', command.text) if name not in SETS]
+    _, words = words_of(command.text)
+    if words[:1] != ["biresnerf"] or words[1] == "restore":
+        return []
+    output = command_context(words[1:]).params.get("output")
+    return [str(output)] if output is not None else []
 
 
 def test_no_exemption_is_stale():
