@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import uuid
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -55,6 +57,17 @@ def create_job(
         priority=priority,
     )
     return (yield from _create(session, "/v1/jobs", body, idempotency_key))
+
+
+def key_of(body: NewJob) -> str:
+    """An idempotency key that is the same wherever the same is asked for."""
+    asked = json.dumps(body.model_dump(mode="json", exclude_unset=True), sort_keys=True)
+    return hashlib.sha256(asked.encode()).hexdigest()[:32]
+
+
+def queued(session: Session, body: NewJob, key: str) -> Flow[JobView]:
+    """The job that the key stands for, queued now or before."""
+    return (yield from _create(session, "/v1/jobs", body, key))
 
 
 def _create(session: Session, path: str, body: NewJob | ForkJob, key: str | None) -> Flow[JobView]:

@@ -11,12 +11,12 @@ from typing import Literal
 from biresnerf.client.calls import Flow, Session, Work
 from biresnerf.client.dataset_calls import create_dataset, dataset, delete_dataset, finalize
 from biresnerf.client.errors import ServiceError
-from biresnerf.client.job_calls import OptionsLike, chosen, create_job
+from biresnerf.client.job_calls import OptionsLike, chosen, key_of, queued
 from biresnerf.client.scene import look_at
 from biresnerf.client.sending import LocalFile, send_missing
 from biresnerf.wire.base import LABEL_LENGTH, LABELS_MOST
 from biresnerf.wire.datasets import DatasetView
-from biresnerf.wire.jobs import JobView, PriorityName
+from biresnerf.wire.jobs import JobView, NewJob, PriorityName
 from biresnerf.wire.webhooks import JobWebhook
 
 
@@ -51,7 +51,8 @@ def submit(
     """Sends what the service lacks of a folder (or file with poses), has it checked, and queues a job.
 
     What the service will not take leaves nothing behind there. Where the connection stayed away, or the caller ends
-    this, the dataset stays: the same submission again sends what still lacks, with ``resume`` into the same dataset.
+    this, the dataset stays: the same submission again sends what still lacks, with ``resume`` into the same dataset; if
+    its job was queued before the end came, that job is the answer.
 
     Args:
         name: of the dataset, and of the job where ``labels`` has no ``name``. Default: the folder's.
@@ -72,17 +73,14 @@ def submit(
     try:
         ready = yield from _filled(session, target, files, on_progress)
         on_progress(Sending("queueing", len(files), dataset_id=target.id))
-        return (
-            yield from create_job(
-                session,
-                ready.id,
-                wanted,
-                labels=_named(labels, target.name),
-                priority=priority,
-                webhook=webhook,
-                idempotency_key=idempotency_key,
-            )
+        body = NewJob(
+            dataset_id=ready.id,
+            options=wanted,
+            labels=_named(labels, target.name),
+            webhook=webhook,
+            priority=priority,
         )
+        return (yield from queued(session, body, idempotency_key or key_of(body)))
     except ServiceError as error:
         if error.users_fault and resume is None:
             yield from _forget(session, target, error)

@@ -59,5 +59,5 @@ def find_input(path: Path) -> FolderContents:
     if path.is_dir():
         return look_into(path)
     raise InputError(
-        "input_missing", "does not exist.", where=str(path), mend="Give a folder or a transforms.json."
+        "input_missing", "does not exist.", where=str(path), mend="Give a folder, or a file with poses."
     )

@@ -92,7 +92,7 @@ def assert_refused(result: subprocess.CompletedProcess[str], *parts: str) -> Non
 
 def test_an_input_that_is_not_there_is_named(tmp_path):
     result = run(tmp_path / "nowhere", tmp_path / "out")
-    assert_refused(result, str(tmp_path / "nowhere"), "does not exist", "Give a folder or a transforms.json")
+    assert_refused(result, str(tmp_path / "nowhere"), "does not exist", "Give a folder, or a file with poses")
     assert not (tmp_path / "out").exists()
 
 

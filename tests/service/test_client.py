@@ -247,6 +247,11 @@ def test_an_interrupted_submission_goes_on_in_the_same_dataset(
         again: list[Sending] = []
         job = client.submit(other, QUICK, resume=left, on_progress=again.append)
         assert (job.dataset_id, again[1].files_missing) == (left, 0)
+        # Who was interrupted after the job was queued gets that job, not a second one.
+        assert client.submit(other, QUICK, resume=left).id == job.id
+        another = client.submit(other, QUICK, resume=left, labels={"run": "again"})
+        assert another.id != job.id
+        client.cancel(another.id)
         client.wait(job.id)
 
 
