@@ -144,6 +144,11 @@ class ImageReport(BaseModel):
     moved_far: bool = Field(False, description="Its pose moved by far more than the other images' did.")
     blurred: bool = Field(False, description="Far less sharp than photos taken from about the same place.")
     exposure_off: bool = Field(False, description="Brighter or darker than the other photos make the scene.")
+    unsure_deg: float | None = Field(
+        None,
+        description="Its photo fits as well with its camera carried about the scene by so many degrees (8, 16 or 32): "
+        "nothing that is measured tells them apart. None where it resists.",
+    )
     sharpness: float | None = Field(
         None, description="Variance of the Laplacian over that of its neighbours' photos; at working size."
     )

@@ -16,6 +16,7 @@ from biresnerf.geometry.pose_error import turned_deg
 from biresnerf.refine import image_flags
 from biresnerf.refine.input_frame import poses_in_input_frame
 from biresnerf.refine.joint_optimiser import JointOptimiser
+from biresnerf.refine.pose_certainty import unsure_deg
 from biresnerf.refine.pose_evidence import (
     EpipolarComparison,
     HeldOutComparison,
@@ -41,6 +42,7 @@ class Judgement:
         trial_psnr: of the unseen views, before and after [2, n]; NaN for the others.
         epipolar_px: before and after [2, n]; NaN where there are too few matches.
         sharpness, gain: see `image_flags`.
+        unsure_deg: how far each camera can be carried about the scene without fitting its photo less; 0 if not far.
         moved_far, blurred, exposure_off: bool.
     """
 
@@ -49,6 +51,7 @@ class Judgement:
     epipolar_px: Array
     sharpness: Array
     gain: Array
+    unsure_deg: Array
     moved_far: NDArray[np.bool_]
     blurred: NDArray[np.bool_]
     exposure_off: NDArray[np.bool_]
@@ -143,6 +146,7 @@ def _with_images(
         epipolar_px=epipolar_px,
         sharpness=sharpness,
         gain=gain,
+        unsure_deg=unsure_deg(optimiser),
         moved_far=image_flags.moved_far(turned, shifted, distance),
         blurred=image_flags.blurred(sharpness),
         exposure_off=image_flags.exposure_off(gain),

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from biresnerf.data.dataset import Dataset
+from biresnerf.data.named_images import few_names
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.evaluation import ViewScore
 from biresnerf.refine.intrinsics_parameters import IntrinsicsParameters
@@ -66,7 +67,10 @@ def run_report(
             rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
             translation=tuple(float(v) for v in similarity.translation),
         ),
-        warnings=dataset.warnings + _stray_warnings(given) + _lost_warnings(dataset, lost),
+        warnings=dataset.warnings
+        + _stray_warnings(given)
+        + _lost_warnings(dataset, lost)
+        + _unsure_warnings(dataset, judgement),
     )
 
 
@@ -106,6 +110,17 @@ def _lost_warnings(dataset: Dataset, lost: list[int]) -> tuple[str, ...]:
     return (f"{len(lost)} of {len(dataset)} images agree with no pose that was found: {names}.",)
 
 
+def _unsure_warnings(dataset: Dataset, judgement: Judgement | None) -> tuple[str, ...]:
+    if judgement is None or not judgement.unsure_deg.any():
+        return ()
+    unsure = np.flatnonzero(judgement.unsure_deg).tolist()
+    named = [f"{dataset.names[i]} ({judgement.unsure_deg[i]:.0f} degrees)" for i in unsure]
+    return (
+        f"{len(unsure)} of {len(dataset)} photos fit as well with their camera carried far round the scene, which "
+        f"looks alike from there: {few_names(named, 20)}. Look at these poses before you rely on them.",
+    )
+
+
 def _image_reports(
     given: RunInput,
     stages: TwoStages,
@@ -143,6 +158,7 @@ def _judged(judgement: Judgement | None, image: int) -> dict[str, float | bool |
     figures = {
         "sharpness": judgement.sharpness[image],
         "gain": judgement.gain[image],
+        "unsure_deg": judgement.unsure_deg[image] or np.nan,
         "trial_psnr_before": judgement.trial_psnr[0, image],
         "trial_psnr_after": judgement.trial_psnr[1, image],
         "epipolar_px_before": judgement.epipolar_px[0, image],
