@@ -134,6 +134,23 @@ def test_images_without_a_pose_are_left_out_and_named(tmp_path: Path) -> None:
     assert len(json.loads((tmp_path / "out/transforms.json").read_text())["frames"]) == 3
 
 
+def test_masks_that_another_form_would_not_find_are_told_of(tmp_path: Path) -> None:
+    write_set(tmp_path / "scene", seed=1, count=4)
+    file = tmp_path / "scene" / "transforms.json"
+    document = json.loads(file.read_text())
+    for index, frame in enumerate(document["frames"]):
+        frame["mask_path"] = f"silhouettes/{index}.png"
+        write_image(tmp_path / "scene" / frame["mask_path"], index, mode="L")
+    file.write_text(json.dumps(document))
+    named = converted(tmp_path / "scene", tmp_path / "named", "--to", "transforms")
+    assert named["warnings"] == ["masks were found for 4 of 4 images"]
+    assert all(frame.mask is not None for frame in read_dataset(tmp_path / "named").frames)
+    lost = converted(tmp_path / "scene", tmp_path / "lost", "--to", "colmap", "--to", "pinhole")
+    assert [w for w in lost["warnings"] if "colmap names no masks: 4 of them" in w]
+    assert [w for w in lost["warnings"] if "pinhole has no masks" in w]
+    assert not any(frame.mask for frame in read_dataset(tmp_path / "lost" / "sparse/0").frames)
+
+
 def test_photos_alone_and_a_folder_with_files_are_refused(tmp_path: Path) -> None:
     trajectories.write_images(tmp_path / "photos")
     nothing = run(tmp_path / "photos", tmp_path / "out", "--to", "tum")

@@ -17,6 +17,7 @@ import numpy as np
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Dataset
 from biresnerf.data.lens_json import lens_values
+from biresnerf.data.mask_files import mask_beside
 from biresnerf.data.packs.bundler import write_bundler
 from biresnerf.data.packs.colmap_binary import write_colmap_binary
 from biresnerf.data.packs.colmap_text import write_colmap_text
@@ -106,7 +107,23 @@ def _notes(dataset: Dataset, forms: Sequence[FormName]) -> tuple[str, ...]:
     bare = [form for form in forms if form in ("tum", "kitti")]
     if bare and len(dataset.cameras) > 1:
         notes += (f"{' and '.join(bare)} know no lenses, and {CAMERA} can only hold one: none was written.",)
-    return notes
+    return notes + _mask_notes(dataset, forms)
+
+
+def _mask_notes(dataset: Dataset, forms: Sequence[FormName]) -> tuple[str, ...]:
+    """Only transforms.json names masks; the other forms have those that lie where they are looked for."""
+    masked = [frame for frame in dataset.frames if frame.mask is not None]
+    unnamed = [form for form in forms if form not in ("transforms", "pinhole", "poses", "scene")]
+    notes = []
+    if masked and "pinhole" in forms:
+        notes.append("pinhole has no masks: they do not fit its undistorted photos.")
+    lost = sum(mask_beside(dataset.root, frame.path, frame.name)[0] != frame.mask for frame in masked)
+    if lost and unnamed:
+        forms_said = f"{', '.join(unnamed)} {'name' if len(unnamed) > 1 else 'names'}"
+        notes.append(
+            f"{forms_said} no masks: {lost} of them are not where they are looked for, masks/NAME.png."
+        )
+    return tuple(notes)
 
 
 def _bring_photos(dataset: Dataset, folder: Path, how: Literal["link", "copy"]) -> None:
