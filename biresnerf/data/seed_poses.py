@@ -188,7 +188,7 @@ def _with_focal_notes(dataset: Dataset, models: list[MappedModel]) -> Dataset:
     notes = tuple(
         f"Feature matches fit better with a focal length {abs(ratio - 1):.1%} {'longer' if ratio > 1 else 'shorter'} "
         f"than given for {dataset.names[next(j for j, f in enumerate(dataset.frames) if f.camera == i)]} and the "
-        "images that share its camera: where it is not certain, set refine_intrinsics=focal."
+        "images that share its camera: where it is not certain, leave it out of the input, and matches find it."
         for model in models
         for i, ratio in sorted(model.focal_ratios.items())
     )
