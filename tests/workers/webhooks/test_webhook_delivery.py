@@ -23,7 +23,7 @@ from workers.follow import Listener
 from workers.outbound import Outbound, Policy
 from workers.settings import Settings
 from workers.stores import Stores
-from workers.webhook_sender import WebhookSender, outcome_of, pause, retry_after
+from workers.webhook_sender import _CLAIM, WebhookSender, outcome_of, pause, retry_after
 
 pytestmark = pytest.mark.anyio
 
@@ -90,6 +90,22 @@ async def test_two_dispatchers_send_each_message_once(stores: Stores, dispatcher
         for delivery_id in ids:
             assert (await concluded(stores, webhook.id, delivery_id)).state == "delivered"
         assert sorted(message.headers["webhook-id"] for message in receiver.messages) == sorted(ids)
+
+
+async def test_of_two_claims_at_one_moment_one_gets_a_message(stores: Stores, settings: Settings):
+    """The second begins while the first has chosen and not committed yet."""
+    webhook, _ = await stores.webhooks.create("local", "http://127.0.0.1:9/", ALL_EVENTS)
+    delivery = await stores.webhooks.test(webhook.id)
+    url = settings.require_database_url()
+    async with open_database(url, connections=2) as database:
+        listener = Listener(database, settings.poll_s, "biresnerf_webhooks")
+        sender = WebhookSender(database, listener, Outbound(Policy.of(settings)), settings)
+        async with await psycopg.AsyncConnection.connect(url) as first:
+            claimed = await first.execute(_CLAIM, (4, 1, 30.0, 8, 32))
+            assert [row[0] for row in await claimed.fetchall()] == [delivery.id]
+            second = asyncio.create_task(sender._claim(32))
+            await asyncio.wait([second], timeout=1.0)
+        assert await second == []
 
 
 async def test_sigterm_finishes_what_is_under_way_and_leaves_the_rest(
