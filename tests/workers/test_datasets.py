@@ -210,6 +210,29 @@ async def test_a_check_longer_than_the_stall_time_comes_to_its_end_and_runs_once
     assert marks.read_text() == "x"
 
 
+async def test_a_check_whose_lease_went_to_another_process_decides_nothing(database_url: str, tmp_path):
+    program = "import time; time.sleep(0.5); print('{\"report\": {}}')"
+    settings = quick_settings(
+        tmp_path / "data", database_url=database_url, check_command=(sys.executable, "-c", program)
+    )
+    async with open_stores(settings) as stores:
+        dataset = await stores.datasets.create("fox")
+        await stores.datasets.add_file(dataset.id, "a", chunks(b"x"))
+        await stores.datasets.finalize(dataset.id)
+        late = asyncio.create_task(stores.datasets.check(dataset.id))
+        folder = settings.scratch_dir / "checks"
+        while not list(folder.glob("*/log.txt")):
+            await asyncio.sleep(0.02)
+        await stores.jobs._database.fetch(
+            "UPDATE datasets SET check_token = gen_random_uuid(), check_until = now() + interval '1 h'"
+        )
+        while list(folder.iterdir()):
+            await asyncio.sleep(0.05)
+        await asyncio.wait([late], timeout=0.5)
+        assert (await stores.datasets.get(dataset.id)).state == "finalizing"
+        late.cancel()
+
+
 async def test_a_check_that_is_killed_once_is_made_again(database_url: str, tmp_path):
     marks = tmp_path / "marks"
     program = f"""

@@ -178,7 +178,7 @@ async def test_a_frozen_worker_that_wakes_up_is_fenced_and_one_result_is_publish
 ):
     """Within a transaction it holds locks on the job or the janitor's office, which the database must end."""
     first = slots.start(settings, "a")
-    await counting.submit(120, 0.05)
+    await counting.submit(80, 0.05)
     await counting.until(lambda job: job.progress.step >= 10)
     slots.start(settings, "b")
     await _freeze(first.pid, counting.stores, within_transaction)
@@ -187,7 +187,7 @@ async def test_a_frozen_worker_that_wakes_up_is_fenced_and_one_result_is_publish
     assert await asyncio.to_thread(first.wait, 15) == 75
     job = await counting.until_final()
     assert (job.state, job.attempt) == ("succeeded", 2)
-    await assert_one_result(counting, 120)
+    await assert_one_result(counting, 80)
     await _trash_is_empty(counting.stores)
     left = {
         file.key.split("/")[3] for file in await counting.stores.files.list(f"jobs/{counting.id}/results")

@@ -30,6 +30,8 @@ SMALL = RefineOptions(
     table_size_log2=12,
     checkpoint_every_s=0.5,
     orbit_frames=2,
+    start="given",  # neither COLMAP nor a verdict: what is shown here is that work goes on
+    verdict=False,
     threads=1,
 )
 

@@ -107,7 +107,7 @@ async def test_a_job_that_takes_longer_to_stop_than_the_stall_time_is_not_taken_
 ):
     slow = settings.model_copy(update={"stop_grace_s": 2.5 * settings.stall_s})
     first = slots.start(slow, "a")
-    await counting.submit(150, 0.05, deaf=True)
+    await counting.submit(110, 0.05, deaf=True)
     await counting.until(lambda job: job.progress.step >= 5)
     slots.start(settings, "b")
     first.terminate()
