@@ -6,6 +6,7 @@ import asyncio
 import uuid
 from contextlib import AsyncExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -63,10 +64,14 @@ async def test_beyond_its_places_a_key_is_told_to_wait_whichever_way_it_sends(
         assert sent.status_code == 204
 
 
-async def test_an_archive_that_waits_for_its_turn_longer_than_its_lease_is_unpacked_once(
-    database_url: str, tmp_path: Path
-):
-    settings = quick_settings(tmp_path / "data", database_url=database_url, beat_s=0.4, stall_s=2)
+async def lease(service: Service, upload: str) -> dict[str, Any]:
+    sql = "SELECT take_token, take_until FROM uploads WHERE id = %s"
+    (row,) = await service.stores.uploads._database.fetch(sql, upload)
+    return row
+
+
+async def test_an_archive_that_waits_for_its_turn_stays_its_takers(database_url: str, tmp_path: Path):
+    settings = quick_settings(tmp_path / "data", database_url=database_url, beat_s=1.0, stall_s=3.0)
     archive = zip_of({"a": b"x"})
     async with serving(settings) as http:
         service: Service = http._transport.app.state.service
@@ -82,9 +87,13 @@ async def test_an_archive_that_waits_for_its_turn_longer_than_its_lease_is_unpac
             upload = begun.json()["id"]
             while await service.stores.uploads.untaken():
                 await asyncio.sleep(0.02)
-            for _ in range(5):  # together longer than two leases
-                await asyncio.sleep(settings.beat_s)
-                assert not await service.stores.uploads.take(upload, uuid.uuid4())
+            taken = renewed = await lease(service, upload)
+            async with asyncio.timeout(20):
+                while renewed["take_until"] == taken["take_until"]:
+                    await asyncio.sleep(0.05)
+                    renewed = await lease(service, upload)
+            assert renewed["take_token"] == taken["take_token"]
+            assert not await service.stores.uploads.take(upload, uuid.uuid4())
             assert (await http.get(f"/v1/datasets/{dataset}")).json()["files"] == 0
         while (await http.get(address)).json()["state"] != "stored":
             await asyncio.sleep(0.05)
