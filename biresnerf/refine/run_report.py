@@ -70,7 +70,7 @@ def run_report(
         warnings=dataset.warnings
         + _stray_warnings(given)
         + _lost_warnings(dataset, lost)
-        + _unsure_warnings(dataset, judgement),
+        + (unsure_warnings(dataset, judgement.unsure_deg) if judgement is not None else ()),
     )
 
 
@@ -110,11 +110,12 @@ def _lost_warnings(dataset: Dataset, lost: list[int]) -> tuple[str, ...]:
     return (f"{len(lost)} of {len(dataset)} images agree with no pose that was found: {names}.",)
 
 
-def _unsure_warnings(dataset: Dataset, judgement: Judgement | None) -> tuple[str, ...]:
-    if judgement is None or not judgement.unsure_deg.any():
+def unsure_warnings(dataset: Dataset, unsure_deg: np.ndarray) -> tuple[str, ...]:
+    """One that names the images whose `Judgement.unsure_deg` [n] is not zero; none of none."""
+    unsure = np.flatnonzero(unsure_deg).tolist()
+    if not unsure:
         return ()
-    unsure = np.flatnonzero(judgement.unsure_deg).tolist()
-    named = [f"{dataset.names[i]} ({judgement.unsure_deg[i]:.0f} degrees)" for i in unsure]
+    named = [f"{dataset.names[i]} ({unsure_deg[i]:.0f} degrees)" for i in unsure]
     return (
         f"{len(unsure)} of {len(dataset)} photos fit as well with their camera carried far round the scene, which "
         f"looks alike from there: {few_names(named, 20)}. Look at these poses before you rely on them.",

@@ -15,8 +15,9 @@ from biresnerf.field.radiance_field import Rendering
 from biresnerf.refine.joint_optimiser import JointOptimiser
 from biresnerf.refine.pose_certainty import unsure_deg
 from biresnerf.refine.rigid_bodies import RigidBodies
+from biresnerf.refine.run_report import unsure_warnings
 from biresnerf.refine.scene_frame import scene_frame
-from tests.refine.scene import CPU, photos_set, tiny_options
+from tests.refine.scene import CPU, photos_set, tiny_options, tiny_set
 
 VIEWS, SIZE = 10, 32
 RADIUS, EDGE = 0.6, 0.05
@@ -96,3 +97,12 @@ def test_a_field_that_leaves_texture_unexplained_has_no_say():
     optimiser = photographed(rings)
     optimiser.haze = 0.1
     assert not unsure_deg(optimiser).any()
+
+
+def test_the_warning_names_those_alone_that_are_not_sure(tmp_path):
+    dataset, _ = tiny_set(tmp_path, views=5)
+    (warning,) = unsure_warnings(dataset, np.array([0.0, 8, 0, 32, 0]))
+    assert [name in warning for name in dataset.names] == [False, True, False, True, False]
+    assert "2 of 5" in warning
+    assert "8 degrees" in warning
+    assert unsure_warnings(dataset, np.zeros(5)) == ()
