@@ -124,6 +124,6 @@ def test_a_result_whose_time_is_over_is_410_while_its_record_stays(
     assert "event: expired" in events
     folder = service.data_dir / "files" / "jobs" / job["id"]
     until(http, job["id"], lambda _: not folder.exists())
-    assert f"deleted jobs/{job['id']}: " in service.log.read_text()
+    until(http, job["id"], lambda _: f"deleted jobs/{job['id']}: " in service.log.read_text())
     assert http.get("/v1/jobs?state=expired").json()["items"][0]["id"] == job["id"]
     assert http.delete(here).status_code == 204

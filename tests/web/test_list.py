@@ -87,7 +87,7 @@ def test_an_archive_goes_on_after_a_reload_from_its_last_byte(
 
     def first_half(route: Route) -> None:
         offsets.append(int(route.request.headers["upload-offset"]))
-        if len(offsets) == 1:
+        if offsets[-1] == 0:  # more than once where the connection is given up under load
             route.continue_(post_data=archive.read_bytes()[:half])
 
     page.route(
@@ -97,7 +97,7 @@ def test_an_archive_goes_on_after_a_reload_from_its_last_byte(
     page.goto(service.url)
     page.locator("input[type=file]").nth(1).set_input_files(archive)
     page.wait_for_url("**/#/datasets/*")
-    while len(offsets) < 2:
+    while not offsets or offsets[-1] == 0:
         page.wait_for_timeout(50)
     page.unroute_all(behavior="ignoreErrors")
     page.reload()
