@@ -70,5 +70,5 @@ def finalize(session: Session, dataset_id: str) -> Flow[DatasetView]:
 
 
 def delete_dataset(session: Session, dataset_id: str) -> Flow[None]:
-    """Deletes the dataset and its files, unless an unfinished job uses it."""
+    """Deletes the dataset and its files. Its jobs, finished ones too, have to be deleted first."""
     yield from ask(session, Call("DELETE", dataset_url(dataset_id)))

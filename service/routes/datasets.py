@@ -107,7 +107,7 @@ async def get_dataset(dataset_id: DatasetId, caller: CallerHere) -> DatasetView:
     responses=declared("not_found", "dataset_in_use", *_WRITES),
 )
 async def delete_dataset(dataset_id: DatasetId, caller: DatasetWriterHere) -> None:
-    """Deletes the dataset and its files, unless an unfinished job uses it."""
+    """Deletes the dataset and its files. Its jobs, finished ones too, have to be deleted first."""
     await caller.datasets.delete(dataset_id)
 
 
