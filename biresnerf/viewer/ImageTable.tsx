@@ -42,7 +42,7 @@ function sorted(rows: readonly ImageRow[], by: Column, down: boolean): ImageRow[
   });
 }
 
-export function ImageTable({ rows, selected, onSelect, cellOf }: ImageTableProps) {
+export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }: ImageTableProps) {
   const [order, setOrder] = useState<{ key: string; down: boolean } | null>(null);
   const [text, setText] = useState("");
   const [kind, setKind] = useState("");
@@ -102,6 +102,11 @@ export function ImageTable({ rows, selected, onSelect, cellOf }: ImageTableProps
         <table class="table">
           <thead>
             <tr>
+              {onTick && (
+                <th scope="col">
+                  <span class="unseen">chosen</span>
+                </th>
+              )}
               {heading(NAME, "up", "")}
               {columns.map((column) => heading(column, "down", "number"))}
               {heading(SOURCE, "up", "")}
@@ -116,6 +121,16 @@ export function ImageTable({ rows, selected, onSelect, cellOf }: ImageTableProps
                 data-image={row.image}
                 onClick={() => onSelect(row.image)}
               >
+                {onTick && (
+                  <td class="tick" onClick={(event) => event.stopPropagation()}>
+                    <input
+                      type="checkbox"
+                      aria-label={`Choose ${row.name}`}
+                      checked={ticked?.has(row.image) ?? false}
+                      onChange={(event) => onTick(row.image, event.currentTarget.checked)}
+                    />
+                  </td>
+                )}
                 <th scope="row">
                   <span class="images-name">
                     {cellOf && <Thumb cell={cellOf(row.image)} />}

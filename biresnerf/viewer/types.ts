@@ -245,6 +245,9 @@ export interface ImageTableProps {
   readonly onSelect: (image: number | null) => void;
   /** The image's place in the contact sheet. */
   readonly cellOf?: (image: number) => SheetCell | null;
+  /** Images that are ticked, where they can be. */
+  readonly ticked?: ReadonlySet<number>;
+  readonly onTick?: (image: number, on: boolean) => void;
 }
 
 /** (5) The verdict in one sentence, with its proof. */

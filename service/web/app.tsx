@@ -36,7 +36,7 @@ function App() {
   }, []);
   return (
     <>
-      <a class="skip" href={location.hash || "#/"} onClick={(event) => skip(event, main.current)}>
+      <a class="skip" href="#main" onClick={(event) => skip(event, main.current)}>
         Skip to the content
       </a>
       <header class="top">
@@ -55,7 +55,7 @@ function App() {
           )}
         </nav>
       </header>
-      <main ref={main} tabIndex={-1}>
+      <main id="main" ref={main} tabIndex={-1}>
         {wanted !== null ? <KeyForm said={wanted} /> : <Shown key={`${route.name} ${route.id} ${key}`} {...route} />}
       </main>
     </>

@@ -30,8 +30,9 @@ ROOT = Path(__file__).resolve().parents[2]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SCREENSHOTS = ROOT / "build" / "screenshots"
 AXE = ROOT / "node_modules" / "axe-core" / "axe.min.js"
+# WebGL without a GPU, and the page painted without either: a sixth of the work.
 ARGUMENTS = [
-    *("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 ]
 DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 360, "height": 740}
@@ -143,6 +144,19 @@ def phone(browser: Browser, service: Running) -> Iterator[Watched]:
     context = browser.new_context(viewport=PHONE, has_touch=True, is_mobile=True, color_scheme="dark")
     yield watched_page(context, service.url)
     context.close()
+
+
+def again(page: Page, job_url: str) -> Locator:
+    """The dialog that asks for other options."""
+    page.goto(job_url)
+    page.get_by_role("button", name="Run again …").click()
+    return page.get_by_role("dialog", name="Run again with other options")
+
+
+def another_job(page: Page, job_url: str) -> str:
+    """The id of the job that the page went to."""
+    page.wait_for_url(lambda url: "#/jobs/" in url and url != job_url)
+    return page.url.rpartition("/")[2]
 
 
 @pytest.fixture

@@ -1,12 +1,14 @@
 """A job program for the tests of the page: finds ever more matches in a set, as COLMAP might, until it is ended.
 
-The protocol of `workers.run` and the library's own previews; no COLMAP, no torch.
+The protocol of `workers.run` and the library's own previews; no COLMAP, no torch. Where the given poses are to be
+taken, which need no matches, the real program takes over.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
+import os
 import signal
 import sys
 import time
@@ -22,6 +24,8 @@ ended = []
 signal.signal(signal.SIGTERM, lambda *_: ended.append(True))
 folder = Path(sys.argv[1])
 order = json.loads((folder / "job.json").read_text())
+if order["options"].get("start") == "given":
+    os.execv(sys.executable, [sys.executable, "-m", "workers.run", str(folder)])
 preview = folder / order["output"] / "preview"
 preview.mkdir(parents=True)
 dataset = read_dataset(folder / order["input"])

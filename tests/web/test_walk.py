@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-from playwright.sync_api import Locator, Page, expect
+from playwright.sync_api import Page, expect
 
 from tests.service.conftest import Running, operator
-from tests.web.conftest import Watched
+from tests.web.conftest import Watched, again, another_job
 
 
 def curve_end(page: Page) -> int:
@@ -86,6 +86,17 @@ def test_the_table_sorts_and_chooses(desktop: Watched, done: dict[str, Any]) -> 
     assert values in (sorted(values), sorted(values, reverse=True))
     table.get_by_role("row").nth(4).get_by_role("button").click()
     expect(table.locator("tr[aria-current]")).to_have_count(1)
+
+
+def test_ticked_images_are_held_in_another_run(desktop: Watched, done: dict[str, Any]) -> None:
+    page = desktop.page
+    for name in ("./train/r_3", "./train/r_8"):
+        page.get_by_label(f"Choose {name}", exact=True).check()
+    page.get_by_role("button", name="Run again with their given poses held").click()
+    dialog = page.get_by_role("dialog", name="Run again with other options")
+    expect(dialog.get_by_label("fixed", exact=True)).to_have_value("./train/r_3, ./train/r_8")
+    page.keyboard.press("Escape")
+    expect(dialog).to_be_hidden()
 
 
 def test_the_verdict_is_the_reports(desktop: Watched, done: dict[str, Any], api: httpx.Client) -> None:
@@ -208,19 +219,6 @@ def test_a_phone_shows_the_same_without_scrolling_sideways(
         assert phone.serious_findings() == []
     assert phone.outside == []
     assert phone.complaints == []
-
-
-def again(page: Page, job_url: str) -> Locator:
-    """The dialog that asks for other options."""
-    page.goto(job_url)
-    page.get_by_role("button", name="Run again …").click()
-    return page.get_by_role("dialog", name="Run again with other options")
-
-
-def another_job(page: Page, job_url: str) -> str:
-    """The id of the job that the page went to."""
-    page.wait_for_url(lambda url: "#/jobs/" in url and url != job_url)
-    return page.url.rpartition("/")[2]
 
 
 def test_a_job_is_run_again_ended_and_deleted(

@@ -1,5 +1,5 @@
 // What can be done with a job: end it, run it again with other options, delete it, pass it on.
-import { useRef, useState } from "preact/hooks";
+import { useEffect, useRef, useState } from "preact/hooks";
 import type { ComponentChildren } from "preact";
 import { isOver } from "../jobs/state";
 import { OptionsForm } from "../options/form";
@@ -7,7 +7,11 @@ import type { Values } from "../options/schema";
 import { ProblemBox } from "../problem_box";
 import type { JobView } from "../service/answers";
 import { asProblem, call, type Problem } from "../service/http";
+import { Store, useStore } from "../service/store";
 import { CopyButton } from "./copy_button";
+
+/** Options to run a job again with, where another part of the page asks for that. */
+export const wishedAgain = new Store<{ job: string; values: Values } | null>(null);
 
 export function Actions({ job }: { job: JobView }) {
   return (
@@ -26,21 +30,23 @@ function Asking(props: {
   title: string;
   tone?: string;
   wide?: boolean;
+  /** Opens the dialog too, whenever it changes. */
+  wish?: object | null;
   children: (close: () => void) => ComponentChildren;
 }) {
   const dialog = useRef<HTMLDialogElement>(null);
   const [open, setOpen] = useState(false);
   const close = () => dialog.current?.close();
+  const show = () => {
+    setOpen(true);
+    if (!dialog.current?.open) dialog.current?.showModal();
+  };
+  useEffect(() => {
+    if (props.wish) show();
+  }, [props.wish]);
   return (
     <>
-      <button
-        type="button"
-        class={`act small ${props.tone ?? ""}`}
-        onClick={() => {
-          setOpen(true);
-          dialog.current?.showModal();
-        }}
-      >
+      <button type="button" class={`act small ${props.tone ?? ""}`} onClick={show}>
         {props.button}
       </button>
       <dialog
@@ -138,6 +144,13 @@ function Again({ job }: { job: JobView }) {
   const [values, setValues] = useState<Values>({});
   const [problem, busy, attempt] = useAttempt();
   const labels = job.labels;
+  const wished = useStore(wishedAgain);
+  const wish = wished?.job === job.id ? wished : null;
+  useEffect(() => {
+    if (!wish) return;
+    setValues((chosen) => ({ ...chosen, ...wish.values }));
+    wishedAgain.set(null);
+  }, [wish]);
   const show = (made: JobView, close: () => void) => {
     close();
     location.hash = `#/jobs/${made.id}`;
@@ -154,10 +167,14 @@ function Again({ job }: { job: JobView }) {
       show(await call<JobView>("POST", "v1/jobs", { json: { dataset_id: job.dataset_id, options, labels } }), close);
     });
   return (
-    <Asking button="Run again …" title="Run again with other options" wide>
+    <Asking button="Run again …" title="Run again with other options" wide wish={wish}>
       {(close) => (
         <>
           <OptionsForm values={values} onChange={setValues} base={job.options} problems={problem?.errors ?? []} />
+          <p class="soft">
+            A fork takes over COLMAP's answer or the whole of stage 1, whichever the changed options allow; where they allow
+            neither, the service says why.
+          </p>
           {problem && <ProblemBox problem={problem} />}
           <p class="dialog-acts">
             <button class="act primary" disabled={busy} onClick={() => anew(close)}>
@@ -169,10 +186,6 @@ function Again({ job }: { job: JobView }) {
             <button class="act" onClick={close}>
               Close
             </button>
-          </p>
-          <p class="soft">
-            A fork takes over COLMAP's answer or the whole of stage 1, whichever the changed options allow; where they allow
-            neither, the service says why.
           </p>
         </>
       )}

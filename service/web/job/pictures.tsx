@@ -2,11 +2,12 @@
 import type { ComponentChildren } from "preact";
 import { useEffect, useMemo, useState } from "preact/hooks";
 import { camerasOf, cellsOf, centresOf, rowsOf } from "../../../biresnerf/viewer/job_data";
-import type { PosesFile, UrlOf } from "../../../biresnerf/viewer/types";
+import type { PosesFile, UrlOf, ViewFile } from "../../../biresnerf/viewer/types";
 import { isOver } from "../jobs/state";
 import { asProblem, type Problem } from "../service/http";
 import { ProblemBox } from "../problem_box";
 import type { ArtifactView, JobView } from "../service/answers";
+import { Images } from "./images";
 import type { Seen } from "./live";
 import { Seeding } from "./seeding";
 
@@ -85,19 +86,42 @@ function Views({ seen, urlOf, widgets }: { seen: Seen; urlOf: UrlOf; widgets: Wi
       </Panel>
       {widgets && rows.length > 0 && (
         <Panel name="Images" kind="panel-table">
-          <widgets.ImageTable rows={rows} cellOf={cellOf} {...choice} />
+          <Images {...{ job, widgets, rows, cellOf, ...choice }} />
         </Panel>
       )}
+      {view && <Orbit view={view} urlOf={urlOf} />}
     </>
+  );
+}
+
+/** Fetched when it is opened. */
+function Orbit({ view, urlOf }: { view: ViewFile; urlOf: UrlOf }) {
+  const [open, setOpen] = useState(false);
+  if (!view.orbit) return null;
+  const [url, poster] = open ? [urlOf(view.orbit), urlOf(view.views[0]?.pictures.render ?? "")] : [null, null];
+  return (
+    <details class="panel" onToggle={(event) => setOpen(event.currentTarget.open)}>
+      <summary>
+        <h2>Orbit</h2>
+      </summary>
+      {url && (
+        <video
+          class="orbit"
+          {...{ src: url, ...(poster && { poster }), controls: true, loop: true, muted: true }}
+          playsInline
+          aria-label="A flight around the scene"
+        />
+      )}
+    </details>
   );
 }
 
 function Panel({ name, kind, children }: { name: string; kind: string; children: ComponentChildren }) {
   return (
-    <section class={`panel ${kind}`} aria-label={name}>
+    <div class={`panel ${kind}`}>
       <h2>{name}</h2>
       {children}
-    </section>
+    </div>
   );
 }
 

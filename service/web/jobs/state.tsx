@@ -28,7 +28,7 @@ const VERDICT_WORDS = {
 const VERDICT_TONES = {
   improved: "good",
   unchanged: "plain",
-  kept_input: "unsure",
+  kept_input: "plain",
   inconclusive: "unsure",
   failed_check: "bad",
 } as const;
