@@ -162,7 +162,8 @@ def test_another_program_at_the_address_is_said_to_be_none_of_ours(service: Runn
 def test_waiting_ends_when_its_time_is_up_with_a_status_of_its_own(
     service: Running, http: httpx.Client, scene: Path
 ) -> None:
-    result = run(service, "submit", scene, "--set", "steps=4000", "--timeout", 0.1, "--json")
+    slow = ("--set", "steps=4000", "--set", "seed=5")  # 5 ms a step
+    result = run(service, "submit", scene, *slow, "--timeout", 0.1, "--json")
     assert result.exit_code == exit_codes.NOT_OVER, result.output
     job = json.loads(result.stdout)
     result = run(service, "wait", job["id"], "--timeout", 0.1, "--json")
