@@ -40,7 +40,7 @@ async function remembered(place: string): Promise<Begun | null> {
   const begun = JSON.parse(text) as Begun;
   try {
     const upload = await call<UploadView>("GET", `v1/uploads/${begun.upload}`);
-    return upload.state === "receiving" ? begun : null;
+    return upload.state === "rejected" ? null : begun;
   } catch (error) {
     if (asProblem(error).passing) throw error;
     return null; // given up meanwhile
