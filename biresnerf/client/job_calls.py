@@ -13,6 +13,7 @@ from biresnerf.client.calls import Call, Flow, Session, ask
 from biresnerf.client.pages import collect
 from biresnerf.config import PackName, RefineOptions, parse_options
 from biresnerf.report import Report
+from biresnerf.wire.base import LABEL_LENGTH, LABELS_MOST
 from biresnerf.wire.jobs import (
     CancelJob,
     ForkJob,
@@ -36,6 +37,11 @@ LOG_LINES = 1000
 def chosen(options: OptionsLike) -> RefineOptions:
     """Options from what a caller may give; raises `InputError` ``invalid_options``."""
     return options if isinstance(options, RefineOptions) else parse_options(dict(options or {}))
+
+
+def with_name(labels: Mapping[str, str], name: str) -> dict[str, str]:
+    """The labels with what people know the job by in lists, where that is not said and there is room for it."""
+    return dict(labels) if len(labels) >= LABELS_MOST else {"name": name[:LABEL_LENGTH], **labels}
 
 
 def create_job(

@@ -11,10 +11,9 @@ from typing import Literal
 from biresnerf.client.calls import Flow, Session, Work
 from biresnerf.client.dataset_calls import create_dataset, dataset, delete_dataset, finalize
 from biresnerf.client.errors import ServiceError
-from biresnerf.client.job_calls import OptionsLike, chosen, key_of, queued
+from biresnerf.client.job_calls import OptionsLike, chosen, key_of, queued, with_name
 from biresnerf.client.scene import look_at
 from biresnerf.client.sending import LocalFile, send_missing
-from biresnerf.wire.base import LABEL_LENGTH, LABELS_MOST
 from biresnerf.wire.datasets import DatasetView
 from biresnerf.wire.jobs import JobView, NewJob, PriorityName
 from biresnerf.wire.webhooks import JobWebhook
@@ -76,7 +75,7 @@ def submit(
         body = NewJob(
             dataset_id=ready.id,
             options=wanted,
-            labels=_named(labels, target.name),
+            labels=with_name(labels or {}, target.name),
             webhook=webhook,
             priority=priority,
         )
@@ -90,12 +89,6 @@ def submit(
 def _called(path: Path) -> str:
     """The folder's name; that of a file with poses is the same in every set."""
     return (path.parent if path.is_file() else path).name
-
-
-def _named(labels: Mapping[str, str] | None, name: str) -> dict[str, str]:
-    """The labels with what people know the job by in lists, where that is not said and there is room for it."""
-    said = dict(labels or {})
-    return said if len(said) >= LABELS_MOST else {"name": name[:LABEL_LENGTH], **said}
 
 
 def local_files(path: Path) -> list[LocalFile]:

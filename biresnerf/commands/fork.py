@@ -7,6 +7,7 @@ from typing import Any, get_args
 
 import click
 
+from biresnerf.client.job_calls import with_name
 from biresnerf.commands.follow_job import follow_options, require_empty, see_through
 from biresnerf.commands.service_options import JOB, JobName, json_option, service_at, service_options
 from biresnerf.commands.settings_option import settings_option
@@ -43,6 +44,7 @@ def fork_command(
     require_empty(output)
     options = parse_options(settings)
     with service_at(url, api_key, job) as client:
-        name = {"name": called} if (called := client.job(job.id).labels.get("name")) else {}
-        made = client.fork(job.id, options, from_stage=from_stage, labels={**name, **labels})
+        if called := client.job(job.id).labels.get("name"):
+            labels = with_name(labels, called)
+        made = client.fork(job.id, options, from_stage=from_stage, labels=labels)
         see_through(client, made, wait=wait, timeout_s=timeout_s, output=output, as_json=as_json)

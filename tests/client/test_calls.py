@@ -18,7 +18,8 @@ from biresnerf.client import AsyncClient, Client, JobNotOver, ServiceError
 from biresnerf.client.calls import Answer, Patience, Session
 from biresnerf.client.errors import retry_after_s
 from biresnerf.client.events import SILENCE_S, Following
-from biresnerf.wire.jobs import JobView
+from biresnerf.client.job_calls import with_name
+from biresnerf.wire.jobs import ForkJob, JobView
 
 
 def public(kind: type) -> set[str]:
@@ -189,3 +190,12 @@ def test_a_connection_that_may_be_silent_for_too_long_is_made_anew_once(
     assert following.connect_again
     assert following.connect().answer_s <= 10.01
     assert not following.connect_again
+
+
+@pytest.mark.parametrize("count", [0, 19, 20])
+def test_a_job_is_named_unless_its_labels_are_all_taken(count: int) -> None:
+    own = {f"label {number}": "x" for number in range(count)}
+    labels = ForkJob(labels=with_name(own, "n" * 300)).labels
+    assert own.items() <= labels.items()
+    assert ("name" in labels) == (count < 20)
+    assert with_name({"name": "mine"}, "other") == {"name": "mine"}
