@@ -41,7 +41,7 @@ export function centresOf(poses: PosesFile): Triple[] {
 }
 
 export function rowsOf(report: ReportFile): ImageRow[] {
-  const flags = ["held_out", "fixed", "lost", "repaired", "moved_far", "blurred", "exposure_off"] as const;
+  const flags = ["held_out", "fixed", "lost", "repaired", "moved_far", "blurred", "exposure_off", "unsure_deg"] as const;
   return report.images.map((image, index) => ({
     image: index,
     name: image.name,

@@ -39,12 +39,13 @@ const FLAGS: Readonly<Record<string, string>> = {
   moved_far: "moved far",
   blurred: "blurred",
   exposure_off: "exposure off",
+  unsure_deg: "place unsure",
 };
 
 export const flagWords = (flag: string): string => FLAGS[flag] ?? flag.replaceAll("_", " ");
 
 /** Flags that ask for a look. */
-export const ALARMING: ReadonlySet<string> = new Set(["lost", "moved_far", "blurred", "exposure_off"]);
+export const ALARMING: ReadonlySet<string> = new Set(["lost", "moved_far", "blurred", "exposure_off", "unsure_deg"]);
 
 export const sourceWords = (source: string): string =>
   source === "given" ? "given" : source.replaceAll("-", " ");

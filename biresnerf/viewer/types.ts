@@ -65,6 +65,7 @@ export interface ImageReport {
   readonly moved_far: boolean;
   readonly blurred: boolean;
   readonly exposure_off: boolean;
+  readonly unsure_deg: number | null;
   readonly trial_psnr_before: number | null;
   readonly trial_psnr_after: number | null;
   readonly epipolar_px_before: number | null;

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 
 from biresnerf.geometry.pose_interpolation import interpolate_pose
+from biresnerf.viewer.report_html import write_report_html
 from tests.viewer.conftest import ARGUMENTS, CHROMIUM, HOSTILE, HOSTILE_IMAGE, SCREENSHOTS, VIEWS, open_report
 
 STAGE = "document.querySelector('.scene-stage').dataset"  # what is really drawn
@@ -165,6 +168,19 @@ def test_no_serious_fault_of_accessibility_and_nothing_wider_than_the_screen(
     found = page.evaluate("() => axe.run()")["violations"]
     serious = [(f["id"], f["nodes"][0]["html"]) for f in found if f["impact"] in ("serious", "critical")]
     assert serious == []
+    page.context.close()
+
+
+def test_a_photo_that_does_not_say_where_its_camera_stood_is_marked_and_found(browser, result, tmp_path):
+    images = tuple(
+        image.model_copy(update={"unsure_deg": 16.0 if number == 4 else None})
+        for number, image in enumerate(result.report.images)
+    )
+    folder = shutil.copytree(result.folder, tmp_path / "out")
+    write_report_html(folder, result.report.model_copy(update={"images": images}))
+    page = open_report(browser, folder / "report.html").page
+    page.locator(".images").get_by_label("Show").select_option(label="place unsure")
+    assert table(page) == [4]
     page.context.close()
 
 
