@@ -62,7 +62,7 @@ def create_job(
         webhook=webhook,
         priority=priority,
     )
-    return (yield from _create(session, "/v1/jobs", body, idempotency_key))
+    return (yield from queued(session, body, idempotency_key))
 
 
 def key_of(body: NewJob) -> str:
@@ -71,7 +71,7 @@ def key_of(body: NewJob) -> str:
     return hashlib.sha256(asked.encode()).hexdigest()[:32]
 
 
-def queued(session: Session, body: NewJob, key: str) -> Flow[JobView]:
+def queued(session: Session, body: NewJob, key: str | None) -> Flow[JobView]:
     """The job that the key stands for, queued now or before."""
     return (yield from _create(session, "/v1/jobs", body, key))
 

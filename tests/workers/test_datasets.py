@@ -156,9 +156,7 @@ async def test_two_checks_at_once_run_the_program_once(database_url: str, tmp_pa
     program = (
         f"open({str(marks)!r}, 'a').write('x'); import time; time.sleep(0.3); print('{{\"report\": {{}}}}')"
     )
-    settings = quick_settings(
-        tmp_path / "data", database_url=database_url, check_command=(sys.executable, "-c", program)
-    )
+    settings = checked_by(program, database_url, tmp_path)
     async with open_stores(settings) as one, open_stores(settings) as other:
         dataset = await one.datasets.create("fox")
         await one.datasets.add_file(dataset.id, "a", chunks(b"x"))
@@ -172,10 +170,7 @@ async def test_many_checks_of_one_tenant_do_not_hold_up_anothers(database_url: s
     marks = tmp_path / "marks"
     mark = f"open({str(marks)!r}, 'a').write(open(sys.argv[1] + '/a').read())"
     program = f"import sys; {mark}; print('{{\"report\": {{}}}}')"
-    settings = quick_settings(
-        tmp_path / "data", database_url=database_url, check_command=(sys.executable, "-c", program)
-    )
-    async with open_stores(settings) as stores:
+    async with open_stores(checked_by(program, database_url, tmp_path)) as stores:
         finalized = []
         for tenant in "aaaaaab":
             await stores.keys.create(tenant, "key", ["admin"])
@@ -190,16 +185,25 @@ async def test_many_checks_of_one_tenant_do_not_hold_up_anothers(database_url: s
     assert order[-1] != "b", order
 
 
-async def checking(database_url: str, folder: Path, program: str) -> DatasetRecord:
-    """The outcome of a check by this program."""
-    settings = quick_settings(
+def checked_by(program: str, database_url: str, folder: Path) -> Settings:
+    """Settings by which this program checks datasets."""
+    return quick_settings(
         folder / "data", database_url=database_url, check_command=(sys.executable, "-c", program)
     )
-    async with open_stores(settings) as stores:
-        dataset = await stores.datasets.create("fox")
-        await stores.datasets.add_file(dataset.id, "a", chunks(b"x"))
-        await stores.datasets.finalize(dataset.id)
-        return await stores.datasets.check(dataset.id)
+
+
+async def finalized_dataset(stores: Stores) -> str:
+    """Its id; nothing has checked it yet."""
+    dataset = await stores.datasets.create("fox")
+    await stores.datasets.add_file(dataset.id, "a", chunks(b"x"))
+    await stores.datasets.finalize(dataset.id)
+    return dataset.id
+
+
+async def checking(database_url: str, folder: Path, program: str) -> DatasetRecord:
+    """The outcome of a check by this program."""
+    async with open_stores(checked_by(program, database_url, folder)) as stores:
+        return await stores.datasets.check(await finalized_dataset(stores))
 
 
 async def test_a_check_longer_than_the_stall_time_comes_to_its_end_and_runs_once(database_url: str, tmp_path):
@@ -212,14 +216,10 @@ async def test_a_check_longer_than_the_stall_time_comes_to_its_end_and_runs_once
 
 async def test_a_check_whose_lease_went_to_another_process_decides_nothing(database_url: str, tmp_path):
     program = "import time; time.sleep(0.5); print('{\"report\": {}}')"
-    settings = quick_settings(
-        tmp_path / "data", database_url=database_url, check_command=(sys.executable, "-c", program)
-    )
+    settings = checked_by(program, database_url, tmp_path)
     async with open_stores(settings) as stores:
-        dataset = await stores.datasets.create("fox")
-        await stores.datasets.add_file(dataset.id, "a", chunks(b"x"))
-        await stores.datasets.finalize(dataset.id)
-        late = asyncio.create_task(stores.datasets.check(dataset.id))
+        dataset = await finalized_dataset(stores)
+        late = asyncio.create_task(stores.datasets.check(dataset))
         folder = settings.scratch_dir / "checks"
         while not list(folder.glob("*/log.txt")):
             await asyncio.sleep(0.02)
@@ -229,7 +229,7 @@ async def test_a_check_whose_lease_went_to_another_process_decides_nothing(datab
         while list(folder.iterdir()):
             await asyncio.sleep(0.05)
         await asyncio.wait([late], timeout=0.5)
-        assert (await stores.datasets.get(dataset.id)).state == "finalizing"
+        assert (await stores.datasets.get(dataset)).state == "finalizing"
         late.cancel()
 
 

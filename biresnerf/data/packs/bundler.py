@@ -6,6 +6,7 @@ image's centre; keypoints are measured from there, y up. Format: Bundler v0.4 us
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -35,21 +36,29 @@ def bundler_problem(camera: Camera) -> str | None:
     return None
 
 
+def refuse_lenses(
+    cameras: Iterable[Camera], problem_of: Callable[[Camera], str | None], form: str, where: str, mend: str
+) -> None:
+    """Raises InputError ``pack_not_possible`` for the first lens with a problem; ``form`` is whose (Bundler's)."""
+    for camera in cameras:
+        problem = problem_of(camera)
+        if problem is not None:
+            raise InputError(
+                "pack_not_possible",
+                f"{form} cannot hold a lens of this set: {problem}.",
+                where=where,
+                mend=mend,
+            )
+
+
 def write_bundler(refined: RefinedSet, folder: Path) -> None:
     """Writes ``bundle.out`` and ``list.txt`` (image names in the cameras' order) into ``folder``.
 
     Raises:
         InputError: ``pack_not_possible``: a lens that the format cannot hold.
     """
-    for camera in refined.cameras:
-        problem = bundler_problem(camera)
-        if problem is not None:
-            raise InputError(
-                "pack_not_possible",
-                f"Bundler's format cannot hold a lens of this set: {problem}.",
-                where="bundler",
-                mend="Ask for the pinhole pack: it holds undistorted images, and a bundle.out for them.",
-            )
+    mend = "Ask for the pinhole pack: it holds undistorted images, and a bundle.out for them."
+    refuse_lenses(refined.cameras, bundler_problem, "Bundler's format", "bundler", mend)
     lines = ["# Bundle file v0.3", f"{len(refined)} {len(refined.model.points)}"]
     for index, cam_from_world in enumerate(refined.cam_from_world):
         full = refined.camera_of(index).full()

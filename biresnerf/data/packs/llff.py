@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.atomic_file import whole_file
 from biresnerf.data.dataset import Camera
-from biresnerf.data.packs.bundler import bundler_problem
+from biresnerf.data.packs.bundler import bundler_problem, refuse_lenses
 from biresnerf.data.refined_set import RefinedSet
 from biresnerf.errors import InputError
 
@@ -52,15 +52,8 @@ def write_llff(refined: RefinedSet, path: Path, bounds: NDArray[np.float64] | No
     Raises:
         InputError: ``pack_not_possible``: a lens that the form cannot hold; ``bounds_missing``: no points are seen.
     """
-    for camera in refined.cameras:
-        problem = llff_problem(camera)
-        if problem is not None:
-            raise InputError(
-                "pack_not_possible",
-                f"LLFF's form cannot hold a lens of this set: {problem}.",
-                where="llff",
-                mend="Convert to pinhole, which undistorts the photos, then that folder to llff.",
-            )
+    mend = "Convert to pinhole, which undistorts the photos, then that folder to llff."
+    refuse_lenses(refined.cameras, llff_problem, "LLFF's form", "llff", mend)
     order = rows_by_name(refined)
     if bounds is None:
         bounds = np.array([_bounds_of_points(refined, index) for index in range(len(refined))])
