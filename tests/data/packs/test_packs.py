@@ -96,11 +96,16 @@ def test_a_damaged_poses_json_is_refused_with_the_field(tmp_path, damage):
     assert where in caught.value.where
 
 
-def test_llff_holds_every_pose_by_name_and_the_depths_that_its_image_sees(tmp_path):
+@pytest.mark.parametrize("backwards", [False, True])
+def test_llff_holds_every_pose_by_name_and_the_depths_that_its_image_sees(tmp_path, backwards):
     refined = centred(random_result(4, model="SIMPLE_PINHOLE"))
+    if backwards:  # rows go by name, whatever the set's order
+        last = len(refined) - 1
+        named = [replace(image, file_name=f"{last - i}.png") for i, image in enumerate(refined.images)]
+        refined = with_(refined, images=tuple(named))
     write_llff(refined, tmp_path / "poses_bounds.npy")
     rows = np.load(tmp_path / "poses_bounds.npy")
-    for index, row in enumerate(rows):
+    for index, row in enumerate(rows[::-1] if backwards else rows):
         down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
         pose, camera = refined.world_from_cam[index], refined.camera_of(index)
         np.testing.assert_array_equal(np.stack([right, down, -back, centre], axis=1), pose[:3])
