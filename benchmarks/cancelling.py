@@ -17,13 +17,13 @@ import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-from biresnerf.config import RefineOptions
-from biresnerf.data.synthetic import write_synthetic_scene
-from workers.embedded_postgres import EmbeddedPostgres
-from workers.migrate import migrate
+from biresnerf.data.synthetic.scene import write_synthetic_scene
+from biresnerf.options.refine_options import RefineOptions
+from workers.database.embedded_postgres import EmbeddedPostgres
+from workers.database.migrate import migrate
+from workers.engine import Stores, open_stores
 from workers.records import JobUpdate
-from workers.settings import Settings
-from workers.stores import Stores, open_stores
+from workers.settings.settings import Settings
 
 STAGES = ("loading", "preparing", "seeding", "coarse", "fine", "evaluating", "exporting")
 OPTIONS = RefineOptions(
@@ -88,7 +88,7 @@ async def measure(folder: Path, stages: list[str], views: int, size: int) -> lis
         variables = {"BIRESNERF_DATABASE_URL": url, "BIRESNERF_DATA_DIR": str(settings.data_dir)}
         with (folder / "slot.log").open("wb") as log:
             slot = subprocess.Popen(
-                [sys.executable, "-m", "workers.slot"],
+                [sys.executable, "-m", "workers.queue.slot"],
                 env={**os.environ, **variables},
                 stdout=log,
                 stderr=log,

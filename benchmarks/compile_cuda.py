@@ -23,7 +23,7 @@ from biresnerf.field.cuda.launches import Launch
 from biresnerf.field.cuda.workspace import Capacity, Workspace
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldShape
-from biresnerf.field.reference_field import ReferenceField
+from biresnerf.field.reference.field import ReferenceField
 
 PLANS = (
     plans.forward,

@@ -7,7 +7,7 @@ import time
 
 import torch
 
-from biresnerf.field.cuda_field import CudaField
+from biresnerf.field.cuda.field import CudaField
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import (
     FieldRates,
@@ -17,7 +17,7 @@ from biresnerf.field.radiance_field import (
     RadianceField,
     Rays,
 )
-from biresnerf.field.reference_field import ReferenceField
+from biresnerf.field.reference.field import ReferenceField
 
 LEVELS, SIDE = 16, 128
 DEVICE = torch.device("cuda")

@@ -11,11 +11,11 @@ from numba import njit, prange
 from benchmarks.clock import Clock, interleave, ratio, summary
 from benchmarks.torch_forms import encode_unrolled, encode_vectorised
 from benchmarks.yardstick import Yardstick, build_yardstick, check_yardstick
-from biresnerf.field import reference
 from biresnerf.field.cpu import encoding
+from biresnerf.field.cpu.field import tasks
 from biresnerf.field.cpu.segments import add_position_gradient
-from biresnerf.field.cpu_field import tasks
 from biresnerf.field.grid_levels import GridLevels, grid_levels
+from biresnerf.field.reference import operations as reference
 
 GRIDS = {
     "pose-estimation module": grid_levels(3, 16, 72, 22),

@@ -19,7 +19,7 @@ from benchmarks.chaos.__main__ import new_folder
 from benchmarks.chaos.clients import Clients, Seen
 from benchmarks.chaos.installation import Installation
 from benchmarks.chaos.verdict import Claim, claims_about_jobs
-from workers.settings import Settings
+from workers.settings.settings import Settings
 
 BEFORE_S = 5.0
 AFTER_S = 20.0

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from biresnerf.config import RefineOptions
-from biresnerf.data.dataset import Camera
-from biresnerf.data.images import ImageSet
-from biresnerf.refine.joint_optimiser import JointOptimiser
-from biresnerf.refine.scene_frame import scene_frame
+from biresnerf.data.model.dataset import Camera
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.options.refine_options import RefineOptions
+from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.scene.scene_frame import scene_frame
 
 CPU = torch.device("cpu")
 DISTANCE, FOCAL = 4.0, 1.4  # of the cameras; in widths of the photo

@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from biresnerf.data.dataset import Camera, Dataset
-from biresnerf.data.guessed_lens import guess_lens
-from biresnerf.data.image_files import read_header
-from biresnerf.data.images import load_images
-from biresnerf.data.read import read_dataset
-from biresnerf.data.seed_poses import PoseCandidate, seed_poses
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.model.dataset import Camera, Dataset
+from biresnerf.data.photos.guessed_lens import guess_lens
+from biresnerf.data.photos.image_files import read_header
+from biresnerf.data.photos.images import load_images
+from biresnerf.data.seeding.seed_poses import PoseCandidate, seed_poses
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread

@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from biresnerf.data.synthetic import write_synthetic_scene
+from biresnerf.data.synthetic.scene import write_synthetic_scene
 
 POLICIES = {"sleep": {}, "spin": {"GOMP_SPINCOUNT": "300000"}}
 SETTINGS = (

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from biresnerf.field import reference
 from biresnerf.field.grid_levels import HASH_PRIMES, GridLevels
 from biresnerf.field.radiance_field import (
     BETA1,
@@ -23,7 +22,8 @@ from biresnerf.field.radiance_field import (
     Rays,
     Rendering,
 )
-from biresnerf.field.reference_field import ReferenceField
+from biresnerf.field.reference import operations as reference
+from biresnerf.field.reference.field import ReferenceField
 from biresnerf.field.spherical_harmonics import spherical_harmonics
 
 _CORNERS = torch.tensor([[k & 1, (k >> 1) & 1, k >> 2] for k in range(8)])

@@ -11,11 +11,11 @@ import torch
 from benchmarks import scene
 from benchmarks.clock import Clock, interleave, peak_memory, ratio, summary, timed
 from benchmarks.torch_forms import UnrolledField, VectorisedField
-from biresnerf.field import cpu_field
-from biresnerf.field.reference_field import ReferenceField
-from biresnerf.refine.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
-from biresnerf.refine.photo_sampler import PhotoSampler
-from biresnerf.refine.pose_parameters import PoseParameters
+from biresnerf.field.cpu import field as cpu_field
+from biresnerf.field.reference.field import ReferenceField
+from biresnerf.refine.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
+from biresnerf.refine.optimise.photo_sampler import PhotoSampler
+from biresnerf.refine.parameters.pose_parameters import PoseParameters
 
 OPERATIONS = [
     (PhotoSampler, "draw", "draw pixels"),

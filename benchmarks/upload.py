@@ -29,8 +29,8 @@ import psutil
 import psycopg
 
 from biresnerf.client import Client, LocalFile
-from workers.embedded_postgres import EmbeddedPostgres
-from workers.migrate import migrate
+from workers.database.embedded_postgres import EmbeddedPostgres
+from workers.database.migrate import migrate
 
 MIB = 2**20
 CUTS = (0.12, 0.33, 0.47, 0.71, 0.9)

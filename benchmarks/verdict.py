@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from biresnerf.config import RefineOptions
-from biresnerf.data.dataset import Dataset
-from biresnerf.data.images import load_images
-from biresnerf.data.pose_file import read_poses
-from biresnerf.data.read import read_dataset
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.formats.read_poses import read_poses
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.photos.images import load_images
 from biresnerf.field.backends import use_threads
-from biresnerf.field.compile_kernels import compile_kernels
+from biresnerf.field.cpu.compile_kernels import compile_kernels
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.geometry.similarity import align_robust
-from biresnerf.refine.left_out_views import held_out_views
-from biresnerf.refine.pose_evidence import Rig, compare_on_unseen_views, moved_px
+from biresnerf.options.refine_options import RefineOptions
+from biresnerf.refine.verdict.pose_evidence import Rig, compare_on_unseen_views, moved_px
+from biresnerf.refine.views.held_out_views import held_out_views
 
 
 def poses_of(text: str, dataset: Dataset) -> np.ndarray:

@@ -27,7 +27,7 @@ from pathlib import Path
 import httpx
 from playwright.sync_api import Browser, sync_playwright
 
-from biresnerf.data.synthetic import write_synthetic_scene
+from biresnerf.data.synthetic.scene import write_synthetic_scene
 
 CONTROLS = {"list": ".drop-buttons .act", "job": ".scene-slider input"}
 QUIET_MS = 1500

@@ -23,10 +23,10 @@ import psutil
 import standardwebhooks
 
 from benchmarks.chaos.__main__ import new_folder
-from workers.embedded_postgres import EmbeddedPostgres
-from workers.migrate import migrate
-from workers.settings import Settings
-from workers.stores import open_stores
+from workers.database.embedded_postgres import EmbeddedPostgres
+from workers.database.migrate import migrate
+from workers.engine import open_stores
+from workers.settings.settings import Settings
 
 # As long as what is told of a job.
 DATA = {"id": "job_0", "state": "succeeded", "error": None, "padding": "x" * 500}
@@ -110,7 +110,7 @@ async def measure(folder: Path, asked: argparse.Namespace) -> bool:
         await fill_outbox(settings, receiver, server.sockets[0].getsockname()[1], asked)
         said = {f"BIRESNERF_{name.upper()}": value for name, value in _plain(settings).items()}
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "workers.dispatcher", env={**os.environ, **said}
+            sys.executable, "-m", "workers.upkeep.dispatcher", env={**os.environ, **said}
         )
         looked_at, before, most = psutil.Process(process.pid), 0.0, 0
         while sum(receiver.heard.values()) < count and process.returncode is None:

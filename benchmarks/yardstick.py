@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from biresnerf.field import reference
 from biresnerf.field.grid_levels import GridLevels
+from biresnerf.field.reference import operations as reference
 
 SOURCE = Path(__file__).with_name("hashgrid_yardstick.cpp")
 FLAGS = ["-O3", "-march=native", "-mprefer-vector-width=512", "-ffast-math", "-fopenmp", "-fPIC"]

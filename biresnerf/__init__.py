@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from biresnerf.config import RefineOptions
 from biresnerf.errors import BiresnerfError, InputError, Interrupted, RefinementError
 from biresnerf.openmp import let_waiting_threads_sleep
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.progress import Progress
 
 if TYPE_CHECKING:

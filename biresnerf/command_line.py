@@ -13,7 +13,7 @@ import click
 
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import with_code
-from biresnerf.commands.completion import NAME
+from biresnerf.commands.machine.completion import NAME
 from biresnerf.errors import BiresnerfError, InputError
 from biresnerf.openmp import let_waiting_threads_sleep
 

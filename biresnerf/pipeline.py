@@ -14,32 +14,32 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from biresnerf.conclude import Run
-from biresnerf.config import STAGE_2_OPTIONS, RefineOptions
-from biresnerf.data.dataset import Dataset
-from biresnerf.data.feature_matches import FeatureMatches
-from biresnerf.data.images import ImageSet, load_images
-from biresnerf.data.read import read_dataset
-from biresnerf.data.seed_poses import PoseCandidate, seed_poses
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.photos.images import ImageSet, load_images
+from biresnerf.data.points.feature_matches import FeatureMatches
+from biresnerf.data.seeding.seed_poses import PoseCandidate, seed_poses
 from biresnerf.errors import InputError, Interrupted
 from biresnerf.field.backends import choose_device, use_threads
-from biresnerf.field.compile_kernels import compile_kernels
-from biresnerf.output_folder import OutputFolder
+from biresnerf.field.cpu.compile_kernels import compile_kernels
+from biresnerf.options.refine_options import STAGE_2_OPTIONS, RefineOptions
 from biresnerf.progress import OnProgress, Progress
-from biresnerf.refine.checkpoint import COARSE, load_checkpoint
-from biresnerf.refine.forward_facing import find_forward_facing
-from biresnerf.refine.history import Observer
-from biresnerf.refine.intrinsics_parameters import lenses_of
-from biresnerf.refine.joint_optimiser import JointOptimiser
-from biresnerf.refine.left_out_views import held_out_views
-from biresnerf.refine.rigid_bodies import rigid_bodies
-from biresnerf.refine.run_input import RunInput
-from biresnerf.refine.scene_depth import matched_depth
-from biresnerf.refine.scene_frame import scene_frame
-from biresnerf.refine.start import Start, choose_start
-from biresnerf.refine.two_stages import TwoStages
+from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.parameters.intrinsics_parameters import lenses_of
+from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
+from biresnerf.refine.scene.scene_depth import matched_depth
+from biresnerf.refine.scene.scene_frame import scene_frame
+from biresnerf.refine.stages.checkpoint import COARSE, load_checkpoint
+from biresnerf.refine.stages.history import Observer
+from biresnerf.refine.stages.two_stages import TwoStages
+from biresnerf.refine.start.choose_start import Start, choose_start
+from biresnerf.refine.start.forward_facing import find_forward_facing
+from biresnerf.refine.verdict.run_input import RunInput
+from biresnerf.refine.views.held_out_views import held_out_views
 from biresnerf.report import Report
-from biresnerf.show_seeding import ShowSeeding
+from biresnerf.write.finish_run import Run
+from biresnerf.write.output_folder import OutputFolder
+from biresnerf.write.show_seeding import ShowSeeding
 
 logger = logging.getLogger(__name__)
 

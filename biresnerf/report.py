@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from biresnerf.config import RefineOptions
+from biresnerf.options.refine_options import RefineOptions
 
 _FROZEN = ConfigDict(frozen=True, extra="forbid")
 

@@ -14,7 +14,7 @@ The notebook is made of this file (`make docs`).
 from walk import arguments, in_words, pose_table, show_progress
 
 from biresnerf import refine_poses
-from biresnerf.commands.make_scene import make_scene
+from biresnerf.commands.poses.make_scene import make_scene
 
 here = arguments("phone_capture", views=40, size=200, preset="fast", steps=1200, orbit_frames=0)
 print(make_scene(here.scene, "phone", own=here.of, views=here.views, size=here.size, seed=1))

@@ -13,7 +13,7 @@ The notebook is made of this file (`make docs`).
 from walk import arguments, in_words, pose_table, show_progress
 
 from biresnerf import refine_poses
-from biresnerf.commands.make_scene import make_scene
+from biresnerf.commands.poses.make_scene import make_scene
 
 here = arguments("vase", views=40, size=160, preset="fast", steps=1500, holdout=8, orbit_frames=0)
 print(make_scene(here.scene, "vase", own=here.of, views=here.views, size=here.size, noise=0.1, seed=1))

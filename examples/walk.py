@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from biresnerf import RefineOptions
-from biresnerf.commands.evaluate import matched_names
+from biresnerf.commands.poses.evaluate import matched_names
 from biresnerf.commands.settings_option import parse_settings
-from biresnerf.config import parse_options
-from biresnerf.data.pose_file import read_poses
+from biresnerf.data.formats.read_poses import read_poses
 from biresnerf.errors import InputError
 from biresnerf.geometry.pose_error import pose_error
+from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import Progress
 from biresnerf.report import Report
 

@@ -1,0 +1,1 @@
+"""HTTP in and out, and the web page. Never loads torch or pycolmap."""

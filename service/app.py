@@ -16,22 +16,23 @@ from starlette.routing import Route
 
 from biresnerf import __version__
 from biresnerf.errors import InputError
-from service import docs_page, web_page
-from service.access import Access, say_who_is_let_in
-from service.dependencies import Service
-from service.intake import take_upload
-from service.json_body import validation_problem
-from service.metrics import WebMetrics
-from service.observe import Observed, is_probe
-from service.openapi import describe
-from service.problems import CATALOGUE, ProblemError
-from service.request_context import RequestContext, render
+from service import web_page
+from service.docs import docs_page
+from service.docs.openapi import describe
+from service.http.access import Access, say_who_is_let_in
+from service.http.dependencies import Service
+from service.http.metrics import WebMetrics
+from service.http.observe import Observed, is_probe
+from service.http.problems import CATALOGUE, ProblemError
+from service.http.request_context import RequestContext, render
+from service.intake.archive_import import take_upload
+from service.intake.json_body import validation_problem
+from service.intake.uploads import sweep_staging
 from service.routes import (
     artifacts,
     datasets,
     events,
     health,
-    job_life,
     jobs,
     meta,
     shares,
@@ -39,12 +40,12 @@ from service.routes import (
     uploads,
     webhooks,
 )
-from service.uploads import sweep_staging
-from workers.errors import EngineError, NotFound, Unavailable
-from workers.settings import Settings
-from workers.stores import open_stores
-from workers.traces import flush_traces
-from workers.watchdog import watched
+from service.routes import derived_jobs as job_life
+from workers.engine import open_stores
+from workers.process.watchdog import watched
+from workers.settings.errors import EngineError, NotFound, Unavailable
+from workers.settings.settings import Settings
+from workers.settings.traces import flush_traces
 
 logger = logging.getLogger(__name__)
 

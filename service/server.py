@@ -13,12 +13,12 @@ from fastapi import FastAPI
 from pydantic import ValidationError
 
 from service.app import create_app
-from service.request_context import HEAD_BYTES_MAX
-from service.strict_http import StrictHttp
-from workers.errors import SetupError
-from workers.logs import set_up_logging
-from workers.settings import Settings
-from workers.traces import set_up_traces
+from service.http.request_context import HEAD_BYTES_MAX
+from service.http.strict_http import StrictHttp
+from workers.settings.errors import SetupError
+from workers.settings.logs import set_up_logging
+from workers.settings.settings import Settings
+from workers.settings.traces import set_up_traces
 
 logger = logging.getLogger(__name__)
 # Long downloads may use it; event streams end at once (see `_Server`).

@@ -12,7 +12,7 @@ from pathlib import Path
 from fastapi import APIRouter, Request
 from fastapi.responses import FileResponse, Response
 
-from service.problems import ProblemError
+from service.http.problems import ProblemError
 
 FOLDER = Path(__file__).parent / "web" / "dist"
 CSP = (

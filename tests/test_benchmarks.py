@@ -17,10 +17,10 @@ from benchmarks.torch_forms import (
     march_at_once,
 )
 from benchmarks.yardstick import build_yardstick, check_yardstick
-from biresnerf.field import reference
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays
-from biresnerf.field.reference_field import ReferenceField
+from biresnerf.field.reference import operations as reference
+from biresnerf.field.reference.field import ReferenceField
 
 DENSE, HASHED = grid_levels(3, 8, 20, 14), grid_levels(4, 64, 200, 12)
 

@@ -12,7 +12,7 @@ import pytest
 ENTRANCES = {
     "library": "import biresnerf; biresnerf.refine_poses",
     "command line": "from biresnerf.command_line import main\ntry: main()\nexcept SystemExit: import torch",
-    "job": "from pathlib import Path; from workers.run import main; main(Path('no-such-job')); import torch",
+    "job": "import pathlib; from workers.run.job_process import main; main(pathlib.Path('none')); import torch",
 }
 
 

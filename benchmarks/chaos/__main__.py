@@ -19,7 +19,7 @@ from benchmarks.chaos.clients import Clients
 from benchmarks.chaos.faults import Faults
 from benchmarks.chaos.installation import Installation
 from benchmarks.chaos.verdict import Claim, claims_about_jobs, claims_about_rest, told
-from workers.database import open_database
+from workers.database.database import open_database
 
 
 async def storm(

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import psutil
 
-from workers.embedded_postgres import EmbeddedPostgres
-from workers.migrate import migrate
-from workers.settings import Settings
-from workers.tether import tethered
+from workers.database.embedded_postgres import EmbeddedPostgres
+from workers.database.migrate import migrate
+from workers.process.die_with_parent import tethered
+from workers.settings.settings import Settings
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = ROOT / "tests" / "workers" / "counting_program.py"
@@ -82,7 +82,7 @@ class Installation:
             for n, port in enumerate(self.ports)
         ]
         self.workers = [
-            Kept(f"worker{n}", (sys.executable, "-m", "workers.slot", "--slot", f"w{n}"))
+            Kept(f"worker{n}", (sys.executable, "-m", "workers.queue.slot", "--slot", f"w{n}"))
             for n in range(workers)
         ]
         self._keeping: list[asyncio.Task[None]] = []

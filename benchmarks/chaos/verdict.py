@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks.chaos.clients import FINAL, Clients, Seen
 from benchmarks.chaos.installation import Installation
-from workers.database import Database
+from workers.database.database import Database
 
 # A start that was under way when the job ended may still say so.
 START_S = 5.0

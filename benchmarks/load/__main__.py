@@ -17,8 +17,8 @@ from benchmarks.chaos.__main__ import new_folder
 from benchmarks.chaos.installation import Installation, Kept
 from benchmarks.load import parts
 from benchmarks.load.calls import Calls, Process
-from workers.database import open_database
-from workers.stores import open_stores
+from workers.database.database import open_database
+from workers.engine import open_stores
 
 DO_NOTHING = (sys.executable, "-I", "-S", "-c", "pass")
 
@@ -79,7 +79,7 @@ async def ready(calls: Calls) -> None:
 async def start_workers(installation: Installation, count: int) -> None:
     """Workers beside the API that runs already."""
     for n in range(count):
-        installation.add(Kept(f"worker{n}", (sys.executable, "-m", "workers.slot", "--slot", f"w{n}")))
+        installation.add(Kept(f"worker{n}", (sys.executable, "-m", "workers.queue.slot", "--slot", f"w{n}")))
     await asyncio.sleep(3.0)
 
 

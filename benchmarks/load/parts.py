@@ -12,9 +12,9 @@ from typing import Any
 from psycopg.types.json import Jsonb
 
 from benchmarks.load.calls import Calls, Process, at_once, spread
-from biresnerf.config import RefineOptions
-from workers.database import Database
-from workers.stores import Stores
+from biresnerf.options.refine_options import RefineOptions
+from workers.database.database import Database
+from workers.engine import Stores
 
 Figures = dict[str, Any]
 OPTIONS = {"preset": "fast"}

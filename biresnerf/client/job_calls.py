@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 from biresnerf.client.calls import Call, Flow, Session, ask
 from biresnerf.client.pages import collect
-from biresnerf.config import PackName, RefineOptions, parse_options
+from biresnerf.options.refine_options import PackName, RefineOptions, parse_options
 from biresnerf.report import Report
 from biresnerf.wire.base import LABEL_LENGTH, LABELS_MOST
 from biresnerf.wire.jobs import (

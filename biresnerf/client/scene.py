@@ -26,7 +26,7 @@ def look_at(path: Path) -> Scene:
     Raises:
         InputError: the input cannot be used, or an image lies outside of its folder.
     """
-    from biresnerf.data.read import read_dataset
+    from biresnerf.data.formats.read_dataset import read_dataset
 
     dataset = read_dataset(path)
     root = dataset.root
@@ -46,7 +46,7 @@ def look_at(path: Path) -> Scene:
 
 def _found_by_name(root: Path, path: Path, poses: list[tuple[str, Path]]) -> list[tuple[str, Path]]:
     """The files, under names by which the service will read the same of them."""
-    from biresnerf.data.folder import usual_name
+    from biresnerf.data.formats.folder import usual_name
 
     usual = usual_name(path)
     return [(usual if usual and file == path else name, file) for name, file in poses]

@@ -1,1 +1,1 @@
-"""What `biresnerf NAME` runs, one file per command; each is found by its entry point."""
+"""What `biresnerf NAME` runs. No command holds logic that a library user would miss."""

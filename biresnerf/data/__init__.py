@@ -1,1 +1,1 @@
-"""Scene files in and out: reading, validating, seeding, loading and writing image sets. Needs no torch."""
+"""Image sets in files: reading, checking, seeding, loading and writing them. Needs no torch; optimises nothing."""

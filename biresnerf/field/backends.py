@@ -10,12 +10,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from biresnerf.config import Device
 from biresnerf.errors import InputError
-from biresnerf.field.device_occupancy import DeviceOccupancyGrid
+from biresnerf.field.cuda.device_occupancy import DeviceOccupancyGrid
 from biresnerf.field.occupancy import OccupancyGrid
 from biresnerf.field.radiance_field import FieldShape, RadianceField
-from biresnerf.geometry.camera import Intrinsics, directions_in_cam
+from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
+from biresnerf.options.refine_options import Device
 
 logger = logging.getLogger(__name__)
 
@@ -93,15 +93,15 @@ def make_field(shape: FieldShape, seed: int, device: torch.device, threads: int)
     """
     field: RadianceField
     if shape.wiring == "residual":
-        from biresnerf.field.reference_field import ReferenceField
+        from biresnerf.field.reference.field import ReferenceField
 
         field = ReferenceField(shape, seed, device)
     elif device.type == "cpu":
-        from biresnerf.field.cpu_field import CpuField
+        from biresnerf.field.cpu.field import CpuField
 
         field = CpuField(shape, seed, device, threads)
     else:
-        from biresnerf.field.cuda_field import CudaField
+        from biresnerf.field.cuda.field import CudaField
 
         field = CudaField(shape, seed, device)
     logger.info("field backend %s on %s, %d threads", field.backend, device, threads)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from biresnerf.config import Wiring
 from biresnerf.field.grid_levels import GridLevels
+from biresnerf.options.refine_options import Wiring
 
 HIDDEN, OUTPUTS = 64, 16
 TABLE_INIT = 1e-4  # uniform +-1e-4, as tiny-cuda-nn

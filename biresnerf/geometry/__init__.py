@@ -1,4 +1,1 @@
-"""Pure mathematics of rigid motions and camera rigs: no files, no scenes.
-
-``lie`` works on torch tensors; the rest on numpy float64 or plain numbers. Importing the package loads neither.
-"""
+"""Pure mathematics of rotations, poses and cameras. Opens no files; knows nothing of images."""

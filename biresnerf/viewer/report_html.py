@@ -15,9 +15,9 @@ from pathlib import Path
 
 from PIL import Image
 
-from biresnerf.data.atomic_file import whole_file
-from biresnerf.data.packs.poses_json import POSES
-from biresnerf.data.view_file import VIEW, ViewFile, read_view_file
+from biresnerf.data.formats.own.poses_json import POSES
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.show.view_file import VIEW, ViewFile, read_view_file
 from biresnerf.errors import InputError
 from biresnerf.report import Report
 

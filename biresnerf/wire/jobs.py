@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 from pydantic import ConfigDict, Field
 
-from biresnerf.config import PackName, RefineOptions
+from biresnerf.options.refine_options import PackName, RefineOptions
 from biresnerf.progress import ReusableStage, Stage
 from biresnerf.report import VerdictName
 from biresnerf.wire.base import Labels, Record

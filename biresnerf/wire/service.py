@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from biresnerf.config import PresetName, RefineOptions
+from biresnerf.options.refine_options import PresetName, RefineOptions
 from biresnerf.wire.base import Record
 from biresnerf.wire.jobs import JobState, PriorityName
 

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from biresnerf.config import RefineOptions
-from biresnerf.presets import (
+from biresnerf.options.presets import (
     COMMON_VALUES,
     CUDA_SCALE,
     METHOD_PAPER_VALUES,
     METHOD_VALUES,
     PRESETS,
 )
+from biresnerf.options.refine_options import RefineOptions
 from docs.generate.markdown import DASH, code, table
 from docs.generate.schema_words import takes
 
 _HEAD = """# Options of a refinement
 
-Written by `make docs` from the models in `biresnerf/config.py` and `biresnerf/presets.py`; a test fails when they differ.
+Written by `make docs` from the models in `biresnerf/options/refine_options.py` and `biresnerf/options/presets.py`; a test fails when they differ.
 
 On the command line `--set KEY=VALUE` sets any of them (`--preset`, `--device` and `--seed` have flags of their own), over
 HTTP they are the object `options` of a job, from Python `biresnerf.RefineOptions(...)`. Values are JSON where they can be

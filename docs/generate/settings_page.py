@@ -6,11 +6,11 @@ from typing import Any
 
 from docs.generate.markdown import DASH, code, table
 from docs.generate.schema_words import takes
-from workers.settings import GIB, MIB, Settings
+from workers.settings.settings import GIB, MIB, Settings
 
 _HEAD = """# Settings of an installation
 
-Written by `make docs` from `workers/settings.py`; a test fails when they differ.
+Written by `make docs` from `workers/settings/settings.py`; a test fails when they differ.
 
 Environment variables of the service's processes; the same for every process of one installation. Lists are JSON:
 `BIRESNERF_WEBHOOK_NETWORKS='["10.0.0.0/8"]'`. Each can be given by a file instead: `BIRESNERF_X_FILE` names a file that
@@ -20,8 +20,8 @@ holds the value of `BIRESNERF_X`. `up` and `api` have flags for some. What the l
 # What differs from machine to machine.
 _IN_WORDS = {
     "data_dir": "`/var/lib/biresnerf` for root, else `~/.local/share/biresnerf`",
-    "job_command": "`python -m workers.run`",
-    "check_command": "`python -m workers.check`",
+    "job_command": "`python -m workers.run.job_process`",
+    "check_command": "`python -m workers.datasets.dataset_check_process`",
 }
 
 

@@ -7,11 +7,11 @@ from fastapi.responses import Response, StreamingResponse
 
 from biresnerf.report import Report
 from biresnerf.wire.results import ArtifactList
-from service.access import Caller, CallerHere
-from service.dependencies import JobId
-from service.downloads import ANSWERS, Asked, answer_with, find_artifact
-from service.problems import ProblemError, declared
-from service.views import artifact_view
+from service.answers.downloads import ANSWERS, Asked, answer_with, find_artifact
+from service.answers.views import artifact_view
+from service.http.access import Caller, CallerHere
+from service.http.dependencies import JobId
+from service.http.problems import ProblemError, declared
 from workers.records import Artifact
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])

@@ -20,14 +20,14 @@ from biresnerf.wire.datasets import (
     dataset_url,
 )
 from biresnerf.wire.safe_paths import checked_path
-from service.access import CallerHere, DatasetWriterHere
-from service.dependencies import DatasetId, next_link, service_of
-from service.finalizing import begin_check, finish_check
-from service.intake import take_archive
-from service.json_body import JSON_BYTES_MAX, json_content, read_json
-from service.problems import ProblemError, declared
-from service.uploads import capped, refuse_announced_excess, staging_folder, write_stream
-from service.views import file_view
+from service.answers.views import file_view
+from service.http.access import CallerHere, DatasetWriterHere
+from service.http.dependencies import DatasetId, next_link, service_of
+from service.http.problems import ProblemError, declared
+from service.intake.archive_import import take_archive
+from service.intake.dataset_finalize import begin_check, finish_check
+from service.intake.json_body import JSON_BYTES_MAX, json_content, read_json
+from service.intake.uploads import capped, refuse_announced_excess, staging_folder, write_stream
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 ENTRY_BYTES = 2048  # of a manifest, for each file that a dataset may have

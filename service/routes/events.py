@@ -12,12 +12,12 @@ from fastapi.responses import StreamingResponse
 
 from biresnerf.wire.jobs import JobView
 from biresnerf.wire.problems import FieldProblem
-from service.access import CallerHere
-from service.dependencies import JobId
-from service.metrics import WebMetrics
-from service.problems import ProblemError, declared
-from workers.errors import NotFound, Unavailable
+from service.http.access import CallerHere
+from service.http.dependencies import JobId
+from service.http.metrics import WebMetrics
+from service.http.problems import ProblemError, declared
 from workers.records import JobUpdate
+from workers.settings.errors import NotFound, Unavailable
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
 KEEP_ALIVE_S = 15.0

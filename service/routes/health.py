@@ -9,12 +9,12 @@ from fastapi.responses import PlainTextResponse, Response
 
 from biresnerf.wire.problems import FieldProblem
 from biresnerf.wire.service import Health
-from service.access import may_scrape
-from service.dependencies import Service, ServiceHere
-from service.metrics import Exposition
-from service.problems import ProblemError, declared
-from workers.errors import Unavailable
-from workers.monitor import Need
+from service.http.access import may_scrape
+from service.http.dependencies import Service, ServiceHere
+from service.http.metrics import Exposition
+from service.http.problems import ProblemError, declared
+from workers.settings.errors import Unavailable
+from workers.upkeep.monitor import Need
 
 router = APIRouter(tags=["service"])
 _CODES: dict[Need, str] = {

@@ -10,13 +10,20 @@ from pydantic import AwareDatetime
 
 from biresnerf.wire.jobs import CancelJob, JobList, JobState, JobView, NewJob
 from biresnerf.wire.problems import FieldProblem
-from service.access import CallerHere, JobWriterHere
-from service.conditions import none_match
-from service.dependencies import JobId, next_link
-from service.job_answers import POLL_S, checked_key, job_answer, job_etag, preferred_wait_s, waited_for
-from service.json_body import json_content, read_json
-from service.one_shot import submit_form
-from service.problems import ProblemError, declared
+from service.answers.job_answers import (
+    POLL_S,
+    checked_key,
+    job_answer,
+    job_etag,
+    preferred_wait_s,
+    waited_for,
+)
+from service.http.access import CallerHere, JobWriterHere
+from service.http.dependencies import JobId, next_link
+from service.http.http_conditionals import none_match
+from service.http.problems import ProblemError, declared
+from service.intake.json_body import json_content, read_json
+from service.routes.one_shot import submit_form
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 _ALWAYS = ("database_unavailable", "internal_error")

@@ -8,12 +8,12 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Response
 
 from biresnerf import __version__
-from biresnerf.config import PRESETS, RefineOptions
+from biresnerf.options.refine_options import PRESETS, RefineOptions
 from biresnerf.wire.service import Info, OptionsView, SizeLimits
-from service.access import CallerHere
-from service.conditions import none_match
-from service.intake import RATIO_MAX
-from service.problems import declared
+from service.http.access import CallerHere
+from service.http.http_conditionals import none_match
+from service.http.problems import declared
+from service.intake.archive_import import RATIO_MAX
 
 router = APIRouter(tags=["service"])
 ARCHIVES = ["application/zip", "application/x-tar", "application/gzip"]

@@ -11,12 +11,12 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import Response, StreamingResponse
 
 from biresnerf.wire.results import NewShare, ShareView
-from service.access import JobWriterHere
-from service.dependencies import JobId, ServiceHere
-from service.downloads import ANSWERS, Asked, answer_with, find_artifact
-from service.json_body import json_content, read_json
-from service.problems import declared
-from service.share_links import require_signature, signature
+from service.answers.downloads import ANSWERS, Asked, answer_with, find_artifact
+from service.answers.share_links import require_signature, signature
+from service.http.access import JobWriterHere
+from service.http.dependencies import JobId, ServiceHere
+from service.http.problems import declared
+from service.intake.json_body import json_content, read_json
 
 _POST = (
     *("malformed_json", "body_too_large", "unsupported_media", "body_timeout", "invalid_request"),

@@ -8,13 +8,13 @@ from fastapi import APIRouter, Depends, Request
 
 from biresnerf.wire.datasets import FileView, NewSignedUploads, SignedUpload, SignedUploads
 from biresnerf.wire.safe_paths import checked_path
-from service.access import Caller, DatasetWriterHere
-from service.dependencies import DatasetId, UploadId
-from service.json_body import json_content, read_json
-from service.problems import ProblemError, declared
-from service.views import file_view, upload_view
-from workers.errors import NotFound
+from service.answers.views import file_view, upload_view
+from service.http.access import Caller, DatasetWriterHere
+from service.http.dependencies import DatasetId, UploadId
+from service.http.problems import ProblemError, declared
+from service.intake.json_body import json_content, read_json
 from workers.records import Upload
+from workers.settings.errors import NotFound
 
 router = APIRouter(prefix="/v1", tags=["uploads"])
 _BODY = ("malformed_json", "unsupported_media", "body_timeout", "invalid_request")

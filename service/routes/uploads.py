@@ -18,12 +18,12 @@ from fastapi.responses import JSONResponse, Response
 
 from biresnerf.wire.datasets import UploadView, upload_url
 from biresnerf.wire.safe_paths import checked_path
-from service.access import CallerHere, DatasetWriterHere
-from service.dependencies import DatasetId, UploadId
-from service.intake import begin_taking
-from service.problems import ProblemError, declared
-from service.uploads import capped, refuse_announced_excess
-from service.views import upload_view
+from service.answers.views import upload_view
+from service.http.access import CallerHere, DatasetWriterHere
+from service.http.dependencies import DatasetId, UploadId
+from service.http.problems import ProblemError, declared
+from service.intake.archive_import import begin_taking
+from service.intake.uploads import capped, refuse_announced_excess
 from workers.records import Upload
 
 VERSION = "1.0.0"

@@ -17,10 +17,10 @@ from biresnerf.wire.webhooks import (
     delivery_path,
     webhook_url,
 )
-from service.access import CallerHere, JobWriterHere
-from service.dependencies import DeliveryId, WebhookId, next_link
-from service.json_body import json_content, read_json
-from service.problems import declared
+from service.http.access import CallerHere, JobWriterHere
+from service.http.dependencies import DeliveryId, WebhookId, next_link
+from service.http.problems import declared
+from service.intake.json_body import json_content, read_json
 
 router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 _ALWAYS = ("database_unavailable", "internal_error")

@@ -15,8 +15,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from biresnerf.data import map_images
-from biresnerf.data.synthetic import render_synthetic, synthetic_cameras
+from biresnerf.data.seeding import map_images
+from biresnerf.data.synthetic.scene import render_synthetic, synthetic_cameras
 from biresnerf.errors import InputError
 
 WIDTH, HEIGHT = 20, 16

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from biresnerf.data.images import load_images
-from biresnerf.data.read import read_dataset
-from biresnerf.data.write import write_transforms
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.formats.transforms.write_transforms import write_transforms
+from biresnerf.data.photos.images import load_images
 
 ROOT = Path(os.environ.get("BIRESNERF_TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
 # Name, number of frames, camera model, dialect, background.

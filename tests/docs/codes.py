@@ -6,7 +6,7 @@ import ast
 import re
 from collections.abc import Iterator
 
-from service.problems import CATALOGUE
+from service.http.problems import CATALOGUE
 from tests.docs.documented import ROOT
 
 # Those whose first argument, or `code`, is the code.
@@ -37,7 +37,7 @@ def codes_in_use() -> dict[str, str]:
     places = dict.fromkeys(_RAISED, 0)
     for tree in trees.values():
         places |= _functions_that_take_a_code(tree)
-    found = dict.fromkeys(CATALOGUE, "service/problems.py")
+    found = dict.fromkeys(CATALOGUE, "service/http/problems.py")
     for place, tree in trees.items():
         found |= {
             code: place for code in _codes(tree, places | _CLASSMETHODS.get(place, {})) if code not in found

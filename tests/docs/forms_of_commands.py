@@ -12,10 +12,10 @@ from pathlib import Path
 
 import click
 
-from biresnerf.config import parse_options
+from biresnerf.options.refine_options import parse_options
 from docs.generate.commands_page import all_commands as click_commands
 from tests.docs.documented import ROOT
-from workers.settings import Settings
+from workers.settings.settings import Settings
 
 VARIABLES = {f"BIRESNERF_{name.upper()}" for name in Settings.model_fields}
 # Read by commands, not settings of the service.

@@ -9,7 +9,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from tests.docs.small_runs import small_runs
-from workers.run import main
+from workers.run.job_process import main
 
 if __name__ == "__main__":
     with small_runs():

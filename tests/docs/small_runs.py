@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-import biresnerf.commands.make_scene
+import biresnerf.commands.poses.make_scene
 import biresnerf.pipeline
-from biresnerf.config import RefineOptions, parse_options
+from biresnerf.options.refine_options import RefineOptions, parse_options
 
 VIEWS, SIZE = 8, 24
 # Choices are kept, sizes are not.
@@ -48,7 +48,7 @@ def made_small(options: RefineOptions) -> RefineOptions:
 def small_runs() -> Iterator[None]:
     """While it lasts, every refinement of this process is a small one, and every scene that is made."""
     refine: Callable[..., Any] = biresnerf.pipeline.refine_poses
-    make: Callable[..., Any] = biresnerf.commands.make_scene.make_scene
+    make: Callable[..., Any] = biresnerf.commands.poses.make_scene.make_scene
 
     def small(scene: Any, output: Any, options: RefineOptions, *more: Any, **named: Any) -> Any:
         return refine(scene, output, made_small(options), *more, **named)
@@ -58,5 +58,5 @@ def small_runs() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(biresnerf.pipeline, "refine_poses", small)
-        patch.setattr(biresnerf.commands.make_scene, "make_scene", few)
+        patch.setattr(biresnerf.commands.poses.make_scene, "make_scene", few)
         yield

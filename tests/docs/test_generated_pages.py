@@ -7,10 +7,10 @@ import re
 
 import pytest
 
-from biresnerf.config import RefineOptions
+from biresnerf.options.refine_options import RefineOptions
 from docs.generate.commands_page import all_commands
 from docs.generate.pages import ROOT, generated
-from workers.settings import Settings
+from workers.settings.settings import Settings
 
 PAGES = generated()
 

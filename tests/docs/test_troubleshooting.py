@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import get_args
 
-from biresnerf.config import RefineOptions
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.report import VerdictName
 from tests.docs.codes import codes_in_use
 from tests.docs.documented import ROOT

@@ -21,8 +21,8 @@ from click.testing import CliRunner
 
 import biresnerf.pipeline
 from biresnerf.command_line import cli
-from biresnerf.commands.make_scene import make_scene
-from biresnerf.config import RefineOptions
+from biresnerf.commands.poses.make_scene import make_scene
+from biresnerf.options.refine_options import RefineOptions
 from tests.docs.forms_of_commands import command_context, words_of
 from tests.docs.small_runs import SIZE, VIEWS, small_runs
 from tests.service.conftest import Running, finished, new_dataset, operator, ready_dataset

@@ -14,7 +14,7 @@ import torch
 if importlib.util.find_spec("triton") is not None and not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"
     try:
-        for module in ("biresnerf.field.cuda_field", "biresnerf.field.cuda.lens"):
+        for module in ("biresnerf.field.cuda.field", "biresnerf.field.cuda.lens"):
             importlib.import_module(module)
         with contextlib.suppress(ImportError):  # not in every version; else loaded at the first launch
             importlib.import_module("triton.experimental.gluon")

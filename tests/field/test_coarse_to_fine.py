@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.field import reference
 from biresnerf.field.coarse_to_fine import band_weights, level_mixing, level_weights
-from biresnerf.field.cpu_field import CpuField
+from biresnerf.field.cpu.field import CpuField
 from biresnerf.field.grid_field import GridField
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldRates, FieldShape, Marching, PositionGradient, Rays
-from biresnerf.field.reference_field import ReferenceField
+from biresnerf.field.reference import operations as reference
+from biresnerf.field.reference.field import ReferenceField
 
 CPU = torch.device("cpu")
 STEPS, LEVELS = 40_000, 16

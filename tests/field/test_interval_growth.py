@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from biresnerf.field import reference
 from biresnerf.field.occupancy import interval_growth
+from biresnerf.field.reference import operations as reference
 
 
 def test_cells_are_judged_by_the_length_of_the_intervals_that_cross_them():

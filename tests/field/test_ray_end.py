@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.field import reference
+from biresnerf.field.cpu.field import CpuField
 from biresnerf.field.cpu.samples import MOST_SEGMENTS, SEGMENT, segments
-from biresnerf.field.cpu_field import CpuField
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldShape, Marching, PositionGradient, Rays
-from biresnerf.field.reference_field import ReferenceField
+from biresnerf.field.reference import operations as reference
+from biresnerf.field.reference.field import ReferenceField
 
 CPU = torch.device("cpu")
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from biresnerf.field import reference
 from biresnerf.field.backends import make_field
-from biresnerf.field.cpu_field import CpuField
+from biresnerf.field.cpu.field import CpuField
 from biresnerf.field.grid_field import GridField
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldRates, FieldShape, PositionGradient
-from biresnerf.field.reference_field import ReferenceField
+from biresnerf.field.reference import operations as reference
+from biresnerf.field.reference.field import ReferenceField
 from tests.field.test_coarse_to_fine import MARCHING, rays
 
 CPU = torch.device("cpu")

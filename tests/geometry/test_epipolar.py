@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from biresnerf.data.synthetic import synthetic_cameras
+from biresnerf.data.synthetic.scene import synthetic_cameras
 from biresnerf.geometry.epipolar import epipolar_angles, match_depths
 from biresnerf.geometry.similarity import Similarity
 

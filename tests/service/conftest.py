@@ -23,10 +23,10 @@ import httpx
 import pytest
 from click.testing import CliRunner
 
-from biresnerf.data.synthetic import write_synthetic_scene
-from service.keys_command import keys_command
-from service.tenants_command import tenants_command
-from workers.tether import tethered
+from biresnerf.data.synthetic.scene import write_synthetic_scene
+from service.commands.keys import keys_command
+from service.commands.tenants import tenants_command
+from workers.process.die_with_parent import tethered
 
 PROGRAM = Path(__file__).with_name("quick_program.py")
 MIB = 2**20

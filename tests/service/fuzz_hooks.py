@@ -8,7 +8,7 @@ from pathlib import Path
 import schemathesis
 from hypothesis import strategies
 
-from biresnerf.data.synthetic import write_synthetic_scene
+from biresnerf.data.synthetic.scene import write_synthetic_scene
 from tests.service.conftest import scene_files, zip_of
 
 with tempfile.TemporaryDirectory() as folder:

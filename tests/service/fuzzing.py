@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 
 import httpx
 
-from biresnerf.data.synthetic import write_synthetic_scene
+from biresnerf.data.synthetic.scene import write_synthetic_scene
 from tests.service.conftest import (
     PROGRAM,
     Running,

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 import httpx
 
 from service.app import create_app
-from workers.settings import Settings
+from workers.settings.settings import Settings
 
 
 @asynccontextmanager

@@ -1,4 +1,4 @@
-"""A job program for the tests: the protocol of `workers.run`, real result files, no torch.
+"""A job program for the tests: the protocol of `workers.run.job_process`, real result files, no torch.
 
 `steps` says how many steps, `seed` how many milliseconds each takes; `threads=77` fails as a diverged job does.
 """
@@ -12,9 +12,9 @@ import sys
 import time
 from pathlib import Path
 
-from biresnerf.config import parse_options
+from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import Progress
-from service.examples import EXAMPLES
+from service.docs.examples import EXAMPLES
 
 folder = Path(sys.argv[1])
 order = json.loads((folder / "job.json").read_text())

@@ -13,9 +13,9 @@ import httpx
 import pytest
 
 from biresnerf.client import Client
-from service.request_context import RequestContext
+from service.http.request_context import RequestContext
 from tests.service.conftest import Running, finished, ready_dataset, submit
-from tests.service.test_events import until_ready, web_process
+from tests.service.routes.test_events import until_ready, web_process
 
 
 def test_a_long_poll_is_answered_when_the_service_stops(

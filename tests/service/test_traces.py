@@ -93,6 +93,6 @@ def test_a_job_is_one_trace_from_the_callers_span_to_its_last_stage(
 
 
 def test_without_traces_nothing_of_opentelemetry_is_set_up() -> None:
-    program = "import sys, service.server, workers.slot; print('opentelemetry.sdk' in sys.modules)"
+    program = "import sys, service.server, workers.queue.slot; print('opentelemetry.sdk' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -12,7 +12,7 @@ import pytest
 from service import web_page
 from service.app import create_app
 from tests.service.conftest import Running, client_with, problem
-from workers.settings import Settings
+from workers.settings.settings import Settings
 
 
 @pytest.fixture

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from biresnerf.config import RefineOptions
-from biresnerf.data.read import read_dataset
-from biresnerf.data.synthetic import synthetic_cameras, write_synthetic_scene
-from biresnerf.data.write import write_transforms
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.formats.transforms.write_transforms import write_transforms
+from biresnerf.data.synthetic.scene import synthetic_cameras, write_synthetic_scene
 from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
 from biresnerf.report import Report
 from biresnerf.viewer.report_html import BUNDLE

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import hatch_build
-from biresnerf.data.renders import ramp_colours
+from biresnerf.data.show.renders import ramp_colours
 from biresnerf.geometry.pose_error import turned_deg
 from biresnerf.geometry.pose_interpolation import interpolate_pose
 

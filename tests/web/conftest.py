@@ -23,7 +23,7 @@ from playwright.sync_api import (
 )
 
 import hatch_build
-from biresnerf.commands.make_scene import make_scene_command
+from biresnerf.commands.poses.make_scene import make_scene_command
 from tests.service.conftest import Running, running_service, short_folder
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,7 +1,7 @@
 """A job program for the tests of the page: finds ever more matches in a set, as COLMAP might, until it is ended.
 
-The protocol of `workers.run` and the library's own previews; no COLMAP, no torch. Where the given poses are to be
-taken, which need no matches, the real program takes over.
+The protocol of `workers.run.job_process` and the library's own previews; no COLMAP, no torch. Where the given poses
+are to be taken, which need no matches, the real program takes over.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import sys
 import time
 from pathlib import Path
 
-from biresnerf.data.read import read_dataset
-from biresnerf.data.seeding_preview import write_seeding_preview
-from biresnerf.data.seeding_progress import SeedingProgress
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.seeding.seeding_preview import write_seeding_preview
+from biresnerf.data.seeding.seeding_progress import SeedingProgress
 from biresnerf.progress import Progress
 
 LOOK_S = 0.5
@@ -25,7 +25,7 @@ signal.signal(signal.SIGTERM, lambda *_: ended.append(True))
 folder = Path(sys.argv[1])
 order = json.loads((folder / "job.json").read_text())
 if order["options"].get("start") == "given":
-    os.execv(sys.executable, [sys.executable, "-m", "workers.run", str(folder)])
+    os.execv(sys.executable, [sys.executable, "-m", "workers.run.job_process", str(folder)])
 preview = folder / order["output"] / "preview"
 preview.mkdir(parents=True)
 dataset = read_dataset(folder / order["input"])

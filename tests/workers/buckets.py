@@ -18,7 +18,7 @@ import pytest
 from botocore.config import Config
 from moto.server import ThreadedMotoServer
 
-from workers.file_places import Bucket
+from workers.store.file_places import Bucket
 
 S3RVER = "s3rver@3.7.1"
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "biresnerf-tests"

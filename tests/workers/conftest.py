@@ -20,13 +20,13 @@ import psutil
 import psycopg
 import pytest
 
-from biresnerf.config import RefineOptions
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.jobs import Job
-from workers.embedded_postgres import EmbeddedPostgres
-from workers.errors import Unavailable
-from workers.migrate import migrate
-from workers.settings import Settings
-from workers.stores import Stores, open_stores
+from workers.database.embedded_postgres import EmbeddedPostgres
+from workers.database.migrate import migrate
+from workers.engine import Stores, open_stores
+from workers.settings.errors import Unavailable
+from workers.settings.settings import Settings
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("counting_program.py")
@@ -120,7 +120,7 @@ class Slots:
     def start(self, settings: Settings, name: str) -> subprocess.Popen[bytes]:
         return self.run(
             settings,
-            [sys.executable, "-m", "workers.slot", "--slot", name],
+            [sys.executable, "-m", "workers.queue.slot", "--slot", name],
             self._folder / f"slot-{name}.log",
         )
 

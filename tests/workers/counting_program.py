@@ -1,4 +1,4 @@
-"""A job program that counts: the same protocol as `workers.run`, with faults on order and without torch.
+"""A job program that counts: the same protocol as `workers.run.job_process`, with faults on order and without torch.
 
 The dataset's ``plan.json`` says how many steps, how long each takes and what goes wrong.
 """
@@ -13,7 +13,7 @@ import sys
 import time
 from pathlib import Path
 
-from biresnerf.config import parse_options
+from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import Progress
 
 folder = Path(sys.argv[1])
@@ -98,7 +98,7 @@ for step in range(start + 1, plan["steps"] + 1):
         show(step)
     size = parse_options(order["options"]).resolved().max_image_size or 0
     if plan.get("hungry", 0) and step == 3 and size > plan["hungry"]:
-        sys.exit(4)  # as `workers.run` says that memory ran out
+        sys.exit(4)  # as `workers.run.job_process` says that memory ran out
     if stopping and plan.get("slow_to_end"):
         (output / "poses.json").write_text("half of a result")
     elif stopping and not plan.get("deaf"):

@@ -1,0 +1,1 @@
+"""The field's CPU backend: kernels in Numba, tested against `reference`."""

@@ -1,6 +1,6 @@
 """Hash and dense grid encodings in Numba: forward with Jacobian, gradient to positions, table update.
 
-The definition is `biresnerf.field.reference.encode`. Layout, chosen so that every inner loop runs over samples
+The definition is `field.reference.operations.encode`. Layout, chosen so that every inner loop runs over samples
 with unit stride: features [2 levels, n], Jacobian [levels, 6, n] (d feature 0 / dxyz, d feature 1 / dxyz); both
 features of an entry share one 8-byte word, so a corner costs one load.
 """

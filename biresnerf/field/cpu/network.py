@@ -1,7 +1,7 @@
 """The two small networks in Numba, block by block: encoded point -> 16 outputs, the first of them the density's;
 those and the view -> colour.
 
-The definition is `biresnerf.field.reference.network`. Weights are flattened: w1 [64, width], w2 [16, 64],
+The definition is `biresnerf.field.reference.operations.network`. Weights are flattened: w1 [64, width], w2 [16, 64],
 w3 [64, 32], w4 [64, 64], w5 [4, 64] (three colours and a row of zeros).
 """
 

@@ -1,6 +1,6 @@
 """Ray marching through the occupancy grid and gradients to rays, in Numba.
 
-The definitions are in `biresnerf.field.reference`. Rays live in the unit frame; the encoding sees positions in
+The definitions are in `field.reference.operations`. Rays live in the unit frame; the encoding sees positions in
 [0, 1]: (x + 1) / 2 when the scene is bounded, (contract(x) + 2) / 4 when it is not.
 """
 

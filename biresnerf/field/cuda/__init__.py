@@ -1,0 +1,1 @@
+"""The field's CUDA backend: kernels in Triton, tested against `reference`."""

@@ -1,6 +1,6 @@
 """Hash and dense grid encodings in Triton: forward with Jacobian, gradient to positions, table gradient, table Adam.
 
-The definition is `biresnerf.field.reference.encode`. Layout: features [2 levels, capacity], Jacobian [levels, 6,
+The definition is `field.reference.operations.encode`. Layout: features [2 levels, capacity], Jacobian [levels, 6,
 capacity] (d feature 0 / dxyz, d feature 1 / dxyz), so that neighbouring threads touch neighbouring samples. Both
 features of an entry are read as one 8-byte word. Programs run level by level, so that one level's table stays in the
 L2 cache.

@@ -1,4 +1,4 @@
-"""Viewing directions of pixels in one Triton kernel: `biresnerf.geometry.camera.directions_in_cam`.
+"""Viewing directions of pixels in one Triton kernel: `biresnerf.geometry.camera.camera.directions_in_cam`.
 
 There, Newton's method asks after every step whether it is done, and the host would wait for the answer. Here all its
 steps are taken.
@@ -11,8 +11,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from biresnerf.geometry.camera import Intrinsics
-from biresnerf.geometry.distortion import NEWTON_STEPS
+from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.camera.distortion import NEWTON_STEPS
 
 BLOCK = 128
 NEAR_AXIS = tl.constexpr(1e-16)  # squared radians, as in the geometry

@@ -1,6 +1,6 @@
 """The small networks in Triton: each block of samples goes through all layers without leaving the chip.
 
-The definition is `biresnerf.field.reference.network`. Weights stay in float32; products take TF32 inputs (10 bits of
+The definition is `field.reference.operations.network`. Weights stay in float32; products take TF32 inputs (10 bits of
 mantissa, as float16, with float32's range, so that gradients need no scaling) and add up in float32. The backward
 pass computes the activations again. Weight gradients are summed by a fixed number of programs, each over its own
 blocks in order, and then over the programs in order: no atomics.

@@ -1,6 +1,6 @@
 """Ray marching through the occupancy grid, compositing, view harmonics and gradients to rays, in Triton.
 
-The definitions are in `biresnerf.field.reference`. Rays live in the unit frame, positions in [0, 1]. Every sum over
+The definitions are in `field.reference.operations`. Rays live in the unit frame, positions in [0, 1]. Every sum over
 the samples of a ray is taken by one program in a fixed order.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from biresnerf.field.reference import LEAST_TRANSMITTANCE
+from biresnerf.field.reference.operations import LEAST_TRANSMITTANCE
 
 LEAST = tl.constexpr(LEAST_TRANSMITTANCE)
 OPAQUE = tl.constexpr(100.0)  # e^-100 is 0 in float32; larger numbers would cost the sums their last digits

@@ -68,7 +68,7 @@ export interface ArtifactList {
   items: ArtifactView[];
 }
 
-/** `report` of a dataset, written by workers/check.py; not in the interface's description. */
+/** `report` of a dataset, written by workers/datasets/dataset_check_process.py; not in the interface's description. */
 export interface CheckReport {
   images: number;
   with_pose: number;

@@ -9,7 +9,7 @@ import pytest
 
 from tests.workers.conftest import Slots
 from tests.workers.webhooks.webhook_receiver import Dispatchers, hook_settings
-from workers.settings import Settings
+from workers.settings.settings import Settings
 
 
 @pytest.fixture

@@ -17,13 +17,13 @@ from tests.workers.webhooks.webhook_receiver import (
     concluded,
     queued_job,
 )
-from workers.database import open_database
-from workers.errors import Conflict
-from workers.follow import Listener
-from workers.outbound import Outbound, Policy
-from workers.settings import Settings
-from workers.stores import Stores
-from workers.webhook_sender import _CLAIM, WebhookSender, outcome_of, pause, retry_after
+from workers.database.database import open_database
+from workers.database.notifications import Listener
+from workers.engine import Stores
+from workers.settings.errors import Conflict
+from workers.settings.settings import Settings
+from workers.webhooks.outbound import Outbound, Policy
+from workers.webhooks.webhook_sender import _CLAIM, WebhookSender, outcome_of, pause, retry_after
 
 pytestmark = pytest.mark.anyio
 

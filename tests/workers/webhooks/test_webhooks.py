@@ -14,10 +14,10 @@ from tests.workers.webhooks.webhook_receiver import (
     concluded,
     queued_job,
 )
-from workers.database import open_database
-from workers.errors import LimitReached, NotFound
-from workers.settings import Settings
-from workers.stores import Stores
+from workers.database.database import open_database
+from workers.engine import Stores
+from workers.settings.errors import LimitReached, NotFound
+from workers.settings.settings import Settings
 
 pytestmark = pytest.mark.anyio
 

@@ -12,12 +12,12 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from biresnerf.config import RefineOptions
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.webhooks import WebhookDelivery
 from tests.workers.conftest import Slots, quick_settings, ready_dataset
-from workers.dispatcher import dispatch
-from workers.settings import Settings
-from workers.stores import Stores
+from workers.engine import Stores
+from workers.settings.settings import Settings
+from workers.upkeep.dispatcher import dispatch
 
 PATIENCE_S = 20.0
 
@@ -108,7 +108,7 @@ class Dispatchers:
         self._tasks.append(asyncio.create_task(dispatch(settings or self._settings, self._stop)))
 
     def start_process(self) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "workers.dispatcher"]
+        command = [sys.executable, "-m", "workers.upkeep.dispatcher"]
         return self._slots.run(self._settings, command, self._folder / "dispatcher.log")
 
     async def end(self) -> None:

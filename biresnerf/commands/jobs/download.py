@@ -1,0 +1,42 @@
+"""`biresnerf download JOB --output OUT`: the files of a result."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import click
+
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.jobs.follow_job import fetch
+from biresnerf.commands.jobs.service_options import JOB, JobName, json_option, service_at, service_options
+
+
+@click.command("download")
+@click.argument("job", type=JOB)
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@click.option("--output", "-o", required=True, type=click.Path(path_type=Path), help="Folder for the files.")
+@click.option("--replace", is_flag=True, help="Overwrite files of other content.")
+@service_options
+@json_option
+def download_command(
+    job: JobName,
+    names: tuple[str, ...],
+    output: Path,
+    replace: bool,
+    url: str | None,
+    api_key: str | None,
+    as_json: bool,
+) -> None:
+    """Download the result of JOB, or its files of these names (with * and ?; a folder stands for what is in it).
+
+    What is there already is not sent again, and what was interrupted goes on where it broke off. Of a running job
+    these are its previews, of a cancelled or failed one what there is.
+    """
+    with service_at(url, api_key, job) as client:
+        found = client.job(job.id)
+        files = fetch(client, found, output, names=names or ("*",), replace=replace)
+    if as_json:
+        print_json({"job": found, "files": [str(path) for path in files]})
+    else:
+        click.echo(f"{len(files)} files in {os.path.relpath(output)}")

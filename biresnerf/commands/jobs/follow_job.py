@@ -1,0 +1,110 @@
+"""What comes after a job is queued, for every command that queues one: its address, waiting, its files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from biresnerf.commands import exit_codes
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.jobs.job_progress import BytesView, JobProgressView, watch
+from biresnerf.errors import InputError
+
+if TYPE_CHECKING:
+    from biresnerf.client import Client
+    from biresnerf.wire.jobs import JobView
+
+
+timeout_option = click.option(
+    "--timeout",
+    "timeout_s",
+    type=click.FloatRange(0, min_open=True),
+    metavar="SECONDS",
+    help="Wait no longer; the job goes on, and the exit status is 7.",
+)
+
+
+def follow_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a click command `--wait`, `--timeout` and `--output`."""
+    wait = click.option("--wait", is_flag=True, help="Show progress until the job is over.")
+    output = click.option(
+        "--output", "-o", type=click.Path(path_type=Path), help="Download the result here; implies --wait."
+    )
+    return wait(timeout_option(output(command)))
+
+
+def require_empty(folder: Path | None) -> None:
+    """Raises `InputError` where downloads would mix with other files."""
+    if folder is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(
+            "output_not_empty",
+            "is not an empty folder.",
+            where=str(folder),
+            mend="Name a new folder for the results.",
+        )
+
+
+def see_through(
+    client: Client, job: JobView, *, wait: bool, timeout_s: float | None, output: Path | None, as_json: bool
+) -> None:
+    """Print where the job is; wait for it and fetch its files where that is wanted. Raises `JobFailed`."""
+    if not as_json:
+        click.echo(f"{client.url}{job.links.self}")
+    if wait or timeout_s is not None or output is not None:
+        job = waited_for(client, job, timeout_s, as_json=as_json)
+        if as_json:
+            print_json(job)
+        require_success(job)
+        if output is not None:
+            count = len(fetch(client, job, output))
+            click.echo(f"{count} files in {os.path.relpath(output)}", err=as_json)
+    elif as_json:
+        print_json(job)
+
+
+def waited_for(client: Client, job: JobView, timeout_s: float | None, *, as_json: bool) -> JobView:
+    """The job once it is over, with its progress on standard error.
+
+    Ctrl-C, ``timeout_s`` and a service that stays away end the waiting, not the job: it is said how to come back to it.
+    """
+    from biresnerf.client import JobNotOver, ServiceError
+
+    try:
+        with JobProgressView() as view:
+            return watch(client, job, view, timeout_s)
+    except KeyboardInterrupt:
+        _tell_how_to_come_back(client, job)
+        raise click.exceptions.Exit(exit_codes.SIGINT) from None
+    except JobNotOver:
+        if as_json:
+            print_json(client.job(job.id))
+        _tell_how_to_come_back(client, job)
+        raise click.exceptions.Exit(exit_codes.NOT_OVER) from None
+    except ServiceError as error:
+        if error.retryable:
+            _tell_how_to_come_back(client, job)
+        raise
+
+
+def _tell_how_to_come_back(client: Client, job: JobView) -> None:
+    address = f"{client.url}{job.links.self}"
+    click.echo(f"The job goes on. To wait again: biresnerf wait {address}", err=True)
+    click.echo(f"To end it: biresnerf cancel {address}", err=True)
+
+
+def require_success(job: JobView) -> None:
+    """Raises `JobFailed` unless the job has succeeded."""
+    from biresnerf.client import JobFailed
+
+    if job.state != "succeeded":
+        raise JobFailed(job)
+
+
+def fetch(client: Client, job: JobView, output: Path, **how: Any) -> list[Path]:
+    """The job's files below ``output``, with a bar; an interrupted one is taken up again by the same command."""
+    with BytesView("downloading") as view:
+        return client.download_all(job.id, output, on_bytes=view.more, **how)

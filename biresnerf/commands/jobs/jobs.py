@@ -1,0 +1,194 @@
+"""Commands about jobs of a service: `status`, `list`, `wait`, `logs`, `cancel`, `delete`."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any, get_args
+
+import click
+
+from biresnerf.commands import exit_codes
+from biresnerf.commands.answers import print_json, table
+from biresnerf.commands.jobs.follow_job import require_success, timeout_option, waited_for
+from biresnerf.commands.jobs.job_progress import left_of, numbers_of, stage_of
+from biresnerf.commands.jobs.service_options import JOB, JobName, json_option, service_at, service_options
+from biresnerf.wire.jobs import JobState, JobView
+
+if TYPE_CHECKING:
+    from biresnerf.client import Client
+
+_LOG_EVERY_S = 1.0
+
+
+@click.command("status")
+@click.argument("job", type=JOB)
+@service_options
+@json_option
+def status_command(job: JobName, url: str | None, api_key: str | None, as_json: bool) -> None:
+    """Show how far JOB is (its id, or its address as `submit` prints it)."""
+    with service_at(url, api_key, job) as client:
+        found = client.job(job.id)
+    if as_json:
+        print_json(found)
+    else:
+        click.echo("\n".join(described(found)))
+
+
+def described(job: JobView) -> list[str]:
+    """A job in lines for people."""
+    lines = [f"{job.id}  {stage_of(job)}"]
+    if job.state == "running":
+        lines.append(f"  {100 * job.progress.fraction:.0f} %  {numbers_of(job)}  left {left_of(job)}")
+    if job.cancel_requested and not job.final:
+        lines.append("  was asked to end")
+    if job.attempt > 1:
+        lines.append(f"  attempt {job.attempt}")
+    if job.partial:
+        lines.append("  partial result: the best poses until it was stopped")
+    if job.verdict is not None:
+        lines.append(f"  verdict: {job.verdict}")
+    if job.error is not None:
+        error = job.error
+        lines.append("  " + " ".join(part for part in (f"{error.code}:", error.detail, error.mend) if part))
+    if job.labels:
+        lines.append("  " + "  ".join(f"{name}={value}" for name, value in job.labels.items()))
+    if job.expires_at is not None:
+        lines.append(f"  files are kept until {job.expires_at:%Y-%m-%d %H:%M %Z}")
+    return lines
+
+
+@click.command("list")
+@click.option("--state", type=click.Choice(get_args(JobState)), help="Only those in this state.")
+@click.option("--label", metavar="NAME=VALUE", help="Only those with this label.")
+@click.option("--limit", type=click.IntRange(1), default=20, show_default=True, help="The newest so many.")
+@service_options
+@json_option
+def list_command(
+    state: JobState | None, label: str | None, limit: int, url: str | None, api_key: str | None, as_json: bool
+) -> None:
+    """List jobs, the newest first."""
+    wanted = None
+    if label is not None:
+        name, separator, value = label.partition("=")
+        if not separator:
+            raise click.BadParameter(f"{label!r} is not NAME=VALUE", param_hint="--label")
+        wanted = (name, value)
+    with service_at(url, api_key) as client:
+        found = client.jobs(state=state, label=wanted, limit=limit)
+    if as_json:
+        print_json({"items": found})
+        return
+    rows = [
+        (
+            job.id,
+            stage_of(job),
+            f"{100 * job.progress.fraction:.0f} %",
+            f"{job.created_at:%Y-%m-%d %H:%M}",
+            job.verdict or (job.error.code if job.error else "-"),
+            " ".join(f"{name}={value}" for name, value in job.labels.items()),
+        )
+        for job in found
+    ]
+    click.echo(table(rows) if rows else "no jobs")
+
+
+@click.command("wait")
+@click.argument("job", type=JOB)
+@timeout_option
+@service_options
+@json_option
+def wait_command(
+    job: JobName, timeout_s: float | None, url: str | None, api_key: str | None, as_json: bool
+) -> None:
+    """Show the progress of JOB until it is over. Exit status 0: it succeeded; 3: it did not.
+
+    Ctrl-C ends the waiting, not the job.
+    """
+    with service_at(url, api_key, job) as client:
+        over = waited_for(client, client.job(job.id), timeout_s, as_json=as_json)
+        if as_json:
+            print_json(over)
+        require_success(over)
+        if not as_json:
+            click.echo("\n".join(described(over)))
+
+
+@click.command("logs")
+@click.argument("job", type=JOB)
+@click.option("--follow", "-f", is_flag=True, help="Go on until the job is over.")
+@click.option("--after", type=click.IntRange(0), default=0, help="Only lines after this number.")
+@service_options
+@json_option
+def logs_command(
+    job: JobName, follow: bool, after: int, url: str | None, api_key: str | None, as_json: bool
+) -> None:
+    """Print what the process of JOB has written so far."""
+    if follow and as_json:
+        raise click.UsageError("--follow has no end that --json could wait for; `biresnerf wait --json` has.")
+    lines = []
+    with service_at(url, api_key, job) as client:
+        while True:
+            # The state first: what is written between the two looks is not missed.
+            over = client.job(job.id).final
+            while page := client.log(job.id, after=after):
+                after = page[-1].n
+                lines += page
+                if not as_json:
+                    click.echo("\n".join(line.text for line in page))
+            if over or not follow:
+                break
+            _sleep_or_leave(client, job)
+    if as_json:
+        print_json({"items": lines})
+
+
+def _sleep_or_leave(client: Client, job: JobName) -> None:
+    try:
+        time.sleep(_LOG_EVERY_S)
+    except KeyboardInterrupt:
+        click.echo(f"The job goes on: biresnerf wait {client.url}/v1/jobs/{job.id}", err=True)
+        raise click.exceptions.Exit(exit_codes.SIGINT) from None
+
+
+@click.command("cancel")
+@click.argument("job", type=JOB)
+@click.option("--keep-partial", is_flag=True, help="Keep the best poses so far as its result.")
+@click.option("--wait", is_flag=True, help="Until it has ended.")
+@timeout_option
+@service_options
+@json_option
+def cancel_command(
+    job: JobName,
+    keep_partial: bool,
+    wait: bool,
+    timeout_s: float | None,
+    url: str | None,
+    api_key: str | None,
+    as_json: bool,
+) -> None:
+    """End JOB. One that is over already stays as it is."""
+    with service_at(url, api_key, job) as client:
+        found = client.cancel(job.id, keep_partial=keep_partial)
+        if (wait or timeout_s is not None) and not found.final:
+            found = waited_for(client, found, timeout_s, as_json=as_json)
+    if as_json:
+        print_json(found)
+    else:
+        click.echo("\n".join(described(found)) if found.final else f"{found.id} was asked to end")
+
+
+@click.command("delete")
+@click.argument("jobs", metavar="JOB...", nargs=-1, required=True, type=JOB)
+@service_options
+@json_option
+def delete_command(jobs: tuple[JobName, ...], url: str | None, api_key: str | None, as_json: bool) -> None:
+    """Delete jobs that are over, with their results and exports."""
+    deleted: list[Any] = []
+    for job in jobs:
+        with service_at(url, api_key, job) as client:
+            client.delete_job(job.id)
+        deleted.append(job.id)
+        if not as_json:
+            click.echo(f"deleted {job.id}")
+    if as_json:
+        print_json({"deleted": deleted})

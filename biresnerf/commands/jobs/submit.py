@@ -1,0 +1,100 @@
+"""`biresnerf submit PATH`: a scene of this machine to a service, and its result back."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from biresnerf.commands import exit_codes
+from biresnerf.commands.jobs.follow_job import follow_options, require_empty, see_through
+from biresnerf.commands.jobs.job_progress import SendingView
+from biresnerf.commands.jobs.service_options import json_option, service_at, service_options
+from biresnerf.commands.settings_option import settings_option
+
+if TYPE_CHECKING:
+    from biresnerf.client import Client, Sending
+    from biresnerf.options.refine_options import RefineOptions
+    from biresnerf.wire.jobs import JobView
+
+
+def _labels(_context: click.Context, _parameter: click.Parameter, texts: tuple[str, ...]) -> dict[str, str]:
+    labels = {}
+    for text in texts:
+        name, separator, value = text.partition("=")
+        if not separator or not name or not value:
+            raise click.BadParameter(f"{text!r} is not NAME=VALUE")
+        labels[name] = value
+    return labels
+
+
+label_option = click.option(
+    "--label", "labels", multiple=True, metavar="NAME=VALUE", callback=_labels, help="To find the job by."
+)
+
+
+@click.command("submit")
+@click.argument("path", type=click.Path(path_type=Path))
+@click.option("--preset", help="fast, balanced, quality or paper.")
+@settings_option
+@follow_options
+@click.option(
+    "--priority", type=click.Choice(["low", "normal", "high"]), default="normal", show_default=True,
+    help="Jobs of a higher one run first; your tenant may be allowed less.",
+)  # fmt: skip
+@label_option
+@click.option("--resume", metavar="DATASET", help="Go on with the dataset of an interrupted submission.")
+@service_options
+@json_option
+def submit_command(
+    path: Path,
+    preset: str | None,
+    settings: dict[str, Any],
+    wait: bool,
+    timeout_s: float | None,
+    output: Path | None,
+    url: str | None,
+    api_key: str | None,
+    as_json: bool,
+    **how: Any,
+) -> None:
+    """Send PATH (a folder, or a file with poses in a folder of images) to a service as a job.
+
+    Only what the service lacks is sent. Prints the job's address. Ctrl-C while waiting leaves the job running.
+    """
+    from biresnerf.options.refine_options import parse_options
+
+    options = parse_options({**settings, **({"preset": preset} if preset else {})})
+    require_empty(output)
+    with service_at(url, api_key) as client:
+        job = submitted(client, path, options, **how)
+        see_through(client, job, wait=wait, timeout_s=timeout_s, output=output, as_json=as_json)
+
+
+def submitted(client: Client, path: Path, options: RefineOptions, **how: Any) -> JobView:
+    """The job of a folder, with what is sent on standard error. Ctrl-C says how to go on."""
+    last: Sending | None = None
+
+    def note(sending: Sending) -> None:
+        nonlocal last
+        last = sending
+        view.sending(sending)
+
+    with SendingView() as view:
+        try:
+            return client.submit(path, options, on_progress=note, **how)
+        except KeyboardInterrupt:
+            _tell_how_to_resume(last, how.get("resume"))
+            raise click.exceptions.Exit(exit_codes.SIGINT) from None
+
+
+def _tell_how_to_resume(last: Sending | None, resumed: str | None) -> None:
+    if last is None or last.dataset_id is None:
+        click.echo("Stopped before anything was sent.", err=True)
+        return
+    again = ["biresnerf", *sys.argv[1:], *(() if resumed else ("--resume", last.dataset_id))]
+    click.echo("Stopped; what has arrived stays there. To go on:", err=True)
+    click.echo(f"  {shlex.join(again)}", err=True)

@@ -1,0 +1,129 @@
+"""What this installation can do on this machine, for `biresnerf doctor`: one small function for each thing needed."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from biresnerf.commands.machine.finding import Check, Found
+
+_COMPILE_S, _IMPORT_S = 900.0, 120.0
+_WORK_BYTES = 2**30
+_SLOW_S = 6.0  # loading from the cache takes less, compiling far more
+
+
+def versions() -> Found:
+    """Python, and the packages that results depend on."""
+    known = []
+    for name in ("biresnerf", "torch", "numba", "numpy", "pycolmap"):
+        try:
+            known.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    return Found("versions", "good", f"Python {platform.python_version()}, {', '.join(known)}")
+
+
+def processor() -> Found:
+    """Cores that this process may use."""
+    from biresnerf.studies.commands.comparison_options import machine
+
+    return Found("processor", "good", machine())
+
+
+def kernels() -> Found:
+    """The CPU kernels, compiled or loaded in a process of their own."""
+    # Processor time: on a busy machine loading takes long, too.
+    code = (
+        "import time; from biresnerf.field.cpu.compile_kernels import compile_kernels; began = time.process_time();"
+        "compile_kernels(); print(time.process_time() - began)"
+    )
+    done = _in_child(code, _COMPILE_S)
+    if isinstance(done, str):
+        return Found(
+            "kernels", "broken", done, "Reinstall numba and its llvmlite: pip install --force-reinstall numba"
+        )
+    seconds = float(done.stdout.split()[-1])
+    how = "compiled" if seconds > _SLOW_S else "loaded from the cache"
+    return Found("kernels", "good", f"{how} in {seconds:.1f} s of processor time")
+
+
+def gpu() -> Found:
+    """Whether the CUDA kernels can run; none is needed."""
+    code = (
+        "import json, torch; from biresnerf.field.backends import cuda_problem; p = cuda_problem();"
+        "print(json.dumps([p, None if p else torch.cuda.get_device_name()]))"
+    )
+    done = _in_child(code, _IMPORT_S)
+    if isinstance(done, str):
+        return Found("GPU", "broken", done, "Reinstall torch: https://pytorch.org/get-started/locally/")
+    problem, name = json.loads(done.stdout.splitlines()[-1])
+    if problem is not None:
+        return Found(
+            "GPU", "missing", f"none used: {problem}", "Not needed: the CPU kernels do the same. docs/cuda.md"
+        )
+    return Found("GPU", "good", name)
+
+
+def colmap() -> Found:
+    """pycolmap, loaded in a process of its own as `refine` does."""
+    if importlib.util.find_spec("pycolmap") is None:
+        return Found(
+            "COLMAP", "missing", "is not installed: images without poses cannot find theirs by features",
+            "pip install 'biresnerf[colmap]'",
+        )  # fmt: skip
+    done = _in_child("import zlib, pycolmap; print(pycolmap.__version__)", _IMPORT_S)
+    if isinstance(done, str):
+        return Found("COLMAP", "broken", done, "pip install --force-reinstall pycolmap")
+    return Found("COLMAP", "good", f"pycolmap {done.stdout.strip()}, in its own process")
+
+
+def video() -> Found:
+    """The encoder of the orbit video."""
+    import imageio_ffmpeg
+
+    try:
+        return Found("video", "good", Path(imageio_ffmpeg.get_ffmpeg_exe()).name)
+    except RuntimeError as error:
+        return Found("video", "broken", str(error), "pip install --force-reinstall imageio-ffmpeg")
+
+
+def report_page() -> Found:
+    """What report.html is made of."""
+    from biresnerf.viewer.report_html import BUNDLE
+
+    if (BUNDLE / "report.js").is_file():
+        return Found("report page", "good", "built")
+    return Found("report page", "missing", "is not built: results come without report.html", "make web")
+
+
+def scratch() -> Found:
+    """Room for work files."""
+    folder = Path(tempfile.gettempdir())
+    free = shutil.disk_usage(folder).free
+    detail = f"{free / 2**30:.1f} GiB free in {folder}"
+    if free > _WORK_BYTES:
+        return Found("work files", "good", detail)
+    return Found("work files", "broken", detail, "Make room, or name another folder in TMPDIR.")
+
+
+CHECKS: Sequence[Check] = (versions, processor, kernels, gpu, colmap, video, report_page, scratch)
+
+
+def _in_child(code: str, limit_s: float) -> subprocess.CompletedProcess[str] | str:
+    """What a piece of Python printed, or why it failed: a crash there is a finding here."""
+    try:
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=limit_s)
+    except subprocess.TimeoutExpired:
+        return f"did not answer within {limit_s:.0f} s"
+    if done.returncode != 0:
+        last = done.stderr.strip().splitlines()[-1:] or ["nothing was said"]
+        return f"failed ({done.returncode}): {last[0]}"
+    return done

@@ -1,0 +1,1 @@
+"""Commands that work on files of this machine: refine, convert, export, inspect, evaluate ..."""

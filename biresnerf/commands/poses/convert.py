@@ -1,0 +1,89 @@
+"""`biresnerf convert INPUT OUTPUT --to FORM`: poses from one form into others, nothing optimised."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.jobs.follow_job import require_empty
+from biresnerf.commands.jobs.service_options import json_option
+
+if TYPE_CHECKING:
+    from biresnerf.data.formats.convert import FormName, Photos
+
+FORMS = (
+    "transforms",
+    "colmap",
+    "colmap-text",
+    "instant-ngp",
+    "tum",
+    "kitti",
+    "bundler",
+    "llff",
+    "pinhole",
+    "poses",
+    "scene",
+)
+
+
+@click.command("convert")
+@click.argument("input_path", metavar="INPUT", type=click.Path(path_type=Path))
+@click.argument("output", type=click.Path(path_type=Path))
+@click.option(
+    "--to", "forms", required=True, multiple=True, type=click.Choice(FORMS), help="A form; may be repeated."
+)
+@click.option(
+    "--photos", type=click.Choice(["link", "copy", "none"]), default="link", show_default=True,
+    help="How images and masks come into OUTPUT.",
+)  # fmt: skip
+@click.option(
+    "--bounds", nargs=2, type=click.FloatRange(0, min_open=True), metavar="NEAR FAR",
+    help="Of depth, in the set's units, for llff. Default: of the points that each image sees.",
+)  # fmt: skip
+@json_option
+def convert_command(
+    input_path: Path,
+    output: Path,
+    forms: tuple[FormName, ...],
+    photos: Photos,
+    bounds: tuple[float, float] | None,
+    as_json: bool,
+) -> None:
+    """Write the poses of INPUT, in any form that `refine` reads, into the new folder OUTPUT in other forms.
+
+    World, scale and names stay as they are. Images without a pose are left out, and named. docs/formats.md says what
+    each form holds. For the result of `refine` there is `export`.
+    """
+    require_empty(output)
+    if bounds is not None and bounds[0] >= bounds[1]:
+        raise click.BadParameter("NEAR must be less than FAR.", param_hint="--bounds")
+    from biresnerf.data.formats.convert import convert
+    from biresnerf.data.formats.read_dataset import read_dataset
+
+    dataset = read_dataset(input_path)
+    done = convert(dataset, tuple(dict.fromkeys(forms)), output, photos, bounds)
+    warnings = [*dataset.warnings, *done.notes]
+    if as_json:
+        print_json(_document(done.places, len(dataset) - len(done.left_out), done.left_out, warnings))
+        return
+    for form, place in done.places.items():
+        click.echo(f"{form} in {os.path.relpath(place)}")
+    if done.left_out:
+        click.echo(f"left out, without a pose: {', '.join(done.left_out)}", err=True)
+    for warning in warnings:
+        click.echo(f"warning: {warning}", err=True)
+
+
+def _document(
+    places: dict[FormName, Path], images: int, left_out: tuple[str, ...], warnings: list[str]
+) -> dict[str, Any]:
+    return {
+        "forms": {form: str(place) for form, place in places.items()},
+        "images": images,
+        "left_out": left_out,
+        "warnings": warnings,
+    }

@@ -1,0 +1,151 @@
+"""`biresnerf inspect INPUT`: what is in a folder, and what `refine` would do with it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.jobs.service_options import json_option
+from biresnerf.commands.settings_option import settings_option
+from biresnerf.options.refine_options import PRESETS, RefineOptions, parse_options
+
+if TYPE_CHECKING:
+    from biresnerf.data.model.dataset import Dataset
+
+
+@click.command("inspect")
+@click.argument("input_path", metavar="INPUT", type=click.Path(path_type=Path))
+@click.option(
+    "--preset", type=click.Choice(list(PRESETS)), help="What would be done with it. Default: balanced."
+)
+@settings_option
+@click.option("--pixels", is_flag=True, help="Decode every image too, to find damaged ones.")
+@json_option
+def inspect_command(
+    input_path: Path, preset: str | None, settings: dict[str, Any], pixels: bool, as_json: bool
+) -> None:
+    """Show what INPUT holds and what `refine` would do with it, without doing it.
+
+    Everything is checked that `refine` checks before it starts, except pixels, unless --pixels asks for them.
+    """
+    options = parse_options({**settings, **({"preset": preset} if preset else {})}).resolved()
+    from biresnerf.data.formats.read_dataset import read_dataset
+    from biresnerf.data.photos.images import load_images
+
+    dataset = read_dataset(input_path)
+    missing_names = sorted(set(options.fixed) - {*dataset.names, *dataset.file_names})
+    if pixels:
+        load_images(dataset, options.max_image_size, options.background)
+    found = {**contents(dataset), "pixels_checked": pixels, "plan": plan(dataset, options)}
+    found["warnings"] += [f"fixed names no image: {name}" for name in missing_names]
+    if as_json:
+        print_json(found)
+    else:
+        click.echo("\n".join(_lines(found)))
+
+
+def contents(dataset: Dataset) -> dict[str, Any]:
+    """What the set holds."""
+    taken = Counter(frame.camera for frame in dataset.frames)
+    return {
+        "folder": str(dataset.root),
+        "form": dataset.source.dialect,
+        "pose_files": [str(file) for file in dataset.source.files or filter(None, [dataset.source.file])],
+        "images": len(dataset),
+        "with_pose": int(dataset.posed.sum()),
+        "without_pose": [f.name for f in dataset.frames if f.world_from_cam is None],
+        "masks": sum(frame.mask is not None for frame in dataset.frames),
+        "cameras": [
+            {
+                "model": camera.model,
+                "width": camera.width,
+                "height": camera.height,
+                "params": camera.params,
+                "intrinsics": dataset.source_of_intrinsics(index),
+                "images": taken[index],
+            }
+            for index, camera in enumerate(dataset.cameras)
+        ],
+        "warnings": list(dataset.warnings),
+    }
+
+
+def plan(dataset: Dataset, options: RefineOptions) -> dict[str, Any]:
+    """What `refine` would do with resolved options."""
+    from biresnerf.data.photos.images import working_size
+
+    sizes = [
+        working_size(camera.width, camera.height, options.max_image_size)
+        for camera in map(dataset.camera_of, range(len(dataset)))
+    ]
+    return {
+        "preset": options.preset,
+        "start": start_in_words(dataset, options),
+        "steps": options.steps,
+        "working_size": max(sizes),
+        "photo_bytes": sum(3 * width * height for width, height in sizes),
+        # Steps take as long as their samples, which nobody knows before there is a field.
+        "seconds": None,
+    }
+
+
+def start_in_words(dataset: Dataset, options: RefineOptions) -> str:
+    """Where the poses would come from that the optimisation starts from."""
+    from biresnerf.data.seeding.match_poses import can_match
+
+    start, missing = options.start or "auto", int((~dataset.posed).sum())
+    none, all_given = missing == len(dataset), missing == 0
+    if start == "given":
+        if all_given:
+            return "the given poses, as they are"
+        return f"refused: start=given, and {missing} images have no pose"
+    if start == "none":
+        return (
+            "the given poses"
+            if all_given
+            else f"{missing} poses are guessed from other images, without features"
+        )
+    if not can_match():
+        if start == "colmap" or none:
+            return "refused: the poses have to be found, and COLMAP is not installed (pip install 'biresnerf[colmap]')"
+        guessed = f"; {missing} are guessed from other images" if missing else ""
+        return (
+            f"the given poses, without comparing them with feature matches: COLMAP is not installed{guessed}"
+        )
+    if start == "colmap":
+        return "COLMAP's poses, whatever is given"
+    if none:
+        return "COLMAP finds the poses of all images, in a frame and scale of its own"
+    found = f"; feature matches find the {missing} missing ones in their frame" if missing else ""
+    return f"the given poses, or what feature matches make of them where that predicts unseen views better{found}"
+
+
+def _lines(found: dict[str, Any]) -> list[str]:
+    lines = [f"{found['folder']}: {found['images']} images, {found['form']}"]
+    lines += [f"  poses from {file}" for file in found["pose_files"][:5]]
+    without = found["without_pose"]
+    lines.append(f"  {found['with_pose']} with a pose" + (f", {len(without)} without" if without else ""))
+    lines += [f"    no pose: {name}" for name in without[:10]]
+    if len(without) > 10:
+        lines.append(f"    and {len(without) - 10} more")
+    for camera in found["cameras"]:
+        size = f"{camera['width']} x {camera['height']} px"
+        lines.append(
+            f"  {camera['images']} images by {camera['model']}, {size}, intrinsics {camera['intrinsics']}"
+        )
+    if found["masks"]:
+        lines.append(f"  {found['masks']} masks")
+    wanted = found["plan"]
+    width, height = wanted["working_size"]
+    lines += [
+        f"refine --preset {wanted['preset']} would",
+        f"  start from: {wanted['start']}",
+        f"  take {wanted['steps']} steps on photos of up to {width} x {height} px"
+        f" ({wanted['photo_bytes'] / 2**20:.0f} MiB of pixels)",
+        "  take a time that is not known before it begins; `biresnerf bench` measures steps on this machine",
+    ]
+    return lines + [f"warning: {warning}" for warning in found["warnings"]]

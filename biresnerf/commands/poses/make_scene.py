@@ -1,0 +1,208 @@
+"""`biresnerf make-scene OUT`: a set whose true poses are known, with poses that are wrong, or missing."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.jobs.service_options import json_option
+from biresnerf.errors import InputError
+
+if TYPE_CHECKING:
+    from biresnerf.data.model.dataset import Dataset
+
+KINDS = {
+    "dome": "cameras on a dome above textured shapes; each pose is turned at random",
+    "phone": "a phone's walk around a table; poses drift, focal length 1 % too long",
+    "half": "the same walk as a COLMAP model that lacks half of the images",
+    "vase": "a plain vase without background; each pose is turned at random",
+}
+_FOCAL_TOO_LONG = 1.01
+
+
+@dataclass(frozen=True)
+class MadeScene:
+    """What was written: a set of so many images, of which so many have a pose, and the file of their true poses."""
+
+    folder: Path
+    images: int
+    with_pose: int
+    truth: Path
+
+    def __str__(self) -> str:
+        said = f", of which the COLMAP model in sparse/0 has {self.with_pose}"
+        without = said if self.with_pose < self.images else ""
+        return f"{self.images} views in {self.folder}{without}, true poses in {self.truth}"
+
+
+@click.command("make-scene")
+@click.argument("output", type=click.Path(path_type=Path))
+@click.option(
+    "--kind",
+    type=click.Choice(list(KINDS)),
+    default="dome",
+    show_default=True,
+    help="; ".join(f"{kind}: {text}" for kind, text in KINDS.items()) + ".",
+)
+@click.option(
+    "--of",
+    "own",
+    type=click.Path(path_type=Path),
+    help="Take these images and poses, in any form that `refine` reads, for true instead of making some.",
+)
+@click.option("--views", type=click.IntRange(3, 400), default=60, show_default=True, help="Images.")
+@click.option("--size", type=click.IntRange(16, 800), default=100, show_default=True, help="Their width, px.")
+@click.option(
+    "--noise",
+    type=click.FloatRange(0, 1),
+    default=0.15,
+    show_default=True,
+    help="BARF's sigma, for dome and vase.",
+)
+@click.option(
+    "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of scene and noise."
+)
+@json_option
+def make_scene_command(
+    output: Path, kind: str, own: Path | None, views: int, size: int, noise: float, seed: int, as_json: bool
+) -> None:
+    """Write images with wrong or missing poses to OUTPUT, and the true poses beside it.
+
+    The true poses are in OUTPUT.truth.json; `biresnerf evaluate` compares a result with them.
+    """
+    made = make_scene(output, kind, own=own, views=views, size=size, noise=noise, seed=seed)
+    if as_json:
+        print_json(
+            {
+                "folder": str(made.folder),
+                "images": made.images,
+                "with_pose": made.with_pose,
+                "truth": str(made.truth),
+            }
+        )
+    else:
+        click.echo(str(made))
+
+
+def make_scene(
+    output: Path,
+    kind: str = "dome",
+    *,
+    own: Path | None = None,
+    views: int = 60,
+    size: int = 100,
+    noise: float = 0.15,
+    seed: int = 0,
+) -> MadeScene:
+    """Writes a set of a kind of `KINDS` to `output`, and its true poses to OUTPUT.truth.json.
+
+    Args:
+        own: a set with poses, in any form that is read, to make wrong instead of rendering one.
+        size: width of the images (px), of those rendered.
+        noise: standard deviation of the poses' noise, as BARF has it, of the kinds that are turned at random.
+
+    Raises:
+        InputError: `output` is not empty, or `own` cannot be read or lacks poses.
+    """
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise InputError(
+            "output_not_empty", "is not an empty folder.", where=str(output), mend="Name a new folder."
+        )
+    from biresnerf.data.formats.transforms.read_transforms import read_transforms
+
+    path = _copied(own, output) if own else _made(output, kind, views, size, seed)
+    truth = output.with_name(f"{output.name}.truth.json")
+    shutil.copyfile(path, truth)
+    dataset = read_transforms(path)
+    if kind == "half":
+        return MadeScene(output, len(dataset), _keep_half(dataset, path), truth)
+    _make_wrong(dataset, path, kind, noise, seed)
+    return MadeScene(output, len(dataset), len(dataset), truth)
+
+
+def _made(output: Path, kind: str, views: int, size: int, seed: int) -> Path:
+    """A rendered set with true poses; its transforms.json."""
+    from biresnerf.data.synthetic.captures import write_vase, write_walk
+    from biresnerf.data.synthetic.scene import write_synthetic_scene
+
+    write = {"dome": write_synthetic_scene, "vase": write_vase}.get(kind, write_walk)
+    return write(output, views, size, seed)
+
+
+def _copied(own: Path, output: Path) -> Path:
+    """The user's images in `output`, with their poses in a transforms.json of nerfstudio's dialect."""
+    import numpy as np
+
+    from biresnerf.data.formats.read_dataset import read_dataset
+    from biresnerf.data.formats.transforms.write_transforms import write_transforms
+    from biresnerf.data.model.dataset import SourceFormat
+
+    dataset = read_dataset(own)
+    if not dataset.posed.all():
+        raise InputError(
+            "poses_missing",
+            f"{int((~dataset.posed).sum())} of {len(dataset)} images have no pose that could be taken for true.",
+            where=str(own),
+            mend="Give a set with all poses, for example a result of `biresnerf refine`.",
+        )
+    frames = []
+    for name, frame in zip(dataset.file_names, dataset.frames, strict=True):
+        copy = output / "images" / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(frame.path, copy)
+        frames.append(replace(frame, path=copy, raw={}))
+    copied = replace(
+        dataset,
+        root=output,
+        frames=tuple(frames),
+        source=SourceFormat("nerfstudio", None, {}, np.eye(4)),
+    )
+    path = output / "transforms.json"
+    write_transforms(copied, copied.world_from_cam, path)
+    return path
+
+
+def _make_wrong(dataset: Dataset, path: Path, kind: str, noise: float, seed: int) -> None:
+    """Writes wrong poses into the transforms file."""
+    import json
+
+    from biresnerf.data.formats.transforms.write_transforms import write_transforms
+    from biresnerf.data.model.image_order import natural_order
+    from biresnerf.geometry.perturb import drift_like_a_phone, perturb_poses
+
+    true = dataset.world_from_cam
+    if kind != "phone":
+        write_transforms(dataset, perturb_poses(true, noise, seed), path)
+        return
+    order = natural_order(dataset.file_names)
+    drifted = true.copy()
+    drifted[order] = drift_like_a_phone(true[order], seed)
+    write_transforms(dataset, drifted, path)
+    document = json.loads(path.read_text("utf-8"))
+    for part in (document, *document["frames"]):
+        part.update({key: part[key] * _FOCAL_TOO_LONG for key in ("fl_x", "fl_y") if key in part})
+    path.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+
+
+def _keep_half(dataset: Dataset, path: Path) -> int:
+    """Replaces the transforms file by a COLMAP model of the first half of the images; gives how many these are."""
+    from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
+    from biresnerf.data.model.image_order import natural_order
+    from biresnerf.data.model.result_model import model_of_poses
+
+    names = [name.removeprefix("images/") for name in dataset.file_names]
+    kept = natural_order(names)[: (len(names) + 1) // 2]
+    model = model_of_poses(
+        [names[i] for i in kept],
+        dataset.cameras,
+        [dataset.frames[i].camera for i in kept],
+        dataset.world_from_cam[kept],
+    )
+    write_colmap_binary(model, path.parent / "sparse" / "0")
+    path.unlink()
+    return len(kept)

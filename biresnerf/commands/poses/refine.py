@@ -1,0 +1,163 @@
+"""`biresnerf refine INPUT --output OUT`."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import click
+from rich.logging import RichHandler
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as ProgressBar
+
+from biresnerf.commands import exit_codes
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.jobs.service_options import json_option
+from biresnerf.commands.settings_option import settings_option
+from biresnerf.errors import Interrupted
+from biresnerf.options.refine_options import PRESETS, parse_options
+from biresnerf.progress import Progress
+from biresnerf.report import Report
+
+LINE_EVERY = 20  # reports of progress between two lines where there is no terminal
+
+
+class StopRequest:
+    """Turns SIGINT and SIGTERM into a wish to stop; a second signal ends the process at once."""
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, _frame: FrameType | None) -> None:
+        if self.signal is not None:
+            sys.exit(128 + number)
+        self.signal = number
+        click.echo("stopping: writing checkpoint and partial result …", err=True)
+
+    def __call__(self) -> bool:
+        return self.signal is not None
+
+
+class ProgressPrinter:
+    """A bar on a terminal, plain lines elsewhere; on standard error."""
+
+    def __init__(self) -> None:
+        self._bar = ProgressBar(
+            TextColumn("{task.description:<11}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[detail]}"),
+            disable=not sys.stderr.isatty(),
+            transient=True,
+        )
+        self._task = self._bar.add_task("preparing", total=1.0, detail="")
+        self._lines = not sys.stderr.isatty()
+        self._count, self._stage = 0, ""
+
+    def __enter__(self) -> ProgressPrinter:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def __call__(self, progress: Progress) -> None:
+        detail = describe(progress)
+        self._bar.update(self._task, completed=progress.fraction, description=progress.stage, detail=detail)
+        self._count += 1
+        if self._lines and (progress.stage != self._stage or self._count % LINE_EVERY == 0):
+            click.echo(f"{progress.stage:<10} {100 * progress.fraction:3.0f} % {detail}", err=True)
+        self._stage = progress.stage
+
+
+def describe(progress: Progress) -> str:
+    """Step, loss, training PSNR and time left, as far as known."""
+    parts = []
+    if progress.steps_total:
+        parts.append(f"step {progress.step}/{progress.steps_total}")
+    if "loss" in progress.metrics:
+        parts.append(f"loss {progress.metrics['loss']:.5f}")
+    if "psnr" in progress.metrics:
+        parts.append(f"train PSNR {progress.metrics['psnr']:.1f} dB")
+    if progress.eta_s is not None and progress.eta_s > 0:
+        minutes, seconds = divmod(round(progress.eta_s), 60)
+        parts.append(f"{minutes}:{seconds:02d} left")
+    if progress.message:
+        parts.append(progress.message)
+    return "  ".join(parts)
+
+
+@click.command("refine")
+@click.argument("input_path", metavar="INPUT", type=click.Path(path_type=Path))
+@click.option(
+    "--output", "-o", required=True, type=click.Path(path_type=Path), help="Folder for the results."
+)
+@click.option("--preset", type=click.Choice(list(PRESETS)), default=None, help="Default: balanced.")
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default=None, help="Default: auto.")
+@click.option("--seed", type=int, default=None, help="Default: 0.")
+@settings_option
+@click.option("--verbose", "-v", is_flag=True, help="Log what happens.")
+@json_option
+def refine_command(
+    input_path: Path,
+    output: Path,
+    preset: str | None,
+    device: str | None,
+    seed: int | None,
+    settings: dict[str, Any],
+    verbose: bool,
+    as_json: bool,
+) -> int:
+    """Refine the camera poses of INPUT: a folder of images, with poses in any form that is read or without.
+
+    Results go to OUT: transforms.json and colmap/sparse/0 in the input's own frame and scale, report.json,
+    renders/ and config.json. --json prints report.json. The same command goes on where an interrupted one stopped.
+    """
+    named = {"preset": preset, "device": device, "seed": seed}
+    options = parse_options({**settings, **{key: value for key, value in named.items() if value is not None}})
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING,
+        format="%(message)s",
+        handlers=[RichHandler(show_path=False)] if sys.stderr.isatty() else None,
+    )
+    from biresnerf.pipeline import refine_poses
+
+    stop = StopRequest()
+    try:
+        with ProgressPrinter() as printer:
+            report = refine_poses(input_path, output, options, printer, stop)
+    except Interrupted as interrupted:
+        click.echo(str(interrupted), err=True)
+        return 128 + (stop.signal or signal.SIGINT)
+    if as_json:
+        print_json(report)
+    else:
+        click.echo(summary(report, output))
+    return exit_codes.DONE
+
+
+def summary(report: Report, output: Path) -> str:
+    """What a person wants to know at the end."""
+    moved = sorted(image.moved_deg for image in report.images)
+    lines = report.verdict.in_words() if report.verdict is not None else []
+    lines += [
+        f"{len(report.images)} cameras, moved by {moved[len(moved) // 2]:.3g} deg (median), {moved[-1]:.3g} deg (most)",
+        f"{report.options.method}: {report.steps_done} steps"
+        if report.switch_step is None
+        else f"stage 2 began at step {report.switch_step} of {report.steps_done} ({report.switch_reason})",
+    ]
+    if report.heldout:
+        lines.append(
+            f"held-out views ({report.heldout.count}): "
+            f"PSNR {report.heldout.psnr:.2f} dB, SSIM {report.heldout.ssim:.3f}"
+        )
+    lines += [f"warning: {warning}" for warning in report.warnings]
+    lines.append(f"time: {sum(report.seconds.values()):.0f} s; results in {output}")
+    return "\n".join(lines)

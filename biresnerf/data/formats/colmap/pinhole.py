@@ -1,0 +1,208 @@
+"""The pinhole pack: undistorted photos with a PINHOLE model, for programs that know no other lens (3DGS, OpenMVS).
+
+Every camera of it has square pixels and its principal point in the picture's middle, as 3DGS takes for granted (it
+reads two angles of view and no more). Undistortion is our own: COLMAP's keeps the principal point where it was, so
+that 3DGS would shift each picture; ours goes by the exact rays that poses were refined with, and needs no COLMAP.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
+from biresnerf.data.formats.tables.write_bundler import write_bundler
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.colmap_scene import ColmapImage
+from biresnerf.data.model.dataset import Camera, Frame
+from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
+from biresnerf.data.photos.decode import decode
+from biresnerf.data.photos.image_files import quiet_pillow
+from biresnerf.data.show.renders import picture_stems
+from biresnerf.errors import InputError, Interrupted
+from biresnerf.geometry.camera.pixel_rays import pixels_of_points, rays_of_pixels
+
+PINHOLE = "pinhole"
+WIDEST_TANGENT = 1.75  # 60 degrees from the axis: beyond it a flat picture is all stretch
+_JPEG = {"quality": 95, "subsampling": 0}
+_ROWS_AT_ONCE = 256
+_THREADS = 4
+
+
+def pinhole_camera(camera: Camera) -> Camera:
+    """The largest centred pinhole picture that ``camera`` sees all of, as sharp as it in its middle.
+
+    A camera that is one already comes back as it is.
+
+    Raises:
+        InputError: ``pack_not_possible``: nothing is seen around the optical axis.
+    """
+    lens = camera.full()
+    centred = lens.cx == camera.width / 2 and lens.cy == camera.height / 2
+    if lens.fx == lens.fy and centred and not lens.distorted and not lens.fisheye:
+        return Camera("PINHOLE", camera.width, camera.height, (lens.fx, lens.fy, lens.cx, lens.cy))
+    width, height = camera.width, camera.height
+    down, across = np.linspace(0, height, height + 1), np.linspace(0, width, width + 1)
+    sides = [np.stack([np.full_like(down, x), down], 1) for x in (0, width)]
+    caps = [np.stack([across, np.full_like(across, y)], 1) for y in (0, height)]
+    focal = (lens.fx * lens.fy) ** 0.5
+    seen = (
+        min(
+            _tangents(rays_of_pixels(lens, side), axis, sign).min()
+            for side, sign in zip(edges, (-1, 1), strict=True)
+        )
+        for axis, edges in ((0, sides), (1, caps))
+    )
+    new_width, new_height = (int(2 * focal * min(tangent, WIDEST_TANGENT)) for tangent in seen)
+    if new_width < 2 or new_height < 2:
+        raise InputError(
+            "pack_not_possible",
+            "a lens of this set sees nothing around its optical axis.",
+            where=PINHOLE,
+            mend="Check the principal point.",
+        )
+    return Camera("PINHOLE", new_width, new_height, (focal, focal, new_width / 2, new_height / 2))
+
+
+def _tangents(rays: NDArray[np.float64], axis: int, sign: int) -> NDArray[np.float64]:
+    """How far out rays [m, 3] go on one side of the axis, as tangents; infinite to the side and behind."""
+    ahead = rays[:, 2] > 1e-6
+    return np.where(ahead, sign * rays[:, axis] / np.where(ahead, rays[:, 2], 1.0), np.inf)
+
+
+def write_pinhole(refined: RefinedSet, folder: Path, should_stop: Callable[[], bool] = lambda: False) -> None:
+    """Writes images/, sparse/0/, bundle.out, list.txt and names.json (pack's name: caller's name) into ``folder``.
+
+    Photos keep their names without folders, where those differ; JPEG stays JPEG, all else becomes PNG. EXIF data are
+    not carried over.
+
+    Raises:
+        InputError: ``pack_not_possible``, or a code of `decode` for a photo that cannot be read.
+        Interrupted: ``should_stop``, asked before each photo, said so; a folder that was new is gone again.
+    """
+    new = not folder.exists()
+    names = _names(refined)
+    cameras = tuple(pinhole_camera(camera) for camera in refined.cameras)
+
+    def convert(index: int) -> None:
+        if should_stop():
+            raise Interrupted("stopped while photos were written; run again to go on")
+        _write_photo(refined.images[index], refined.camera_of(index), cameras[refined.images[index].camera],
+                     folder / "images" / names[index])  # fmt: skip
+
+    try:
+        with quiet_pillow(), ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+            list(pool.map(convert, range(len(refined))))
+    except Interrupted:
+        if new:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    pack = _as_pinhole(refined, cameras, names)
+    write_colmap_binary(pack.model, folder / "sparse" / "0")
+    write_bundler(pack, folder)
+    with whole_file(folder / "names.json") as temporary:
+        named = dict(zip(names, (image.name for image in refined.images), strict=True))
+        temporary.write_text(json.dumps(named, indent=1, ensure_ascii=False) + "\n", "utf-8")
+
+
+def _names(refined: RefinedSet) -> list[str]:
+    """Plain file names: 3DGS looks for a name's last part only, and tells views apart by what is before its dot."""
+    paths = [PurePosixPath(image.file_name) for image in refined.images]
+    labels = {path.name.split(".")[0].casefold() for path in paths}
+    stems = [path.stem for path in paths]
+    if len(labels) < len(paths):
+        stems = [
+            stem.replace(".", "_") for stem in picture_stems([image.file_name for image in refined.images])
+        ]
+    suffixes = [path.suffix if path.suffix.lower() in (".jpg", ".jpeg", ".png") else ".png" for path in paths]
+    return [stem + suffix for stem, suffix in zip(stems, suffixes, strict=True)]
+
+
+def _as_pinhole(refined: RefinedSet, cameras: tuple[Camera, ...], names: list[str]) -> RefinedSet:
+    """The same set as the pack's cameras see it: features go where their rays meet the new picture."""
+    model = refined.model
+    index_of = {number: row for row, number in enumerate(refined.image_ids)}
+    lenses = dict(model.cameras)
+    images: dict[int, ColmapImage] = {}
+    for number, row in sorted(index_of.items()):
+        image, old, new = model.images[number], refined.camera_of(row), cameras[refined.images[row].camera]
+        lenses[image.camera_id] = new
+        rays = rays_of_pixels(old.full(), image.points2d_px)
+        images[number] = replace(image, name=names[row], points2d_px=pixels_of_points(new.full(), rays))
+    used = {image.camera_id for image in images.values()}
+    model = replace(
+        model, cameras={k: v for k, v in lenses.items() if k in used}, images=images, rigs={}, frames={}
+    )
+    listed = tuple(
+        replace(image, file_name=f"images/{name}") for image, name in zip(refined.images, names, strict=True)
+    )
+    return replace(refined, cameras=cameras, images=listed, model=model)
+
+
+def _write_photo(image: RefinedImage, old: Camera, new: Camera, path: Path) -> None:
+    if image.path is None:
+        raise InputError(
+            "image_missing",
+            "is not known by its file.",
+            where=image.name,
+            mend="Name the folder of the photos (--photos).",
+        )
+    same = (new.width, new.height, new.full()) == (old.width, old.height, old.full())
+    if same and image.orientation == 1 and image.path.suffix == path.suffix:
+        with whole_file(path) as temporary:
+            shutil.copyfile(image.path, temporary)
+        return
+    frame = Frame(image.name, image.path, 0, None, None, orientation=image.orientation)
+    picture = decode(frame, old)
+    flat = picture if same else undistorted(picture, old, new)
+    with whole_file(path) as temporary:
+        saved = Image.fromarray(flat)
+        if path.suffix.lower() == ".png":
+            saved.save(temporary, format="PNG", compress_level=3)
+        else:
+            saved.convert("RGB").save(temporary, format="JPEG", **_JPEG)
+
+
+def undistorted(picture: NDArray[np.uint8], old: Camera, new: Camera) -> NDArray[np.uint8]:
+    """The picture [h, w, channels] that ``old`` took, as the pinhole camera ``new`` at its place would; bilinear.
+
+    Colours of a picture with opacity are weighed by it.
+    """
+    lens, focal, cx, cy = old.full(), new.params[0], new.params[2], new.params[3]
+    values = picture.astype(np.float32)
+    opacity = values.shape[2] == 4
+    if opacity:
+        values[..., :3] *= values[..., 3:] / 255.0
+    flat = np.empty((new.height, new.width, values.shape[2]), dtype=np.uint8)
+    for first in range(0, new.height, _ROWS_AT_ONCE):
+        last = min(first + _ROWS_AT_ONCE, new.height)
+        y, x = np.mgrid[first:last, 0 : new.width] + 0.5
+        rays = np.stack([((x - cx) / focal).ravel(), ((y - cy) / focal).ravel(), np.ones(x.size)], axis=1)
+        rows = _bilinear(values, pixels_of_points(lens, rays) - 0.5)
+        if opacity:
+            rows[:, :3] *= 255.0 / np.maximum(rows[:, 3:], 1e-3)
+        shape = (last - first, new.width, values.shape[2])
+        flat[first:last] = np.clip(np.rint(rows), 0, 255).astype(np.uint8).reshape(shape)
+    return flat
+
+
+def _bilinear(values: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Samples [m, channels] at positions [m, 2] in pixel indices; the border pixel goes on outside."""
+    height, width = values.shape[:2]
+    x, y = np.clip(at[:, 0], 0, width - 1), np.clip(at[:, 1], 0, height - 1)
+    left, top = np.minimum(x.astype(np.int64), width - 2), np.minimum(y.astype(np.int64), height - 2)
+    left, top = np.maximum(left, 0), np.maximum(top, 0)
+    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    a, b = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
+    upper = values[top, left] * (1 - a) + values[top, right] * a
+    lower = values[below, left] * (1 - a) + values[below, right] * a
+    return upper * (1 - b) + lower * b

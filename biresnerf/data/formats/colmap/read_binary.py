@@ -1,0 +1,209 @@
+"""COLMAP's binary tables, parsed field by field; nothing is allocated before the file is known to hold it.
+
+Layouts: src/colmap/scene/reconstruction_io_binary.cc; little-endian throughout. Whether the tables fit each
+other is `biresnerf.data.formats.colmap.model_checks`' to say.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+
+from biresnerf.data.formats.colmap.model_checks import (
+    broken,
+    camera_of_numbers,
+    image_name,
+    model_name_of_id,
+    points_of_records,
+    refuse_repeated,
+    rigid_pose,
+    sensor_type,
+)
+from biresnerf.data.model.colmap_scene import (
+    ColmapFrame,
+    ColmapImage,
+    ColmapPoints,
+    ColmapRig,
+    RigidPose,
+    Sensor,
+)
+from biresnerf.data.model.dataset import Camera
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+
+_U64, _U32, _U8 = struct.Struct("<Q"), struct.Struct("<I"), struct.Struct("<B")
+_CAMERA = struct.Struct("<IiQQ")
+_IMAGE = struct.Struct("<I7dI")
+_SENSOR = struct.Struct("<iI")
+_POSE = struct.Struct("<7d")
+_RIG = struct.Struct("<II")
+_FRAME = struct.Struct("<II7dI")
+_DATA_ID = struct.Struct("<iIQ")
+_POINT = struct.Struct("<Q3d3BdQ")
+_POINT_2D = np.dtype([("xy", "<f8", 2), ("id", "<u8")])
+_POINT_3D = np.dtype(
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
+)
+_MAX_NAME_BYTES = 4096
+
+
+class _Bytes:
+    """A file's content and how far it was read."""
+
+    def __init__(self, data: bytes, file: str) -> None:
+        self.data, self.file, self.at = data, file, 0
+
+    @property
+    def left(self) -> int:
+        return len(self.data) - self.at
+
+    def take(self, form: struct.Struct, what: str) -> tuple[Any, ...]:
+        """The values of ``form``, which are ``what``."""
+        if self.left < form.size:
+            raise broken(self.file, f"ends in the middle of {what}, at byte {len(self.data)}")
+        values = form.unpack_from(self.data, self.at)
+        self.at += form.size
+        return values
+
+    def count(self, form: struct.Struct, least_bytes: int, what: str) -> int:
+        """A number of things that take ``least_bytes`` each at least, checked against what is left."""
+        at = self.at
+        (number,) = self.take(form, f"the number of {what}")
+        if number * least_bytes > self.left:
+            raise broken(self.file, f"names {number} {what} at byte {at}, but only {self.left} bytes follow")
+        return int(number)
+
+    def array(self, dtype: np.dtype[Any], number: int) -> np.ndarray:
+        """``number`` records that `count` has checked."""
+        values = np.frombuffer(self.data, dtype, number, self.at)
+        self.at += number * dtype.itemsize
+        return values
+
+    def name(self, what: str) -> bytes:
+        """The bytes up to the next NUL."""
+        end = self.data.find(b"\0", self.at, self.at + _MAX_NAME_BYTES)
+        if end < 0:
+            raise broken(self.file, f"the name of {what} has no end")
+        name = self.data[self.at : end]
+        self.at = end + 1
+        return name
+
+    def finish(self) -> None:
+        """Refuses bytes after the last record."""
+        if self.left:
+            raise broken(self.file, f"{self.left} bytes follow the last record")
+
+
+def parse_cameras(data: bytes, file: str) -> dict[int, Camera]:
+    """The cameras by id."""
+    source = _Bytes(data, file)
+    cameras: dict[int, Camera] = {}
+    for index in range(source.count(_U64, _CAMERA.size, "cameras")):
+        number, model_id, width, height = source.take(_CAMERA, f"camera {index + 1}")
+        model = model_name_of_id(model_id, f"{file} camera {number}")
+        form = struct.Struct(f"<{len(MODEL_PARAMETERS[model])}d")
+        params = source.take(form, f"the parameters of camera {number}")
+        refuse_repeated(cameras, number, f"{file} camera")
+        cameras[number] = camera_of_numbers(model, width, height, params, f"{file} camera {number}")
+    source.finish()
+    return cameras
+
+
+def parse_images(data: bytes, file: str) -> dict[int, ColmapImage]:
+    """The registered images by id."""
+    source = _Bytes(data, file)
+    images: dict[int, ColmapImage] = {}
+    for index in range(source.count(_U64, _IMAGE.size + 1 + _U64.size, "images")):
+        number, *pose, camera_id = source.take(_IMAGE, f"image {index + 1}")
+        where = f"{file} image {number}"
+        name = image_name(source.name(f"image {number}"), where)
+        points = source.array(_POINT_2D, source.count(_U64, _POINT_2D.itemsize, f"points of image {number}"))
+        if not np.isfinite(points["xy"]).all():
+            raise broken(where, "a feature's position is no finite number", code="pose_not_finite")
+        refuse_repeated(images, number, f"{file} image")
+        images[number] = ColmapImage(
+            number,
+            name,
+            camera_id,
+            rigid_pose(pose, where),
+            points["xy"].astype(np.float64),
+            points["id"].astype(np.int64),  # COLMAP's mark of no point, 2^64 - 1, becomes NO_POINT
+        )
+    source.finish()
+    return images
+
+
+def parse_points(data: bytes, file: str) -> ColmapPoints:
+    """The 3D points in the file's order."""
+    source = _Bytes(data, file)
+    number = source.count(_U64, _POINT.size, "points")
+    records = np.zeros(number, _POINT_3D)
+    flat, tracks = records.view(np.uint8).reshape(number, _POINT_3D.itemsize), []
+    for index in range(number):
+        if source.left < _POINT.size:
+            raise broken(file, f"ends in the middle of point {index + 1}, at byte {len(data)}")
+        at = source.at
+        source.at += _POINT.size - _U64.size
+        length = source.count(_U64, 2 * _U32.size, f"track elements of point {index + 1}")
+        flat[index] = np.frombuffer(data, np.uint8, _POINT.size, at)
+        tracks.append(source.array(np.dtype("<u4"), 2 * length))
+    source.finish()
+    elements = np.concatenate(tracks).reshape(-1, 2) if tracks else np.zeros((0, 2), np.uint32)
+    return points_of_records(
+        records["id"].astype(np.int64),
+        records["xyz"].astype(np.float64),
+        records["rgb"].copy(),
+        records["error"].astype(np.float64),
+        records["length"].astype(np.int64),
+        elements.astype(np.int64),
+        file,
+    )
+
+
+def parse_rigs(data: bytes, file: str) -> dict[int, ColmapRig]:
+    """The rigs by id."""
+    source = _Bytes(data, file)
+    rigs: dict[int, ColmapRig] = {}
+    for index in range(source.count(_U64, _RIG.size, "rigs")):
+        number, sensors = source.take(_RIG, f"rig {index + 1}")
+        where = f"{file} rig {number}"
+        if sensors * _SENSOR.size > source.left:
+            raise broken(where, f"names {sensors} sensors, but only {source.left} bytes follow")
+        reference = _sensor(source, where) if sensors else None
+        others: dict[Sensor, RigidPose | None] = {}
+        for _ in range(sensors - 1):
+            sensor = _sensor(source, where)
+            (has_pose,) = source.take(_U8, f"a sensor of rig {number}")
+            if has_pose > 1:
+                raise broken(where, "a yes or no is neither")
+            pose = rigid_pose(source.take(_POSE, f"a pose of rig {number}"), where) if has_pose else None
+            if sensor in others or sensor == reference:
+                raise broken(where, f"the sensor {sensor[0]} {sensor[1]} stands twice")
+            others[sensor] = pose
+        refuse_repeated(rigs, number, f"{file} rig")
+        rigs[number] = ColmapRig(number, reference, others)
+    source.finish()
+    return rigs
+
+
+def _sensor(source: _Bytes, where: str) -> Sensor:
+    kind, number = source.take(_SENSOR, "a sensor")
+    return sensor_type(kind, where), number
+
+
+def parse_frames(data: bytes, file: str) -> dict[int, ColmapFrame]:
+    """The frames by id."""
+    source = _Bytes(data, file)
+    frames: dict[int, ColmapFrame] = {}
+    for index in range(source.count(_U64, _FRAME.size, "frames")):
+        number, rig_id, *pose, data_count = source.take(_FRAME, f"frame {index + 1}")
+        where = f"{file} frame {number}"
+        if data_count * _DATA_ID.size > source.left:
+            raise broken(where, f"names {data_count} images, but only {source.left} bytes follow")
+        taken = [source.take(_DATA_ID, f"frame {number}") for _ in range(data_count)]
+        refuse_repeated(frames, number, f"{file} frame")
+        data_ids = tuple(((sensor_type(kind, where), sensor), data_id) for kind, sensor, data_id in taken)
+        frames[number] = ColmapFrame(number, rig_id, rigid_pose(pose, where), data_ids)
+    source.finish()
+    return frames

@@ -1,0 +1,156 @@
+"""A COLMAP model and the images it was made of, as a dataset."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from biresnerf.data.formats.bind_images import GivenImage, dataset_of, match_files
+from biresnerf.data.formats.colmap.read_model import ColmapModel, read_colmap_model, world_from_cam_of
+from biresnerf.data.formats.folder import IMAGE_FOLDER, images_below, images_in, visible
+from biresnerf.data.model.dataset import Dataset, SourceFormat
+from biresnerf.data.photos.image_files import read_header
+from biresnerf.data.photos.named_images import few_names
+from biresnerf.data.photos.orientation import same_shape
+from biresnerf.errors import InputError
+
+# Folders beside the poses whose pictures are not the set's photos; `biresnerf convert` writes pinhole/.
+_NO_PHOTOS = frozenset({"masks", "depth", "pinhole"})
+
+
+def read_colmap_dataset(root: Path, model_folder: Path, within: Path | None = None) -> Dataset:
+    """The images of a model, by name, and those beside them that the model has not registered, without pose.
+
+    Images lie in ``root``/images, or in ``root`` itself and those of its folders that the model names.
+
+    Raises:
+        InputError: codes as in docs/input.md.
+    """
+    model = read_colmap_model(model_folder)
+    files = images_beside(root)
+    prefix = f"{IMAGE_FOLDER}/"
+    if model.images and all(image.name.startswith(prefix) for image in model.images.values()):
+        files = {(name if name.startswith(prefix) else prefix + name): path for name, path in files.items()}
+    # Without images/, the model's folders of images lie in the root itself.
+    elsewhere = {image.name: root / image.name for image in model.images.values() if image.name not in files}
+    files |= {name: path for name, path in elsewhere.items() if path.is_file()}
+    refuse_no_images(files, root)
+    registered = sorted(model.images.values(), key=lambda image: image.name)
+    table = "images.bin" if model.form == "binary" else "images.txt"
+    found, notes = match_files(
+        [image.name for image in registered], list(files), lambda i: f"{table} image {registered[i].id}"
+    )
+    given = [
+        GivenImage(
+            image.name,
+            files[file],
+            model.cameras[image.camera_id],
+            world_from_cam_of(image.cam_from_world),
+            f"{table} image {image.id}",
+            camera_id=image.camera_id,
+        )
+        for image, file in zip(registered, found, strict=True)
+    ]
+    for file in sorted(files.keys() - set(found)):
+        number = _likely_camera(model, files[file], file)
+        camera = None if number is None else model.cameras[number]
+        given.append(GivenImage(file, files[file], camera, None, file, camera_id=number))
+    tables = tuple(sorted(path for path in model_folder.iterdir() if path.suffix == Path(table).suffix))
+    source = SourceFormat("colmap", None, {}, np.eye(4), colmap=model, files=tables)
+    ordered = sorted(given, key=lambda image: image.name)
+    dataset = dataset_of(root, ordered, source, [*model.notes, *notes, *_beside_notes(model_folder)], within)
+    return replace(dataset, source=replace(source, colmap=_for_these_images(model, dataset, table)))
+
+
+def image_files(root: Path) -> dict[str, Path]:
+    """As `photos_beside`. Raises InputError ``no_images`` where there are none."""
+    files = photos_beside(root)
+    refuse_no_images(files, root)
+    return files
+
+
+def photos_beside(root: Path) -> dict[str, Path]:
+    """The images beside poses that do not say where theirs are, by path with forward slashes; perhaps none.
+
+    Those of `images_beside`, else those in the one other folder of ``root`` that has images (rgb/ of TUM's sets,
+    train/ of NeRF-synthetic ones), by their path in ``root``.
+    """
+    return images_beside(root) or _images_of_only_folder(root)
+
+
+def _images_of_only_folder(root: Path) -> dict[str, Path]:
+    folders = [path for path in visible(root) if path.is_dir() and path.name not in _NO_PHOTOS]
+    found = [paths for paths in map(images_below, folders) if paths]
+    return {path.relative_to(root).as_posix(): path for path in found[0]} if len(found) == 1 else {}
+
+
+def refuse_no_images(files: dict[str, Path], root: Path) -> None:
+    """Raises InputError ``no_images`` where there are none."""
+    if not files:
+        raise InputError(
+            "no_images",
+            "there are poses, but no images.",
+            where=str(root),
+            mend="Put the images into images/ beside the poses.",
+        )
+
+
+def images_beside(root: Path) -> dict[str, Path]:
+    """The images in ``root``/images, else in ``root``, by their path there; empty where there are none."""
+    folder = root / IMAGE_FOLDER
+    paths = images_below(folder)
+    if not paths:
+        folder, paths = root, images_in(root)
+    return {path.relative_to(folder).as_posix(): path for path in paths}
+
+
+def _for_these_images(model: ColmapModel, dataset: Dataset, table: str) -> ColmapModel:
+    """The model, with cameras and features for the images' true size where the model's are for another."""
+    by_name = {image.name: image for image in model.images.values()}
+    cameras, images, scaled = dict(model.cameras), dict(model.images), set()
+    for index, frame in enumerate(dataset.frames):
+        image = by_name.get(frame.name)
+        if image is None:
+            continue
+        given, fitted = model.cameras[image.camera_id], dataset.camera_of(index)
+        if image.camera_id in scaled and cameras[image.camera_id] != fitted:
+            raise InputError(
+                "mixed_sizes",
+                f"images of camera {image.camera_id} differ in size.",
+                where=f"{table} image {image.id}",
+                mend="Give images of one size, that of the camera.",
+            )
+        scaled.add(image.camera_id)
+        cameras[image.camera_id] = fitted
+        if fitted != given:
+            ratio = (fitted.width / given.width, fitted.height / given.height)
+            images[image.id] = replace(image, points2d_px=image.points2d_px * ratio)
+    return replace(model, cameras=cameras, images=images)
+
+
+def _likely_camera(model: ColmapModel, path: Path, name: str) -> int | None:
+    """Of an image that the model has not: the camera that took most of those of its shape; None where none did."""
+    header = read_header(path, name)
+    uses = Counter(image.camera_id for image in model.images.values())
+    for number, _ in uses.most_common():
+        camera = model.cameras[number]
+        if same_shape(camera.width, camera.height, header.width, header.height):
+            return number
+    return None
+
+
+def _beside_notes(model_folder: Path) -> list[str]:
+    """A note on further models: COLMAP writes sparse/1, sparse/2 where not all images hold together."""
+    if model_folder.name != "0":
+        return []
+    others = sorted(
+        path.name for path in model_folder.parent.iterdir() if path.name.isdecimal() and path.name != "0"
+    )
+    if not others:
+        return []
+    return [
+        f"the model {model_folder.parent.name}/0 was read and the models {few_names(others)} beside it were not"
+    ]

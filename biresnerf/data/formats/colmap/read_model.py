@@ -1,0 +1,196 @@
+"""A COLMAP model (sparse/0) read strictly, without COLMAP: binary or text, with or without rigs and frames.
+
+pycolmap takes truncated files and zero quaternions in silence and allocates whatever a count says; here every
+such file is refused, at once, by an error that says what is wrong with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from biresnerf.data.formats.colmap import read_binary as colmap_binary
+from biresnerf.data.formats.colmap import read_text as colmap_text
+from biresnerf.data.formats.colmap.model_checks import broken, check_images, check_rigs, check_tracks
+from biresnerf.data.model.colmap_scene import (
+    NO_POINT,
+    ColmapFrame,
+    ColmapImage,
+    ColmapModel,
+    ColmapPoints,
+    ColmapRig,
+    ModelForm,
+    RigidPose,
+    no_points,
+)
+from biresnerf.data.model.conventions import rotation_from_quat_wxyz
+from biresnerf.data.model.dataset import Camera
+
+MAX_TABLE_BYTES = 2 * 2**30
+# Where a dataset's model lies, in the order they are looked at; also `sparse_txt`, as `refine` writes it.
+MODEL_FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse", "colmap/sparse", ".", "sparse_txt/0", "sparse_txt")
+_SUFFIXES: dict[ModelForm, str] = {"binary": ".bin", "text": ".txt"}
+# An image's pose by images.bin and by frames.bin are the same motion, up to this much: radians, and the share of
+# the distance.
+_SAME_POSE = 1e-3
+
+__all__ = [
+    "NO_POINT",
+    "ColmapFrame",
+    "ColmapImage",
+    "ColmapModel",
+    "ColmapPoints",
+    "ColmapRig",
+    "RigidPose",
+    "model_forms",
+    "read_colmap_model",
+]
+
+
+def model_forms(folder: Path) -> tuple[ModelForm, ...]:
+    """The forms in which ``folder`` holds a model, binary first, as COLMAP reads them."""
+    return tuple(
+        form
+        for form, suffix in _SUFFIXES.items()
+        if (folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file()
+    )
+
+
+def read_colmap_model(folder: Path) -> ColmapModel:
+    """The model in ``folder``; binary where it holds both forms, and a note says so.
+
+    Raises:
+        InputError: with the file and the id, line or byte; codes as in docs/input.md.
+    """
+    forms = model_forms(folder)
+    if not forms:
+        raise broken(
+            folder.name, "holds no COLMAP model", "input_missing", "Give cameras.bin and images.bin."
+        )
+    form = forms[0]
+    tables = _Tables(folder, form)
+    notes = [f"the binary model in {folder.name} was read and the text model beside it was not"]
+    notes = notes if len(forms) > 1 else []
+    cameras: dict[int, Camera] = tables.required("cameras")
+    images: dict[int, ColmapImage] = tables.required("images")
+    points: ColmapPoints | None = tables.optional("points3D")
+    rigs: dict[int, ColmapRig] | None = tables.optional("rigs")
+    frames: dict[int, ColmapFrame] | None = tables.optional("frames")
+    check_images(images, cameras, tables.file("images"))
+    if points is None:
+        notes.append(f"{tables.file('points3D')} is missing: the model is taken without points")
+        points, images = no_points(), {number: _unseeing(image) for number, image in images.items()}
+    check_tracks(images, points, tables.file("points3D"))
+    if (rigs is None) != (frames is None):
+        there, lacking = ("frames", "rigs") if rigs is None else ("rigs", "frames")
+        raise broken(tables.file(there), f"there is no {tables.file(lacking)} beside it")
+    rigs, frames = rigs or {}, frames or {}
+    if rigs or frames:
+        check_rigs(rigs, frames, cameras, images, tables.file("frames"))
+        images, moved = _with_poses_of_frames(rigs, frames, images)
+        if moved:
+            notes.append(
+                f"{tables.file('images')} and {tables.file('frames')} have different poses for {len(moved)} "
+                f"images ({moved[0]}, ...); the frames' were taken, as COLMAP does"
+            )
+    return ColmapModel(folder, form, cameras, images, points, rigs, frames, tuple(notes))
+
+
+class _Tables:
+    """The files of a model in one form."""
+
+    def __init__(self, folder: Path, form: ModelForm) -> None:
+        self.folder, self.form = folder, form
+        self.parsers: ModuleType = colmap_binary if form == "binary" else colmap_text
+
+    def file(self, table: str) -> str:
+        return table + _SUFFIXES[self.form]
+
+    def required(self, table: str) -> Any:
+        """The parsed table."""
+        return self._parse(table, self.folder / self.file(table))
+
+    def optional(self, table: str) -> Any:
+        """The parsed table, or None where there is no such file."""
+        path = self.folder / self.file(table)
+        return self._parse(table, path) if path.is_file() else None
+
+    def _parse(self, table: str, path: Path) -> Any:
+        parse = getattr(self.parsers, "parse_" + table.removesuffix("3D"))
+        return parse(self._content(path), path.name)
+
+    def _content(self, path: Path) -> bytes | str:
+        try:
+            size = path.stat().st_size
+            if size > MAX_TABLE_BYTES:
+                raise broken(
+                    path.name, f"{size / 2**30:.1f} GiB is more than is read", mend="Split the model."
+                )
+            content = path.read_bytes()
+            return content if self.form == "binary" else content.decode("utf-8-sig")
+        except OSError as error:
+            raise broken(path.name, f"cannot be read: {error.strerror}") from None
+        except UnicodeDecodeError:
+            raise broken(path.name, "is not UTF-8 text") from None
+
+
+def _unseeing(image: ColmapImage) -> ColmapImage:
+    return replace(image, point3d_ids=np.full(len(image.point3d_ids), NO_POINT))
+
+
+def _with_poses_of_frames(
+    rigs: dict[int, ColmapRig], frames: dict[int, ColmapFrame], images: dict[int, ColmapImage]
+) -> tuple[dict[int, ColmapImage], list[str]]:
+    """The images with their frame's pose where their own is another; and the names of these."""
+    images, moved = dict(images), []
+    for frame in frames.values():
+        rig = rigs[frame.rig_id]
+        for sensor, data_id in frame.data_ids:
+            if sensor[0] != "CAMERA":
+                continue
+            cam_from_rig = None if sensor == rig.reference else rig.sensor_from_rig[sensor]
+            if sensor != rig.reference and cam_from_rig is None:
+                continue
+            cam_from_world = composed(cam_from_rig, frame.rig_from_world)
+            if not _same(cam_from_world, images[data_id].cam_from_world):
+                images[data_id] = replace(images[data_id], cam_from_world=cam_from_world)
+                moved.append(images[data_id].name)
+    return images, moved
+
+
+def composed(c_from_b: RigidPose | None, b_from_a: RigidPose) -> RigidPose:
+    """``c_from_a``; None stands for no motion."""
+    if c_from_b is None:
+        return b_from_a
+    (w, x, y, z), (a, b, c, d) = c_from_b.quat_wxyz, b_from_a.quat_wxyz
+    quat_wxyz = np.array(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ]
+    )
+    turned = rotation_from_quat_wxyz(c_from_b.quat_wxyz) @ b_from_a.translation
+    return RigidPose(quat_wxyz, turned + c_from_b.translation)
+
+
+def _same(one: RigidPose, other: RigidPose) -> bool:
+    unit, unit_other = (pose.quat_wxyz / np.linalg.norm(pose.quat_wxyz) for pose in (one, other))
+    turned = 2.0 * min(np.linalg.norm(unit - unit_other), np.linalg.norm(unit + unit_other))
+    far = max(1.0, float(np.linalg.norm(one.translation)))
+    return bool(
+        turned < _SAME_POSE and np.linalg.norm(one.translation - other.translation) < _SAME_POSE * far
+    )
+
+
+def world_from_cam_of(cam_from_world: RigidPose) -> np.ndarray:
+    """The pose as float64 [4, 4]."""
+    rotation = rotation_from_quat_wxyz(cam_from_world.quat_wxyz).T
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ cam_from_world.translation
+    return pose

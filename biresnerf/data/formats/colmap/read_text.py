@@ -1,0 +1,235 @@
+"""COLMAP's text tables, parsed line by line.
+
+Layouts: src/colmap/scene/reconstruction_io_text.cc. An image's name is the whole rest of its line: COLMAP's own
+reader cuts it at the first space, which loses names that COLMAP's own writer wrote.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.formats.colmap.model_checks import (
+    broken,
+    camera_of_numbers,
+    image_name,
+    points_of_records,
+    refuse_repeated,
+    rigid_pose,
+    sensor_type,
+    supported_model,
+)
+from biresnerf.data.model.colmap_scene import (
+    ColmapFrame,
+    ColmapImage,
+    ColmapPoints,
+    ColmapRig,
+    RigidPose,
+    Sensor,
+    no_points,
+)
+from biresnerf.data.model.dataset import Camera
+
+T = TypeVar("T")
+_MAX_ID = 2**63 - 1
+_SENSOR_NUMBERS = {"CAMERA": 0, "IMU": 1}
+_NO_POINT_WORDS = ("-1", str(2**64 - 1))
+
+
+class _Words:
+    """The words of one line, taken from the left."""
+
+    def __init__(self, line: str, where: str) -> None:
+        self.words, self.where, self.at = line.split(), where, 0
+
+    def word(self, what: str) -> str:
+        if self.at >= len(self.words):
+            raise broken(self.where, f"the line ends before {what}")
+        self.at += 1
+        return self.words[self.at - 1]
+
+    def integer(self, what: str) -> int:
+        word = self.word(what)
+        if not (word.isascii() and word.isdecimal() and len(word) < 20) or int(word) > _MAX_ID:
+            raise broken(self.where, f"{what} is {word[:40]!r}, not a whole number")
+        return int(word)
+
+    def numbers(self, count: int, what: str) -> list[float]:
+        words = [self.word(what) for _ in range(count)]
+        return list(floats(words, self.where, what))
+
+    def finish(self) -> None:
+        if self.at < len(self.words):
+            raise broken(self.where, f"{len(self.words) - self.at} words more than the line should have")
+
+
+def floats(words: list[str], where: str, what: str) -> NDArray[np.float64]:
+    """The words as float64 [n], NaN and infinity among them. Raises InputError where one is no number."""
+    try:
+        return np.array([float(word) for word in words], dtype=np.float64)
+    except ValueError:
+        raise broken(where, f"{what}: not a number") from None
+
+
+def _integers(words: list[str], where: str, what: str) -> NDArray[np.int64]:
+    try:
+        return np.array([int(word) for word in words], dtype=np.int64)
+    except (ValueError, OverflowError):
+        raise broken(where, f"{what}: not a whole number") from None
+
+
+def _lines(text: str, file: str) -> Iterator[tuple[str, str]]:
+    """Each line that says something, and where it stands."""
+    for number, line in enumerate(text.split("\n"), start=1):
+        stripped = line.strip()
+        if stripped and not stripped.startswith("#"):
+            yield stripped, f"{file} line {number}"
+
+
+def _table(text: str, file: str, parse: Callable[[_Words], tuple[int, T]]) -> dict[int, T]:
+    table: dict[int, T] = {}
+    for line, where in _lines(text, file):
+        words = _Words(line, where)
+        number, row = parse(words)
+        words.finish()
+        refuse_repeated(table, number, f"{where}: id")
+        table[number] = row
+    return table
+
+
+def parse_cameras(text: str, file: str) -> dict[int, Camera]:
+    """The cameras by id."""
+
+    def camera(words: _Words) -> tuple[int, Camera]:
+        number = words.integer("the camera's id")
+        model = supported_model(words.word("the camera's model"), words.where)
+        width, height = words.integer("the width"), words.integer("the height")
+        params = words.numbers(len(words.words) - words.at, "the parameters")
+        return number, camera_of_numbers(model, width, height, params, words.where)
+
+    return _table(text, file, camera)
+
+
+def parse_images(text: str, file: str) -> dict[int, ColmapImage]:
+    """The registered images by id: two lines each, of which the second, with the features, may be empty."""
+    images: dict[int, ColmapImage] = {}
+    lines = iter(enumerate(text.split("\n"), start=1))
+    for number_of_line, line in lines:
+        where = f"{file} line {number_of_line}"
+        if not line.strip() or line.strip().startswith("#"):
+            continue
+        parts = line.strip().split(maxsplit=9)
+        words = _Words(" ".join(parts[:9]), where)
+        number, pose = words.integer("the image's id"), words.numbers(7, "the pose")
+        camera_id = words.integer("the camera's id")
+        if len(parts) < 10:
+            raise broken(where, "the line ends before the image's name")
+        name = image_name(parts[9], where)
+        _, features = next(lines, (0, ""))
+        xy, ids = _features(features, f"{file} line {number_of_line + 1}")
+        refuse_repeated(images, number, f"{where}: id")
+        images[number] = ColmapImage(number, name, camera_id, rigid_pose(pose, where), xy, ids)
+    return images
+
+
+def _features(line: str, where: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    words = line.split()
+    if len(words) % 3:
+        raise broken(
+            where,
+            "not a list of x, y, point id; each image has two lines, the second may be empty",
+            mend="Write an empty line after each image that has no features.",
+        )
+    numbers = floats(words, where, "a feature").reshape(-1, 3)
+    if not np.isfinite(numbers).all():
+        raise broken(where, "a feature's position is no finite number", "pose_not_finite")
+    ids = ["-1" if word in _NO_POINT_WORDS else word for word in words[2::3]]
+    return numbers[:, :2].copy(), _integers(ids, where, "a point's id")
+
+
+def parse_points(text: str, file: str) -> ColmapPoints:
+    """The 3D points in the file's order."""
+    ids: list[int] = []
+    values: list[list[float]] = []
+    lengths: list[int] = []
+    elements: list[int] = []
+    for line, where in _lines(text, file):
+        words = line.split()
+        if len(words) < 8 or len(words) % 2:
+            raise broken(where, "not an id, three coordinates, a colour, an error and a track")
+        try:
+            ids.append(int(words[0]))
+            values.append([float(word) for word in words[1:8]])
+            elements += [int(word) for word in words[8:]]
+        except ValueError:
+            raise broken(where, "holds a word that is no number, or no whole one") from None
+        lengths.append(len(words) // 2 - 4)
+    if not ids:
+        return no_points()
+    numbers = np.array(values)
+    rgb = numbers[:, 3:6]
+    if not ((rgb >= 0) & (rgb <= 255) & (rgb == np.round(rgb))).all():
+        raise broken(file, "a point's colour is not three whole numbers from 0 to 255")
+    return points_of_records(
+        _bounded(ids, file),
+        numbers[:, :3].copy(),
+        rgb.astype(np.uint8),
+        numbers[:, 6].copy(),
+        np.array(lengths, np.int64),
+        _bounded(elements, file).reshape(-1, 2),
+        file,
+    )
+
+
+def _bounded(ids: list[int], file: str) -> NDArray[np.int64]:
+    if any(not 0 <= number <= _MAX_ID for number in ids):
+        raise broken(file, "an id is out of range")
+    return np.array(ids, dtype=np.int64)
+
+
+def _sensor(words: _Words) -> Sensor:
+    name = words.word("a sensor's type")
+    number = words.integer("a sensor's id")
+    return sensor_type(_SENSOR_NUMBERS.get(name, -1), words.where), number
+
+
+def _pose(words: _Words, what: str) -> RigidPose:
+    return rigid_pose(words.numbers(7, what), words.where)
+
+
+def parse_rigs(text: str, file: str) -> dict[int, ColmapRig]:
+    """The rigs by id."""
+
+    def rig(words: _Words) -> tuple[int, ColmapRig]:
+        number, sensors = words.integer("the rig's id"), words.integer("the number of sensors")
+        reference = _sensor(words) if sensors else None
+        others: dict[Sensor, RigidPose | None] = {}
+        for _ in range(min(sensors, len(words.words)) - 1):
+            sensor = _sensor(words)
+            has_pose = words.word("whether a sensor has a pose")
+            if has_pose not in ("0", "1"):
+                raise broken(words.where, "a yes or no is neither")
+            if sensor in others or sensor == reference:
+                raise broken(words.where, f"the sensor {sensor[0]} {sensor[1]} stands twice")
+            others[sensor] = _pose(words, "a sensor's pose") if has_pose == "1" else None
+        return number, ColmapRig(number, reference, others)
+
+    return _table(text, file, rig)
+
+
+def parse_frames(text: str, file: str) -> dict[int, ColmapFrame]:
+    """The frames by id."""
+
+    def frame(words: _Words) -> tuple[int, ColmapFrame]:
+        number, rig_id = words.integer("the frame's id"), words.integer("the rig's id")
+        pose = _pose(words, "the frame's pose")
+        count = words.integer("the number of images")
+        if 3 * count > len(words.words):
+            raise broken(words.where, f"names {count} images, but the line is shorter")
+        data_ids = tuple((_sensor(words), words.integer("an image's id")) for _ in range(count))
+        return number, ColmapFrame(number, rig_id, pose, data_ids)
+
+    return _table(text, file, frame)

@@ -1,0 +1,113 @@
+"""COLMAP's binary model, written without COLMAP; rigs and frames too, where the model has them.
+
+Layouts: src/colmap/scene/reconstruction_io_binary.cc; little-endian throughout.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.colmap_scene import (
+    ColmapFrame,
+    ColmapImage,
+    ColmapModel,
+    ColmapPoints,
+    ColmapRig,
+    RigidPose,
+    Sensor,
+)
+from biresnerf.data.model.dataset import Camera
+from biresnerf.geometry.camera.camera_models import MODEL_IDS
+
+_SENSOR_TYPES = {"CAMERA": 0, "IMU": 1}
+_OBSERVATION = np.dtype([("xy", "<f8", 2), ("id", "<u8")])
+
+
+def write_colmap_binary(model: ColmapModel, folder: Path) -> None:
+    """Writes the model's files into ``folder``, each whole or not at all (COLMAP wants ``sparse/0``).
+
+    A points3D.bin is written even without points: readers fail without it.
+
+    Raises:
+        ValueError: a name that the form cannot hold.
+    """
+    if any("\0" in image.name or not image.name for image in model.images.values()):
+        raise ValueError("image names must not be empty and not hold NUL")
+    _write(folder / "points3D.bin", _points(model.points))
+    _write(folder / "cameras.bin", _cameras(model.cameras))
+    _write(folder / "images.bin", _images(model.images))
+    if model.rigs:
+        _write(folder / "rigs.bin", _rigs(model.rigs))
+        _write(folder / "frames.bin", _frames(model.frames))
+
+
+def _cameras(cameras: dict[int, Camera]) -> bytes:
+    parts = [struct.pack("<Q", len(cameras))]
+    for number, camera in cameras.items():
+        parts.append(struct.pack("<IiQQ", number, MODEL_IDS[camera.model], camera.width, camera.height))
+        parts.append(struct.pack(f"<{len(camera.params)}d", *camera.params))
+    return b"".join(parts)
+
+
+def _images(images: dict[int, ColmapImage]) -> bytes:
+    parts = [struct.pack("<Q", len(images))]
+    for number, image in images.items():
+        parts.append(
+            struct.pack("<I", number) + _pose(image.cam_from_world) + struct.pack("<I", image.camera_id)
+        )
+        observations = np.zeros(len(image.points2d_px), _OBSERVATION)
+        observations["xy"] = image.points2d_px
+        observations["id"] = image.point3d_ids.astype(np.uint64)  # no point, -1, becomes COLMAP's 2^64 - 1
+        parts.append(image.name.encode() + b"\0" + struct.pack("<Q", len(observations)))
+        parts.append(observations.tobytes())
+    return b"".join(parts)
+
+
+def _points(points: ColmapPoints) -> bytes:
+    parts = [struct.pack("<Q", len(points))]
+    tracks = np.stack([points.track_image_ids, points.track_point2d_indices], axis=1).astype("<u4")
+    for k in range(len(points)):
+        track = tracks[points.track_starts[k] : points.track_starts[k + 1]]
+        parts.append(struct.pack("<Q3d", int(points.ids[k]), *points.xyz[k]) + points.rgb[k].tobytes())
+        parts.append(struct.pack("<dQ", points.errors[k], len(track)) + track.tobytes())
+    return b"".join(parts)
+
+
+def _rigs(rigs: dict[int, ColmapRig]) -> bytes:
+    parts = [struct.pack("<Q", len(rigs))]
+    for number, rig in rigs.items():
+        if rig.reference is None:
+            parts.append(struct.pack("<II", number, 0))
+            continue
+        parts.append(struct.pack("<II", number, 1 + len(rig.sensor_from_rig)) + _sensor(rig.reference))
+        for sensor, sensor_from_rig in rig.sensor_from_rig.items():
+            parts.append(_sensor(sensor) + struct.pack("<B", sensor_from_rig is not None))
+            if sensor_from_rig is not None:
+                parts.append(_pose(sensor_from_rig))
+    return b"".join(parts)
+
+
+def _frames(frames: dict[int, ColmapFrame]) -> bytes:
+    parts = [struct.pack("<Q", len(frames))]
+    for number, frame in frames.items():
+        parts.append(struct.pack("<II", number, frame.rig_id) + _pose(frame.rig_from_world))
+        parts.append(struct.pack("<I", len(frame.data_ids)))
+        parts += [_sensor(sensor) + struct.pack("<Q", data_id) for sensor, data_id in frame.data_ids]
+    return b"".join(parts)
+
+
+def _sensor(sensor: Sensor) -> bytes:
+    return struct.pack("<iI", _SENSOR_TYPES[sensor[0]], sensor[1])
+
+
+def _pose(pose: RigidPose) -> bytes:
+    return struct.pack("<7d", *pose.quat_wxyz, *pose.translation)
+
+
+def _write(path: Path, content: bytes) -> None:
+    with whole_file(path) as temporary:
+        temporary.write_bytes(content)

@@ -1,0 +1,143 @@
+"""``poses.json``: every image's pose before and after, its lens and flags, in one self-describing file of ours.
+
+It is the only form that loses nothing, so the other packs can be made from it later.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.json_document import read_model
+from biresnerf.data.model.refined_set import PointsSource, RefinedSet
+
+_FROZEN = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+POSES = "poses.json"
+AXES = (
+    "world_from_cam and cam_from_world are [R | t] with OpenCV axes (x right, y down, z forward), in the input's "
+    "world; the centre of the first pixel is (0.5, 0.5)"
+)
+
+Row = tuple[float, float, float, float]
+Matrix = tuple[Row, Row, Row]
+
+
+class PoseCamera(BaseModel):
+    """A lens: COLMAP's model name, size in px and parameters in COLMAP's order."""
+
+    model_config = _FROZEN
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+class PoseImage(BaseModel):
+    """One image. Poses are the upper three rows of 4 x 4 matrices."""
+
+    model_config = _FROZEN
+
+    name: str = Field(description="As the input writes it.")
+    file_name: str = Field(description="Path relative to the input's folder, with extension.")
+    camera: int = Field(description="Index into cameras.")
+    orientation: int = Field(
+        1,
+        description="EXIF orientation that stored pixels are turned by first; camera and poses are for the result.",
+    )
+    cam_from_world: Matrix
+    world_from_cam: Matrix = Field(description="The inverse: its last column is the camera's centre.")
+    world_from_cam_before: Matrix | None = Field(description="As given; null where no pose was.")
+    pose_source: str
+    flags: tuple[str, ...]
+
+
+class PoseSimilarity(BaseModel):
+    """x_in_input = scale * rotation @ x_in_optimised + translation."""
+
+    model_config = _FROZEN
+
+    scale: float
+    rotation: tuple[Annotated[tuple[float, float, float], Field()], ...]
+    translation: tuple[float, float, float]
+
+
+class PosesDocument(BaseModel):
+    """The whole file."""
+
+    model_config = _FROZEN
+
+    format: Literal["biresnerf-poses"] = "biresnerf-poses"
+    version: Literal[1] = 1
+    axes: str = AXES
+    cameras: tuple[PoseCamera, ...]
+    images: tuple[PoseImage, ...]
+    input_from_optimised: PoseSimilarity
+    points_source: PointsSource
+    timestamps_s: tuple[float, ...] | None = None
+
+
+def write_poses_json(refined: RefinedSet, path: Path) -> None:
+    """Writes the file, whole or not at all; numbers with all their digits."""
+    similarity = refined.similarity
+    images = tuple(
+        PoseImage(
+            name=image.name,
+            file_name=image.file_name,
+            camera=image.camera,
+            orientation=image.orientation,
+            cam_from_world=_rows(cam_from_world),
+            world_from_cam=_rows(image.world_from_cam),
+            world_from_cam_before=None if image.given is None else _rows(image.given),
+            pose_source=image.pose_source,
+            flags=image.flags,
+        )
+        for image, cam_from_world in zip(refined.images, refined.cam_from_world, strict=True)
+    )
+    document = PosesDocument(
+        cameras=tuple(
+            PoseCamera(model=c.model, width=c.width, height=c.height, params=c.params)
+            for c in refined.cameras
+        ),
+        images=images,
+        input_from_optimised=PoseSimilarity(
+            scale=similarity.scale,
+            rotation=tuple(tuple(row) for row in similarity.rotation.tolist()),
+            translation=tuple(similarity.translation.tolist()),
+        ),
+        points_source=refined.points_source,
+        timestamps_s=refined.timestamps_s,
+    )
+    with whole_file(path) as temporary:
+        text = json.dumps(document.model_dump(), indent=1, ensure_ascii=False, allow_nan=False)
+        temporary.write_text(text + "\n", "utf-8")
+
+
+def read_poses_json(path: Path) -> PosesDocument:
+    """The file, checked.
+
+    Raises:
+        InputError: ``pose_file_invalid``, or a code of `read_json_object`.
+    """
+    return read_model(
+        PosesDocument,
+        path,
+        code="pose_file_invalid",
+        mend="Give the poses.json of a finished result, as it was written.",
+    )
+
+
+def matrix_of(rows: Matrix) -> NDArray[np.float64]:
+    """The 4 x 4 matrix of a file's three rows."""
+    return np.array([*rows, (0.0, 0.0, 0.0, 1.0)])
+
+
+def _rows(matrix: NDArray[np.float64]) -> Matrix:
+    a, b, c = (tuple(float(value) for value in row) for row in matrix[:3])
+    return a, b, c  # type: ignore[return-value]

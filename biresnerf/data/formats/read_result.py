@@ -1,0 +1,92 @@
+"""A finished result read back from its folder, so that it can be written in further forms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from biresnerf.data.formats.colmap.read_model import read_colmap_model
+from biresnerf.data.formats.own.poses_json import POSES, PoseImage, matrix_of, read_poses_json
+from biresnerf.data.formats.write_formats import COLMAP
+from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
+from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.geometry.similarity import Similarity
+
+
+def read_result(folder: Path, photos: Path | None = None) -> RefinedSet:
+    """The result in ``folder``, from its poses.json and its COLMAP model.
+
+    Args:
+        folder: what `refine` wrote.
+        photos: the input's folder, which file names are relative to; only the pinhole pack needs it.
+
+    Raises:
+        InputError: ``result_missing``, ``result_inconsistent``, ``image_missing``, or a code of the readers.
+    """
+    path = folder / POSES
+    if not path.is_file():
+        raise InputError(
+            "result_missing",
+            f"holds no {POSES}.",
+            where=str(folder),
+            mend="Name the output folder of a finished `biresnerf refine`.",
+        )
+    document = read_poses_json(path)
+    model = read_colmap_model(folder / COLMAP)
+    id_of_name = {image.name: image.id for image in model.images.values()}
+    image_ids = []
+    for image in document.images:
+        number = id_of_name.get(image.file_name, id_of_name.get(image.name))
+        if number is None or not 0 <= image.camera < len(document.cameras):
+            raise _inconsistent(folder, image.name)
+        image_ids.append(number)
+    cameras = []
+    for camera in document.cameras:
+        if len(camera.params) != len(MODEL_PARAMETERS.get(camera.model, ())):
+            raise _inconsistent(folder, camera.model)
+        cameras.append(Camera(camera.model, camera.width, camera.height, camera.params))
+    tie = document.input_from_optimised
+    return RefinedSet(
+        tuple(cameras),
+        tuple(_image(image, photos) for image in document.images),
+        model,
+        tuple(image_ids),
+        document.points_source,
+        Similarity(tie.scale, np.array(tie.rotation), np.array(tie.translation)),
+        document.timestamps_s,
+    )
+
+
+def _image(image: PoseImage, photos: Path | None) -> RefinedImage:
+    path = None if photos is None else photos / image.file_name
+    if path is not None and not path.is_file():
+        raise InputError(
+            "image_missing",
+            f"{image.file_name} is not there.",
+            where=str(photos),
+            mend="Name the input's folder, which the file names of poses.json are relative to.",
+        )
+    before = image.world_from_cam_before
+    return RefinedImage(
+        image.name,
+        image.file_name,
+        image.camera,
+        matrix_of(image.world_from_cam),
+        None if before is None else matrix_of(before),
+        image.pose_source,
+        image.flags,
+        path,
+        image.orientation,
+    )
+
+
+def _inconsistent(folder: Path, what: str) -> InputError:
+    return InputError(
+        "result_inconsistent",
+        f"{POSES} and the model in {COLMAP} do not fit each other: {what!r}.",
+        where=str(folder),
+        mend="Leave the files of a result together, as they were written.",
+    )

@@ -1,0 +1,1 @@
+"""Poses in plain tables and XML: TUM, KITTI, LLFF, Bundler, Metashape."""

@@ -1,0 +1,77 @@
+"""One camera for all images, given in a file beside a trajectory: camera.json, cameras.txt or KITTI's calib.txt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from biresnerf.data.formats.colmap import read_text as colmap_text
+from biresnerf.data.formats.colmap.model_checks import broken, camera_of_numbers
+from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
+from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.json_document import read_json_object
+from biresnerf.data.model.text_file import read_text
+from biresnerf.data.photos.image_files import read_header
+from biresnerf.errors import InputError
+
+CAMERA_NAMES = ("camera.json", "cameras.txt", "calib.txt")
+# The image file and its name -> its camera.
+CameraOf = Callable[[Path, str], Camera | None]
+
+
+def read_camera_file(root: Path) -> tuple[CameraOf, tuple[Path, ...]]:
+    """Who says which camera took an image, and the files that were read; None for each where there is no such file.
+
+    camera.json has the keys of a transforms.json's top (``w``, ``h``, ``fl_x``, ``k1``, ...), cameras.txt is COLMAP's
+    with one camera, calib.txt is KITTI's (its P0 belongs to the poses).
+
+    Raises:
+        InputError: the first of `CAMERA_NAMES` that is there does not hold one camera.
+    """
+    present = [root / name for name in CAMERA_NAMES if (root / name).is_file()]
+    if not present:
+        return (lambda _path, _name: None), ()
+    file = present[0]
+    if file.suffix == ".json":
+        document = read_json_object(file)
+
+        def of_json(path: Path, name: str) -> Camera:
+            found = camera_of_frame(Fields({}, document, file.name, 0), read_header(path, name), name)
+            if found.source != "given":
+                raise InputError(
+                    "intrinsics_missing",
+                    "no focal length: neither fl_x nor camera_angle_x.",
+                    where=file.name,
+                    mend="Add fl_x (pixels), or remove the file: a focal length is then guessed and refined.",
+                )
+            return found.camera
+
+        return of_json, (file,)
+    if file.name == "cameras.txt":
+        cameras = list(colmap_text.parse_cameras(read_text(file), file.name).values())
+        if len(cameras) != 1:
+            raise broken(file.name, f"has {len(cameras)} cameras, and nothing says which image is whose")
+        return (lambda _path, _name: cameras[0]), (file,)
+    focal_x, focal_y, cx, cy = _kitti_projection(file)
+
+    def of_calibration(path: Path, name: str) -> Camera:
+        header = read_header(path, name)
+        params = (focal_x, focal_y, cx, cy)
+        return camera_of_numbers("PINHOLE", header.width, header.height, params, f"{file.name} P0")
+
+    return of_calibration, (file,)
+
+
+def _kitti_projection(file: Path) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy (px) of the line ``P0: `` and 12 numbers, by rows."""
+    for line in read_text(file).splitlines():
+        name, _, rest = line.partition(":")
+        if name.strip() != "P0":
+            continue
+        values = colmap_text.floats(rest.split(), f"{file.name} P0", "the projection")
+        if len(values) != 12:
+            raise broken(f"{file.name} P0", f"has {len(values)} numbers, not 12")
+        return float(values[0]), float(values[5]), float(values[2]), float(values[6])
+    raise broken(
+        file.name, "has no line P0:", mend="Give KITTI's calib.txt, or a camera.json with fl_x, fl_y, cx, cy."
+    )

@@ -1,0 +1,163 @@
+"""Bundler's ``bundle.out`` (v0.3) and its list of images: cameras only, the points are not kept.
+
+Cameras look along -z with y up, have one focal length, two radial coefficients and their principal point in the
+image's centre. Format: Bundler v0.4 user's manual, section 6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.formats.bind_images import GivenImage, dataset_of, match_files
+from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
+from biresnerf.data.formats.colmap.read_colmap import image_files
+from biresnerf.data.model.dataset import Camera, Dataset, SourceFormat
+from biresnerf.data.model.pose_validation import rigid_matrix
+from biresnerf.data.model.text_file import read_text
+from biresnerf.data.photos.image_files import read_header
+from biresnerf.errors import InputError
+
+LIST_NAMES = ("list.txt", "bundle/list.txt")
+MAX_CAMERAS = 100_000
+_LINES_PER_CAMERA, _LINES_PER_POINT = 5, 3
+_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+def read_bundler(root: Path, file: Path, within: Path | None = None) -> Dataset:
+    """The images of ``root`` with the cameras of a bundle file; those whose focal length is 0 have no pose.
+
+    list.txt, beside the images or the file, says which image each camera is; without it their order by name does.
+
+    Raises:
+        InputError: codes as in docs/input.md.
+    """
+    entries = read_cameras(file)
+    files = image_files(root)
+    names, list_file, notes = names_of_cameras(root, file, sorted(files), len(entries))
+    found, more = match_files(names, list(files), lambda i: f"{file.name} camera {i}")
+    given = []
+    for index, (name, place, (lens, pose)) in enumerate(zip(names, found, entries, strict=True)):
+        where = f"{file.name} camera {index}"
+        camera = None if pose is None else _camera(lens, files[place], name, where)
+        given.append(GivenImage(name, files[place], camera, pose, where))
+    read = (file,) if list_file is None else (file, list_file)
+    source = SourceFormat("bundler", None, {}, np.eye(4), files=read)
+    return dataset_of(root, given, source, [*notes, *more], within)
+
+
+Lens = tuple[float, float, float]
+
+
+def read_cameras(file: Path) -> list[tuple[Lens, NDArray[np.float64] | None]]:
+    """Focal length (px), k1, k2, and ``world_from_cam`` [4, 4] of each camera; None where it has no pose.
+
+    Raises:
+        InputError: ``pose_file_invalid`` and codes of `rigid_matrix`.
+    """
+    lines = [
+        line.split() for line in read_text(file).splitlines() if line.strip() and not line.startswith("#")
+    ]
+    counts = _numbers(lines[:1], 1, 2, f"{file.name} first line")[0]
+    if not all(count == round(count) and count >= 0 for count in counts) or counts[0] > MAX_CAMERAS:
+        raise _invalid(f"{file.name} first line", "does not give the numbers of cameras and points.")
+    cameras, points = int(counts[0]), int(counts[1])
+    if len(lines) != 1 + _LINES_PER_CAMERA * cameras + _LINES_PER_POINT * points:
+        raise _invalid(
+            file.name,
+            f"has not the lines of the {cameras} cameras and {points} points it names: {len(lines)}.",
+        )
+    entries = []
+    for index in range(cameras):
+        at = 1 + _LINES_PER_CAMERA * index
+        where = f"{file.name} camera {index}"
+        block = _numbers(lines[at : at + _LINES_PER_CAMERA], _LINES_PER_CAMERA, 3, where)
+        focal, k1, k2 = block[0]
+        pose = None if focal == 0.0 else _world_from_cam(block[1:4], block[4], where)
+        entries.append(((float(focal), float(k1), float(k2)), pose))
+    return entries
+
+
+def _world_from_cam(
+    rotation: NDArray[np.float64], translation: NDArray[np.float64], where: str
+) -> NDArray[np.float64]:
+    cam_from_world = _OPENCV_FROM_OPENGL @ np.column_stack([rotation, translation])
+    matrix, _ = rigid_matrix(cam_from_world.tolist(), where)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = matrix[:3, :3].T, -matrix[:3, :3].T @ matrix[:3, 3]
+    return pose
+
+
+def _numbers(lines: Sequence[Sequence[str]], rows: int, columns: int, where: str) -> NDArray[np.float64]:
+    if len(lines) != rows or any(len(line) != columns for line in lines):
+        raise _invalid(where, f"is not {rows} lines of {columns} numbers.")
+    try:
+        values = np.array([[float(word) for word in line] for line in lines])
+    except ValueError:
+        raise _invalid(where, "holds a word that is no number.") from None
+    if not np.isfinite(values).all():
+        raise InputError(
+            "pose_not_finite", "NaN or an infinite number.", where=where, mend="Export it again."
+        )
+    return values
+
+
+def names_of_cameras(
+    root: Path, file: Path, in_order: list[str], count: int
+) -> tuple[list[str], Path | None, list[str]]:
+    """The images' names in the order of the cameras, the list they come from, and notes.
+
+    Args:
+        in_order: what they are called where there is no list.
+
+    Raises:
+        InputError: ``pose_count_mismatch``, or the list is bad.
+    """
+    places = [file.parent / "list.txt", *(root / name for name in LIST_NAMES)]
+    table = next((path for path in places if path.is_file()), None)
+    if table is None:
+        names, note = (
+            in_order,
+            f"{file.name}: without list.txt, images were taken in the order of their names",
+        )
+        where, notes = file.name, [note]
+    else:
+        # `name`, or `name 0 focal_length` as Bundler's own tools write it.
+        lines = [line.strip() for line in read_text(table).splitlines() if line.strip()]
+        names = [_without_focal(line) for line in lines]
+        names = [
+            image_name(name.removeprefix("./"), f"{table.name} line {i + 1}") for i, name in enumerate(names)
+        ]
+        where, notes = table.name, []
+        if len(set(names)) != len(names):
+            raise InputError("duplicate_image", "names an image twice.", where=where, mend="Remove one.")
+    if len(names) != count:
+        raise InputError(
+            "pose_count_mismatch",
+            f"{len(names)} images for the {count} cameras of {file.name}.",
+            where=where,
+            mend="Give list.txt as it was written with the bundle file: one image a line, in its order.",
+        )
+    return names, table, notes
+
+
+def _without_focal(line: str) -> str:
+    words = line.rsplit(maxsplit=2)
+    return (
+        words[0] if len(words) == 3 and words[1] == "0" and words[2].replace(".", "", 1).isdigit() else line
+    )
+
+
+def _camera(lens: Lens, path: Path, name: str, where: str) -> Camera:
+    header = read_header(path, name)
+    focal, k1, k2 = lens
+    centre = (header.width / 2, header.height / 2)
+    model, params = ("RADIAL", (focal, *centre, k1, k2)) if k1 or k2 else ("SIMPLE_PINHOLE", (focal, *centre))
+    return camera_of_numbers(model, header.width, header.height, params, where)
+
+
+def _invalid(where: str, what: str) -> InputError:
+    return InputError("pose_file_invalid", what, where=where, mend="Export the bundle file (v0.3) again.")

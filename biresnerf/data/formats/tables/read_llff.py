@@ -1,0 +1,114 @@
+"""LLFF's ``poses_bounds.npy``: one row of 17 numbers an image, images by the order of their names."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.formats.bind_images import GivenImage, dataset_of
+from biresnerf.data.formats.colmap.read_colmap import image_files
+from biresnerf.data.model.dataset import Camera, Dataset, SourceFormat
+from biresnerf.data.model.pose_validation import rigid_matrix
+from biresnerf.errors import InputError
+
+MAX_IMAGES = 100_000
+_MAX_HEADER_BYTES = 4096
+_COLUMNS = 17
+_HEADER = re.compile(
+    rb"\{'descr': '(<f[48])', 'fortran_order': (True|False), 'shape': \(([0-9]{1,9}), 17\),? ?\}[ \n]*"
+)
+
+
+def read_llff(root: Path, file: Path, within: Path | None = None) -> Dataset:
+    """The images of ``root`` in the order of their names, with the poses and focal lengths of ``file``.
+
+    A row is a matrix 3 x 5, whose columns are the camera's axes down, right and back, its centre, and height, width and
+    focal length (px); then two bounds of depth, which are not used.
+
+    Raises:
+        InputError: codes as in docs/input.md.
+    """
+    rows = _rows(file)
+    files = image_files(root)
+    names = sorted(files)
+    if len(names) != len(rows):
+        raise InputError(
+            "pose_count_mismatch",
+            f"has {len(rows)} poses for {len(names)} images, and says not which is whose.",
+            where=file.name,
+            mend="Leave in images/ just the images that the poses are for; their order by name decides.",
+        )
+    given = []
+    for index, (name, row) in enumerate(zip(names, rows, strict=True)):
+        where = f"{file.name} row {index}"
+        matrix = row[:15].reshape(3, 5)
+        down, right, back, centre, (height, width, focal) = matrix.T
+        pose = np.stack([right, down, -back, centre], axis=1)
+        world_from_cam, _ = rigid_matrix(pose.tolist(), where)
+        given.append(
+            GivenImage(name, files[name], _camera(height, width, focal, where), world_from_cam, where)
+        )
+    source = SourceFormat("llff", None, {}, np.eye(4), files=(file,))
+    note = "poses_bounds.npy: images were taken in the order of their names"
+    return dataset_of(root, given, source, [note], within)
+
+
+def read_llff_poses(file: Path) -> list[NDArray[np.float64]]:
+    """``world_from_cam`` [4, 4] of each row. Raises InputError as `read_llff` does."""
+    return [_world_from_cam(row, f"{file.name} row {index}") for index, row in enumerate(_rows(file))]
+
+
+def _world_from_cam(row: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+    down, right, back, centre, _ = row[:15].reshape(3, 5).T
+    return rigid_matrix(np.stack([right, down, -back, centre], axis=1).tolist(), where)[0]
+
+
+def _camera(height: float, width: float, focal: float, where: str) -> Camera:
+    whole = 0 < width < 1e6 and 0 < height < 1e6 and width == round(width) and height == round(height)
+    if not whole or not 1e-3 * max(width, height) < focal < 1e5 * max(width, height):
+        raise InputError(
+            "intrinsics_invalid",
+            f"{width:g} x {height:g} px with a focal length of {focal:g} px is no camera.",
+            where=where,
+            mend="Give height, width and focal length in pixels in the fifth column.",
+        )
+    return Camera("SIMPLE_PINHOLE", int(width), int(height), (float(focal), width / 2, height / 2))
+
+
+def _rows(file: Path) -> NDArray[np.float64]:
+    """The rows, float64 [n, 17], finite.
+
+    The npy format (numpy.lib.format) is read by hand: nothing is allocated before the file is known to hold it, nothing
+    is unpickled, and its header, a Python literal, is matched and not evaluated.
+    """
+
+    def invalid(what: str, code: str = "pose_file_invalid") -> InputError:
+        return InputError(
+            code, what, where=file.name, mend="Write it again with numpy.save, 17 numbers a row."
+        )
+
+    try:
+        with file.open("rb") as stream:
+            content = stream.read(_MAX_HEADER_BYTES + MAX_IMAGES * _COLUMNS * 8 + 1)
+    except OSError as error:
+        raise invalid(f"cannot be read: {error.strerror}.") from None
+    start = {1: 10, 2: 12}.get(content[6] if len(content) > 12 else 0, 0)
+    if not content.startswith(b"\x93NUMPY") or not start:
+        raise invalid("is no npy file.")
+    length = int.from_bytes(content[8:start], "little")
+    match = _HEADER.fullmatch(content[start : start + min(length, _MAX_HEADER_BYTES)])
+    if match is None:
+        raise invalid(f"holds something other than rows of {_COLUMNS} floating-point numbers.")
+    dtype, by_columns, count = np.dtype(match[1].decode()), match[2] == b"True", int(match[3])
+    numbers = content[start + length :]
+    if count > MAX_IMAGES or len(numbers) != count * _COLUMNS * dtype.itemsize:
+        raise invalid(f"has {count} rows by its header, but its content is shorter or longer.")
+    order: Literal["F", "C"] = "F" if by_columns else "C"
+    rows = np.frombuffer(numbers, dtype).reshape((count, _COLUMNS), order=order).astype(np.float64)
+    if not np.isfinite(rows).all():
+        raise invalid("NaN or an infinite number.", "pose_not_finite")
+    return rows

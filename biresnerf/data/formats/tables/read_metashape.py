@@ -1,0 +1,224 @@
+"""Metashape's camera export (XML): sensors, cameras, and their poses in the chunk's own frame.
+
+Lens: Agisoft Metashape user manual, appendix on camera models ("frame" type). Its p1 and p2 are COLMAP's p2 and p1.
+"""
+
+from __future__ import annotations
+
+import xml.parsers.expat
+from collections import Counter
+from pathlib import Path, PurePosixPath
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.formats.bind_images import GivenImage, dataset_of
+from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
+from biresnerf.data.formats.colmap.read_colmap import image_files
+from biresnerf.data.model.dataset import Camera, Dataset, SourceFormat
+from biresnerf.data.model.pose_validation import rigid_matrix
+from biresnerf.data.model.text_file import read_text
+from biresnerf.data.photos.named_images import few_names
+from biresnerf.errors import InputError
+
+_MAX_DEPTH, _MAX_ELEMENTS = 50, 500_000
+
+
+def read_metashape(root: Path, file: Path, within: Path | None = None) -> Dataset:
+    """The images of ``root`` with the cameras of a Metashape export, in the order of their labels.
+
+    Labels are file names, with or without extension. The world is the chunk's own frame: the chunk's transform into
+    geographic coordinates is not applied. Cameras that are not aligned or stand in another component than most have no
+    pose.
+
+    Raises:
+        InputError: codes as in docs/input.md.
+    """
+    chunk = _chunk(file)
+    sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
+    entries = _labelled(chunk, file)
+    files = image_files(root)
+    place_of = _places(list(files))
+    missing = [label for label in entries if label not in place_of]
+    if missing:
+        raise InputError(
+            "image_missing",
+            f"{len(missing)} of {len(entries)} images not found: {few_names(missing)}.",
+            where=file.name,
+            mend="Put the images into images/ under their labels.",
+        )
+    components = Counter(
+        entry.get("component_id") for entry in entries.values() if entry.find("transform") is not None
+    )
+    main = components.most_common(1)[0][0] if components else None
+    lenses: dict[str | None, Camera | None] = {}
+    given, apart = [], []
+    for label, entry in sorted(entries.items()):
+        where, place = f"{file.name} camera {label!r}", place_of[label]
+        sensor = entry.get("sensor_id")
+        if sensor not in lenses:
+            lenses[sensor] = _camera(sensors.get(sensor), f"{file.name} sensor {sensor}")
+        pose = _pose(entry, where)
+        if pose is not None and entry.get("component_id") != main:
+            pose = None
+            apart.append(label)
+        given.append(GivenImage(place, files[place], lenses[sensor], pose, where))
+    notes = [f"{file.name}: poses are in the chunk's own frame; its transform was not applied"]
+    if apart:
+        notes.append(
+            f"{len(apart)} images stand in another component; their poses were not taken: {few_names(apart)}"
+        )
+    source = SourceFormat("metashape", None, {}, np.eye(4), files=(file,))
+    return dataset_of(root, given, source, notes, within)
+
+
+def read_metashape_poses(file: Path) -> dict[str, NDArray[np.float64]]:
+    """``world_from_cam`` [4, 4] by label, of the cameras that are aligned, in the chunk's own frame."""
+    entries = _labelled(_chunk(file), file)
+    poses = {label: _pose(entry, f"{file.name} camera {label!r}") for label, entry in entries.items()}
+    return {label: pose for label, pose in poses.items() if pose is not None}
+
+
+class _Builder(ElementTree.TreeBuilder):
+    """A tree that is neither too deep nor too large."""
+
+    depth = elements = 0
+
+    def start(self, tag: str, attrs: dict[str, str]) -> ElementTree.Element:
+        self.depth, self.elements = self.depth + 1, self.elements + 1
+        if self.depth > _MAX_DEPTH or self.elements > _MAX_ELEMENTS:
+            raise ElementTree.ParseError("nested too deeply, or too long")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str) -> ElementTree.Element:
+        self.depth -= 1
+        return super().end(tag)
+
+
+def _chunk(file: Path) -> ElementTree.Element:
+    """The one chunk of the file. Entities are refused, so nothing can expand."""
+    text = read_text(file)
+    try:
+        if "<!DOCTYPE" in text or "<!ENTITY" in text:
+            raise ElementTree.ParseError("document types and entities are not read")
+        tree = ElementTree.fromstring(text, parser=ElementTree.XMLParser(target=_Builder()))
+    except (ElementTree.ParseError, xml.parsers.expat.ExpatError, ValueError) as error:
+        raise _invalid(file.name, f"is no XML that is read: {error}.") from None
+    chunks = [tree] if tree.tag == "chunk" else list(tree.iter("chunk"))
+    if len(chunks) != 1:
+        raise _invalid(file.name, f"has {len(chunks)} chunks, not one.")
+    return chunks[0]
+
+
+def _labelled(chunk: ElementTree.Element, file: Path) -> dict[str, ElementTree.Element]:
+    """The cameras by label, but those switched off."""
+    entries: dict[str, ElementTree.Element] = {}
+    for entry in chunk.iter("camera"):
+        label = image_name(entry.get("label") or "", f"{file.name} camera {entry.get('id')}")
+        if entry.get("enabled") in ("0", "false"):
+            continue
+        if label in entries:
+            raise InputError(
+                "duplicate_image",
+                "the label stands twice.",
+                where=f"{file.name} camera {label!r}",
+                mend="Remove one.",
+            )
+        entries[label] = entry
+    return entries
+
+
+def _places(names: list[str]) -> dict[str, str]:
+    """The image that a label means: its path, its file name, or that without extension, where just one has it."""
+    places: dict[str, list[str]] = {}
+    for name in names:
+        path = PurePosixPath(name)
+        for label in {name, path.name, path.stem, str(path.with_suffix(""))}:
+            places.setdefault(label, []).append(name)
+    return {label: found[0] for label, found in places.items() if len(found) == 1}
+
+
+def _pose(entry: ElementTree.Element, where: str) -> NDArray[np.float64] | None:
+    transform = entry.find("transform")
+    if transform is None:
+        return None
+    values = _floats(transform, where)
+    if len(values) != 16:
+        raise _invalid(where, f"the transform has {len(values)} numbers, not 16.")
+    return rigid_matrix(np.reshape(values, (4, 4)).tolist(), where)[0]
+
+
+def _floats(element: ElementTree.Element, where: str) -> list[float]:
+    try:
+        values = [float(word) for word in (element.text or "").split()]
+    except ValueError:
+        raise _invalid(where, f"{element.tag} holds a word that is no number.") from None
+    if not np.isfinite(values).all():
+        raise InputError(
+            "pose_not_finite", "NaN or an infinite number.", where=where, mend="Export it again."
+        )
+    return values
+
+
+def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
+    """The adjusted calibration (else the first) as a COLMAP camera; None where the file has none."""
+    if sensor is None:
+        return None
+    found = sensor.findall("calibration")
+    adjusted = [one for one in found if one.get("class") == "adjusted"]
+    if not found:
+        return None
+    calibration = (adjusted or found)[0]
+    kind = calibration.get("type") or sensor.get("type") or "frame"
+    if kind != "frame":
+        raise InputError(
+            "camera_model_unsupported",
+            f"the camera type {kind[:40]} is not supported.",
+            where=where,
+            mend="Export undistorted images and cameras of the type frame.",
+        )
+    values = {}
+    for name in ("f", "fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2"):
+        element = calibration.find(name)
+        numbers = [] if element is None else _floats(element, where)
+        values[name] = numbers[0] if numbers else 0.0
+    unmodelled = [name for name in ("k4", "p3", "p4", "b2") if values[name]]
+    if unmodelled:
+        raise InputError(
+            "camera_model_unsupported",
+            f"{', '.join(unmodelled)} is not zero, and no supported camera model has it.",
+            where=where,
+            mend="Optimise the cameras without it and export again, or export undistorted images.",
+        )
+    resolution = calibration.find("resolution")
+    resolution = sensor.find("resolution") if resolution is None else resolution
+    size = {} if resolution is None else resolution.attrib
+    try:
+        width, height = int(size["width"]), int(size["height"])
+    except (KeyError, ValueError):
+        raise _invalid(where, "has no resolution of whole width and height.") from None
+    return _colmap_camera(values, width, height, where)
+
+
+def _colmap_camera(values: dict[str, float], width: int, height: int, where: str) -> Camera:
+    focal_y = values["f"] or values["fy"]
+    focal_x = values["f"] + values["b1"] if values["f"] else values["fx"]
+    # Newer exports measure the principal point from the image's centre, older ones (fx, fy) from its corner.
+    from_centre = bool(values["f"])
+    cx = values["cx"] + width / 2 if from_centre else values["cx"]
+    cy = values["cy"] + height / 2 if from_centre else values["cy"]
+    pinhole = (focal_x, focal_y, cx, cy)
+    lens = (values["k1"], values["k2"], values["p2"], values["p1"])
+    params: tuple[float, ...]
+    if values["k3"]:
+        model, params = "FULL_OPENCV", (*pinhole, *lens, values["k3"], 0.0, 0.0, 0.0)
+    elif any(lens):
+        model, params = "OPENCV", (*pinhole, *lens)
+    else:
+        model, params = "PINHOLE", pinhole
+    return camera_of_numbers(supported_model(model, where), width, height, params, where)
+
+
+def _invalid(where: str, what: str) -> InputError:
+    return InputError("pose_file_invalid", what, where=where, mend="Export the cameras from Metashape again.")

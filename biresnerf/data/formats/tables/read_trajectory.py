@@ -1,0 +1,209 @@
+"""Trajectories of SLAM tools: TUM (time, position, quaternion) and KITTI (12 numbers), with a camera beside them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.formats.bind_images import GivenImage, dataset_of, match_files
+from biresnerf.data.formats.colmap.read_colmap import image_files
+from biresnerf.data.formats.tables.camera_file import read_camera_file
+from biresnerf.data.model.conventions import rotation_from_quat_wxyz
+from biresnerf.data.model.dataset import Dataset, Dialect, SourceFormat
+from biresnerf.data.model.pose_validation import rigid_matrix
+from biresnerf.data.model.text_file import read_text
+from biresnerf.errors import InputError
+
+TIMES_OF_IMAGES = "rgb.txt"  # of TUM's sets
+MAX_POSES = 100_000
+MAX_TIME_APART_S = 0.02  # between an image and its pose, as in TUM's own tools
+_QUAT_LENGTH_ERROR = 1e-2
+_COLUMNS: dict[int, Dialect] = {8: "tum", 12: "kitti"}
+# What `refine` writes above its poses: which image was taken when.
+_NAMED_TIME = re.compile(r"#\s*([-+0-9.eE]+)\s+(\S.*\S|\S)\s*$")
+
+
+class Trajectory:
+    """Poses in the file's order; ``times_s`` and ``names`` (of images, by time) where the file says them."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.poses: list[NDArray[np.float64]] = []
+        self.times_s: list[float] = []
+        self.lines: list[int] = []
+        self.name_of_time: dict[float, str] = {}
+        columns = 0
+        for number, line in enumerate(read_text(file).splitlines(), start=1):
+            words = line.replace(",", " ").split()
+            if not words or line.lstrip().startswith("#"):
+                self._note_name(line)
+                continue
+            where = f"{file.name} line {number}"
+            columns = columns or len(words)
+            if len(words) not in _COLUMNS or len(words) != columns:
+                raise _invalid(where, f"has {len(words)} numbers, not 8 (TUM) or 12 (KITTI) as every line.")
+            try:
+                values = np.array([float(word) for word in words])
+            except ValueError:
+                raise _invalid(where, "holds a word that is no number.") from None
+            if not np.isfinite(values).all():
+                raise _invalid(where, "NaN or an infinite number.", "pose_not_finite")
+            self.poses.append(_tum_pose(values, where) if columns == 8 else _kitti_pose(values, where))
+            self.lines.append(number)
+            if len(self.poses) > MAX_POSES:
+                raise _invalid(where, f"more than {MAX_POSES} poses are not read.")
+            if columns == 8:
+                self.times_s.append(float(values[0]))
+        if not self.poses:
+            raise _invalid(file.name, "holds no pose.")
+        self.dialect = _COLUMNS[columns]
+        if len(set(self.times_s)) != len(self.times_s):
+            raise _invalid(file.name, "a time stands twice.")
+
+    def _note_name(self, line: str) -> None:
+        match = _NAMED_TIME.match(line.strip())
+        if match:
+            try:
+                self.name_of_time[float(match[1])] = match[2]
+            except ValueError:
+                return
+
+    def names(self) -> list[str]:
+        """A name for each pose: the image's where the file says it, else the time, else the line's number from 0."""
+        if not self.times_s:
+            return [str(index) for index in range(len(self.poses))]
+        return [self.name_of_time.get(time, f"{time:.17g}") for time in self.times_s]
+
+
+def read_trajectory(root: Path, file: Path, within: Path | None = None) -> Dataset:
+    """The images of ``root`` with the poses of the trajectory ``file``, camera to world with OpenCV axes.
+
+    Which pose is whose, by the first of these that applies: names in the file's own comments; rgb.txt (times and
+    names, as in TUM's sets) or images named by their time, nearest within 0.02 s; times that are the images' numbers
+    from 0; as many poses as images, in order. The camera is that of `read_camera_file`, else a guess.
+
+    Raises:
+        InputError: codes as in docs/input.md.
+    """
+    trajectory = Trajectory(file)
+    files = image_files(root)
+    names = sorted(files)
+    pose_of, how = matched(trajectory, names, root)
+    camera, camera_files = read_camera_file(root)
+    given = []
+    for name in names:
+        index = pose_of.get(name)
+        where = file.name if index is None else f"{file.name} line {trajectory.lines[index]}"
+        pose = None if index is None else trajectory.poses[index]
+        time = trajectory.times_s[index] if index is not None and trajectory.times_s else None
+        given.append(GivenImage(name, files[name], camera(files[name], name), pose, where, time))
+    table = (path for path in (root / TIMES_OF_IMAGES,) if path.is_file())
+    source = SourceFormat(trajectory.dialect, None, {}, np.eye(4), files=(file, *camera_files, *table))
+    return dataset_of(root, given, source, [f"{file.name}: images and poses were matched {how}"], within)
+
+
+def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[dict[str, int], str]:
+    """Which pose (by index) each image has, and how that was found out: the rules of `read_trajectory`.
+
+    Args:
+        names: of the images, sorted.
+        root: the folder that may hold rgb.txt.
+
+    Raises:
+        InputError: ``pose_count_mismatch``.
+    """
+    count, times = len(trajectory.poses), trajectory.times_s
+    said = [trajectory.name_of_time.get(time, "") for time in times]
+    if said and all(said) and len(set(said)) == count:
+        try:
+            found, _ = match_files(said, names, lambda _: trajectory.file.name)
+            return {name: index for index, name in enumerate(found)}, "by the names in its comments"
+        except InputError:
+            pass  # comments about something else
+    if times:
+        taken, by = _times_of_images(names, root)
+        nearest = _nearest(taken, times)
+        numbers = all(time == math.floor(time) and 0 <= time < len(names) for time in times)
+        # Whole numbers may be names, or count from 0 what names count from 1: then not all of them meet.
+        if len(nearest) >= (count if numbers else min(count, len(names)) / 2):
+            return nearest, f"by time ({by}, at most {MAX_TIME_APART_S} s apart)"
+        if numbers:
+            return {
+                names[int(time)]: i for i, time in enumerate(times)
+            }, "by number, in the order of the images' names"
+    if count == len(names):
+        return {name: i for i, name in enumerate(names)}, "in the order of the images' names"
+    raise InputError(
+        "pose_count_mismatch",
+        f"has {count} poses for {len(names)} images, and nothing says which is whose.",
+        where=trajectory.file.name,
+        mend="Name images by their time, add rgb.txt (time and name a line), or give one pose an image.",
+    )
+
+
+def _times_of_images(names: Sequence[str], root: Path) -> tuple[dict[str, float], str]:
+    """When each image was taken, s, where rgb.txt or its own name says so."""
+    times: dict[str, float] = {}
+    table = root / TIMES_OF_IMAGES
+    if table.is_file():
+        by_base = {PurePosixPath(name).name: name for name in names}
+        for line in read_text(table).splitlines():
+            words = line.split(maxsplit=1)
+            if len(words) == 2 and not words[0].startswith("#"):
+                time, name = _number(words[0]), by_base.get(PurePosixPath(words[1].strip()).name)
+                if time is not None and name is not None:
+                    times[name] = time
+        return times, "by rgb.txt"
+    for name in names:
+        number = _number(PurePosixPath(name).stem)
+        if number is not None:
+            times[name] = number
+    return times, "by the images' names"
+
+
+def _number(word: str) -> float | None:
+    try:
+        number = float(word)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _nearest(taken: dict[str, float], times: Sequence[float]) -> dict[str, int]:
+    """The pose nearest in time to each image, where one is near enough; each pose for the image nearest to it."""
+    order = np.argsort(times)
+    ordered = np.array(times)[order]
+    best: dict[int, tuple[float, str]] = {}
+    for name, time in taken.items():
+        right = int(np.searchsorted(ordered, time))
+        for k in (right - 1, right):
+            if 0 <= k < len(ordered) and abs(ordered[k] - time) <= MAX_TIME_APART_S:
+                index = int(order[k])
+                best[index] = min(best.get(index, (math.inf, "")), (abs(float(ordered[k]) - time), name))
+    found: dict[str, tuple[float, int]] = {}
+    for index, (apart, name) in best.items():
+        found[name] = min(found.get(name, (math.inf, -1)), (apart, index))
+    return {name: index for name, (_, index) in found.items()}
+
+
+def _tum_pose(values: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+    x, y, z, w = values[4:]
+    length = float(np.linalg.norm(np.clip(values[4:], -9.0, 9.0)))  # a square overflows
+    if abs(length - 1.0) > _QUAT_LENGTH_ERROR:
+        raise _invalid(where, f"the quaternion has length {length:.3g}, not 1.", "pose_not_rotation")
+    rotation = rotation_from_quat_wxyz(np.array([w, x, y, z]))
+    return rigid_matrix(np.column_stack([rotation, values[1:4]]).tolist(), where)[0]
+
+
+def _kitti_pose(values: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+    return rigid_matrix(values.reshape(3, 4).tolist(), where)[0]
+
+
+def _invalid(where: str, what: str, code: str = "pose_file_invalid") -> InputError:
+    mend = "Give lines of `time x y z qx qy qz qw` (TUM), or of 12 numbers, [R | t] by rows (KITTI)."
+    return InputError(code, what, where=where, mend=mend)

@@ -1,0 +1,96 @@
+"""``transforms_ngp.json``: the poses by the rules of instant-ngp's loader (src/nerf_loader.cu).
+
+The world is kept; ``scale`` and ``offset`` say where the scene lies in the loader's unit cube, so nothing is moved in
+the matrices. Images are named by their path relative to the caller's folder: put the file there.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.conventions import file_from_world_from_cam
+from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import COEFFICIENTS
+from biresnerf.geometry.focus import focus_point
+
+TRANSFORMS_NGP = "transforms_ngp.json"
+LARGEST_AABB = 128  # the loader's bound; powers of two only
+INNER_SHARE = 0.9  # of the unit cube, for what the cameras look at
+POINTS_INSIDE = 0.98  # of the points that the box must hold
+# What its image reader decodes, of what we read.
+_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp"})
+_PERSPECTIVE = ("k1", "k2", "p1", "p2")
+# In a fisheye k3, k4 lie where a perspective lens has p1, p2, and the key read last wins: these must not be there.
+_FISHEYE = ("k1", "k2", "k3", "k4")
+
+
+def write_transforms_ngp(refined: RefinedSet, path: Path) -> None:
+    """Writes the file, whole or not at all.
+
+    Raises:
+        InputError: ``pack_not_possible``: a lens that instant-ngp does not have, or images it cannot decode.
+    """
+    for image in refined.images:
+        if PurePosixPath(image.file_name).suffix.lower() not in _SUFFIXES:
+            raise _impossible(f"it cannot decode {image.file_name}")
+    lenses = [_lens(camera) for camera in refined.cameras]
+    shared = lenses[0] if len(refined.cameras) == 1 else {}
+    scale, offset, aabb_scale = _placement(refined)
+    document: dict[str, Any] = {**shared, "scale": scale, "offset": offset, "aabb_scale": aabb_scale}
+    matrices = file_from_world_from_cam(refined.world_from_cam, np.eye(4), 1.0)
+    document["frames"] = [
+        {
+            "file_path": image.file_name,
+            **({} if shared else lenses[image.camera]),
+            "transform_matrix": matrix.tolist(),
+        }
+        for image, matrix in zip(refined.images, matrices, strict=True)
+    ]
+    with whole_file(path) as temporary:
+        text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)
+        temporary.write_text(text + "\n", "utf-8")
+
+
+def _lens(camera: Camera) -> dict[str, Any]:
+    full = camera.full()
+    names = _FISHEYE if full.fisheye else _PERSPECTIVE
+    if any(getattr(full, name) for name in COEFFICIENTS if name not in names):
+        raise _impossible(f"it has no lens with all coefficients of {camera.model}")
+    values: dict[str, Any] = {"w": camera.width, "h": camera.height}
+    values |= {"fl_x": full.fx, "fl_y": full.fy, "cx": full.cx, "cy": full.cy}
+    values |= {name: getattr(full, name) for name in names}
+    return {**values, "is_fisheye": True} if full.fisheye else values
+
+
+def _placement(refined: RefinedSet) -> tuple[float, list[float], int]:
+    """``scale``, ``offset`` and ``aabb_scale``: what the cameras look at fills the unit cube, and all of it the box."""
+    poses = refined.world_from_cam
+    focus = focus_point(poses)
+    cameras = [refined.camera_of(index) for index in range(len(refined))]
+    tangents = [max(c.width / c.full().fx, c.height / c.full().fy) / 2 for c in cameras]
+    half = max(focus.mean_distance * float(np.median(tangents)), 1e-9)
+    scale = 0.5 * INNER_SHARE / half
+    reach = [np.abs(poses[:, :3, 3] - focus.point).max()]
+    if len(refined.model.points):
+        away = np.abs(refined.model.points.xyz - focus.point).max(1)
+        reach.append(np.quantile(away, POINTS_INSIDE))
+    aabb_scale = 1
+    while aabb_scale < LARGEST_AABB and 0.5 * aabb_scale < scale * max(reach):
+        aabb_scale *= 2
+    return scale, (0.5 - scale * focus.point).tolist(), aabb_scale
+
+
+def _impossible(why: str) -> InputError:
+    return InputError(
+        "pack_not_possible",
+        f"instant-ngp cannot read this set: {why}.",
+        where=TRANSFORMS_NGP,
+        mend="Ask for the pinhole pack, which holds undistorted images, and use its model.",
+    )

@@ -1,0 +1,256 @@
+"""One frame's camera from the intrinsics of a transforms.json: shared ones, the frame's own, or a mix."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from biresnerf.data.formats.transforms.write_intrinsics import FOCAL_KEYS
+from biresnerf.data.model.dataset import Camera, IntrinsicsSource
+from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
+from biresnerf.data.photos.image_files import ImageHeader
+from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import (
+    COEFFICIENTS,
+    FISHEYE_MODELS,
+    MODEL_IDS,
+    FullParameters,
+    smallest_model,
+)
+from biresnerf.geometry.camera.lens import lens_problem
+
+_UNSUPPORTED = "camera_model_unsupported"
+# Keys of instant-ngp that mean a lens of neither family.
+_OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
+_MODEL_MEND = (
+    f"Supported are {', '.join(MODEL_IDS)}; undistort the images to one of them "
+    "(for example with COLMAP's image_undistorter)."
+)
+
+
+class Fields:
+    """Numbers looked up in the frame first and in the file's top level second."""
+
+    def __init__(self, frame: dict[str, Any], top: dict[str, Any], file: str, index: int) -> None:
+        self.frame, self.top, self.file, self.index = frame, top, file, index
+
+    def where(self, key: str) -> str:
+        """File and field of ``key``."""
+        return f"{self.file} frames[{self.index}].{key}" if self.own(key) else f"{self.file} {key}"
+
+    def own(self, key: str) -> bool:
+        """Whether the frame itself says it."""
+        return self.frame.get(key) is not None
+
+    def get(self, key: str) -> float | None:
+        """The number, or None where neither says it. Raises InputError where it is no finite number."""
+        value = self.frame[key] if self.own(key) else self.top.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
+            raise InputError(
+                "intrinsics_invalid",
+                f"{_short(value)} is not a usable number.",
+                where=self.where(key),
+                mend="Give a number (pixels for lengths).",
+            )
+        return float(value)
+
+
+class FrameCamera(NamedTuple):
+    """The camera, who found its intrinsics, whether other frames share them, and notes for the user."""
+
+    camera: Camera
+    source: IntrinsicsSource
+    shared: bool
+    notes: tuple[str, ...]
+
+
+def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCamera:
+    """The full-size camera of one frame.
+
+    Raises:
+        InputError: ``camera_model_unsupported``, ``intrinsics_missing``, ``intrinsics_invalid`` or
+            ``image_size_mismatch``.
+    """
+    preferred, fisheye = _declared_lens(fields)
+    width, height, notes = _declared_size(fields, header, name)
+    if not any(fields.get(key) is not None for key in FOCAL_KEYS):
+        return _guessed(fields, header, preferred, fisheye, notes)
+    full, more = _parameters(fields, preferred, fisheye, width, height)
+    # nerfstudio writes OPENCV with zeros for a pinhole; PINHOLE is the same camera and more programs read it.
+    if preferred == "OPENCV" and not full.distorted:
+        preferred = "PINHOLE"
+    problem = lens_problem(full, width, height)
+    if problem is not None:
+        raise InputError(
+            "intrinsics_invalid",
+            problem,
+            where=fields.where("k1"),
+            mend="Check the coefficients k1, k2, ... and p1, p2, or undistort the images.",
+        )
+    model, params = smallest_model(full, preferred)
+    camera = Camera(model, width, height, params).resized(header.width, header.height)
+    shared = not any(fields.own(key) for key in ("fl_x", "fl_y", "camera_angle_x", "x_fov"))
+    return FrameCamera(camera, "given", shared, (*notes, *more))
+
+
+def _guessed(
+    fields: Fields, header: ImageHeader, model: str | None, fisheye: bool, notes: list[str]
+) -> FrameCamera:
+    """The lens of a frame for which nobody gives a focal length: EXIF's, or a normal lens, in the model declared.
+
+    Raises:
+        InputError: ``intrinsics_missing`` where the file describes the rest of the lens, or a fisheye.
+    """
+    said = [key for key in ("cx", "cy", *COEFFICIENTS) if fields.get(key)]
+    if fisheye or said:
+        what = f"{said[0]} is given" if said else "the lens is a fisheye"
+        raise InputError(
+            "intrinsics_missing",
+            f"{what}, but no focal length: neither fl_x nor camera_angle_x.",
+            where=f"{fields.file} frames[{fields.index}]",
+            mend="Add fl_x (pixels) or camera_angle_x (radians), for all frames or in each; or leave out all of it.",
+        )
+    camera, source = guess_lens(header)
+    if model is not None:
+        name, params = smallest_model(camera.full(), model)
+        camera = Camera(name, header.width, header.height, params)
+    return FrameCamera(camera, source, False, (*notes, guess_note(source)))
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def _declared_lens(fields: Fields) -> tuple[str | None, bool]:
+    """The model that the file names, and whether the lens is a fisheye's."""
+    for key in _OTHER_LENSES:
+        if fields.frame.get(key) or fields.top.get(key):
+            raise _unsupported(fields, key, f"{key}: panoramas and f-theta lenses are not supported.")
+    declared = fields.frame.get("camera_model") or fields.top.get("camera_model")
+    if declared is not None and (not isinstance(declared, str) or declared.upper() not in MODEL_IDS):
+        raise _unsupported(fields, "camera_model", f"the camera model {_short(declared)} is not supported.")
+    model = None if declared is None else declared.upper()
+    flag = fields.frame.get("is_fisheye", fields.top.get("is_fisheye"))
+    if flag not in (None, False, True):
+        raise _unsupported(fields, "is_fisheye", f"{_short(flag)} is neither true nor false.")
+    if flag and model is not None and model not in FISHEYE_MODELS:
+        raise _unsupported(fields, "is_fisheye", f"is_fisheye is true, but camera_model is {model}.")
+    return model, bool(flag) or model in FISHEYE_MODELS
+
+
+def _unsupported(fields: Fields, key: str, what: str, also: str = "") -> InputError:
+    return InputError(_UNSUPPORTED, what, where=fields.where(key), mend=_MODEL_MEND + also)
+
+
+def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int, int, list[str]]:
+    """The size the intrinsics are meant for, and notes. The image's own size where the file names none."""
+    width, height = fields.get("w"), fields.get("h")
+    if width is None and height is None:
+        return header.width, header.height, []
+    # A file-wide size says nothing about frames that bring their own focal length and differ in size.
+    if fields.own("fl_x") and not (fields.own("w") or fields.own("h")):
+        return header.width, header.height, []
+    w = header.width if width is None else round(width)
+    h = header.height if height is None else round(height)
+    if (w, h) == (header.width, header.height):
+        return w, h, []
+    sizes = f"{name} has {header.width} x {header.height} px"
+    where = fields.where("w")
+    if w <= 0 or h <= 0:
+        raise InputError(
+            "intrinsics_invalid", f"w = {w}, h = {h}.", where=where, mend="Give the size in pixels."
+        )
+    if (w, h) == (header.height, header.width):
+        raise InputError(
+            "image_size_mismatch",
+            f"{sizes}, the file says {w} x {h}: turned by 90 degrees.",
+            where=where,
+            mend="Rotate the stored pixels (or tag them with EXIF's orientation), or exchange w and h, cx and cy.",
+        )
+    # Within one pixel of rounding, the image is a resized copy of the one the intrinsics were made for.
+    if min(abs(h * header.width / w - header.height), abs(w * header.height / h - header.width)) > 1.0:
+        raise InputError(
+            "image_size_mismatch",
+            f"{sizes}, the file says {w} x {h}: not the same shape.",
+            where=where,
+            mend="Give the intrinsics of these images; cropped images need their own cx and cy.",
+        )
+    scaled = f"{w} x {h} px in the file, {header.width} x {header.height} in the images"
+    return w, h, [f"{scaled}: the intrinsics were scaled to the images"]
+
+
+def _coefficients(fields: Fields, model: str | None, fisheye: bool) -> dict[str, float]:
+    """Distortion by the names of `FullParameters`. Raises InputError for a term that the lens's model lacks."""
+    values = {key: fields.get(key) or 0.0 for key in COEFFICIENTS}
+    if model == "FULL_OPENCV":
+        return values
+    if fisheye:
+        # instant-ngp keeps p1 and p2 in the places of k3 and k4, the last one named wins; nobody means that.
+        for key in ("p1", "p2", "k5", "k6"):
+            if values[key]:
+                raise _unsupported(fields, key, f"{key} is not zero, but a fisheye has k1 to k4 only.")
+        return values
+    for key in ("k4", "k5", "k6"):
+        if values[key]:
+            meaning = " In nerfstudio's files it is a fourth radial term, which no model of COLMAP's has."
+            also = " If it is the rational model's, say camera_model FULL_OPENCV. If it is not needed, set it to 0."
+            raise _unsupported(fields, key, f"{key} is not zero.{meaning if key == 'k4' else ''}", also)
+    return values
+
+
+def _parameters(
+    fields: Fields, model: str | None, fisheye: bool, width: int, height: int
+) -> tuple[FullParameters, list[str]]:
+    coefficients = _coefficients(fields, model, fisheye)
+    fx, key_x = _focal(fields, ("fl_x", "camera_angle_x", "x_fov"), width)
+    fy, key_y = _focal(fields, ("fl_y", "camera_angle_y", "y_fov"), height)
+    if key_x != "fl_x" and key_y != "fl_y":
+        # camera_angle_y and y_fov come from rounded angles of square pixels: one focal length serves both
+        # axes.
+        fy = fx if fx is not None else fy
+    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
+    assert fx is not None, "who has none is told so before"
+    assert fy is not None
+    cx, cy = fields.get("cx"), fields.get("cy")
+    notes = []
+    if key_x == "fl_x" and (cx is None or cy is None):
+        notes.append("cx or cy is not given; the image centre was taken")
+    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    if not (-width < cx < 2 * width and -height < cy < 2 * height):
+        raise InputError(
+            "intrinsics_invalid",
+            f"the principal point ({cx:g}, {cy:g}) lies far outside the image.",
+            where=fields.where("cx"),
+            mend="Give cx and cy in pixels from the top left corner.",
+        )
+    return FullParameters(fx, fy, cx, cy, **coefficients, fisheye=fisheye), notes
+
+
+def _focal(fields: Fields, keys: tuple[str, str, str], size: int) -> tuple[float | None, str | None]:
+    """Focal length (px) and the key it came from: pixels, an angle in radians, or instant-ngp's degrees."""
+    # What the frame says goes before what the file says, whichever way it is put.
+    ordered = sorted(keys, key=lambda key: not fields.own(key))
+    for key in ordered:
+        value = fields.get(key)
+        if value is None:
+            continue
+        if key == keys[0]:
+            focal, fits = value, value > 0.0
+        else:
+            angle = value if key == keys[1] else math.radians(value)
+            fits = 0.0 < angle < math.pi
+            focal = 0.5 * size / math.tan(0.5 * angle) if fits else 0.0
+        if not fits or not 1e-3 * size < focal < 1e5 * size:
+            raise InputError(
+                "intrinsics_invalid",
+                f"{value:g} is not a focal length."
+                if key == keys[0]
+                else f"{value:g} is not an angle of view.",
+                where=fields.where(key),
+                mend="Give a positive focal length in pixels, or camera_angle_x in radians below pi.",
+            )
+        return focal, key
+    return None, None

@@ -1,0 +1,233 @@
+"""transforms.json as nerfstudio, instant-ngp and Blender (NeRF-synthetic) write it, read and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.formats.transforms.older_nerfstudio import applied_transform_left_out
+from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
+from biresnerf.data.model.conventions import world_from_cam_of_file
+from biresnerf.data.model.dataset import Camera, Dataset, Dialect, Frame, IntrinsicsSource, SourceFormat
+from biresnerf.data.model.json_document import read_json_object
+from biresnerf.data.model.pose_validation import ROTATION_WARNED, refuse_coinciding, rigid_matrix
+from biresnerf.data.photos.image_files import ImageHeader, read_header
+from biresnerf.data.photos.mask_files import dynamic_mask, named_mask
+from biresnerf.data.photos.named_images import (
+    few_names,
+    find_images,
+    refuse_names_outside,
+    refuse_too_few,
+    unused_image_notes,
+)
+from biresnerf.data.photos.orientation import meant_orientations, orientation_notes, page_notes, turned_header
+from biresnerf.errors import InputError
+
+_NGP_KEYS = frozenset(
+    {"aabb_scale", "scale", "offset", "is_fisheye", "sharpness", "x_fov", "enable_depth_loading"}
+)
+_NERFSTUDIO_KEYS = frozenset({"camera_model", "applied_transform", "ply_file_path", "applied_scale"})
+
+
+def read_transforms(path: Path, within: Path | None = None) -> Dataset:
+    """The validated image set that the transforms file ``path`` describes; image headers are read only.
+
+    Args:
+        path: the file.
+        within: refuse images outside of this folder; for files of strangers.
+
+    Raises:
+        InputError: with the file, the field and the mend; codes as in docs/input.md.
+    """
+    document = read_json_object(path)
+    rows = _frame_objects(document, path.name)
+    names = _names(rows, path.name)
+    if within is not None:
+        refuse_names_outside(path, names, within, "file_path")
+    paths = find_images(path, names)
+    source, notes = _source_format(document, path)
+    stored = [read_header(image, name) for image, name in zip(paths, names, strict=True)]
+    sizes = [_named_size(row, document) for row in rows]
+    orientations = meant_orientations(stored, sizes)
+    headers = [turned_header(header, o) for header, o in zip(stored, orientations, strict=True)]
+    cameras, sources, camera_indices, more = _cameras(rows, source, headers, names, path.name)
+    poses, pose_notes = _poses(rows, names, source, path.name)
+    masks = _masks(path, rows, paths, within)
+    notes += more + pose_notes + orientation_notes(stored, orientations, names) + page_notes(stored, names)
+    notes += _other_notes(rows, document, masks)
+    notes += unused_image_notes(paths, [mask for mask, _ in masks if mask is not None])
+    frames = tuple(
+        Frame(
+            name, paths[i], camera_indices[i], poses[i], "given" if poses[i] is not None else None, rows[i],
+            mask=masks[i][0], mask_inverted=masks[i][1], orientation=orientations[i],
+        )
+        for i, name in enumerate(names)
+    )  # fmt: skip
+    return Dataset(path.parent, cameras, frames, source, tuple(notes), sources)
+
+
+def _named_size(row: dict[str, Any], document: dict[str, Any]) -> tuple[float | None, float | None]:
+    """w and h that go with a frame; None for what is no number, which is refused where it is used."""
+    top = {} if row.get("fl_x") is not None else document  # its own focal length goes with its own size
+    width, height = (_usable(row.get(key, top.get(key))) for key in ("w", "h"))
+    return width, height
+
+
+def _usable(value: Any) -> float | None:
+    return float(value) if isinstance(value, int | float) and 0 < value < 1e12 else None
+
+
+def _frame_objects(document: dict[str, Any], file: str) -> list[dict[str, Any]]:
+    rows = document.get("frames")
+    if not isinstance(rows, list):
+        raise InputError(
+            "pose_file_invalid",
+            "has no list of frames.",
+            where=f"{file} frames",
+            mend="Give a transforms.json as nerfstudio, instant-ngp or Blender write it.",
+        )
+    for index, row in enumerate(rows):
+        if not isinstance(row, dict):
+            raise InputError(
+                "pose_file_invalid",
+                "is not an object.",
+                where=f"{file} frames[{index}]",
+                mend="Give file_path and transform_matrix in each frame.",
+            )
+    refuse_too_few(len(rows), f"{file} frames")
+    return rows
+
+
+def _source_format(document: dict[str, Any], path: Path) -> tuple[SourceFormat, list[str]]:
+    applied = document.get("applied_transform")
+    matrix, scale = np.eye(4), document.get("applied_scale", 1.0)
+    if applied is not None:
+        matrix, _ = rigid_matrix(applied, f"{path.name} applied_transform")
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not 1e-9 < scale < 1e9:
+        raise InputError(
+            "pose_file_invalid",
+            "is not a positive number.",
+            where=f"{path.name} applied_scale",
+            mend="Remove the key, or give the factor that was applied to the positions.",
+        )
+    dialect, notes = _dialect(document), []
+    if applied is None and dialect == "nerfstudio":
+        older = applied_transform_left_out(path, document["frames"])
+        if older is not None:
+            matrix = older
+            notes.append(
+                "applied_transform is not given; colmap/sparse/0 shows that it was older nerfstudio's, so that model's "
+                "world is taken for the result's COLMAP model"
+            )
+    kept = {key: None if key == "frames" else value for key, value in document.items()}
+    return SourceFormat(dialect, path, kept, matrix, float(scale), files=(path,)), notes
+
+
+def _dialect(document: dict[str, Any]) -> Dialect:
+    if document.keys() & _NERFSTUDIO_KEYS:
+        return "nerfstudio"
+    if document.keys() & _NGP_KEYS:
+        return "instant-ngp"
+    first = document["frames"][0]
+    return (
+        "blender"
+        if "camera_angle_x" in document and "fl_x" not in document.keys() | first.keys()
+        else "nerfstudio"
+    )
+
+
+def _names(rows: list[dict[str, Any]], file: str) -> list[str]:
+    names = []
+    for index, row in enumerate(rows):
+        name = row.get("file_path")
+        if not isinstance(name, str) or not name:
+            raise InputError(
+                "frame_without_image",
+                "the frame names no image.",
+                where=f"{file} frames[{index}].file_path",
+                mend="Give the image's path relative to this file, or remove the frame.",
+            )
+        names.append(name)
+    return names
+
+
+def _cameras(
+    rows: list[dict[str, Any]], source: SourceFormat, headers: list[ImageHeader], names: list[str], file: str
+) -> tuple[tuple[Camera, ...], tuple[IntrinsicsSource, ...], list[int], list[str]]:
+    """The cameras, who found each (empty where the file gives all), each frame's, and notes."""
+    cameras: dict[tuple[Camera, IntrinsicsSource], int] = {}
+    shared_sizes: dict[tuple[int, int], int] = {}
+    indices: list[int] = []
+    notes: dict[str, None] = {}
+    for index, (row, header, name) in enumerate(zip(rows, headers, names, strict=True)):
+        result = camera_of_frame(Fields(row, source.document, file, index), header, name)
+        if result.shared:
+            shared_sizes.setdefault((header.width, header.height), index)
+        indices.append(cameras.setdefault((result.camera, result.source), len(cameras)))
+        notes.update(dict.fromkeys(result.notes))
+    if len(shared_sizes) > 1:
+        (size_a, a), (size_b, b) = list(shared_sizes.items())[:2]
+        raise InputError(
+            "mixed_sizes",
+            f"{names[a]} has {size_a[0]} x {size_a[1]} px, {names[b]} {size_b[0]} x {size_b[1]} px, "
+            "but the intrinsics are shared.",
+            where=f"{file} frames[{b}]",
+            mend="Give each frame its own fl_x, fl_y, cx, cy, w and h, or images of one size.",
+        )
+    sources = tuple(by for _, by in cameras)
+    return tuple(camera for camera, _ in cameras), sources, indices, list(notes)
+
+
+def _poses(
+    rows: list[dict[str, Any]], names: list[str], source: SourceFormat, file: str
+) -> tuple[list[NDArray[np.float64] | None], list[str]]:
+    """Each frame's pose, or None where the file has none for it, and notes."""
+    poses: list[NDArray[np.float64] | None] = []
+    worst, worst_name = 0.0, ""
+    for index, (row, name) in enumerate(zip(rows, names, strict=True)):
+        if row.get("transform_matrix") is None:
+            poses.append(None)
+            continue
+        matrix, deviation = rigid_matrix(row["transform_matrix"], f"{file} frames[{index}].transform_matrix")
+        poses.append(world_from_cam_of_file(matrix, source.applied_transform, source.applied_scale))
+        if deviation > worst:
+            worst, worst_name = deviation, name
+    notes = []
+    if worst > ROTATION_WARNED:
+        notes.append(f"rotations were made orthonormal; the worst was off by {worst:.1e} ({worst_name})")
+    without = [name for name, pose in zip(names, poses, strict=True) if pose is None]
+    if without:
+        notes.append(f"{len(without)} of {len(rows)} frames have no pose yet: {few_names(without)}")
+    refuse_coinciding([pose for pose in poses if pose is not None], f"{file} frames")
+    return poses, notes
+
+
+def _masks(
+    path: Path, rows: list[dict[str, Any]], images: Sequence[Path], within: Path | None
+) -> list[tuple[Path | None, bool]]:
+    """Each frame's mask, its own or instant-ngp's beside the image, and whether it is black where pixels count."""
+    masks = []
+    for index, (row, image) in enumerate(zip(rows, images, strict=True)):
+        name = row.get("mask_path")
+        where = f"{path.name} frames[{index}].mask_path"
+        if name is None:
+            masks.append(dynamic_mask(image, within))
+        else:
+            masks.append((named_mask(path, name, where, within), False))
+    return masks
+
+
+def _other_notes(
+    rows: list[dict[str, Any]], document: dict[str, Any], masks: list[tuple[Path | None, bool]]
+) -> list[str]:
+    notes = []
+    masked = sum(mask is not None for mask, _ in masks)
+    if masked:
+        notes.append(f"masks were found for {masked} of {len(rows)} images")
+    if any(row.get("rolling_shutter") or document.get("rolling_shutter") for row in rows):
+        notes.append("rolling_shutter is not modelled")
+    return notes

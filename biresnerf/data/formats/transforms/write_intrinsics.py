@@ -1,0 +1,63 @@
+"""Intrinsics into a transforms.json: as nerfstudio and instant-ngp name them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from biresnerf.data.model.dataset import Camera
+
+FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+_OTHER_KEYS = ("cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+def family(camera: Camera) -> str:
+    """``camera_model`` of the file; FULL_OPENCV, which nerfstudio does not know, where nothing less will do."""
+    if camera.full().fisheye:
+        return "OPENCV_FISHEYE"
+    return "FULL_OPENCV" if camera.model == "FULL_OPENCV" else "OPENCV"
+
+
+def lens_values(camera: Camera) -> dict[str, Any]:
+    """Size and intrinsics by their keys."""
+    p = camera.full()
+    values: dict[str, Any] = {"w": camera.width, "h": camera.height}
+    values |= {"fl_x": p.fx, "fl_y": p.fy, "cx": p.cx, "cy": p.cy}
+    # instant-ngp would take p1 and p2 of a fisheye for its k3 and k4.
+    names = ["k1", "k2", "k3", "k4"] if p.fisheye else ["k1", "k2", "p1", "p2"]
+    if camera.model == "FULL_OPENCV":
+        names += ["k3", "k4", "k5", "k6"]
+    return values | {name: getattr(p, name) for name in names}
+
+
+def says_lens(place: dict[str, Any]) -> bool:
+    """Whether a frame brings intrinsics of its own."""
+    return any(place.get(key) is not None for key in (*FOCAL_KEYS, *_OTHER_KEYS))
+
+
+def put_lens(place: dict[str, Any], camera: Camera) -> None:
+    """Change what a frame, or the file's top level, says of the lens to ``camera``, under the keys that are there.
+
+    Angles stay angles where they suffice: a Blender file gets no focal length in pixels as long as its pixels are
+    square and its principal point is in the middle. Other keys are added where they are not zero.
+    """
+    p = camera.full()
+    angles = {
+        "camera_angle_x": 2 * math.atan(camera.width / (2 * p.fx)),
+        "camera_angle_y": 2 * math.atan(camera.height / (2 * p.fy)),
+    }
+    angles |= {
+        "x_fov": math.degrees(angles["camera_angle_x"]),
+        "y_fov": math.degrees(angles["camera_angle_y"]),
+    }
+    values = lens_values(camera)
+    plain = not p.distorted and p.fx == p.fy and (p.cx, p.cy) == (camera.width / 2, camera.height / 2)
+    in_angles = plain and place.keys() & angles.keys() and not place.keys() & {"fl_x", "fl_y"}
+    for key, angle in angles.items():
+        if place.get(key) is not None:
+            place[key] = angle
+    if not in_angles:
+        needed = {"w", "h", "fl_x", "fl_y", "cx", "cy"}
+        place |= {k: v for k, v in values.items() if k in place or k in needed or v != 0.0}
+    elif "w" in place or "h" in place:
+        place |= {key: values[key] for key in ("w", "h") if key in place}

@@ -1,0 +1,124 @@
+"""A COLMAP model in memory: every id, rig, frame, observation and point as its files have them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import Camera
+
+SensorType = Literal["CAMERA", "IMU"]
+ModelForm = Literal["binary", "text"]
+Sensor = tuple[SensorType, int]
+NO_POINT = -1  # of an observation that belongs to no 3D point
+
+
+@dataclass(frozen=True, eq=False)
+class RigidPose:
+    """``b_from_a`` as COLMAP writes it: a quaternion (w, x, y, z), float64 [4], and a translation, float64 [3].
+
+    The quaternion is kept as it stands in the file; its length is not exactly 1.
+    """
+
+    quat_wxyz: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapImage:
+    """One registered image.
+
+    Attributes:
+        id, name, camera_id: as in the file; the name is relative to the folder of images, with forward slashes.
+        cam_from_world: its pose, OpenCV axes.
+        points2d_px: its features, float64 [n, 2], px.
+        point3d_ids: the 3D point that each feature sees, int64 [n]; `NO_POINT` where none.
+    """
+
+    id: int
+    name: str
+    camera_id: int
+    cam_from_world: RigidPose
+    points2d_px: NDArray[np.float64]
+    point3d_ids: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapPoints:
+    """The 3D points, in the file's order; point k is seen by the track elements starts[k] to starts[k + 1].
+
+    Attributes:
+        ids: int64 [m].
+        xyz: float64 [m, 3], in the world.
+        rgb: uint8 [m, 3].
+        errors: mean reprojection error, float64 [m], px; -1 where COLMAP has not computed it.
+        track_starts: int64 [m + 1].
+        track_image_ids: int64 [k].
+        track_point2d_indices: which feature of that image, int64 [k].
+    """
+
+    ids: NDArray[np.int64]
+    xyz: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    errors: NDArray[np.float64]
+    track_starts: NDArray[np.int64]
+    track_image_ids: NDArray[np.int64]
+    track_point2d_indices: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def no_points() -> ColmapPoints:
+    """The points of a model that has none."""
+    none = np.zeros(0, np.int64)
+    return ColmapPoints(
+        none, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(1, np.int64), none, none
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapRig:
+    """Sensors bolted together. ``sensor_from_rig`` has all but the reference; None where it is not known."""
+
+    id: int
+    reference: Sensor | None
+    sensor_from_rig: dict[Sensor, RigidPose | None]
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapFrame:
+    """One moment of a rig: its pose, and what each sensor took (for a camera the image's id)."""
+
+    id: int
+    rig_id: int
+    rig_from_world: RigidPose
+    data_ids: tuple[tuple[Sensor, int], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapModel:
+    """A validated model: no dangling reference, no repeated id or name, all numbers finite.
+
+    Attributes:
+        folder: where it was read.
+        form: which of the two forms was read.
+        cameras: by id, in the file's order.
+        images: by id, in the file's order.
+        points: the 3D points.
+        rigs, frames: by id; both empty in models from before COLMAP 3.12.
+        notes: what the user should know about how it was read.
+    """
+
+    folder: Path
+    form: ModelForm
+    cameras: dict[int, Camera]
+    images: dict[int, ColmapImage]
+    points: ColmapPoints
+    rigs: dict[int, ColmapRig]
+    frames: dict[int, ColmapFrame]
+    notes: tuple[str, ...] = ()

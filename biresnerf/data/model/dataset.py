@@ -1,0 +1,177 @@
+"""What the reader hands on: cameras, frames and where they came from. Frozen, numpy only."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.geometry.camera.camera_models import FullParameters, full_parameters, smallest_model
+from biresnerf.report import PoseSource
+
+if TYPE_CHECKING:
+    from biresnerf.data.model.colmap_scene import ColmapModel
+
+# Guesses from other images: worth trying, not worth believing.
+GUESSES: frozenset[PoseSource] = frozenset({"neighbours", "nearest-view"})
+IntrinsicsSource = Literal["given", "exif", "colmap", "guessed", "refined"]
+Dialect = Literal[
+    "nerfstudio", "instant-ngp", "blender", "images", "colmap", "llff", "tum", "kitti", "bundler", "metashape"
+]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics: COLMAP model name, image size (px) and parameters in COLMAP's order.
+
+    Pixels; the centre of the first pixel lies at (0.5, 0.5).
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def full(self) -> FullParameters:
+        """These intrinsics with all coefficients written out, and whether they are a fisheye's."""
+        return full_parameters(self.model, self.params)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the same picture resampled to ``width`` x ``height`` px.
+
+        The true ratios are used, so a model with one focal length may have to become one with two.
+        """
+        a, b = width / self.width, height / self.height
+        p = self.full()
+        scaled = p._replace(fx=p.fx * a, fy=p.fy * b, cx=p.cx * a, cy=p.cy * b)
+        model, params = smallest_model(scaled, self.model)
+        return Camera(model, width, height, params)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image and its pose.
+
+    Attributes:
+        name: exactly what the user's file calls the image, or its path relative to the folder of images.
+        path: the image file.
+        camera: index into ``Dataset.cameras``.
+        world_from_cam: float64 [4, 4], a rigid motion; OpenCV axes (x right, y down, z forward). None where
+            nobody has said yet where the image was taken.
+        pose_source: who found the pose; None where there is none.
+        raw: the frame as the user's file has it (empty for a folder of images).
+        mask: a file that says which pixels count: where it is black they do not.
+        orientation: EXIF orientation (1 to 8) by which stored pixels are turned first; camera, pose and mask are
+            for the turned picture. 1 where they are for pixels as stored.
+        mask_inverted: the mask means the opposite: pixels count where it is black (instant-ngp's dynamic_mask_*).
+        timestamp_s: when it was taken, where a trajectory said so.
+    """
+
+    name: str
+    path: Path
+    camera: int
+    world_from_cam: NDArray[np.float64] | None
+    pose_source: PoseSource | None
+    raw: dict[str, Any] = field(default_factory=dict)
+    mask: Path | None = None
+    orientation: int = 1
+    mask_inverted: bool = False
+    timestamp_s: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SourceFormat:
+    """How the input was written, so that the result can be written the same way.
+
+    Attributes:
+        dialect: which convention the input follows; ``images`` for a folder without poses.
+        file: the transforms file, or None for other inputs.
+        document: its top-level values other than ``frames``, in their order; and the place of ``frames`` kept
+            as a None.
+        applied_transform: float64 [4, 4] rigid motion of nerfstudio's key, identity where there is none.
+        applied_scale: nerfstudio's key, 1 where there is none. A point of the world lies in the file at
+            ``applied_scale * (applied_transform @ x)``.
+        colmap: the model that the input was, with its ids, rigs and points; ``Frame.name`` is then its name of the
+            image. None for other inputs.
+        files: all files but images and masks that were read.
+    """
+
+    dialect: Dialect
+    file: Path | None
+    document: dict[str, Any]
+    applied_transform: NDArray[np.float64]
+    applied_scale: float = 1.0
+    colmap: ColmapModel | None = None
+    files: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A validated set of images with poses, or with some or all of them still to be found.
+
+    Attributes:
+        root: the folder that image names are relative to.
+        cameras: the intrinsics that frames refer to.
+        frames: in the user's order.
+        source: how the input was written.
+        warnings: what the user should know about how it was read.
+        intrinsics_sources: who found each camera's intrinsics; empty where the user gave them all.
+    """
+
+    root: Path
+    cameras: tuple[Camera, ...]
+    frames: tuple[Frame, ...]
+    source: SourceFormat
+    warnings: tuple[str, ...] = ()
+    intrinsics_sources: tuple[IntrinsicsSource, ...] = ()
+
+    def __post_init__(self) -> None:
+        if all(by == "given" for by in self.intrinsics_sources):
+            object.__setattr__(self, "intrinsics_sources", ())
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The images' names as the user's file writes them, in its order."""
+        return tuple(frame.name for frame in self.frames)
+
+    @property
+    def file_names(self) -> tuple[str, ...]:
+        """The images' paths relative to ``root``, with extension and forward slashes (COLMAP's names)."""
+        return tuple(Path(os.path.relpath(frame.path, self.root)).as_posix() for frame in self.frames)
+
+    @property
+    def posed(self) -> NDArray[np.bool_]:
+        """Which frames have a pose, bool [n]."""
+        return np.array([frame.world_from_cam is not None for frame in self.frames], dtype=np.bool_)
+
+    @property
+    def world_from_cam(self) -> NDArray[np.float64]:
+        """All poses, float64 [n, 4, 4]. Raises ValueError while one is missing."""
+        poses = [frame.world_from_cam for frame in self.frames if frame.world_from_cam is not None]
+        if len(poses) != len(self.frames):
+            raise ValueError(f"{len(self.frames) - len(poses)} of {len(self.frames)} frames have no pose yet")
+        return np.stack(poses)
+
+    @property
+    def anchors(self) -> NDArray[np.bool_]:
+        """Whose poses say what the frame is, bool [n]: those given; where there are none, all but guesses."""
+        given = np.array([frame.pose_source == "given" for frame in self.frames], dtype=np.bool_)
+        if given.any():
+            return given
+        found = np.array([frame.pose_source not in GUESSES for frame in self.frames], dtype=np.bool_)
+        return found if found.any() else ~found
+
+    def camera_of(self, index: int) -> Camera:
+        """The camera of frame ``index``, at full size."""
+        return self.cameras[self.frames[index].camera]
+
+    def source_of_intrinsics(self, camera: int) -> IntrinsicsSource:
+        """Who found the intrinsics of camera ``camera``."""
+        return self.intrinsics_sources[camera] if self.intrinsics_sources else "given"

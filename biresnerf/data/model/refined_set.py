@@ -1,0 +1,174 @@
+"""A finished result as the writers take it: cameras, poses before and after, the sparse model. Frozen, numpy only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.colmap_scene import ColmapModel, no_points
+from biresnerf.data.model.dataset import Camera, Dataset
+from biresnerf.data.model.result_model import model_at_poses, model_of_poses, with_points
+from biresnerf.geometry.rigid import rigid_inverse
+from biresnerf.geometry.similarity import Similarity
+
+# ``given``: the input's, as nothing moved; ``tracks``: its tracks triangulated again; ``features``: matches of features
+# triangulated; ``moved``: the input's points carried along with the cameras nearest to them.
+PointsSource = Literal["none", "given", "features", "tracks", "moved"]
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedImage:
+    """One image of a result.
+
+    Attributes:
+        name: as the caller wrote it.
+        file_name: its path relative to the caller's folder, with extension and forward slashes.
+        camera: index into `RefinedSet.cameras`.
+        world_from_cam: float64 [4, 4], refined, in the caller's world; OpenCV axes.
+        given: its pose before, float64 [4, 4]; None where there was none.
+        pose_source: who found the pose that the optimisation started from.
+        flags: what is to be known of it: ``fixed``, ``held_out``, ``lost``, ``repaired``, ...
+        path: the file; None where it is not known.
+        orientation: as `biresnerf.data.model.dataset.Frame` has it.
+    """
+
+    name: str
+    file_name: str
+    camera: int
+    world_from_cam: NDArray[np.float64]
+    given: NDArray[np.float64] | None
+    pose_source: str
+    flags: tuple[str, ...] = ()
+    path: Path | None = None
+    orientation: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedSet:
+    """Poses that have been refined, with all that writers ask of a set.
+
+    Attributes:
+        cameras: intrinsics at full size.
+        images: in the caller's order.
+        model: the same as a COLMAP model, with the caller's ids where the input was one, and the points.
+        image_ids: of the images in the model.
+        points_source: where the model's points come from.
+        similarity: ``input_from_optimised``, which tied the poses to the caller's frame.
+        timestamps_s: of the images, where the input was a trajectory with times.
+    """
+
+    cameras: tuple[Camera, ...]
+    images: tuple[RefinedImage, ...]
+    model: ColmapModel
+    image_ids: tuple[int, ...]
+    points_source: PointsSource
+    similarity: Similarity
+    timestamps_s: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        poses = [image.world_from_cam for image in self.images]
+        if any(pose.shape != (4, 4) or not np.isfinite(pose).all() for pose in poses):
+            raise ValueError("poses must be finite and of shape (4, 4)")
+        if len({image.file_name for image in self.images}) != len(self.images):
+            raise ValueError("images must have different names")
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def world_from_cam(self) -> NDArray[np.float64]:
+        """The refined poses, float64 [n, 4, 4]."""
+        return np.stack([image.world_from_cam for image in self.images])
+
+    @property
+    def cam_from_world(self) -> NDArray[np.float64]:
+        """The refined poses the other way round, float64 [n, 4, 4]."""
+        return rigid_inverse(self.world_from_cam)
+
+    def camera_of(self, index: int) -> Camera:
+        """The camera that took image ``index``."""
+        return self.cameras[self.images[index].camera]
+
+
+def refined_set(
+    dataset: Dataset,
+    world_from_cam: NDArray[np.float64],
+    *,
+    given: Sequence[NDArray[np.float64] | None] | None = None,
+    similarity: Similarity | None = None,
+    pose_sources: Sequence[str] | None = None,
+    flags: Sequence[tuple[str, ...]] | None = None,
+    timestamps_s: tuple[float, ...] | None = None,
+) -> RefinedSet:
+    """The set of ``dataset`` at refined poses [n, 4, 4], without points; what is left out is unknown or none.
+
+    Where the input was a COLMAP model, its ids, rigs and features are kept.
+
+    Args:
+        given: the poses before; those of the dataset where left out.
+        timestamps_s: of the images; those of the dataset where left out.
+
+    Raises:
+        ValueError: poses are not finite or not of all images.
+    """
+    count = len(dataset)
+    if world_from_cam.shape != (count, 4, 4) or not np.isfinite(world_from_cam).all():
+        raise ValueError(f"poses must be finite and of shape ({count}, 4, 4), not {world_from_cam.shape}")
+    before = [frame.world_from_cam for frame in dataset.frames] if given is None else list(given)
+    sources = pose_sources or [frame.pose_source or "none" for frame in dataset.frames]
+    marks = flags or [()] * count
+    images = tuple(
+        RefinedImage(
+            frame.name,
+            file_name,
+            frame.camera,
+            pose,
+            before[i],
+            sources[i],
+            marks[i],
+            frame.path,
+            frame.orientation,
+        )
+        for i, (frame, file_name, pose) in enumerate(
+            zip(dataset.frames, dataset.file_names, np.asarray(world_from_cam, np.float64), strict=True)
+        )
+    )
+    model, image_ids = _model(dataset, before, world_from_cam)
+    return RefinedSet(
+        dataset.cameras,
+        images,
+        model,
+        image_ids,
+        "none",
+        similarity or Similarity.identity(),
+        _times(dataset) if timestamps_s is None else timestamps_s,
+    )
+
+
+def _model(
+    dataset: Dataset, before: Sequence[NDArray[np.float64] | None], world_from_cam: NDArray[np.float64]
+) -> tuple[ColmapModel, tuple[int, ...]]:
+    """The set as a COLMAP model without points, the caller's own where the input was one, and the images' ids."""
+    indices = [frame.camera for frame in dataset.frames]
+    given = dataset.source.colmap
+    if given is None:
+        made = model_of_poses(dataset.file_names, dataset.cameras, indices, world_from_cam)
+        return made, tuple(range(1, len(dataset) + 1))
+    changed = np.array(
+        [old is None or not np.array_equal(old, new) for old, new in zip(before, world_from_cam, strict=True)]
+    )
+    moved = model_at_poses(given, dataset.names, dataset.cameras, indices, world_from_cam, changed)
+    model = with_points(moved, no_points())  # the given ones belong to the poses before
+    id_of_name = {image.name: image.id for image in model.images.values()}
+    return model, tuple(id_of_name[name] for name in dataset.names)
+
+
+def _times(dataset: Dataset) -> tuple[float, ...] | None:
+    """When the images were taken, where the input says it of all of them."""
+    times = tuple(frame.timestamp_s for frame in dataset.frames if frame.timestamp_s is not None)
+    return times if len(times) == len(dataset) else None

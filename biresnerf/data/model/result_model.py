@@ -1,0 +1,164 @@
+"""A result as a COLMAP model: the caller's ids, cameras, rigs and frames where the input was a COLMAP model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.colmap_scene import (
+    NO_POINT,
+    ColmapFrame,
+    ColmapImage,
+    ColmapModel,
+    ColmapPoints,
+    ColmapRig,
+    RigidPose,
+    Sensor,
+    no_points,
+)
+from biresnerf.data.model.conventions import quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from biresnerf.data.model.dataset import Camera
+from biresnerf.geometry.rigid import rigid_inverse
+
+
+def rigid_pose_of(b_from_a: NDArray[np.float64]) -> RigidPose:
+    """The pose of a matrix [4, 4] as COLMAP writes it; the quaternion's w is not negative."""
+    return RigidPose(quat_wxyz_from_rotation(b_from_a[:3, :3]), b_from_a[:3, 3].copy())
+
+
+def matrix_of_pose(pose: RigidPose) -> NDArray[np.float64]:
+    """The matrix [4, 4] of a pose as COLMAP writes it."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation_from_quat_wxyz(pose.quat_wxyz), pose.translation
+    return matrix
+
+
+def model_of_poses(
+    names: Sequence[str],
+    cameras: Sequence[Camera],
+    camera_indices: Sequence[int],
+    world_from_cam: NDArray[np.float64],
+) -> ColmapModel:
+    """A model without points or rigs; ids are positions counted from 1."""
+    cam_from_world = rigid_inverse(world_from_cam)
+    images = {
+        number: _unseeing(number, name, camera + 1, rigid_pose_of(pose))
+        for number, (name, camera, pose) in enumerate(
+            zip(names, camera_indices, cam_from_world, strict=True), start=1
+        )
+    }
+    return ColmapModel(Path(), "binary", dict(enumerate(cameras, start=1)), images, no_points(), {}, {})
+
+
+def model_at_poses(
+    given: ColmapModel,
+    names: Sequence[str],
+    cameras: Sequence[Camera],
+    camera_indices: Sequence[int],
+    world_from_cam: NDArray[np.float64],
+    changed: NDArray[np.bool_],
+) -> ColmapModel:
+    """The caller's model with refined poses and lenses; all ids, names, features and points as given.
+
+    Images that did not change (``changed`` [n] false) keep their numbers to the bit. Images that the model did not
+    have get new ids behind the last ones, and a frame each where the model has frames. Points are the given ones: the
+    caller is to put them right (`biresnerf.data.triangulate`).
+
+    Args:
+        given: the caller's model.
+        names: of the images in it.
+        cameras, camera_indices: lenses after the refinement, and which took each image.
+        world_from_cam: float64 [n, 4, 4].
+    """
+    cam_from_world = rigid_inverse(world_from_cam)
+    by_name = {image.name: image for image in given.images.values()}
+    lenses, images = dict(given.cameras), dict(given.images)
+    lens_ids: dict[int, int] = {}  # by index into cameras
+    for name, index in zip(names, camera_indices, strict=True):
+        if name in by_name:
+            number = by_name[name].camera_id
+            lenses[number], lens_ids[index] = cameras[index], number
+    for row, (name, index) in enumerate(zip(names, camera_indices, strict=True)):
+        pose = rigid_pose_of(cam_from_world[row])
+        image = by_name.get(name)
+        if image is None:
+            if index not in lens_ids:
+                lens_ids[index] = max(lenses) + 1
+                lenses[lens_ids[index]] = cameras[index]
+            number = max(images) + 1
+            images[number] = _unseeing(number, name, lens_ids[index], pose)
+        elif changed[row]:
+            images[image.id] = replace(image, cam_from_world=pose)
+    moved = {
+        by_name[name].id for name, new in zip(names, changed.tolist(), strict=True) if new and name in by_name
+    }
+    rigs, frames = _rigs_and_frames(given, images, moved)
+    return replace(given, cameras=lenses, images=images, rigs=rigs, frames=frames)
+
+
+def _unseeing(number: int, name: str, camera_id: int, pose: RigidPose) -> ColmapImage:
+    return ColmapImage(number, name, camera_id, pose, np.zeros((0, 2)), np.zeros(0, np.int64))
+
+
+def _rigs_and_frames(
+    given: ColmapModel, images: dict[int, ColmapImage], moved: set[int]
+) -> tuple[dict[int, ColmapRig], dict[int, ColmapFrame]]:
+    """The given frames at their images' new poses, and one more for each image that had none."""
+    if not given.rigs:
+        return {}, {}
+    rigs, frames = dict(given.rigs), {}
+    placed: set[int] = set()
+    for number, frame in given.frames.items():
+        taken = [(sensor, image) for sensor, image in frame.data_ids if sensor[0] == "CAMERA"]
+        placed.update(image for _, image in taken)
+        pose = frame.rig_from_world
+        if any(image in moved for _, image in taken):
+            pose = _rig_from_world(rigs[frame.rig_id], taken, images) or pose
+        frames[number] = replace(frame, rig_from_world=pose)
+    for image in images.values():
+        if image.id in placed:
+            continue
+        sensor: Sensor = ("CAMERA", image.camera_id)
+        rig = next(
+            (rig for rig in rigs.values() if sensor == rig.reference or sensor in rig.sensor_from_rig), None
+        )
+        if rig is None:
+            rig = ColmapRig(max(rigs) + 1, sensor, {})
+            rigs[rig.id] = rig
+        new_pose = _rig_from_world(rig, [(sensor, image.id)], images)
+        if new_pose is None:  # a sensor whose place in its rig nobody knows: COLMAP has no way to hold this
+            continue
+        number = max(frames, default=0) + 1
+        frames[number] = ColmapFrame(number, rig.id, new_pose, ((sensor, image.id),))
+    return rigs, frames
+
+
+def _rig_from_world(
+    rig: ColmapRig, taken: Sequence[tuple[Sensor, int]], images: dict[int, ColmapImage]
+) -> RigidPose | None:
+    """The rig's pose by what its reference took, else by the first sensor whose place in the rig is known."""
+    for sensor, image in taken:
+        if sensor == rig.reference:
+            return images[image].cam_from_world
+    for sensor, image in taken:
+        sensor_from_rig = rig.sensor_from_rig.get(sensor)
+        if sensor_from_rig is not None:
+            rig_from_sensor = rigid_inverse(matrix_of_pose(sensor_from_rig))
+            return rigid_pose_of(rig_from_sensor @ matrix_of_pose(images[image].cam_from_world))
+    return None
+
+
+def with_points(model: ColmapModel, points: ColmapPoints) -> ColmapModel:
+    """The model with other points: features stay, and say which of these points they see."""
+    ids = {number: np.full(len(image.point3d_ids), NO_POINT) for number, image in model.images.items()}
+    owners = np.repeat(points.ids, np.diff(points.track_starts))
+    for owner, image, feature in zip(
+        owners.tolist(), points.track_image_ids.tolist(), points.track_point2d_indices.tolist(), strict=True
+    ):
+        ids[image][feature] = owner
+    images = {number: replace(image, point3d_ids=ids[number]) for number, image in model.images.items()}
+    return replace(model, images=images, points=points)

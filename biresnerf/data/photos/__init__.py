@@ -1,0 +1,1 @@
+"""Photos and masks: found, decoded, turned upright, resized, compared. Reads no poses."""

@@ -1,0 +1,71 @@
+"""Decoding one image file into the pixels that its frame means: 8-bit colours, turned only where the frame says so."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from biresnerf.data.model.dataset import Camera, Frame
+from biresnerf.data.photos.image_files import DAMAGED, header_of, open_image
+from biresnerf.data.photos.orientation import INVERSE, turned, turned_size
+from biresnerf.errors import InputError
+
+T = TypeVar("T", bound=np.generic)
+_ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})
+
+
+def decode(frame: Frame, camera: Camera) -> NDArray[np.uint8]:
+    """The frame's pixels, uint8 [h, w, 3] or [h, w, 4] (straight alpha); 16-bit and grey become 8-bit RGB.
+
+    Of several pages or frames in one file it is the first. Wide colour spaces are taken as they are.
+
+    Raises:
+        InputError: ``not_an_image``, ``image_truncated``, ``image_too_large``, ``image_changed`` or
+            ``image_format_unsupported``.
+    """
+    with open_image(frame.path, frame.name) as image:
+        header = header_of(image)
+        width, height = turned_size(header.width, header.height, frame.orientation)
+        if (width, height) != (camera.width, camera.height):
+            raise InputError(
+                "image_changed",
+                f"has {width} x {height} px now, not {camera.width} x {camera.height}.",
+                where=frame.name,
+                mend="Leave the images alone while they are being read.",
+            )
+        try:
+            image.load()
+            stored = as_stored(_eight_bit(image, frame.name), image, header.orientation)
+            return turned(stored, frame.orientation)
+        except DAMAGED:
+            raise InputError(
+                "image_truncated",
+                "is cut off or damaged.",
+                where=frame.name,
+                mend="Copy it again, or remove its frame.",
+            ) from None
+
+
+def as_stored(picture: NDArray[T], image: Image.Image, orientation: int) -> NDArray[T]:
+    """The decoded ``picture`` as its file has it: Pillow turns a TIFF as its tag says, and nothing else."""
+    return turned(picture, INVERSE[orientation]) if image.format == "TIFF" else picture
+
+
+def _eight_bit(image: Image.Image, name: str) -> NDArray[np.uint8]:
+    if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
+        # 65535 becomes 255: the full range, rounded.
+        grey = ((np.asarray(image).astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+        return np.repeat(grey[..., None], 3, axis=2)
+    if image.mode in ("I", "F"):
+        raise InputError(
+            "image_format_unsupported",
+            "holds 32-bit numbers, which are no colours.",
+            where=name,
+            mend="Save it with 8 or 16 bits per channel.",
+        )
+    if image.mode in _ALPHA_MODES or "transparency" in image.info:
+        return np.asarray(image.convert("RGBA"))
+    return np.asarray(image.convert("RGB"))

@@ -1,0 +1,45 @@
+"""How alike whole photos are: what says, without any features, which of them may show the same."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.photos.area_resize import area_resize
+from biresnerf.data.photos.image_files import open_image, quiet_pillow
+
+SIDE = 24  # px that photos are shrunk to
+_DRAFT = 8 * SIDE  # px that a JPEG is decoded at
+_DECODERS = 4
+
+
+def likeness(dataset: Dataset) -> NDArray[np.float32]:
+    """Normalised correlation [n, n] of the photos in grey, each shrunk to 24 x 24 px: 1 on the diagonal, -1 at least.
+
+    A photo of one colour is like no other (0). Raises `InputError` as `open_image` does.
+    """
+    with quiet_pillow(), ThreadPoolExecutor(_DECODERS, thread_name_prefix="thumbnail") as pool:
+        small = np.stack(list(pool.map(lambda i: _thumbnail(dataset, i), range(len(dataset)))))
+    small = small.reshape(len(small), -1)
+    small = small - small.mean(1, keepdims=True)
+    lengths = np.linalg.norm(small, axis=1, keepdims=True)
+    unit = np.divide(small, lengths, out=np.zeros_like(small), where=lengths > 1e-6)
+    alike: NDArray[np.float32] = unit @ unit.T
+    np.fill_diagonal(alike, 1.0)
+    return alike
+
+
+def _thumbnail(dataset: Dataset, index: int) -> NDArray[np.float32]:
+    frame = dataset.frames[index]
+    with open_image(frame.path, frame.name) as image:
+        image.draft("L", (_DRAFT, _DRAFT))
+        wide = image.mode.startswith(("I", "F"))  # 16 bit: Pillow would clip them
+        grey = np.asarray(image if wide else image.convert("L"), dtype=np.float32)
+    side_y, side_x = min(SIDE, grey.shape[0]), min(SIDE, grey.shape[1])
+    small = area_resize(grey[..., None], side_x, side_y)[..., 0]
+    padded = np.full((SIDE, SIDE), small.mean(), dtype=np.float32)
+    padded[:side_y, :side_x] = small
+    return padded

@@ -1,0 +1,166 @@
+"""Decoding every image fully, at working size, into one flat array of bytes."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import Camera, Dataset
+from biresnerf.data.photos.area_resize import area_resize
+from biresnerf.data.photos.background import uniform_background
+from biresnerf.data.photos.decode import decode
+from biresnerf.data.photos.image_files import quiet_pillow
+from biresnerf.data.photos.masks import load_mask, shrink_mask
+from biresnerf.options.refine_options import Background
+
+T = TypeVar("T", bound=np.generic)
+_WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+# More threads hold more full-size pictures at once than they save time.
+_DECODERS = 4
+_DECODING_BYTES = 2**30  # for all threads together
+_DECODING_BYTES_PER_PX = 24  # RGBA as bytes and as floats, and the float copy being shrunk
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSet:
+    """All images at working size. Colours are as stored (sRGB values, not linear light), 0 to 255.
+
+    Attributes:
+        pixels: uint8 [total_px, 3], image after image, row by row; composited on the background where there
+            is
+            transparency.
+        alpha: uint8 [total_px], or None where every pixel is opaque.
+        offsets: int64 [n + 1]; image i has the pixels from offsets[i] to offsets[i + 1].
+        widths, heights: int32 [n], px.
+        cameras: of each image, at its working size.
+        background: float32 [3], 0 to 1: the colour behind the scene; None where photos show surroundings.
+        counts: bool [total_px], which pixels may be learnt from and measured at (masks); None where all may.
+    """
+
+    pixels: NDArray[np.uint8]
+    alpha: NDArray[np.uint8] | None
+    offsets: NDArray[np.int64]
+    widths: NDArray[np.int32]
+    heights: NDArray[np.int32]
+    cameras: tuple[Camera, ...]
+    background: NDArray[np.float32] | None
+    counts: NDArray[np.bool_] | None = None
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """uint8 [h, w, 3], a view of image ``index``."""
+        rows = self.pixels[self.offsets[index] : self.offsets[index + 1]]
+        return rows.reshape(int(self.heights[index]), int(self.widths[index]), 3)
+
+    def alpha_image(self, index: int) -> NDArray[np.uint8] | None:
+        """uint8 [h, w], a view of the opacity of image ``index``, or None where all is opaque."""
+        return None if self.alpha is None else self._plane(self.alpha, index)
+
+    def counts_image(self, index: int) -> NDArray[np.bool_] | None:
+        """bool [h, w], a view of which pixels of image ``index`` count, or None where there are no masks."""
+        return None if self.counts is None else self._plane(self.counts, index)
+
+    def _plane(self, values: NDArray[T], index: int) -> NDArray[T]:
+        rows = values[self.offsets[index] : self.offsets[index + 1]]
+        return rows.reshape(int(self.heights[index]), int(self.widths[index]))
+
+
+def working_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
+    """Width and height (px) with the long side at most ``max_size``; never enlarged, never below 1."""
+    longest = max(width, height)
+    if max_size is None or longest <= max_size:
+        return width, height
+    return max(1, round(width * max_size / longest)), max(1, round(height * max_size / longest))
+
+
+def load_images(dataset: Dataset, max_size: int | None = None, background: Background = "auto") -> ImageSet:
+    """Decodes all images, shrunk by exact area averaging so that the long side is ``max_size`` px at most.
+
+    ``background``: ``white`` and ``black`` say what lies behind the scene, and what transparency is
+    composited on; ``none`` says that photos show surroundings (opacity is then dropped and colours are taken
+    as stored); ``auto`` is white where images have transparency, else black or white where all borders show
+    it, else none.
+
+    Raises:
+        InputError: ``not_an_image``, ``image_truncated``, ``image_too_large``, ``image_changed``,
+            ``image_format_unsupported``, ``mask_size_mismatch`` or ``mask_hides_image``, naming the image.
+    """
+    sizes = [working_size(c.width, c.height, max_size) for c in map(dataset.camera_of, range(len(dataset)))]
+    widths = np.array([w for w, _ in sizes], dtype=np.int32)
+    heights = np.array([h for _, h in sizes], dtype=np.int32)
+    offsets = np.concatenate(([0], np.cumsum(widths.astype(np.int64) * heights)))
+    pixels = np.empty((int(offsets[-1]), 3), dtype=np.uint8)
+    alpha = np.empty(int(offsets[-1]), dtype=np.uint8)
+    masked = any(frame.mask is not None for frame in dataset.frames)
+    counts = np.ones(int(offsets[-1]) if masked else 0, dtype=np.bool_)
+    behind = _BLACK if background == "black" else _WHITE
+
+    def fill(index: int) -> None:
+        part = slice(int(offsets[index]), int(offsets[index + 1]))
+        picture = decode(dataset.frames[index], dataset.camera_of(index))
+        colour, opacity = _shrink(picture, *sizes[index], behind, keep_alpha=background != "none")
+        pixels[part], alpha[part] = colour.reshape(-1, 3), opacity.reshape(-1)
+        mask = load_mask(dataset.frames[index], dataset.camera_of(index))
+        if mask is not None:
+            counts[part] = shrink_mask(mask, *sizes[index]).reshape(-1)
+
+    largest = max(camera.width * camera.height for camera in dataset.cameras)
+    fitting = _DECODING_BYTES // (largest * _DECODING_BYTES_PER_PX)
+    threads = max(1, min(_DECODERS, os.cpu_count() or 1, len(dataset), fitting))
+    with quiet_pillow(), ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
+        pending = [pool.submit(fill, index) for index in range(len(dataset))]
+        try:
+            for job in pending:
+                job.result()
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    opaque = bool(alpha.min() == 255)
+    cameras = tuple(dataset.camera_of(i).resized(*sizes[i]) for i in range(len(dataset)))
+    images = ImageSet(
+        pixels, None if opaque else alpha, offsets, widths, heights, cameras, None, counts if masked else None
+    )
+    return _with_background(images, background, behind)
+
+
+def _with_background(images: ImageSet, background: Background, behind: tuple[float, ...]) -> ImageSet:
+    colour: NDArray[np.float32] | None
+    if background == "none":
+        colour = None
+    elif background == "auto" and images.alpha is None:
+        indices = range(len(images))
+        colour = uniform_background(
+            [images.image(i) for i in indices], [images.counts_image(i) for i in indices]
+        )
+    else:
+        colour = np.array(behind, dtype=np.float32)
+    return replace(images, background=colour)
+
+
+def _shrink(
+    picture: NDArray[np.uint8], width: int, height: int, behind: tuple[float, ...], *, keep_alpha: bool
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Colour over ``behind`` uint8 [h, w, 3] and opacity uint8 [h, w] at the given size."""
+    opaque = np.full((height, width), 255, dtype=np.uint8)
+    if picture.shape[2] == 3 or not keep_alpha or picture[..., 3].min() == 255:
+        if picture.shape[:2] == (height, width):
+            return picture[..., :3], opaque
+        return _bytes(area_resize(picture[..., :3], width, height)), opaque
+    # Averages of colours weigh by opacity, else hidden colours bleed into the edges.
+    premultiplied = picture.astype(np.float32)
+    premultiplied[..., :3] *= premultiplied[..., 3:] / 255.0
+    small = area_resize(premultiplied, width, height)
+    opacity = small[..., 3:] / 255.0
+    colour = small[..., :3] + (1.0 - opacity) * (255.0 * np.asarray(behind, dtype=np.float32))
+    return _bytes(colour), _bytes(small[..., 3])
+
+
+def _bytes(values: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)

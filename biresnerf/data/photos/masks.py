@@ -1,0 +1,140 @@
+"""Masks: which pixels of a photo count. Black ones do not, as in COLMAP and nerfstudio; all others do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from biresnerf.data.model.dataset import Camera, Dataset, Frame
+from biresnerf.data.photos.decode import as_stored
+from biresnerf.data.photos.image_files import DAMAGED, header_of, open_image, quiet_pillow, read_header
+from biresnerf.data.photos.orientation import same_shape, turned, turned_size
+from biresnerf.errors import InputError
+
+# JPEG and lossy WebP keep no exact black; what they store lies on the nearer side of the middle.
+_LOSSY, _LOSSY_BLACK_BELOW = frozenset({"JPEG", "MPO", "WEBP"}), 128
+LEAST_SHARE = 1e-3  # of a photo's pixels must count: from fewer nothing can be said about it
+_WHOLLY = 1 - 1e-6
+
+
+def refuse_unfit_mask(frame: Frame, camera: Camera) -> None:
+    """Looks at the header of the frame's mask, if it has one.
+
+    Raises:
+        InputError: ``mask_size_mismatch``, or what `open_image` says of a file that is no image.
+    """
+    if frame.mask is not None:
+        header = read_header(frame.mask, _where(frame))
+        _turn_to_fit(frame, camera, header.width, header.height, header.orientation)
+
+
+def load_mask(frame: Frame, camera: Camera) -> NDArray[np.bool_] | None:
+    """Which pixels count, bool [h, w] at the mask's own size, turned as the photo; None where there is no mask.
+
+    Any kind of picture will do. A pixel counts unless it is black; in formats with losses, unless it is darker than
+    the middle; a transparent one does not. An inverted mask (``Frame.mask_inverted``) means the opposite.
+
+    Raises:
+        InputError: ``mask_size_mismatch`` where the mask is no copy of the photo's shape, ``mask_hides_image`` where
+            next to nothing counts, ``not_an_image``, ``image_truncated`` or ``image_too_large``.
+    """
+    if frame.mask is None:
+        return None
+    with open_image(frame.mask, _where(frame)) as image:
+        header = header_of(image)
+        turn = _turn_to_fit(frame, camera, header.width, header.height, header.orientation)
+        try:
+            image.load()
+            counts = as_stored(_not_black(image) ^ frame.mask_inverted, image, header.orientation)
+        except DAMAGED:
+            raise InputError(
+                "image_truncated", "is cut off or damaged.", where=_where(frame), mend="Copy the mask again."
+            ) from None
+    if counts.mean() < LEAST_SHARE:
+        raise InputError(
+            "mask_hides_image",
+            f"leaves {100 * counts.mean():.2g} % of the photo: {_meaning(frame)}.",
+            where=_where(frame),
+            mend="Invert the mask if it means the opposite; else remove the frame, or its mask.",
+        )
+    return turned(counts, turn)
+
+
+def shrink_mask(counts: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
+    """``counts`` [h, w] at another size: a pixel counts where all that it covers does.
+
+    Where that leaves nothing (a mask of dots), those count that cover most of what does.
+    """
+    covered = _sums(_sums(counts, height).T, width).T * (width * height / counts.size)
+    whole: NDArray[np.bool_] = covered >= _WHOLLY
+    return whole if whole.any() else covered >= _WHOLLY * covered.max()
+
+
+def write_masks(dataset: Dataset, names: Sequence[str], folder: Path) -> bool:
+    """Writes the masks as COLMAP wants them, ``folder``/``name``.png of the photo's full size; False if there are none.
+
+    Photos without a mask get a white one: COLMAP leaves out photos whose mask it does not find. ``names`` are those
+    that COLMAP is given for the frames, in their order.
+    """
+    if all(frame.mask is None for frame in dataset.frames):
+        return False
+    for index, (frame, name) in enumerate(zip(dataset.frames, names, strict=True)):
+        camera = dataset.camera_of(index)
+        with quiet_pillow():
+            counts = load_mask(frame, camera)
+        full = np.ones((camera.height, camera.width), dtype=np.bool_)
+        if counts is not None:
+            full = shrink_mask(counts, camera.width, camera.height)
+        path = folder / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(full.astype(np.uint8) * 255).save(path)
+    return True
+
+
+def _meaning(frame: Frame) -> str:
+    if frame.mask_inverted:
+        return "black pixels count, all others do not"
+    return "black pixels do not count, all others do"
+
+
+def _where(frame: Frame) -> str:
+    return f"{frame.name} mask {frame.mask.name if frame.mask else ''}"
+
+
+def _turn_to_fit(frame: Frame, camera: Camera, width: int, height: int, orientation: int) -> int:
+    """The orientation that brings a stored mask onto the photo as its frame means it."""
+    if same_shape(*turned_size(width, height, frame.orientation), camera.width, camera.height) and (
+        orientation == frame.orientation or not same_shape(width, height, camera.width, camera.height)
+    ):
+        return frame.orientation
+    if same_shape(width, height, camera.width, camera.height):
+        return 1
+    raise InputError(
+        "mask_size_mismatch",
+        f"has {width} x {height} px, the photo {camera.width} x {camera.height}: not the same shape.",
+        where=_where(frame),
+        mend="Give a mask of the photo's size, or of that scaled by one factor.",
+    )
+
+
+def _not_black(image: Image.Image) -> NDArray[np.bool_]:
+    if image.mode == "F" or image.mode.startswith("I"):
+        return np.asarray(image) > 0
+    values = np.asarray(image.convert("RGBA"))
+    bright = values[..., :3].max(axis=2) * (values[..., 3] > 0)
+    return np.asarray(bright >= (_LOSSY_BLACK_BELOW if image.format in _LOSSY else 1))
+
+
+def _sums(values: NDArray[np.generic], parts: int) -> NDArray[np.float64]:
+    """Sums of ``values`` [h, w] over equal parts of the rows, float64 [parts, w]; fractions of a row count as such."""
+    rows = len(values)
+    total = np.zeros((rows + 1, values.shape[1]), dtype=np.float64)
+    np.cumsum(values, axis=0, out=total[1:])
+    edges = np.arange(parts + 1) * (rows / parts)
+    below = np.minimum(edges.astype(np.int64), rows - 1)
+    upto = total[below] + (edges - below)[:, None] * (total[below + 1] - total[below])
+    return np.diff(upto, axis=0)

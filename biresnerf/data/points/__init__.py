@@ -1,0 +1,1 @@
+"""Feature matches, tracks, and points triangulated from them. Moves no camera."""

@@ -1,0 +1,200 @@
+"""The sparse points of a result: triangulated anew at the refined poses, never those of the poses before.
+
+Trainers start from these points, and points that lie beside the refined cameras' rays undo the refinement
+(nerfstudio's users, issue 3443).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.colmap_scene import NO_POINT, ColmapModel, ColmapPoints
+from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.data.model.result_model import matrix_of_pose, with_points
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.data.points.feature_matches import FeatureMatches
+from biresnerf.data.points.match_tracks import match_tracks
+from biresnerf.geometry.camera.pixel_rays import pixels_of_points, rays_of_pixels
+from biresnerf.geometry.rigid import rigid_inverse
+from biresnerf.geometry.triangulation import parallax_deg, triangulate
+
+# COLMAP's own bounds for a point worth keeping.
+MOST_ERROR_PX, LEAST_PARALLAX_DEG = 4.0, 1.5
+LEAST_AGREEING = 0.5  # of a track's observations: two of eight wrong ones agree on something by chance
+NEAREST = 4  # cameras that carry a point along that no image is known to see
+
+
+def with_points_of(
+    refined: RefinedSet, given: ColmapModel | None, matches: FeatureMatches | None, images: ImageSet
+) -> RefinedSet:
+    """The result with the best points there are: of the input's tracks, else of feature matches, else carried along.
+
+    Args:
+        refined: without points.
+        given: the input, where it was a COLMAP model.
+        matches: found on the way; between frames in the order of ``refined``.
+        images: the photos, for colours.
+    """
+    if given is not None and len(given.points.track_image_ids):
+        return with_given_points(refined, given)
+    if matches is not None:
+        matched = with_matched_points(refined, matches, images)
+        if len(matched.model.points):
+            return matched
+    return refined if given is None else with_given_points(refined, given)
+
+
+def with_matched_points(refined: RefinedSet, matches: FeatureMatches, images: ImageSet) -> RefinedSet:
+    """The result with points triangulated from feature matches; the model's features are then the matched ones."""
+    features, tracks = match_tracks(matches, len(refined))
+    if not tracks:
+        return refined
+    ids = np.array(refined.image_ids)
+    model_images = dict(refined.model.images)
+    for row, number in enumerate(refined.image_ids):
+        none = np.full(len(features[row]), NO_POINT)
+        model_images[number] = replace(model_images[number], points2d_px=features[row], point3d_ids=none)
+    elements = np.concatenate(tracks)
+    starts = np.concatenate(([0], np.cumsum([len(track) for track in tracks]))).astype(np.int64)
+    seen = np.stack([_colour(images, refined, photo, features[photo][k]) for photo, k in elements])
+    rgb = np.add.reduceat(seen, starts[:-1], axis=0) / np.diff(starts)[:, None]
+    count = len(tracks)
+    points = ColmapPoints(
+        np.arange(1, count + 1), np.zeros((count, 3)), np.rint(rgb).astype(np.uint8), np.full(count, -1.0),
+        starts, ids[elements[:, 0]], elements[:, 1].copy(),
+    )  # fmt: skip
+    model = replace(refined.model, images=model_images)
+    return replace(refined, model=with_points(model, triangulated(model, points)), points_source="features")
+
+
+def _colour(
+    images: ImageSet, refined: RefinedSet, photo: int, xy: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The photo's colour [3] at a position in full-size pixels."""
+    picture, camera = images.image(photo), refined.camera_of(photo)
+    height, width = picture.shape[:2]
+    column = min(max(int(xy[0] * width / camera.width), 0), width - 1)
+    row = min(max(int(xy[1] * height / camera.height), 0), height - 1)
+    return picture[row, column].astype(np.float64)
+
+
+def with_given_points(refined: RefinedSet, given: ColmapModel) -> RefinedSet:
+    """The result with the points of the model that the input was.
+
+    Where nothing moved, they are taken as they are. Points with tracks are triangulated from the refined cameras, and
+    left out where those do not agree on them. Points without tracks are carried along by the cameras nearest to them.
+    """
+    if len(given.points) == 0:
+        return refined
+    if _unmoved(refined, given):
+        return replace(refined, model=with_points(refined.model, given.points), points_source="given")
+    if len(given.points.track_image_ids):
+        points = triangulated(refined.model, given.points)
+        return replace(refined, model=with_points(refined.model, points), points_source="tracks")
+    points = replace(given.points, xyz=_carried(refined, given.points.xyz))
+    return replace(refined, model=with_points(refined.model, points), points_source="moved")
+
+
+def _unmoved(refined: RefinedSet, given: ColmapModel) -> bool:
+    model = refined.model
+    return all(
+        number in model.images
+        and np.array_equal(model.images[number].cam_from_world.quat_wxyz, image.cam_from_world.quat_wxyz)
+        and np.array_equal(model.images[number].cam_from_world.translation, image.cam_from_world.translation)
+        and model.cameras[image.camera_id] == given.cameras[image.camera_id]
+        for number, image in given.images.items()
+    )
+
+
+def triangulated(model: ColmapModel, tracks: ColmapPoints) -> ColmapPoints:
+    """The points of ``tracks`` as the model's cameras see them; ids and colours stay.
+
+    Observations that are off by more than `MOST_ERROR_PX` are left out, and points that most of their observations do
+    not agree on, that fewer than two images see, or those only by rays within `LEAST_PARALLAX_DEG` of each other.
+    """
+    lengths = np.diff(tracks.track_starts)
+    owner = np.repeat(np.arange(len(tracks)), lengths)
+    kept = np.isin(tracks.track_image_ids, list(model.images))
+    errors = np.full(len(tracks), -1.0)
+    xyz = np.zeros((len(tracks), 3))
+    good = np.zeros(len(tracks), dtype=np.bool_)
+    # First with all observations, robustly; then with those that agree.
+    for last in (False, True):
+        seen = np.bincount(owner[kept], minlength=len(tracks)) >= 2
+        kept &= seen[owner]
+        rows, point = np.unique(owner[kept], return_inverse=True)
+        views = _Views(model, tracks.track_image_ids[kept], tracks.track_point2d_indices[kept])
+        found = triangulate(views.origins, views.directions, views.focal_px, point, len(rows))
+        off_px = views.errors_px(found[point])
+        agree = off_px <= MOST_ERROR_PX  # NaN, from behind, is no agreement
+        if not last:
+            kept[np.flatnonzero(kept)[~agree]] = False
+            agreeing = np.bincount(owner[kept], minlength=len(tracks)) / np.maximum(lengths, 1)
+            kept &= (agreeing >= LEAST_AGREEING)[owner]
+            continue
+        xyz[rows] = found
+        errors[rows] = np.bincount(point, np.nan_to_num(off_px, nan=np.inf)) / np.maximum(
+            np.bincount(point), 1
+        )
+        good[rows] = errors[rows] <= MOST_ERROR_PX
+        good[rows] &= parallax_deg(views.origins, found, point) >= LEAST_PARALLAX_DEG
+    kept &= good[owner]
+    lengths = np.bincount(owner[kept], minlength=len(tracks))[good]
+    return ColmapPoints(
+        tracks.ids[good],
+        xyz[good],
+        tracks.rgb[good],
+        errors[good],
+        np.concatenate(([0], np.cumsum(lengths))).astype(np.int64),
+        tracks.track_image_ids[kept],
+        tracks.track_point2d_indices[kept],
+    )
+
+
+class _Views:
+    """The rays of observations: from which camera, in which direction."""
+
+    def __init__(self, model: ColmapModel, image_ids: NDArray[np.int64], features: NDArray[np.int64]) -> None:
+        self.model, self.image_ids = model, image_ids
+        count = len(image_ids)
+        self.pixel_xy, self.focal_px = np.zeros((count, 2)), np.zeros(count)
+        self.origins, self.directions = np.zeros((count, 3)), np.zeros((count, 3))
+        for number in np.unique(image_ids).tolist():
+            rows, image = image_ids == number, model.images[number]
+            lens = model.cameras[image.camera_id].full()
+            world_from_cam = rigid_inverse(matrix_of_pose(image.cam_from_world))
+            self.pixel_xy[rows] = image.points2d_px[features[rows]]
+            self.focal_px[rows] = (lens.fx * lens.fy) ** 0.5
+            self.origins[rows] = world_from_cam[:3, 3]
+            self.directions[rows] = rays_of_pixels(lens, self.pixel_xy[rows]) @ world_from_cam[:3, :3].T
+
+    def errors_px(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far from its feature each observation's point [observations, 3] appears; NaN from behind."""
+        off = np.zeros(len(xyz))
+        for number in np.unique(self.image_ids).tolist():
+            rows, image = self.image_ids == number, self.model.images[number]
+            pose = matrix_of_pose(image.cam_from_world)
+            in_cam = xyz[rows] @ pose[:3, :3].T + pose[:3, 3]
+            there = pixels_of_points(self.model.cameras[image.camera_id].full(), in_cam)
+            off[rows] = np.linalg.norm(there - self.pixel_xy[rows], axis=1)
+        return off
+
+
+def _carried(refined: RefinedSet, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points [m, 3] moved as the cameras nearest to them moved, the nearer the more."""
+    pairs = [(image.world_from_cam, image.given) for image in refined.images if image.given is not None]
+    after_from_before = np.stack([after @ rigid_inverse(before) for after, before in pairs])
+    centres = np.stack([before[:3, 3] for _, before in pairs])
+    carried = np.empty_like(xyz)
+    for part in np.array_split(np.arange(len(xyz)), -(-len(xyz) // 4096)):
+        away = np.linalg.norm(xyz[part, None] - centres[None], axis=2)
+        nearest = np.argsort(away, axis=1)[:, :NEAREST]
+        weights = 1.0 / np.maximum(np.take_along_axis(away, nearest, 1), 1e-12) ** 2
+        weights /= weights.sum(1, keepdims=True)
+        moved = np.einsum("mkij,mj->mki", after_from_before[nearest][..., :3, :3], xyz[part])
+        moved += after_from_before[nearest][..., :3, 3]
+        carried[part] = (weights[..., None] * moved).sum(1)
+    return carried

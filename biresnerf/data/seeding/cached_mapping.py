@@ -1,0 +1,76 @@
+"""COLMAP's answer for a set, asked once: a run that goes on is given the same poses again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.seeding.map_images import Mapping, ask_colmap, read_mapping
+from biresnerf.data.seeding.seeding_progress import OnSeeding, SeedingProgress
+from biresnerf.options.refine_options import SeedingEffort
+
+GUIDED_LIMIT_S, LIMIT_S = 900.0, 3600.0  # where all poses are given, and else
+
+
+def remembered_mapping(
+    dataset: Dataset,
+    should_stop: Callable[[], bool],
+    seed: int,
+    effort: SeedingEffort,
+    limit_s: float | None,
+    remember: Path | None,
+    on_progress: OnSeeding,
+) -> Mapping:
+    """What COLMAP finds, or found when it was asked the same before and the file ``remember`` kept it.
+
+    An answer found with more effort than is asked for now is as good.
+
+    Raises:
+        InputError: ``seed_timeout``.
+        Interrupted: ``should_stop`` said so.
+        RefinementError: ``seeding_crashed``.
+    """
+    key = _fingerprint(dataset, seed) if remember is not None else ""
+    keys = {"full": (key,), "low": (f"{key} low", key)}[effort]
+    answer = _remembered(remember, keys)
+    if answer is None:
+        on_progress(SeedingProgress())
+        if limit_s is None:
+            limit_s = GUIDED_LIMIT_S if dataset.posed.all() else LIMIT_S
+        answer = ask_colmap(
+            dataset,
+            should_stop=should_stop,
+            seed=seed,
+            effort=effort,
+            limit_s=limit_s,
+            log_folder=remember.parent if remember is not None else None,
+            on_progress=on_progress,
+        )
+        if remember is not None:
+            with whole_file(remember) as temporary:
+                temporary.write_text(json.dumps({"key": keys[0], "answer": answer}), "utf-8")
+    return read_mapping(dataset, answer)
+
+
+def _fingerprint(dataset: Dataset, seed: int) -> str:
+    """Of everything that COLMAP's answer depends on."""
+    given = [None if f.world_from_cam is None else f.world_from_cam.tolist() for f in dataset.frames]
+    cameras = [[c.model, c.params] for c in dataset.cameras]
+    digest = hashlib.sha256(json.dumps([dataset.names, seed, given, cameras]).encode())
+    for frame in dataset.frames:
+        with frame.path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
+
+
+def _remembered(remember: Path | None, keys: tuple[str, ...]) -> dict[str, Any] | None:
+    """The answer kept for the same images, if there is one; our own file, written whole."""
+    if remember is None or not remember.is_file():
+        return None
+    kept = json.loads(remember.read_text("utf-8"))
+    return kept["answer"] if kept["key"] in keys else None

@@ -1,0 +1,249 @@
+"""Runs COLMAP on a folder of images, in a process of its own: ``python -P colmap_child.py REQUEST.json``.
+
+REQUEST.json names the images, the work folder and where the answer goes. pycolmap is kept out of every other
+process: its crashes end this one only, and time limits and cancelling work by ending this process.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+
+# pycolmap's wheels export another zlib; Python's own must be bound first, or PNG and gzip corrupt the heap.
+import zlib  # noqa: F401
+from pathlib import Path
+from typing import Any
+
+from biresnerf.data.seeding.colmap_pairs import (
+    drop_contradicting_pairs,
+    match_features,
+    matched_pairs,
+    write_position_priors,
+)
+
+DATABASE = "database.db"
+SAYS = "seeding: "  # before lines meant for the job's log; all others are COLMAP's own
+# Small photos have few features: faint ones count as well, and fewer matches than COLMAP asks for must do.
+FAINTEST_PEAK, LEAST_SEEN = 0.003, 10
+ENOUGH_PLACED = 0.8  # of the images: where all poses are given, no other way of mapping is tried then
+INTRINSICS_FROM = 0.5  # of the images: a model of fewer does not say what the lens is
+# Matches handed on to measure poses by: so many do, and checkpoints carry them.
+MATCHES_PER_PAIR, MATCHES_IN_ALL, LEAST_KEPT = 50, 100_000, 8
+
+
+def main(request_path: Path) -> None:
+    """Does what the request asks and writes its ``answer``."""
+    request: dict[str, Any] = json.loads(request_path.read_text("utf-8"))
+    Path(request["answer"]).write_text(json.dumps(map_images(request)), "utf-8")
+
+
+def say(text: str) -> None:
+    """A line for the job's log."""
+    sys.stdout.write(f"{SAYS}{text}\n")
+    sys.stdout.flush()
+
+
+def map_images(request: dict[str, Any]) -> dict[str, Any]:
+    """Features and matches; the largest model of image by image mapping, guided by the poses there are.
+
+    And global mapping's, which places more and makes more mistakes: always where poses are missing, else where the
+    first leaves out many images.
+    """
+    import pycolmap
+
+    work = Path(request["work"])
+    database, images = work / DATABASE, Path(request["root"])
+    count = sum(len(camera["names"]) for camera in request["cameras"])
+    pycolmap.set_random_seed(request["seed"])
+    given = [camera["known"] for camera in request["cameras"]]
+    numbers = extract_features(request, database, images)
+    say(f"features of {count} images found")
+    match_features(request, database, work)
+    write_matches(database, work)
+    if request["cam_from_world"]:
+        drop_contradicting_pairs(database, request["cam_from_world"])
+        write_position_priors(database, request["cam_from_world"], request["position_deviation"])
+    matches = matched_pairs(database)
+    say(f"{len(matches)} pairs of images match")
+
+    answer: list[dict[str, Any]] = []
+    largest: Any = None
+    for mapper, run in (("incremental", map_incrementally), ("global", map_globally)):
+        (work / mapper).mkdir()
+        models = run(database, images, work / mapper, request, numbers)
+        if not models:
+            say(f"{mapper} mapping: no model")
+            continue
+        best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
+        answer.append({"mapper": mapper, **describe(best, numbers)})
+        if largest is None or best.num_reg_images() > largest.num_reg_images():
+            largest = best
+        placed = best.num_reg_images()
+        say(
+            f"{mapper} mapping: {placed} of {count} images, {best.num_points3D()} points, "
+            f"error {answer[-1]['reprojection_px']:.2f} px, {len(models)} models"
+        )
+        if len(request["cam_from_world"]) == count and placed >= ENOUGH_PLACED * count:
+            break
+        if mapper == "incremental" and placed >= INTRINSICS_FROM * count:
+            keep_intrinsics(database, best, request, numbers)
+    focals = {} if largest is None else preferred_focals(largest, given, numbers)
+    return {"models": answer, "matches": matches, "focals": focals}
+
+
+def extract_features(request: dict[str, Any], database: Path, images: Path) -> list[int]:
+    """Features of all images; returns the database's number of each camera asked for."""
+    import pycolmap
+
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size = request["widest_image"]
+    extraction.num_threads = request["threads"]
+    extraction.sift.max_num_features = request["most_features"]
+    extraction.sift.peak_threshold = FAINTEST_PEAK
+    extraction.sift.domain_size_pooling = extraction.sift.estimate_affine_shape = request["thorough"]
+    for camera in request["cameras"]:
+        if not camera["names"]:
+            continue
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = camera["model"]
+        if request["masks"] is not None:
+            reader.mask_path = request["masks"]
+        if camera["params"] is not None:
+            reader.camera_params = ",".join(repr(float(value)) for value in camera["params"])
+        pycolmap.extract_features(
+            database, images, image_names=camera["names"], camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=reader, extraction_options=extraction,
+        )  # fmt: skip
+    opened = pycolmap.Database.open(database)
+    camera_of = {image.name: image.camera_id for image in opened.read_all_images()}
+    opened.close()
+    firsts = [camera["names"][0] if camera["names"] else "" for camera in request["cameras"]]
+    return [camera_of.get(name, -1) for name in firsts]
+
+
+def write_matches(database_path: Path, work: Path) -> None:
+    """All verified matches, thinned evenly, to matches.npz: images by their number, the order of names; px."""
+    import numpy as np
+    import pycolmap
+
+    database = pycolmap.Database.open(database_path)
+    names = {image.image_id: image.name for image in database.read_all_images()}
+    number = {image: i for i, (_, image) in enumerate(sorted((name, image) for image, name in names.items()))}
+    points = {image: np.asarray(database.read_keypoints(image))[:, :2] for image in names}
+    pairs = list(zip(*database.read_two_view_geometries(), strict=True))
+    database.close()
+    most = max(LEAST_KEPT, min(MATCHES_PER_PAIR, MATCHES_IN_ALL // max(1, len(pairs))))
+    images, xy = [np.zeros((0, 2), np.int32)], [np.zeros((0, 4), np.float32)]
+    for pair, geometry in pairs:
+        found = np.asarray(geometry.inlier_matches).reshape(-1, 2)
+        found = found[np.linspace(0, len(found) - 1, min(most, len(found))).astype(int)]
+        a, b = pycolmap.pair_id_to_image_pair(pair)
+        images.append(np.tile(np.array([[number[a], number[b]]], np.int32), (len(found), 1)))
+        xy.append(np.hstack([points[a][found[:, 0]], points[b][found[:, 1]]]).astype(np.float32))
+    np.savez(work / "matches.npz", images=np.concatenate(images), xy=np.concatenate(xy))
+
+
+def map_incrementally(
+    database: Path, images: Path, work: Path, request: dict[str, Any], numbers: list[int]
+) -> dict[int, Any]:
+    """Models by adding image to image, with position priors; few matches suffice, as images may be small."""
+    import pycolmap
+
+    known = [number for number, c in zip(numbers, request["cameras"], strict=True) if c["known"]]
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed, options.num_threads = request["seed"], request["threads"]
+    options.min_model_size, options.min_num_matches = 3, 10
+    options.ba_refine_focal_length = options.ba_refine_extra_params = len(known) < len(numbers)
+    options.constant_cameras = set(known)
+    guided = len(request["cam_from_world"]) >= 3
+    options.use_prior_position = options.use_robust_loss_on_prior_position = guided
+    mapper, scale = options.mapper, request["error_scale"]
+    mapper.init_min_num_inliers, mapper.abs_pose_min_num_inliers = 3 * LEAST_SEEN, LEAST_SEEN
+    mapper.init_min_tri_angle, mapper.max_reg_trials = 8.0, 6
+    mapper.init_max_error *= scale
+    mapper.abs_pose_max_error *= scale
+    mapper.filter_max_reproj_error *= scale
+    return pycolmap.incremental_mapping(database, images, work, options)
+
+
+def map_globally(
+    database: Path, images: Path, work: Path, request: dict[str, Any], numbers: list[int]
+) -> dict[int, Any]:
+    """Models by averaging all pairs' rotations, then placing all cameras at once."""
+    import pycolmap
+
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed, options.num_threads = request["seed"], request["threads"]
+    options.mapper.random_seed, options.mapper.num_threads = request["seed"], request["threads"]
+    fixed = all(camera["known"] for camera in request["cameras"])
+    adjustment = options.mapper.bundle_adjustment
+    adjustment.refine_focal_length = adjustment.refine_extra_params = not fixed
+    adjustment.refine_principal_point = False
+    return pycolmap.global_mapping(database, images, work, options)
+
+
+def preferred_focals(model: Any, known: list[bool], numbers: list[int]) -> dict[str, Any]:
+    """What known focal lengths the matches would rather have: by a bundle adjustment that lets them go, too.
+
+    By the camera's place in the request: the focal length preferred over the known one; and the mean reprojection
+    errors before and after. The model is not to be used afterwards.
+    """
+    import pycolmap
+
+    places = [i for i, number in enumerate(numbers) if known[i] and number in model.cameras]
+    before = {i: model.cameras[numbers[i]].mean_focal_length() for i in places}
+    errors = [float(model.compute_mean_reprojection_error())]
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = True
+    options.refine_principal_point = options.refine_extra_params = False
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    errors.append(float(model.compute_mean_reprojection_error()))
+    ratios = {str(i): model.cameras[numbers[i]].mean_focal_length() / before[i] for i in places}
+    return {"ratios": ratios, "errors_px": errors}
+
+
+def keep_intrinsics(database_path: Path, model: Any, request: dict[str, Any], numbers: list[int]) -> None:
+    """What image by image mapping found of a lens holds for what follows, so that models can be compared."""
+    import pycolmap
+
+    database = pycolmap.Database.open(database_path)
+    for camera, number in zip(request["cameras"], numbers, strict=True):
+        if not camera["known"] and number in model.cameras:
+            found = model.cameras[number]
+            found.has_prior_focal_length = True
+            database.update_camera(found)
+            camera["known"] = True
+    database.close()
+
+
+def describe(model: Any, numbers: list[int]) -> dict[str, Any]:
+    """Cameras, by their place in the request, and poses of one model, and how well it explains its matches."""
+    seen = {image.camera_id for image in model.images.values() if image.has_pose}
+    cameras = {
+        str(index): {
+            "model": model.cameras[number].model.name,
+            "width": model.cameras[number].width,
+            "height": model.cameras[number].height,
+            "params": [float(value) for value in model.cameras[number].params],
+        }
+        for index, number in enumerate(numbers)
+        if number in seen
+    }
+    images = [
+        {"name": image.name, "cam_from_world": image.cam_from_world().matrix().tolist()}
+        for image in model.images.values()
+        if image.has_pose
+    ]
+    return {
+        "cameras": cameras,
+        "images": images,
+        "points": model.num_points3D(),
+        "observations": model.compute_num_observations(),
+        "reprojection_px": float(model.compute_mean_reprojection_error()),
+    }
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,254 @@
+"""Models of a set of images by their feature matches: COLMAP, with the intrinsics and the poses there are."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from biresnerf.data.model.dataset import Camera, Dataset
+from biresnerf.data.model.image_order import natural_order, pose_distances
+from biresnerf.data.photos.decode import decode
+from biresnerf.data.photos.image_likeness import likeness
+from biresnerf.data.photos.masks import write_masks
+from biresnerf.data.points.feature_matches import KEPT, keep_matches
+from biresnerf.data.seeding.colmap_child import DATABASE
+from biresnerf.data.seeding.colmap_process import run_colmap
+from biresnerf.data.seeding.seeding_progress import OnSeeding, SeedingWatch
+from biresnerf.geometry.focus import focus_point
+from biresnerf.options.refine_options import SeedingEffort
+
+# Images whose poses are given; beyond it, each is matched with those whose given poses see most nearly the same.
+GUIDED_ALL_PAIRS_UP_TO = 60
+NEIGHBOURS = 40
+ALL_PAIRS_UP_TO = 150  # images of which some have no pose (11 000 pairs)
+# Beyond it each is matched with its neighbours by name, and with those that look most alike: loops close there.
+BY_NAME, BY_LIKENESS = 12, 10
+# Standard deviation of given positions, of the cameras' distance: holds what matches leave open (the drift of narrow
+# views, the mirror of flat scenes) and, under a robust loss, no more.
+POSITION_DEVIATION = 0.2
+# A start for the optimisation needs no more, and matching costs the features' square. Where nothing else says where
+# photos were taken, or with what lens, more is spent.
+WIDEST_IMAGE, MOST_FEATURES = 1000, 2048
+WIDEST_ALONE, MOST_FEATURES_ALONE = 1600, 4096
+# COLMAP's bounds on reprojection errors are made for photos of thousands of px. At 200 px they let wrong matches pass:
+# with 0.35 of them temple's mean rotation error went from 6.8 to 1.4 deg, entry-P10's from 4.9 to 0.8.
+ERROR_SIZE = 1600  # px, long side at which COLMAP's own bounds hold; they shrink with the root of the size
+# Where memory is short.
+WIDEST_LOW, MOST_FEATURES_LOW = 800, 1024
+# Pixels in all: affine shapes and pooled scales find more and cost several times as much, by the number of features.
+THOROUGH_UP_TO, THOROUGH_ALONE_UP_TO = 10e6, 4e6
+
+
+# A given focal length is doubted if matches prefer one that differs by more, with less than this share of the error.
+# Few small photos tell it to 3 % only. At 200 px, preferred over given, and the share: fountain-P11 given right 0.970
+# and 0.993, 5 % too long 0.932 and 0.972; fox given right 1.000 and 1.000, 5 % too long 0.961 and 0.988.
+FOCAL_OFF, FOCAL_ERROR_LEFT = 0.03, 0.99
+
+
+@dataclass(frozen=True, eq=False)
+class MappedModel:
+    """What one way of mapping made of the images, in a frame and scale of its own.
+
+    Attributes:
+        mapper: ``incremental`` or ``global``.
+        rows: indices [m] of the images it places.
+        world_from_cam: float64 [m, 4, 4].
+        cameras: by index in the set, those that see any of them; known intrinsics as they were.
+        points: how many points the matches made.
+        observations: in how many images, in sum.
+        reprojection_px: mean distance of the points from their features.
+        focal_ratios: by index of the camera, the focal length that matches clearly prefer, over the given one.
+    """
+
+    mapper: str
+    rows: NDArray[np.int64]
+    world_from_cam: NDArray[np.float64]
+    cameras: dict[int, Camera]
+    points: int
+    observations: int
+    reprojection_px: float
+    focal_ratios: dict[int, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Mapping:
+    """The models found, and how many features [n, n] any two images have in common."""
+
+    models: tuple[MappedModel, ...]
+    matches: NDArray[np.int64]
+
+
+def known_intrinsics(dataset: Dataset) -> list[bool]:
+    """Whether each camera's intrinsics are the user's own, which COLMAP then leaves alone."""
+    if not dataset.intrinsics_sources:
+        return [True] * len(dataset.cameras)
+    return [source == "given" for source in dataset.intrinsics_sources]
+
+
+def ask_colmap(
+    dataset: Dataset,
+    *,
+    should_stop: Callable[[], bool],
+    seed: int,
+    effort: SeedingEffort,
+    limit_s: float,
+    log_folder: Path | None = None,
+    on_progress: OnSeeding = lambda _found: None,
+) -> dict[str, Any]:
+    """What COLMAP finds, as plain data for `read_mapping`. Poses that the set has guide it.
+
+    Beside the log in ``log_folder`` the matches are left, for `FeatureMatches.load`. One thread where all poses are
+    given: more would make the answer differ from run to run. One where little is asked of it, too: each takes memory.
+
+    Raises:
+        InputError: ``seed_timeout``, or a code of `open_image`.
+        Interrupted: ``should_stop`` said so.
+        RefinementError: ``seeding_crashed``.
+    """
+    names, posed = _numbered(dataset), dataset.posed
+    with tempfile.TemporaryDirectory(prefix="biresnerf-colmap-") as work:
+        _link_photos(dataset, names, Path(work, "photos"))
+        masks = Path(work, "masks")
+        request = {
+            "set": str(dataset.root),
+            "root": str(Path(work, "photos")),
+            "masks": str(masks) if write_masks(dataset, names, masks) else None,
+            "work": work,
+            "answer": str(Path(work, "answer.json")),
+            "seed": seed,
+            "threads": 1 if posed.all() or effort == "low" else -1,
+            **_request_images(dataset, names),
+            **_thoroughness(dataset, effort),
+        }
+        watch = SeedingWatch(Path(work, DATABASE), on_progress)
+        answer = run_colmap(request, Path(work), should_stop, limit_s, log_folder, watch.look)
+        if log_folder is not None:
+            keep_matches(Path(work), dataset.names, log_folder / KEPT)
+        return answer
+
+
+def _numbered(dataset: Dataset) -> list[str]:
+    """COLMAP's list of pairs knows no spaces, so photos go by numbers there."""
+    suffixes = (frame.path.suffix if frame.orientation == 1 else ".png" for frame in dataset.frames)
+    return [f"{i:06}{suffix}" for i, suffix in enumerate(suffixes)]
+
+
+def _link_photos(dataset: Dataset, names: list[str], folder: Path) -> None:
+    """COLMAP takes pixels as they are stored: photos that are meant turned are written so."""
+    folder.mkdir()
+    for i, (name, frame) in enumerate(zip(names, dataset.frames, strict=True)):
+        if frame.orientation == 1:
+            (folder / name).symlink_to(frame.path.resolve())
+        else:
+            Image.fromarray(decode(frame, dataset.camera_of(i))).save(folder / name)
+
+
+def _request_images(dataset: Dataset, names: list[str]) -> dict[str, Any]:
+    posed, known = dataset.posed, known_intrinsics(dataset)
+    given = np.stack(
+        [f.world_from_cam for f in dataset.frames if f.world_from_cam is not None] or [np.eye(4)]
+    )
+    posed_names = [name for name, has in zip(names, posed, strict=True) if has]
+    guessed = [source == "guessed" for source in dataset.intrinsics_sources] or [False] * len(known)
+    return {
+        "cameras": [
+            {
+                "model": camera.model,
+                "params": None if guessed[i] else list(camera.params),
+                "known": known[i],
+                "names": [n for n, f in zip(names, dataset.frames, strict=True) if f.camera == i],
+            }
+            for i, camera in enumerate(dataset.cameras)
+        ],
+        "cam_from_world": dict(zip(posed_names, np.linalg.inv(given).tolist(), strict=False)),
+        "position_deviation": POSITION_DEVIATION * focus_point(given).mean_distance,
+        "pairs": _pairs(dataset, names),
+    }
+
+
+def _thoroughness(dataset: Dataset, effort: SeedingEffort) -> dict[str, Any]:
+    sizes = [dataset.camera_of(i) for i in range(len(dataset))]
+    alone = not dataset.posed.all()
+    low = effort == "low"
+    most = WIDEST_LOW if low else WIDEST_ALONE if alone else WIDEST_IMAGE
+    widest = min(most, float(np.median([max(c.width, c.height) for c in sizes])))
+    return {
+        "widest_image": most,
+        "most_features": MOST_FEATURES_LOW if low else MOST_FEATURES_ALONE if alone else MOST_FEATURES,
+        "error_scale": min(1.0, (widest / ERROR_SIZE) ** 0.5),
+        "thorough": not low
+        and sum(c.width * c.height for c in sizes) <= (THOROUGH_ALONE_UP_TO if alone else THOROUGH_UP_TO),
+    }
+
+
+def _pairs(dataset: Dataset, names: list[str]) -> list[tuple[str, str]] | None:
+    """The pairs worth matching, None for all of them."""
+    if dataset.posed.all():
+        if len(names) <= GUIDED_ALL_PAIRS_UP_TO:
+            return None
+        pairs = nearest_pairs(pose_distances(dataset.world_from_cam), NEIGHBOURS)
+    else:
+        if len(names) <= ALL_PAIRS_UP_TO:
+            return None
+        pairs = nearest_pairs(-likeness(dataset).astype(np.float64), BY_LIKENESS)
+        order = natural_order(dataset.names)
+        for step in range(1, BY_NAME + 1):
+            pairs |= {(min(a, b), max(a, b)) for a, b in zip(order, order[step:], strict=False)}
+    return [(names[i], names[j]) for i, j in sorted(pairs)]
+
+
+def nearest_pairs(apart: NDArray[np.float64], count: int) -> set[tuple[int, int]]:
+    """Each of n with its `count` nearest by the distances [n, n]."""
+    apart = apart.copy()
+    np.fill_diagonal(apart, np.inf)
+    nearest = np.argsort(apart, axis=1, kind="stable")[:, : min(count, len(apart) - 1)]
+    return {(min(i, int(j)), max(i, int(j))) for i in range(len(apart)) for j in nearest[i]}
+
+
+def read_mapping(dataset: Dataset, answer: dict[str, Any]) -> Mapping:
+    """`ask_colmap`'s answer for this set, best model first: by images placed, then by features explained, and how well.
+
+    Of lego with noisy poses (200 px) both ways of mapping place all; global mapping explains more features, with half
+    the error again, and its poses are off by half as much again.
+    """
+    index = {name: i for i, name in enumerate(_numbered(dataset))}
+    models = [_model(model, index) for model in answer["models"]]
+    if models:  # the focal lengths are those of the first of the largest
+        asked = max(range(len(models)), key=lambda i: len(models[i].rows))
+        models[asked] = replace(models[asked], focal_ratios=_focal_ratios(answer["focals"]))
+    matches = np.zeros((len(dataset), len(dataset)), dtype=np.int64)
+    for a, b, count in answer["matches"]:
+        matches[index[a], index[b]] = matches[index[b], index[a]] = count
+    best_first = sorted(models, key=lambda m: (-len(m.rows), -m.observations / max(m.reprojection_px, 0.1)))
+    return Mapping(tuple(best_first), matches)
+
+
+def _focal_ratios(found: dict[str, Any]) -> dict[int, float]:
+    before, after = found.get("errors_px", (0.0, 0.0))
+    if after > FOCAL_ERROR_LEFT * before:
+        return {}
+    return {int(i): ratio for i, ratio in found.get("ratios", {}).items() if abs(ratio - 1) > FOCAL_OFF}
+
+
+def _model(found: dict[str, Any], index: dict[str, int]) -> MappedModel:
+    rows = np.array([index[image["name"]] for image in found["images"]], dtype=np.int64)
+    model_from_cam = np.tile(np.eye(4), (len(rows), 1, 1))
+    for pose, image in zip(model_from_cam, found["images"], strict=True):
+        cam_from_model = np.array(image["cam_from_world"])
+        pose[:3, :3] = cam_from_model[:, :3].T
+        pose[:3, 3] = -cam_from_model[:, :3].T @ cam_from_model[:, 3]
+    cameras = {
+        int(i): Camera(c["model"], c["width"], c["height"], tuple(c["params"]))
+        for i, c in found["cameras"].items()
+    }
+    return MappedModel(
+        found["mapper"], rows, model_from_cam, cameras,
+        int(found["points"]), int(found["observations"]), float(found["reprojection_px"]),
+    )  # fmt: skip

@@ -1,0 +1,81 @@
+"""Models that feature matches support, carried into the frame of given poses, and believed or not."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.seeding.map_images import MappedModel
+from biresnerf.geometry.focus import focus_point
+from biresnerf.geometry.pose_error import turned_deg
+from biresnerf.geometry.similarity import align_robust
+
+logger = logging.getLogger(__name__)
+
+# A camera that leaves its given pose by far more than the others do was placed by wrong matches (global mapping turned
+# one of lego's by 92 deg where the others moved by 12): this many medians, but not below these floors.
+STRAY, STRAY_DEG, STRAY_SHARE = 4.0, 30.0, 0.05
+# A model with more of them is wrong as a whole (lego at 100 px: 23 of 78 stray, and the others are off by 17 deg).
+STRAY_MOST = 0.15
+JUDGED_FROM = 3  # given poses in a model; fewer tie it to their frame and say nothing of it
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedPoses:
+    """Poses that one way of mapping found, in the frame of the given ones.
+
+    Attributes:
+        mapper: ``incremental`` or ``global``.
+        world_from_cam: float64 [n, 4, 4]; as given where not placed.
+        placed: bool [n], whether matches gave the pose.
+    """
+
+    mapper: str
+    world_from_cam: NDArray[np.float64]
+    placed: NDArray[np.bool_]
+
+
+def can_match() -> bool:
+    """Whether COLMAP is installed."""
+    return importlib.util.find_spec("pycolmap") is not None
+
+
+def carry_model(
+    model: MappedModel, given: NDArray[np.float64], posed: NDArray[np.bool_], *, judged: bool = True
+) -> MatchedPoses | None:
+    """A model in the frame of the given poses [n, 4, 4], of which those ``posed`` [n] count.
+
+    Cameras that stray from their given pose by far more than the others are left at it, unless ``judged`` is false.
+    None where too many do, or where the model holds no image with a given pose.
+    """
+    rows = model.rows
+    common = posed[rows]
+    if not common.any():
+        return None
+    there = given[rows][common]
+    similarity = align_robust(model.world_from_cam[common], there, with_rotations=True)
+    found = similarity.apply_to_poses(model.world_from_cam)
+    trusted = np.ones(len(rows), dtype=np.bool_)
+    if judged and common.sum() >= JUDGED_FROM:
+        here = found[common]
+        turned = turned_deg(here, there)
+        shifted = np.linalg.norm(here[:, :3, 3] - there[:, :3, 3], axis=1)
+        floor = STRAY_SHARE * focus_point(given[posed]).mean_distance
+        trusted[common] = (turned <= max(STRAY_DEG, STRAY * float(np.median(turned)))) & (
+            shifted <= STRAY * max(float(np.median(shifted)), floor)
+        )
+        if trusted[common].mean() < 1 - STRAY_MOST:
+            logger.info(
+                "%s mapping is not believed: %d of %d images leave their given pose by far more than the others",
+                model.mapper, (~trusted).sum(), common.sum(),
+            )  # fmt: skip
+            return None
+    poses = given.copy()
+    poses[rows[trusted]] = found[trusted]
+    placed = np.zeros(len(given), dtype=np.bool_)
+    placed[rows[trusted]] = True
+    return MatchedPoses(model.mapper, poses, placed)

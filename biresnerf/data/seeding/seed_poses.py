@@ -1,0 +1,295 @@
+"""Poses to start from: those given, those that feature matches find, and guesses for what neither has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import GUESSES, Dataset
+from biresnerf.data.photos.image_likeness import likeness
+from biresnerf.data.photos.named_images import MIN_IMAGES, few_names
+from biresnerf.data.seeding.cached_mapping import remembered_mapping
+from biresnerf.data.seeding.compare_models import adds_to, model_lens_problem, with_found_lenses
+from biresnerf.data.seeding.map_images import MappedModel, Mapping
+from biresnerf.data.seeding.match_poses import MatchedPoses, can_match, carry_model
+from biresnerf.data.seeding.missing_poses import guess_missing
+from biresnerf.data.seeding.seeding_progress import OnSeeding
+from biresnerf.errors import InputError, RefinementError
+from biresnerf.options.refine_options import SeedingEffort, StartPoses
+from biresnerf.report import PoseSource
+
+LEAST_PLACED = 0.6  # of the images; a model of fewer says too little about a rig whose poses are given
+LEAST_REGISTERED = 0.4  # of images of which none has a pose; from fewer, the rest cannot be guessed
+# Median likeness of all pairs of photos: from nearly one place 0.56 (LLFF's horns) to 0.87, around a scene 0.1 to 0.66.
+FACING_ALIKE = 0.4
+MATCHED: dict[str, PoseSource] = {"incremental": "matches-incremental", "global": "matches-global"}
+OVERLAP_MEND = (
+    "Take sharp photos that overlap by more than half, of something with texture, from many places; "
+    "or give approximate poses."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseCandidate:
+    """A complete set of poses to start from.
+
+    Attributes:
+        name: whose they are, as a whole.
+        world_from_cam: float64 [n, 4, 4].
+        sources: who found each of them.
+    """
+
+    name: PoseSource
+    world_from_cam: NDArray[np.float64]
+    sources: tuple[PoseSource, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Seeding:
+    """A set of which every image has a pose, and what to start from.
+
+    Attributes:
+        dataset: given poses as they were, missing ones those of the first candidate.
+        candidates: one or more; where poses are given, the first are those, completed.
+    """
+
+    dataset: Dataset
+    candidates: tuple[PoseCandidate, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """The poses there are: identity where there is none."""
+
+    dataset: Dataset
+    poses: NDArray[np.float64]
+    posed: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> _Given:
+        poses = [np.eye(4) if f.world_from_cam is None else f.world_from_cam for f in dataset.frames]
+        return cls(dataset, np.stack(poses), dataset.posed)
+
+    def candidate(
+        self, name: PoseSource, matched: MatchedPoses | None, source: PoseSource, matches: NDArray[np.int64]
+    ) -> PoseCandidate:
+        """``matched`` where it placed an image, else the given pose, else a guess."""
+        poses = self.poses.copy() if matched is None else matched.world_from_cam.copy()
+        placed = np.zeros(len(poses), dtype=np.bool_) if matched is None else matched.placed
+        guessed = guess_missing(
+            poses, placed | self.posed, self.dataset.names, matches, cache(lambda: likeness(self.dataset))
+        )
+        sources: list[PoseSource] = ["given"] * len(poses)
+        for i, guess in enumerate(guessed):
+            if guess is not None or placed[i]:
+                sources[i] = guess or source
+        return PoseCandidate(name, poses, tuple(sources))
+
+
+def seed_poses(
+    dataset: Dataset,
+    start: StartPoses = "auto",
+    *,
+    should_stop: Callable[[], bool] = lambda: False,
+    seed: int = 0,
+    effort: SeedingEffort = "full",
+    limit_s: float | None = None,
+    remember: Path | None = None,
+    on_progress: OnSeeding = lambda _found: None,
+) -> Seeding:
+    """The set with a pose for every image, and the sets of poses worth starting from.
+
+    ``given`` takes the poses as they are. ``none`` looks for no features: missing poses are guessed from other
+    images. ``auto`` lets features complete the given poses and compete with them; where there are none, COLMAP maps
+    the images from scratch, in a frame and scale of its own. ``colmap`` does that in any case and then ties the result
+    to the frame of given poses. Images that COLMAP cannot place are guessed from those it can.
+
+    COLMAP's threads make its answer differ a little from run to run. A run that is to be continued keeps it in the
+    file ``remember``, with colmap.log beside it. ``on_progress`` is called only
+    if COLMAP does run: at once, then when more is known.
+
+    Raises:
+        InputError: ``pose_missing``, ``colmap_missing``, ``seed_failed``, ``insufficient_overlap`` or ``seed_timeout``.
+        Interrupted: ``should_stop`` said so.
+        RefinementError: ``seeding_crashed``: COLMAP itself failed, and there are no given poses.
+    """
+    given = _Given.of(dataset)
+    nothing = np.zeros((len(dataset), len(dataset)), dtype=np.int64)
+    if start == "given" or (start == "none" and given.posed.all()):
+        _refuse_missing(dataset)
+        return _seeding(dataset, given.candidate("given", None, "given", nothing))
+    if start == "none":
+        return _seeding(dataset, _without_features(given, nothing))
+    if not can_match():
+        return _without_colmap(given, start, nothing)
+    try:
+        mapping = remembered_mapping(
+            replace(dataset, frames=tuple(replace(f, world_from_cam=None) for f in dataset.frames))
+            if start == "colmap"
+            else dataset,
+            should_stop, seed, effort, limit_s, remember, on_progress,
+        )  # fmt: skip
+    except (InputError, RefinementError) as error:
+        if start == "colmap" or not given.posed.any():
+            raise
+        warning = f"The given poses could not be compared with feature matches: {error}"
+        noted = replace(dataset, warnings=(*dataset.warnings, warning))
+        return _seeding(noted, given.candidate("given", None, "given", nothing))
+    if start == "auto" and given.posed.any():
+        return _beside_given(given, mapping)
+    return _from_scratch(given, mapping, start)
+
+
+def _refuse_missing(dataset: Dataset) -> None:
+    missing = [f.name for f in dataset.frames if f.world_from_cam is None]
+    if missing:
+        raise InputError(
+            "pose_missing",
+            f"{len(missing)} of {len(dataset)} images have no pose: {few_names(missing, 5)}.",
+            where=dataset.root.name,
+            mend="Give their poses, or have them found: start=auto.",
+        )
+
+
+def _without_features(given: _Given, nothing: NDArray[np.int64]) -> PoseCandidate:
+    if given.posed.any():
+        return given.candidate("given", None, "given", nothing)
+    name: PoseSource = "forward-facing"
+    count = len(given.dataset)
+    return PoseCandidate(name, np.tile(np.eye(4), (count, 1, 1)), (name,) * count)
+
+
+def _without_colmap(given: _Given, start: StartPoses, nothing: NDArray[np.int64]) -> Seeding:
+    if start == "colmap" or not given.posed.any():
+        raise InputError(
+            "colmap_missing",
+            "finding poses needs COLMAP, which is not installed.",
+            where=given.dataset.root.name,
+            mend="Run `pip install 'biresnerf[colmap]'`, or give poses; photos that all look the same way can do "
+            "without: start=none.",
+        )
+    warning = "COLMAP is not installed: the given poses were not compared with feature matches."
+    noted = replace(given.dataset, warnings=(*given.dataset.warnings, warning))
+    return _seeding(noted, given.candidate("given", None, "given", nothing))
+
+
+def _with_focal_notes(dataset: Dataset, models: list[MappedModel]) -> Dataset:
+    """The set, with a warning for every camera whose given focal length a model contradicts.
+
+    Args:
+        models: good enough to start from. Of the others, the lens is as wrong as the poses: on a plain vase, five of
+            40 images in one, 15 points, preferred a focal length 67 % shorter than the true one.
+    """
+    notes = tuple(
+        f"Feature matches fit better with a focal length {abs(ratio - 1):.1%} {'longer' if ratio > 1 else 'shorter'} "
+        f"than given for {dataset.names[next(j for j, f in enumerate(dataset.frames) if f.camera == i)]} and the "
+        "images that share its camera: where it is not certain, leave it out of the input, and matches find it."
+        for model in models
+        for i, ratio in sorted(model.focal_ratios.items())
+    )
+    return replace(dataset, warnings=dataset.warnings + notes)
+
+
+def _beside_given(given: _Given, mapping: Mapping) -> Seeding:
+    """The given poses, completed by the best model, and every model that places enough of the images."""
+    carried: list[tuple[MatchedPoses, MappedModel]] = []
+    for model in mapping.models:
+        matched = carry_model(model, given.poses, given.posed)
+        if matched is not None and model_lens_problem(given.dataset, model) is None:
+            carried.append((matched, model))
+    dataset = with_found_lenses(given.dataset, [model for _, model in carried])
+    given = replace(given, dataset=dataset)
+    best = carried[0][0] if carried else None
+    completing = (
+        None
+        if best is None or given.posed.all()
+        else MatchedPoses(
+            best.mapper,
+            np.where(given.posed[:, None, None], given.poses, best.world_from_cam),
+            best.placed & ~given.posed,
+        )
+    )
+    source = "given" if best is None else MATCHED[best.mapper]
+    candidates = [given.candidate("given", completing, source, mapping.matches)]
+    most = max(MIN_IMAGES, LEAST_PLACED * len(dataset))
+    enough = [(matched, model) for matched, model in carried if matched.placed.sum() >= most]
+    for matched, model in enough:
+        if matched is best or adds_to(carried[0][1], model):
+            name = MATCHED[matched.mapper]
+            candidates.append(given.candidate(name, matched, name, mapping.matches))
+    return _seeding(_with_focal_notes(dataset, [model for _, model in enough]), *candidates)
+
+
+def _from_scratch(given: _Given, mapping: Mapping, start: StartPoses) -> Seeding:
+    """The best model, and another one that sees through the same lenses; in the frame of the given poses, if any."""
+    dataset = given.dataset
+    models = [m for m in mapping.models if model_lens_problem(dataset, m) is None]
+    placed = max((len(model.rows) for model in models), default=0)
+    least = max(MIN_IMAGES, int(np.ceil(LEAST_REGISTERED * len(dataset))))
+    if placed < least:
+        what = f"COLMAP could place {placed} of {len(dataset)} images; at least {least} are needed"
+        if start == "colmap":
+            raise InputError("seed_failed", f"{what}.", where=dataset.root.name, mend=OVERLAP_MEND)
+        return _facing_forward(given, what)
+    best = models[0]
+    dataset = with_found_lenses(dataset, [best])
+    candidates = []
+    for model in models:
+        if model is not best and (
+            len(model.rows) < LEAST_PLACED * len(best.rows) or not adds_to(best, model)
+        ):
+            continue
+        matched = _tied(model, given)
+        unplaced = replace(given, dataset=dataset, posed=given.posed & ~matched.placed)
+        name: PoseSource = "colmap" if model is best else MATCHED[model.mapper]
+        candidates.append(unplaced.candidate(name, matched, "colmap", mapping.matches))
+    enough = [model for model in models if len(model.rows) >= LEAST_PLACED * len(dataset)]
+    return _seeding(_with_focal_notes(dataset, enough), *candidates)
+
+
+def _tied(model: MappedModel, given: _Given) -> MatchedPoses:
+    """The model in the given poses' frame, however much it contradicts them; in its own where there are none."""
+    carried = carry_model(model, given.poses, given.posed, judged=False)
+    if carried is not None:
+        return carried
+    poses, placed = given.poses.copy(), np.zeros(len(given.poses), dtype=np.bool_)
+    poses[model.rows], placed[model.rows] = model.world_from_cam, True
+    return MatchedPoses(model.mapper, poses, placed)
+
+
+def _facing_forward(given: _Given, what: str) -> Seeding:
+    """All cameras at one place, if the photos are alike enough to have been taken from nearly there."""
+    dataset = given.dataset
+    alike = likeness(dataset)
+    pairs = alike[np.triu_indices(len(alike), 1)]
+    if float(np.median(pairs)) < FACING_ALIKE:
+        raise InputError(
+            "insufficient_overlap",
+            f"{what}, and the photos are too different to have been taken from nearly one place.",
+            where=dataset.root.name,
+            mend=OVERLAP_MEND,
+        )
+    warning = f"{what}: all cameras begin at one place, looking the same way, and find their poses without features."
+    noted = replace(dataset, warnings=(*dataset.warnings, warning))
+    return _seeding(noted, _without_features(given, np.zeros((0, 0), dtype=np.int64)))
+
+
+def _seeding(dataset: Dataset, *candidates: PoseCandidate) -> Seeding:
+    first = candidates[0]
+    frames = tuple(
+        replace(frame, world_from_cam=pose, pose_source=source) if frame.world_from_cam is None else frame
+        for frame, pose, source in zip(dataset.frames, first.world_from_cam, first.sources, strict=True)
+    )
+    guessed = [f"{f.name} ({f.pose_source})" for f in frames if f.pose_source in GUESSES]
+    notes = dataset.warnings
+    if guessed:
+        notes += (
+            f"No feature matches placed {len(guessed)} of {len(frames)} images; their poses were guessed from "
+            f"other images: {few_names(guessed, 20)}",
+        )
+    return Seeding(replace(dataset, frames=frames, warnings=notes), candidates)

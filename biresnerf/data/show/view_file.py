@@ -1,0 +1,103 @@
+"""``view.json``: what of a result there is to be looked at, for the service's page and report.html."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.json_document import read_model
+
+_FROZEN = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+VIEW, THUMBNAIL = "view.json", "thumbnail.jpg"
+CONTACT_SHEET, POINTS = "view/contact_sheet.jpg", "view/points_{source}.bin"
+
+PictureKind = Literal["render", "photo", "difference", "depth"]
+
+
+class ShownPictures(BaseModel):
+    """A rendered view's files, relative to the result's folder."""
+
+    model_config = _FROZEN
+
+    render: str
+    photo: str
+    difference: str
+    depth: str
+
+
+class ShownView(BaseModel):
+    """A view that was rendered at the end."""
+
+    model_config = _FROZEN
+
+    image: int = Field(description="Index of the image in poses.json.")
+    held_out: bool = Field(description="Whether the field never learnt from its photo.")
+    width: int
+    height: int
+    psnr: float = Field(description="Render against photo at this size, dB.")
+    pictures: ShownPictures
+
+
+class ContactSheet(BaseModel):
+    """All photos, small, in one picture: image i lies in row i // columns, in the middle of its cell."""
+
+    model_config = _FROZEN
+
+    file: str
+    columns: int
+    cell_width: int
+    cell_height: int
+
+
+class ShownPoints(BaseModel):
+    """Points: float32 [count, 3] positions minus origin, little-endian, then uint8 [count, 3] colours."""
+
+    model_config = _FROZEN
+
+    source: Literal["given", "features", "tracks", "moved", "field"] = Field(
+        description="As points_source of poses.json; field: where the shown views' rays end in the radiance field."
+    )
+    file: str
+    count: int
+    origin: tuple[float, float, float]
+
+
+class ViewFile(BaseModel):
+    """The whole file; names of files are relative to the result's folder."""
+
+    model_config = _FROZEN
+
+    format: Literal["biresnerf-view"] = "biresnerf-view"
+    version: Literal[1] = 1
+    poses: str = Field(
+        description="The poses that were refined, whatever the verdict: refined/poses.json where the result holds the "
+        "input's."
+    )
+    thumbnail: str = Field(description="One photo that stands for the set, 320 px at most.")
+    contact_sheet: ContactSheet | None = Field(description="None of more than 4,000 images.")
+    views: tuple[ShownView, ...] = Field(description="Those that were rendered, held-out ones first.")
+    points: tuple[ShownPoints, ...]
+    orbit: str | None
+
+
+def write_view_file(view: ViewFile, folder: Path) -> None:
+    """Writes the file into the result's ``folder``, whole or not at all."""
+    with whole_file(folder / VIEW) as temporary:
+        temporary.write_text(view.model_dump_json(indent=1) + "\n", "utf-8")
+
+
+def read_view_file(folder: Path) -> ViewFile:
+    """The file of the result in ``folder``, checked.
+
+    Raises:
+        InputError: ``view_file_invalid``, or a code of `read_json_object`.
+    """
+    return read_model(
+        ViewFile,
+        folder / VIEW,
+        code="view_file_invalid",
+        mend="Leave the files of a result together, as they were written.",
+    )

@@ -1,0 +1,83 @@
+"""Small pictures and points of a set, for pages that show it: a thumbnail, all photos in one, points as bytes."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.data.show.view_file import CONTACT_SHEET, POINTS, ContactSheet, ShownPoints
+
+THUMBNAIL_PX = 320
+# Long side of a photo in the contact sheet by how many there are at most: some megabytes, and no side that JPEG or a
+# browser cannot take.
+CELL_PX = ((400, 96), (1200, 64), (4000, 40))
+QUALITY = 80  # of JPEG
+MOST_POINTS = 20_000  # 300 kB
+_AROUND = (128, 128, 128)  # between photos of different shapes
+
+
+def write_thumbnail(photo: NDArray[np.uint8], path: Path) -> Path:
+    """Writes a photo [h, w, 3], at most 320 px long."""
+    picture = Image.fromarray(photo)
+    picture.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX), Image.Resampling.LANCZOS)
+    return _write_jpeg(picture, path)
+
+
+def write_contact_sheet(images: ImageSet, folder: Path) -> ContactSheet | None:
+    """All photos in one picture, and where each lies; None, and no file, of more than 4,000."""
+    sides = [side for count, side in CELL_PX if len(images) <= count]
+    if not sides:
+        return None
+    scales = [min(1.0, sides[0] / max(w, h)) for w, h in zip(images.widths, images.heights, strict=True)]
+    cell_width = max(max(1, round(w * s)) for w, s in zip(images.widths, scales, strict=True))
+    cell_height = max(max(1, round(h * s)) for h, s in zip(images.heights, scales, strict=True))
+    columns = math.ceil(math.sqrt(len(images) * cell_height / cell_width))
+    rows = math.ceil(len(images) / columns)
+    sheet = Image.new("RGB", (columns * cell_width, rows * cell_height), _AROUND)
+    for i in range(len(images)):
+        photo = Image.fromarray(images.image(i))
+        photo.thumbnail((cell_width, cell_height), Image.Resampling.BOX)
+        left = (i % columns) * cell_width + (cell_width - photo.width) // 2
+        top = (i // columns) * cell_height + (cell_height - photo.height) // 2
+        sheet.paste(photo, (left, top))
+    _write_jpeg(sheet, folder / CONTACT_SHEET)
+    return ContactSheet(file=CONTACT_SHEET, columns=columns, cell_width=cell_width, cell_height=cell_height)
+
+
+def write_points(
+    layers: list[tuple[str, NDArray[np.floating], NDArray[np.uint8]]], folder: Path
+) -> tuple[ShownPoints, ...]:
+    """Writes a file for each layer: its source, positions [n, 3] in the input's world and colours [n, 3].
+
+    Of more than 20,000 points evenly many are left out; a layer without points has no file.
+    """
+    written = []
+    for source, positions, colours in layers:
+        step = max(1, -(-len(positions) // MOST_POINTS))
+        shown = np.isfinite(positions).all(1)[::step]
+        xyz, rgb = positions[::step][shown].astype(np.float64), colours[::step][shown]
+        if not len(xyz):
+            continue
+        origin = np.median(xyz, axis=0)
+        name = POINTS.format(source=source)
+        with whole_file(folder / name) as temporary:
+            temporary.write_bytes((xyz - origin).astype("<f4").tobytes() + rgb.astype(np.uint8).tobytes())
+        x, y, z = origin.tolist()
+        written.append(
+            ShownPoints.model_validate(
+                {"source": source, "file": name, "count": len(xyz), "origin": (x, y, z)}
+            )
+        )
+    return tuple(written)
+
+
+def _write_jpeg(picture: Image.Image, path: Path) -> Path:
+    with whole_file(path) as temporary:
+        picture.convert("RGB").save(temporary, format="JPEG", quality=QUALITY, optimize=True)
+    return path

@@ -1,0 +1,1 @@
+"""Made scenes whose true poses are known, for tests, demo and benchmarks."""

@@ -1,0 +1,135 @@
+"""Image sets as people bring them, of synthetic scenes: a phone's walk, half of a COLMAP model, a plain vase."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.conventions import file_from_world_from_cam
+from biresnerf.data.synthetic.scene import (
+    CAMERA_ANGLE_X,
+    SHAPES,
+    random_textures,
+    render_shapes,
+    synthetic_cameras,
+    synthetic_focal,
+)
+from biresnerf.data.synthetic.shapes import Shape, Texture
+
+# The objects of the scene stand on a table in a room, which fills the photos.
+TABLE_SCENE = (
+    *SHAPES,
+    Shape("box", (0.1, -0.05, -0.64), (1.9, 1.5, 0.06), (12.0, 0.0)),
+    Shape("room", (0.0, 0.0, 0.0), (8.0, 8.0, 8.0), (0.0, 0.0)),
+)
+# Walls far away show patches, not grain.
+_TABLE_SCALES, _ROOM_SCALES = 4, 2
+# Nothing but its spout and a glaze that hardly changes tells one side of it from another.
+VASE = (
+    Shape("cylinder", (0.0, 0.0, -0.85), (0.36, 0.36, 0.08), (0.0, 0.0)),
+    Shape("sphere", (0.0, 0.0, -0.25), (0.62, 0.62, 0.62), (0.0, 0.0)),
+    Shape("cylinder", (0.0, 0.0, 0.45), (0.24, 0.24, 0.30), (0.0, 0.0)),
+    Shape("cylinder", (0.0, 0.0, 0.78), (0.34, 0.34, 0.05), (0.0, 0.0)),
+    Shape("cylinder", (0.48, 0.0, 0.40), (0.07, 0.07, 0.36), (90.0, 35.0)),
+)
+_GLAZE = ((0.34, 0.50, 0.52), (0.36, 0.52, 0.54), (0.36, 0.50, 0.53), (0.33, 0.48, 0.50), (0.38, 0.50, 0.50))
+_GLAZE_CONTRAST = 0.05
+# A phone's main camera held across, 4:3; its world has y up and metres, where the scene has z up.
+PHONE_FOCAL_OF_WIDTH = 0.77
+PHONE_FROM_SCENE = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
+_METRES = 0.35
+_WALK_TURNS, _WALK_DISTANCE, _WALK_ELEVATION_RAD = 1.2, 3.3, (0.42, 0.75)
+
+
+def walking_cameras(n_views: int, seed: int) -> NDArray[np.float64]:
+    """world_from_cam [n_views, 4, 4] on a walk around the table (z up), 1.2 rounds at changing heights."""
+    rng = np.random.default_rng([seed, 4])
+    along = np.arange(n_views) / max(n_views - 1, 1)
+    azimuth = rng.uniform(0, 2 * np.pi) + 2 * np.pi * _WALK_TURNS * along
+    low, high = _WALK_ELEVATION_RAD
+    elevation = low + (high - low) * (0.5 - 0.5 * np.cos(2 * np.pi * 2.3 * along))
+    distance = _WALK_DISTANCE * (1 + 0.08 * np.sin(2 * np.pi * 3.1 * along))
+    across = np.cos(elevation)
+    outward = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)], axis=1)
+    centres = distance[:, None] * outward
+    targets = rng.normal(0, 0.08, (n_views, 3))
+    forward = targets - centres
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (n_views, 1, 1))
+    poses[:, :3, 0], poses[:, :3, 1], poses[:, :3, 2] = right, np.cross(forward, right), forward
+    poses[:, :3, 3] = centres
+    return poses
+
+
+def table_textures(seed: int) -> list[Texture]:
+    """Those of `TABLE_SCENE`."""
+    around = [
+        Texture.random(np.random.default_rng([seed, 7, scales]), scales)
+        for scales in (_TABLE_SCALES, _ROOM_SCALES)
+    ]
+    return random_textures(len(SHAPES), seed) + around
+
+
+def write_walk(folder: Path, n_views: int, width: int, seed: int) -> Path:
+    """Writes photos of a walk around the table and transforms.json as NeRFCapture does, with true poses, in metres.
+
+    Returns:
+        the path of transforms.json.
+    """
+    height, focal = round(width * 3 / 4), PHONE_FOCAL_OF_WIDTH * width
+    poses = walking_cameras(n_views, seed)
+    textures = table_textures(seed)
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    for index, pose in enumerate(poses):
+        pixels = render_shapes(TABLE_SCENE, textures, pose, width, height, focal)[0]
+        Image.fromarray(pixels[..., :3].copy()).save(folder / "images" / f"{index}.png", compress_level=3)
+    in_metres = PHONE_FROM_SCENE @ poses
+    in_metres[:, :3, 3] *= _METRES
+    lens = {
+        "fl_x": focal,
+        "fl_y": focal,
+        "cx": width / 2,
+        "cy": height / 2,
+        "w": width,
+        "h": height,
+    }
+    frames = [
+        {"file_path": f"images/{index}", "transform_matrix": matrix.tolist(), "timestamp": index / 2, **lens}
+        for index, matrix in enumerate(file_from_world_from_cam(in_metres, np.eye(4), 1.0))
+    ]
+    path = folder / "transforms.json"
+    _write_json(path, {**lens, "frames": frames})
+    return path
+
+
+def write_vase(folder: Path, n_views: int, size: int, seed: int) -> Path:
+    """Writes square cut-out views of the vase and transforms.json (Blender dialect, true poses); returns its path."""
+    textures = [
+        Texture.glaze(np.random.default_rng([seed, 5, index]), base, _GLAZE_CONTRAST)
+        for index, base in enumerate(_GLAZE)
+    ]
+    poses = synthetic_cameras(n_views, seed)
+    (folder / "train").mkdir(parents=True, exist_ok=True)
+    for index, pose in enumerate(poses):
+        pixels = render_shapes(VASE, textures, pose, size, size, synthetic_focal(size))[0]
+        Image.fromarray(pixels).save(folder / "train" / f"r_{index}.png", compress_level=3)
+    frames = [
+        {"file_path": f"./train/r_{index}", "transform_matrix": matrix.tolist()}
+        for index, matrix in enumerate(file_from_world_from_cam(poses, np.eye(4), 1.0))
+    ]
+    path = folder / "transforms.json"
+    _write_json(path, {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames})
+    return path
+
+
+def _write_json(path: Path, document: dict[str, Any]) -> None:
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(document, indent=1) + "\n")

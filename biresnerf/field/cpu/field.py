@@ -1,0 +1,264 @@
+"""The radiance field on the Numba kernels. Works on CPU tensors in place, sharing their memory with NumPy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from biresnerf.field.cpu import encoding, network
+from biresnerf.field.cpu import rays as ray_kernels
+from biresnerf.field.cpu.harmonics import add_harmonics_gradient, harmonics
+from biresnerf.field.cpu.matrix_blocks import CHANNELS, from_tiles
+from biresnerf.field.cpu.samples import Samples, segments
+from biresnerf.field.cpu.segments import render_segments, render_segments_backward
+from biresnerf.field.grid_field import GridField
+from biresnerf.field.grid_levels import GridLevels
+from biresnerf.field.radiance_field import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    HIDDEN,
+    OUTPUTS,
+    FieldShape,
+    Marching,
+    PositionGradient,
+    Rays,
+    Rendering,
+)
+from biresnerf.field.spherical_harmonics import VIEW_FEATURES
+
+f4 = np.float32
+
+
+def tasks() -> np.ndarray:
+    """The counter that the workers of one kernel call draw their tasks from."""
+    return np.zeros(1, np.int64)
+
+
+class Buffers:
+    """Arrays that live from step to step and grow by 1.3, so that a step allocates nothing large."""
+
+    def __init__(self) -> None:
+        self._held: dict[str, np.ndarray] = {}
+
+    def take(self, name: str, *shape: int, dtype: Any = f4) -> np.ndarray:
+        """An uninitialised array of this shape; valid until the same name is taken again."""
+        size = int(np.prod(shape))
+        held = self._held.get(name)
+        if held is None or held.size < size or held.dtype != dtype:
+            held = self._held[name] = np.empty(int(size * 1.3) + 1024, dtype)
+        return held[:size].reshape(shape)
+
+
+class CpuField(GridField):
+    """Backend `cpu`."""
+
+    backend = "cpu"
+
+    def __init__(self, shape: FieldShape, seed: int, device: torch.device, workers: int) -> None:
+        super().__init__(shape, seed, device)
+        self.workers = workers
+        self._buffers = Buffers()
+        sizes = [np.diff(grid.offset) for grid in (shape.pose_grid, shape.reconstruction_grid)]
+        largest = int(np.concatenate(sizes).max())
+        self._scratch = np.zeros((workers, 2 * largest), f4)
+        self._pending: tuple[Samples, np.ndarray] | None = None
+
+    def _grids(self) -> list[tuple[GridLevels, np.ndarray]]:
+        grids = [(self.shape.pose_grid, self.pose_table.numpy())]
+        if self.reconstructing:
+            grids.append((self.shape.reconstruction_grid, self.reconstruction_table.numpy()))
+        return grids
+
+    def _width(self) -> int:
+        return -CHANNELS * (-sum(grid.width for grid, _ in self._grids()) // CHANNELS)  # whole register tiles
+
+    def _weights(self) -> list[np.ndarray]:
+        """The five layers as contiguous arrays; input columns padded to whole tiles, colour rows to 4."""
+        first = np.zeros((HIDDEN, self._width()), f4)
+        low = self.shape.pose_grid.width
+        first[:, :low] = self.networks[0].detach().numpy()
+        if self.reconstructing:
+            high = self.shape.reconstruction_grid.width
+            first[:, low : low + high] = self.reconstruction_columns.detach().numpy()
+        last = np.zeros((4, HIDDEN), f4)
+        last[:3] = self.networks[4].detach().numpy()
+        return [first, *(w.detach().numpy() for w in self.networks[1:4]), last]
+
+    def _encode(
+        self, x: np.ndarray, gradient: PositionGradient, role: str
+    ) -> tuple[np.ndarray, list[np.ndarray]]:
+        n, width = len(x) // 3, self._width()
+        features = self._buffers.take(f"{role} features", width, n)
+        jacobians, row = [], 0
+        smoothings = (gradient.pose_smoothing, gradient.reconstruction_smoothing)
+        for i, (grid, table) in enumerate(self._grids()):
+            jacobian = self._buffers.take(f"{role} jacobian {i}", grid.levels, 6, n)
+            encoding.encode(
+                x, table.reshape(-1).view(np.uint64), grid.scale, grid.stride, grid.hashed, grid.offset,
+                f4(smoothings[i]), features[row : row + grid.width], jacobian,
+            )  # fmt: skip
+            jacobians.append(jacobian)
+            row += grid.width
+        features[row:] = 0
+        return features, jacobians
+
+    def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
+        colour, opacity, depth, count = _RenderRays.apply(
+            rays.origin, rays.direction, self, rays, marching, gradient
+        )
+        return Rendering(colour, opacity, depth, int(count))
+
+    def density(self, position: Tensor) -> Tensor:
+        x = position.contiguous().numpy().reshape(-1)
+        features, _ = self._encode(x, PositionGradient(), "density")
+        result = np.empty(len(position), f4)
+        w1, w2 = (w.reshape(-1) for w in self._weights()[:2])
+        network.network_density(
+            features.reshape(-1), features.shape[0], w1, w2, result, tasks(), self.workers
+        )
+        return torch.from_numpy(result)
+
+    def march(self, origin: np.ndarray, direction: np.ndarray, jitter: np.ndarray, marching: Marching,
+              ) -> tuple[np.ndarray, ...]:  # fmt: skip
+        """Where the live intervals of rays are: offset [rays + 1], grid positions x [3 n], t, dt, ray [n]."""
+        rays, take = len(origin), self._buffers.take
+        t_buffer = take("march t", rays, marching.most)
+        dt_buffer = take("march dt", rays, marching.most)
+        count = take("count", rays, dtype=np.int32)
+        ray_kernels.march(
+            origin, direction, jitter, marching.occupied.numpy().reshape(-1), marching.occupied.shape[0],
+            f4(marching.step), f4(marching.near), f4(marching.far), self.shape.unbounded, t_buffer, dt_buffer, count,
+        )  # fmt: skip
+        offset = np.zeros(rays + 1, np.int64)
+        np.cumsum(count, out=offset[1:])
+        n = int(offset[-1])
+        x, t, dt, ray = take("x", 3 * n), take("t", n), take("dt", n), take("ray", n, dtype=np.int32)
+        ray_kernels.pack(
+            origin, direction, t_buffer, dt_buffer, count, offset, self.shape.unbounded, x, t, dt, ray
+        )
+        return offset, x, t, dt, ray
+
+    def render_forward(self, origin: np.ndarray, direction: np.ndarray, view: np.ndarray, rays: Rays,
+                       marching: Marching, gradient: PositionGradient,
+                       ) -> tuple[Samples, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+        """March, evaluate the field at every live sample and composite: colour [rays, 3], opacity, depth [rays]."""
+        take, count = self._buffers.take, len(origin)
+        offset, x, t, dt, ray = self.march(origin, direction, rays.jitter.numpy(), marching)
+        n = len(t)
+        features, jacobians = self._encode(x, gradient, "render")
+        segment, learning = segments(offset, rays.trained)
+        samples = Samples(
+            segment, learning, offset, x, t, dt, ray, features, jacobians,
+            take("outputs", OUTPUTS * n), take("density", n), take("alpha", n), take("kept", n, dtype=np.int32),
+            take("kept begin", count, dtype=np.int64), take("kept end", count, dtype=np.int64), take("colour", 3 * n),
+        )  # fmt: skip
+        colour, opacity, depth = np.empty((count, 3), f4), np.empty(count, f4), np.empty(count, f4)
+        render_segments(
+            segment, offset, t, dt, ray, features.reshape(-1), len(features), view.reshape(-1),
+            rays.background.numpy(), *(w.reshape(-1) for w in self._weights()),
+            samples.outputs, samples.density, samples.alpha, samples.kept, samples.kept_begin, samples.kept_end,
+            samples.colour, colour, opacity, depth, tasks(), self.workers,
+        )  # fmt: skip
+        return samples, colour, opacity, depth
+
+    def render_backward(self, s: Samples, view: np.ndarray, colour: np.ndarray, opacity: np.ndarray,
+                        g_colour: np.ndarray, g_opacity: np.ndarray, gradient: PositionGradient,
+                        ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Gradients to grid positions [3, n] and view harmonics [rays, 16]; keeps those to the field for `step`."""
+        take, n, width = self._buffers.take, len(s.t), len(s.features)
+        weights = self._weights()
+        sums = [np.zeros((max(1, s.learning), w.size), f4) for w in weights]
+        g_features, dx = take("g features", width, n), take("dx", 3, n)
+        g_view = np.empty((len(opacity), VIEW_FEATURES), f4)
+        longest = int(np.diff(s.offset[s.segment]).max(initial=0))
+        second = s.jacobians[1] if len(s.jacobians) > 1 else np.empty((0, 6, n), f4)
+        render_segments_backward(
+            s.segment, s.learning, longest, s.offset, s.dt, s.ray, s.features.reshape(-1), width, view.reshape(-1),
+            *(w.reshape(-1) for w in weights), s.outputs, s.density, s.alpha, s.kept, s.kept_begin, s.kept_end,
+            s.colour, colour, opacity, g_colour, g_opacity, s.jacobians[0], second, f4(gradient.reconstruction_share),
+            s.x, take("g density", n), take("g colour", 3 * n), g_features.reshape(-1), dx, g_view, *sums,
+            tasks(), self.workers,
+        )  # fmt: skip
+        if s.learning:
+            self._keep_network_gradients(
+                [from_tiles(d.sum(0), *w.shape) for d, w in zip(sums, weights, strict=True)]
+            )
+            self._pending = (s, g_features)
+        return dx, g_view
+
+    def _keep_network_gradients(self, gradients: list[np.ndarray]) -> None:
+        low = self.shape.pose_grid.width
+        first = torch.from_numpy(gradients[0])
+        self.networks[0].grad = first[:, :low].clone()
+        if self.reconstructing:
+            self.reconstruction_columns.grad = first[
+                :, low : low + self.shape.reconstruction_grid.width
+            ].clone()
+        for weight, gradient in zip(self.networks[1:4], gradients[1:4], strict=True):
+            weight.grad = torch.from_numpy(gradient)
+        self.networks[4].grad = torch.from_numpy(gradients[4][:3].copy())
+
+    def _update_table(self, name: str, rates: np.ndarray) -> None:
+        if self._pending is None:
+            return
+        samples, g_features = self._pending
+        # Kept samples lie without gaps from each segment's first sample on.
+        begin = samples.offset[samples.segment[: samples.learning]]
+        end = samples.kept_end[samples.segment[1 : samples.learning + 1] - 1]
+        pose = name == "pose"
+        grid = self.shape.pose_grid if pose else self.shape.reconstruction_grid
+        table = self.pose_table if pose else self.reconstruction_table
+        row = 0 if pose else self.shape.pose_grid.width
+        step = self.steps[name]
+        adam = (
+            f4(BETA1),
+            f4(BETA2),
+            f4(EPSILON),
+            f4(1 / (1 - BETA1**step)),
+            f4(1 / (1 - BETA2**step) ** 0.5),
+        )
+        moment1, moment2 = (m.numpy().reshape(-1) for m in self.moments[name])
+        encoding.update_table(
+            samples.x, begin, end, g_features[row : row + grid.width],
+            grid.scale, grid.stride, grid.hashed, grid.offset,
+            table.numpy().reshape(-1), moment1, moment2, rates, adam, self._scratch, tasks(), self.workers,
+        )  # fmt: skip
+
+    def discard_gradients(self) -> None:
+        self._pending = None
+        for weight in (*self.networks, self.reconstruction_columns):
+            weight.grad = None
+
+
+class _RenderRays(torch.autograd.Function):
+    """Ties the kernels to autograd at the rays, so that poses are optimised like any other torch parameter."""
+
+    @staticmethod
+    def forward(ctx, origin, direction, field: CpuField, rays: Rays, marching, gradient):
+        o, d = origin.detach().numpy(), direction.detach().numpy()
+        view = np.empty((len(d), VIEW_FEATURES), f4)
+        harmonics(d, view)
+        samples, colour, opacity, depth = field.render_forward(o, d, view, rays, marching, gradient)
+        ctx.kept = (field, samples, o, d, view, colour, opacity, gradient)
+        tensors = (torch.from_numpy(colour), torch.from_numpy(opacity), torch.from_numpy(depth))
+        samples_taken = torch.tensor(len(samples.t))
+        ctx.mark_non_differentiable(tensors[2], samples_taken)
+        return (*tensors, samples_taken)
+
+    @staticmethod
+    def backward(ctx, g_colour, g_opacity, _g_depth, _g_count):
+        field, samples, o, d, view, colour, opacity, gradient = ctx.kept
+        dx, g_view = field.render_backward(
+            samples, view, colour, opacity, np.ascontiguousarray(g_colour.numpy()),
+            np.ascontiguousarray(g_opacity.numpy()), gradient,
+        )  # fmt: skip
+        g_origin, g_direction = np.empty_like(o), np.empty_like(d)
+        ray_kernels.ray_gradients(
+            o, d, samples.offset, samples.t, dx, field.shape.unbounded, g_origin, g_direction
+        )
+        add_harmonics_gradient(d, g_view, g_direction)
+        return torch.from_numpy(g_origin), torch.from_numpy(g_direction), None, None, None, None

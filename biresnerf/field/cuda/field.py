@@ -1,0 +1,244 @@
+"""The radiance field on the Triton kernels. Nothing in a training step waits for the device.
+
+How many samples a step takes is known on the device only: buffers have a fixed capacity, kernels read counts from
+device memory, and the host hears of them a step late. docs/cuda.md says more.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from biresnerf.errors import InputError
+from biresnerf.field.cuda import plans
+from biresnerf.field.cuda.launches import interpreted
+from biresnerf.field.cuda.sample_count import SampleCount
+from biresnerf.field.cuda.workspace import Capacity, Workspace
+from biresnerf.field.grid_field import GridField
+from biresnerf.field.radiance_field import (
+    BETA1,
+    BETA2,
+    FieldShape,
+    Marching,
+    PositionGradient,
+    Rays,
+    Rendering,
+)
+
+logger = logging.getLogger(__name__)
+
+RAYS_LEAST, SAMPLES_LEAST = 256, 1 << 16
+MARGIN = 1.3  # counts change from step to step by less; a step with more leaves its last rays out
+GROWTH = 1.6  # of what is needed, where buffers have to grow
+BOX_DIAGONAL = 2 * math.sqrt(3)
+
+
+class CudaField(GridField):
+    """Backend `cuda`.
+
+    Args:
+        samples: samples that fit at first; grows by itself.
+
+    Raises:
+        InputError: Triton's interpreter is on (or, for a device without CUDA, off).
+    """
+
+    backend = "cuda"
+
+    def __init__(
+        self, shape: FieldShape, seed: int, device: torch.device, samples: int = SAMPLES_LEAST
+    ) -> None:
+        _refuse_the_wrong_mode(device)
+        super().__init__(shape, seed, device)
+        self._samples = samples
+        self._workspace: Workspace | None = None
+        self._sample_count = SampleCount(device)
+        self._forward_number = 0  # of the forward pass whose samples the buffers hold
+        self._pending = False
+
+    def start_reconstruction(self) -> None:
+        super().start_reconstruction()
+        self._workspace, self._pending = None, False
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        super().load_state(state)
+        self._workspace, self._pending = None, False
+
+    def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
+        if torch.is_grad_enabled() and (rays.origin.requires_grad or rays.direction.requires_grad):
+            colour, opacity, depth, samples = _RenderRays.apply(
+                rays.origin, rays.direction, self, rays, marching, gradient
+            )
+            return Rendering(colour, opacity, depth, int(samples))
+        return self._view(rays, marching, gradient)
+
+    def density(self, position: Tensor) -> Tensor:
+        return self.density_of_first(torch.full((1,), len(position), device=self.device), position)
+
+    def density_of_first(self, count: Tensor, position: Tensor) -> Tensor:
+        w = self._reserve(0, 1, 1, self._side())
+        self._forward_number += 1
+        results = [position.new_zeros(0)]
+        for begin in range(0, len(position), w.capacity.samples):
+            part = position[begin : begin + w.capacity.samples]
+            w.buffers["x"][:, : len(part)].copy_(part.T)
+            w.buffers["taken"].copy_((count - begin).clamp(0, len(part)))
+            w.record()
+            w.plan(plans.density).run()
+            results.append(w.buffers["density"][: len(part)].clone())
+        return torch.cat(results)
+
+    def _view(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
+        """Rendering without gradient, in parts whose samples fit whatever they turn out to be."""
+        side = marching.occupied.shape[0]
+        w = self._reserve(0, self._most_of_a_ray(marching), marching.most, side)
+        parts, total = [], torch.zeros(1, dtype=torch.int32, device=self.device)
+        size = w.capacity.samples // self._most_of_a_ray(marching)
+        for begin in range(0, max(1, len(rays.origin)), size):
+            taken = slice(begin, begin + size)
+            part = Rays(
+                rays.origin[taken], rays.direction[taken], rays.background[taken], rays.jitter[taken], trained=0
+            )  # fmt: skip
+            w = self._reserve(len(part.origin), 1, marching.most, side)
+            self._write(w, part, marching, gradient)
+            w.record()
+            w.plan(plans.viewing).run()
+            n = len(part.origin)
+            parts.append([w.buffers[name][:n].clone() for name in ("ray_colour", "opacity", "depth")])
+            total += w.buffers["ray_offset"][-1:]
+        colour, opacity, depth = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
+        return Rendering(colour, opacity, depth, int(total))
+
+    def run_forward(
+        self, rays: Rays, marching: Marching, gradient: PositionGradient
+    ) -> tuple[Tensor, Tensor, Tensor, int, int]:
+        """Colour, opacity and depth for a backward pass to follow; samples; the number of this pass."""
+        count, interval, side = len(rays.origin), marching.step, marching.occupied.shape[0]
+        w = self._reserve(count, 1, marching.most, side)
+        heard = self._sample_count.latest()
+        if heard > w.capacity.samples:
+            logger.warning(
+                "a step needed %d samples of %d: its last rays were left out", heard, w.capacity.samples
+            )
+        samples = self._sample_count.expected(count, interval)
+        certain = count * self._most_of_a_ray(marching) <= w.capacity.samples
+        if samples is None or not (certain or samples * MARGIN <= w.capacity.samples):
+            # The first of its kind, or far more than before: here alone the host waits for the device.
+            self._write(w, rays, marching, gradient)
+            w.plan(plans.marching).run()
+            samples = int(w.buffers["ray_offset"][-1])
+            if samples * MARGIN > w.capacity.samples:
+                del w  # frees its memory before the larger one takes its own
+                w = self._reserve(count, int(samples * GROWTH), marching.most, side)
+        self._write(w, rays, marching, gradient)
+        w.record()
+        w.plan(plans.forward).run()
+        self._sample_count.note(w.buffers["ray_offset"][-1:], count, interval)
+        results = (w.buffers[name][:count].clone() for name in ("ray_colour", "opacity", "depth"))
+        colour, opacity, depth = results
+        return colour, opacity, depth, samples, self._forward_number
+
+    def run_backward(
+        self, number: int, count: int, trained: int, g_colour: Tensor, g_opacity: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Gradients to origin and direction; keeps those to the field for `step`."""
+        w = self._workspace
+        if w is None or number != self._forward_number:
+            raise RuntimeError("the field was asked for something else between render and backward")
+        w.buffers["g_ray_colour"][:count].copy_(g_colour)
+        w.buffers["g_opacity"][:count].copy_(g_opacity)
+        w.plan(plans.backward).run()
+        if trained:
+            self._pending = True
+            weights = (*w.density_weights, *w.colour_weights)
+            for weight, gradient in zip(weights, w.weight_gradients(), strict=True):
+                weight.grad = gradient
+        return w.buffers["g_origin"][:count].clone(), w.buffers["g_direction"][:count].clone()
+
+    def _update_table(self, name: str, rates: np.ndarray) -> None:
+        w = self._workspace
+        if not self._pending or w is None:
+            return
+        step = self.steps[name]
+        table = w.tables[name]
+        table["rates"].copy_(torch.from_numpy(rates), non_blocking=True)
+        corrections = torch.tensor([1 / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step)])
+        table["corrections"].copy_(corrections, non_blocking=True)
+        w.plan(plans.update_pose if name == "pose" else plans.update_reconstruction).run()
+
+    def discard_gradients(self) -> None:
+        self._pending = False
+        for weight in (*self.networks, self.reconstruction_columns):
+            weight.grad = None
+
+    def _side(self) -> int:
+        return 1 if self._workspace is None else self._workspace.capacity.side
+
+    def _most_of_a_ray(self, marching: Marching) -> int:
+        """No ray has more samples."""
+        if self.unbounded:
+            return marching.most
+        return min(marching.most, math.ceil(BOX_DIAGONAL / marching.step) + 1)
+
+    def _reserve(self, rays: int, samples: int, most: int, side: int) -> Workspace:
+        """A workspace for at least so many rays and samples: the one at hand, or a larger one in its stead."""
+        held = self._workspace
+        if held is not None and held.capacity.holds(Capacity(rays, samples, most, side)):
+            return held
+        before = held.capacity if held is not None else Capacity(RAYS_LEAST, self._samples, 1, side)
+        rays = max(before.rays, 1 << (rays - 1).bit_length() if rays else 0)
+        self._samples = max(before.samples, samples)
+        # The old one's memory goes first.
+        held = self._workspace = None
+        self._pending = False
+        self._forward_number += 1
+        self._workspace = Workspace(self, Capacity(rays, self._samples, max(before.most, most), side))
+        return self._workspace
+
+    def _write(self, w: Workspace, rays: Rays, marching: Marching, gradient: PositionGradient) -> None:
+        """Put into the buffers what this pass is about."""
+        self._forward_number += 1
+        count = len(rays.origin)
+        for name in ("origin", "direction", "background", "jitter"):
+            w.buffers[name][:count].copy_(getattr(rays, name).detach())
+        w.buffers["occupied"].copy_(marching.occupied)
+        values = {
+            "ray_count": count, "trained_rays": rays.trained,
+            "interval": marching.step, "near": marching.near, "far": marching.far,
+            "pose_smoothing": gradient.pose_smoothing, "pose_share": 1.0,
+            "reconstruction_smoothing": gradient.reconstruction_smoothing,
+            "reconstruction_share": gradient.reconstruction_share,
+        }  # fmt: skip
+        w.write_controls(values)
+
+
+def _refuse_the_wrong_mode(device: torch.device) -> None:
+    """The interpreter is for tests on machines without CUDA: it may neither slow a GPU down nor be missing here."""
+    if interpreted() == (device.type == "cuda"):
+        raise InputError(
+            "device_unavailable",
+            f"Triton's interpreter is {'on' if interpreted() else 'off'}: the kernels cannot run on {device}.",
+            where="device",
+            mend="Unset TRITON_INTERPRET, and use --device cpu where there is no CUDA.",
+        )
+
+
+class _RenderRays(torch.autograd.Function):
+    """Ties the kernels to autograd at the rays, so that poses are optimised like any other torch parameter."""
+
+    @staticmethod
+    def forward(ctx, origin, direction, field: CudaField, rays: Rays, marching, gradient):
+        colour, opacity, depth, samples, number = field.run_forward(rays, marching, gradient)
+        ctx.kept = (field, number, len(origin), rays.trained)
+        ctx.mark_non_differentiable(depth)
+        return colour, opacity, depth, samples
+
+    @staticmethod
+    def backward(ctx, g_colour, g_opacity, _g_depth, _g_samples):
+        field, number, count, trained = ctx.kept
+        g_origin, g_direction = field.run_backward(number, count, trained, g_colour, g_opacity)
+        return g_origin, g_direction, None, None, None, None

@@ -1,0 +1,1 @@
+"""Cameras that are far off: found and brought home."""

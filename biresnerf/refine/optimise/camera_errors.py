@@ -1,0 +1,202 @@
+"""How well each camera agrees with the field, from the training batches themselves; which ones stand out as lost."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from biresnerf.data.photos.images import ImageSet
+
+STANDS_OUT = 2.0  # times the median error
+STANDS_OUT_UNTRAINED = 4.0  # for held-out views too few to be compared with each other
+DEVIATIONS = 4.0  # and this many standard deviations, estimated as 1.4826 x the median absolute deviation
+SUSPECT_DEVIATIONS = 2.0  # enough to try other poses: those are judged by themselves
+# A photo that is hard to render stands out late in a run, when others are nearly exact (0.03 at most on lego and
+# temple); a camera in a wrong place leaves this share of its photo's variance unexplained (0.12 and more there).
+UNEXPLAINED = 0.08
+# Few photos predict an unseen one badly from good poses, too: ten of fountain-P11 leave 0.28 of the eleventh.
+UNEXPLAINED_UNTRAINED = 0.7
+MAD_TO_DEVIATION = 1.4826
+OWN_YARDSTICK_FROM = 4  # held-out views
+IN_A_ROW = 2  # blocks
+COVERAGE = 0.1  # of the photo's share that is no background: rendering less has lost the scene from sight
+DOUBTED_WEIGHT = 0.1  # of a camera whose pose is a guess, until it agrees with the field
+SMOOTHING = 0.5  # share of the newest block in the moving average
+BACKGROUND_TOLERANCE = 0.05  # colours nearer to the background than this count as background
+LEAST_FOREGROUND = 0.02
+
+
+def foreground_shares(images: ImageSet) -> np.ndarray:
+    """The share [n] of each photo that shows the scene: opaque, or unlike the background; 1 without background.
+
+    Of the pixels that count, where there are masks.
+    """
+    shares = np.ones(len(images))
+    if images.background is None:
+        return shares
+    for i in range(len(images)):
+        alpha = images.alpha_image(i)
+        if alpha is not None:
+            shows = alpha / np.float32(255)
+        else:
+            difference = np.abs(images.image(i) / np.float32(255) - images.background).max(-1)
+            shows = (difference > BACKGROUND_TOLERANCE).astype(np.float32)
+        shares[i] = _counted(shows, images, i).mean()
+    return np.maximum(shares, LEAST_FOREGROUND)
+
+
+def _counted(values: np.ndarray, images: ImageSet, index: int) -> np.ndarray:
+    """Those of `values` [h, w, ...] whose pixels of image `index` count, one after another."""
+    counts = images.counts_image(index)
+    return values.reshape(-1, *values.shape[2:]) if counts is None else values[counts]
+
+
+def outliers(
+    errors: Tensor,
+    held_out: Tensor,
+    deviations: float = DEVIATIONS,
+    untrained: float = STANDS_OUT_UNTRAINED,
+) -> Tensor:
+    """Mask [n] of the errors [n] that stand out.
+
+    Held-out views, which the field never saw, are measured by their own median where there are enough of them;
+    else they must exceed `untrained` times that of the others.
+    """
+    training = errors[~held_out]
+    median, spread = _middle(training)
+    result = errors > torch.maximum(STANDS_OUT * median, median + deviations * spread)
+    if bool(held_out.any()):
+        factor, own = untrained, errors[held_out]
+        if len(own) >= OWN_YARDSTICK_FROM:
+            factor = STANDS_OUT
+            own_median, own_spread = _middle(own)
+            median, spread = torch.maximum(median, own_median), torch.maximum(spread, own_spread)
+        bound = torch.maximum(factor * median, median + deviations * spread)
+        result = torch.where(held_out, errors > bound, result)
+    return result
+
+
+def _middle(errors: Tensor) -> tuple[Tensor, Tensor]:
+    """Median and robust standard deviation; both zero of nothing."""
+    if len(errors) == 0:
+        return errors.new_zeros(()), errors.new_zeros(())
+    median = errors.median()
+    return median, MAD_TO_DEVIATION * (errors - median).abs().median()
+
+
+class CameraErrors:
+    """Collects the squared errors of each camera's rays block by block (a block ends at each check).
+
+    Errors are against the (blurred) targets and per ray that shows the scene, so that a small object does not
+    make for a small error.
+
+    Attributes:
+        shares: see `foreground_shares`.
+        errors: moving average [n] over blocks; infinite where there is none yet.
+        doubted: mask [n] of cameras that began at a guess and have not been seen to agree with the others' field.
+        lost: mask [n] of cameras that stood out for `IN_A_ROW` blocks, and of those in doubt.
+        weights: of each camera's rays in the loss [n], None where all weigh the same.
+    """
+
+    def __init__(self, images: ImageSet, held_out: list[int], device: torch.device) -> None:
+        count = len(images)
+        self.shares = torch.from_numpy(foreground_shares(images)).float().to(device)
+        variances = [
+            _counted(images.image(i) / np.float32(255), images, i).var(0).mean() for i in range(count)
+        ]
+        # Per ray that shows the scene, as the errors are.
+        self._variances = torch.tensor(variances, device=device) / self.shares
+        self.bounded = images.background is not None
+        self.held_out = torch.zeros(count, dtype=torch.bool, device=device)
+        self.held_out[held_out] = True
+        self.errors = torch.full((count,), torch.inf, device=device)
+        self.weights: Tensor | None = None
+        self.doubted = torch.zeros(count, dtype=torch.bool, device=device)
+        self._stood_out = torch.zeros(count, dtype=torch.int64, device=device)
+        self._sums = torch.zeros(3, count, device=device)  # rays, squared errors, opacities
+
+    @property
+    def lost(self) -> Tensor:
+        return (self._stood_out >= IN_A_ROW) | self.doubted
+
+    @property
+    def suspects(self) -> Tensor:
+        """Mask [n] of cameras that other poses should be tried for: the lost ones, and those that nearly are."""
+        return self.lost | self._outliers(SUSPECT_DEVIATIONS, STANDS_OUT)
+
+    @property
+    def relative(self) -> Tensor:
+        """Errors [n] over the median of the training cameras; infinite where there is none yet."""
+        known = self.errors[~self.held_out & self.errors.isfinite()]
+        return self.errors / known.median().clamp(min=1e-12) if len(known) else self.errors
+
+    def _weigh(self) -> None:
+        """A lost camera must not fog the field where it believes it stands."""
+        self.weights = None
+        if bool(self.lost.any()):
+            known = self.errors.isfinite()
+            weights = torch.where(known, 1 / self.relative.clamp(min=1), torch.ones_like(self.errors))
+            weights = torch.where(self.doubted, weights.clamp(max=DOUBTED_WEIGHT), weights)
+            self.weights = torch.where(self.lost, weights, torch.ones_like(weights))
+
+    def doubt(self, cameras: np.ndarray) -> None:
+        """Begin with little weight, and as suspects, for cameras [n] whose pose is a guess."""
+        self.doubted.copy_(torch.from_numpy(cameras))
+        self._weigh()
+
+    def believe(self, camera: int) -> None:
+        """The camera has been seen to agree with the others' field."""
+        self.doubted[camera] = False
+        self._weigh()
+
+    def add(self, image: Tensor, colour: Tensor, target: Tensor, opacity: Tensor) -> None:
+        """One batch: image [rays], colours [rays, 3] rendered and wanted, opacity [rays]."""
+        squared = ((colour - target) ** 2).mean(1)
+        for total, values in zip(self._sums, (torch.ones_like(squared), squared, opacity), strict=True):
+            total.index_add_(0, image, values)
+
+    def close_block(self) -> None:
+        """Take the block's errors into the moving average and look who stands out."""
+        rays, squared, opacity = self._sums
+        measured = rays > 0
+        block = squared / rays.clamp(min=1) / self.shares
+        smoothed = torch.where(self.errors.isfinite(), self.errors + SMOOTHING * (block - self.errors), block)
+        self.errors = torch.where(measured, smoothed, self.errors)
+        out = self._outliers(DEVIATIONS, STANDS_OUT_UNTRAINED)
+        if 0 < int(self.held_out.sum()) < OWN_YARDSTICK_FROM:
+            out &= ~self.held_out | (self.errors > UNEXPLAINED_UNTRAINED * self._variances)
+        if self.bounded:
+            out |= measured & (opacity / rays.clamp(min=1) < COVERAGE * self.shares)
+        self._stood_out = torch.where(out, self._stood_out + 1, torch.zeros_like(self._stood_out))
+        self._sums.zero_()
+        self._weigh()
+
+    def _outliers(self, deviations: float, untrained: float) -> Tensor:
+        known = self.errors.isfinite()
+        out = torch.zeros_like(known)
+        out[known] = outliers(self.errors[known], self.held_out[known], deviations, untrained)
+        return out & (self.errors > UNEXPLAINED * self._variances)
+
+    def forget(self, camera: int) -> None:
+        """Start over with one camera: its pose is another one now."""
+        self.errors[camera] = torch.inf
+        self._stood_out[camera] = 0
+        self.doubted[camera] = False
+        self._sums[:, camera] = 0
+        self._weigh()
+
+    def state(self) -> dict[str, Tensor]:
+        return {
+            "errors": self.errors,
+            "stood_out": self._stood_out,
+            "sums": self._sums,
+            "doubted": self.doubted,
+        }
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self.errors.copy_(state["errors"])
+        self._stood_out.copy_(state["stood_out"])
+        self._sums.copy_(state["sums"])
+        self.doubted.copy_(state["doubted"])
+        self._weigh()

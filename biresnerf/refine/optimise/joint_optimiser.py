@@ -1,0 +1,299 @@
+"""The joint optimisation of poses and radiance field: one object holding all state, one method taking a step."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.field.backends import directions_for, make_occupancy
+from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
+from biresnerf.geometry.camera.camera import Intrinsics, directions_with_gradient
+from biresnerf.geometry.perturb import RIG_DISTANCE
+from biresnerf.options.refine_options import RefineOptions
+from biresnerf.refine.optimise.async_metrics import LateFigures, StepResult
+from biresnerf.refine.optimise.camera_errors import CameraErrors
+from biresnerf.refine.optimise.methods import METHODS, build_field, occupancy_side
+from biresnerf.refine.optimise.parts_state import Part, load_state_of, state_of
+from biresnerf.refine.optimise.photo_sampler import PhotoSampler, PixelBatch
+from biresnerf.refine.optimise.pose_hypotheses import photo_distances
+from biresnerf.refine.parameters.camp_preconditioner import camp_preconditioner
+from biresnerf.refine.parameters.exposure import Exposure
+from biresnerf.refine.parameters.intrinsics_parameters import IntrinsicsParameters
+from biresnerf.refine.parameters.pose_parameters import PoseParameters
+from biresnerf.refine.parameters.rigid_bodies import RigidBodies
+from biresnerf.refine.scene.scene_frame import SceneFrame
+
+MOST_SAMPLES = 768  # per ray
+RAYS_MOST = 1 << 15
+FIRST_SAMPLES = 64  # per ray, as guessed for the first step
+OCCUPANCY_PERIOD = 16
+
+
+class JointOptimiser:
+    """Poses, field, occupancy and their schedules.
+
+    Args:
+        images: photos at working size.
+        frame: the unit frame.
+        unit_from_cam: start poses [n, 4, 4].
+        options: resolved.
+        held_out: images whose rays move their own pose but never the field.
+        mobility: each camera's factor of the pose rate [2, n] in stage 1 and stage 2; 1 where left out.
+        bodies: which cameras move together, and which not at all; all by themselves where left out.
+        lenses: the intrinsics, where they may move; as the images have them where left out.
+        sampler: of the same images and held-out views, where another optimiser has made it already.
+    """
+
+    def __init__(
+        self,
+        images: ImageSet,
+        frame: SceneFrame,
+        unit_from_cam: np.ndarray,
+        options: RefineOptions,
+        held_out: list[int],
+        device: torch.device,
+        threads: int,
+        mobility: np.ndarray | None = None,
+        bodies: RigidBodies | None = None,
+        lenses: IntrinsicsParameters | None = None,
+        sampler: PhotoSampler | None = None,
+    ) -> None:
+        self.frame, self.options, self.device = frame, options, device
+        self.bodies = bodies or RigidBodies.free(len(images))
+        self.method = METHODS[options.method]
+        self.field = build_field(self.method, options, frame, device, threads)
+        self.lenses = lenses or IntrinsicsParameters.held(images.cameras, device)
+        self.poses = self._pose_parameters(torch.from_numpy(unit_from_cam))
+        self.schedule = self.method.schedule(options, frame.pixel, frame.unbounded, frame.distance)
+        self._images = images
+        self.sampler = sampler or PhotoSampler(images, held_out, device)
+        self.camera_errors = CameraErrors(images, held_out, device)
+        self.directions, self.figures = directions_for(device), LateFigures(device)
+        self.occupancy = make_occupancy(occupancy_side(self.method, options), device)
+        self.generator = torch.Generator().manual_seed(options.seed)
+        # What a step draws, it draws on the device: the host's draws would have to be waited for.
+        on_device = None if device.type == "cpu" else torch.Generator(device).manual_seed(options.seed)
+        self.draws = on_device or self.generator
+        seen = images.pixels if images.counts is None else images.pixels[images.counts]
+        behind = frame.background if frame.background is not None else seen.mean(0) / 255
+        self.background = torch.as_tensor(behind, dtype=torch.float32, device=device)
+        around = self.background if frame.background is not None else None
+        self.exposure = Exposure(images, options.exposure or "auto", held_out, around, device)
+        self.step_index = 0
+        # The step that stage 2 began at. What has one stage is in its last from the first step on.
+        self.switch: int | None = None if self.method.two_stages else 0
+        self.pose_scale = 1.0
+        self.mobility = (
+            torch.ones(2, len(self.poses), device=device)
+            if mobility is None or not self.method.additions
+            else torch.tensor(mobility, dtype=torch.float32, device=device)
+        )
+        self.mobility[:, torch.from_numpy(self.bodies.fixed).to(device)] = 0.0
+        guess = self.schedule.samples(0, None) // (self.field.stratified or FIRST_SAMPLES)
+        self.rays = max(self.method.rays_least, guess)
+
+    @cached_property
+    def photo_distances(self) -> NDArray[np.float32]:
+        """How unlike the photos are, see `photo_distances`; worked out when a lost camera first needs it."""
+        return photo_distances(self._images)
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Every image's intrinsics at working size, as they are now."""
+        return self.lenses.intrinsics
+
+    def _pose_parameters(self, unit_from_cam: Tensor) -> PoseParameters:
+        options, distance = self.options, self.frame.distance
+        length = distance / RIG_DISTANCE
+        preconditioner = None
+        if options.pose_parametrisation == "so3xr3_camp":
+            preconditioner = camp_preconditioner(
+                unit_from_cam, self.intrinsics, distance, length, options.seed
+            )
+        return PoseParameters(
+            unit_from_cam,
+            options.pose_parametrisation,
+            length,
+            self.device,
+            betas=self.method.pose_betas,
+            double_step=bool(options.double_pose_step),
+            preconditioner=preconditioner,
+            body=torch.from_numpy(self.bodies.of),
+        )
+
+    def replace_pose(self, camera: int, unit_from_cam: Tensor) -> None:
+        """Start one camera over from another pose [3, 4]: as free as any, with nothing known of it yet."""
+        self.poses.replace(camera, unit_from_cam)
+        self.camera_errors.forget(camera)
+        self.exposure.forget(camera)
+        self.mobility[:, self.poses.members(camera)] = 1.0
+        if self.poses.preconditioner is not None:
+            fresh = self._pose_parameters(self.poses.poses()).preconditioner
+            assert fresh is not None
+            self.poses.preconditioner[camera] = fresh[camera]
+
+    def marching(self, interval: float) -> Marching:
+        near = self.schedule.near(self.step_index, self.switch)
+        near = self.frame.distance * (max(near, self.frame.near) if self.method.additions else near)
+        far = self.schedule.far(self.frame.far)
+        return Marching(interval, near, far, MOST_SAMPLES, self.occupancy.occupied)
+
+    def cast(
+        self, matrix: Tensor, image: Tensor, xy: Tensor, intrinsics: Intrinsics | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Origin and direction [rays, 3] in the unit frame of pixels `xy` [rays, 2] seen by cameras of images.
+
+        `matrix` [rays, 3, 4] is each ray's unit_from_cam; `intrinsics` are the run's images' where not given.
+        """
+        lenses = intrinsics or self.intrinsics
+        with torch.no_grad():
+            in_cam = self.directions(lenses, image, xy).float()
+        if lenses.fx.requires_grad:
+            in_cam = directions_with_gradient(lenses, image, xy, in_cam)
+        direction = (matrix[:, :, :3] @ in_cam[:, :, None])[:, :, 0]
+        return matrix[:, :, 3].contiguous(), direction.contiguous()
+
+    def render(
+        self,
+        origin: Tensor,
+        direction: Tensor,
+        trained: int,
+        interval: float,
+        gradient: PositionGradient,
+        *,
+        jitter: bool,
+    ) -> Rendering:
+        """Render rays over the scene's background; `jitter` randomises where sampling starts."""
+        count = len(origin)
+        shape = (count,) if self.field.stratified is None else (count, self.field.stratified)
+        start = (
+            torch.rand(shape, generator=self.draws, device=self.device)
+            if jitter
+            else torch.full(shape, 0.5, device=self.device)
+        )
+        background = self.background.expand(count, 3).contiguous()
+        rays = Rays(origin, direction, background, start, trained)
+        return self.field.render(rays, self.marching(interval), gradient)
+
+    def step(self) -> StepResult:
+        """One step of the joint optimisation."""
+        t, schedule = self.step_index, self.schedule
+        self.field.reach(t / schedule.steps)
+        if t % OCCUPANCY_PERIOD == 0 and self.method.pruned:
+            self._update_occupancy(t)
+        batch = self.sampler.draw(
+            self.rays, schedule.blur(t, self.switch, self.sampler.long_side), self.draws
+        )
+        lens_rate = schedule.lens_rate(t, self.switch) * self.pose_scale if self.lenses.moving else 0.0
+        matrices, lenses = self.poses.matrices(), self.intrinsics
+        if lens_rate > 0:
+            matrices, lenses = self.lenses.with_gradient(matrices)
+        origin, direction = self.cast(matrices[batch.image], batch.image, batch.xy, lenses)
+        rendering = self.render(
+            origin, direction, batch.trained, schedule.interval(t, self.switch),
+            schedule.position_gradient(t, self.switch), jitter=True,
+        )  # fmt: skip
+        colour = self.exposure.shown(rendering, batch.image)
+        loss = self._loss(self.exposure.forgiven(colour, batch.target), batch)
+        loss.backward()
+        rates = schedule.field_rates(t, self.switch)
+        self.field.step(rates)
+        self.exposure.step(rates.networks)
+        rate = self.pose_rate()
+        if rate > 0:
+            mobility = self.mobility[0 if self.switch is None else 1]
+            self.poses.step(rate, mobility, field_rate=rates.networks)
+            if lens_rate > 0:
+                self.poses.dolly(self.lenses.step(lens_rate, focal=schedule.focal_moves(self.switch)))
+        else:
+            self.poses.forget_gradients()
+        self.step_index += 1
+        self._adapt_rays(rendering.samples, schedule.samples(t, self.switch))
+        shown = colour.detach().clamp(max=1)
+        self.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach())
+        error = ((shown - batch.sharp) ** 2)[: batch.trained].mean()
+        told_loss, told_error = self.figures.read(loss.detach(), error)
+        return StepResult(told_loss, told_error, len(origin), rendering.samples)
+
+    def _loss(self, colour: Tensor, batch: PixelBatch) -> Tensor:
+        weights = self.camera_errors.weights
+        if weights is None or not self.method.additions:
+            return self.method.loss(colour, batch.target)
+        loss = torch.nn.functional.smooth_l1_loss(colour, batch.target, reduction="none")
+        return (loss * weights[batch.image][:, None]).mean()
+
+    def pose_rate(self) -> float:
+        """Learning rate of the poses at this step."""
+        return self.schedule.pose_rate(self.step_index, self.switch) * self.pose_scale
+
+    def start_reconstruction(self) -> None:
+        """Switch to stage 2 at this step."""
+        self.switch = self.step_index
+        self.field.start_reconstruction()
+
+    def _update_occupancy(self, step: int) -> None:
+        self.occupancy.update(
+            self.field,
+            self.schedule.fine_interval,
+            self.draws,
+            looked_at=self.schedule.empty_cells_looked_at(step, self.switch),
+            prune=self.schedule.pruned(step),
+            dilate=self.schedule.dilated(self.switch),
+        )
+
+    def _adapt_rays(self, samples: int, budget: int) -> None:
+        wanted = self.rays * budget / max(1, samples)
+        wanted = min(max(wanted, self.rays / 1.5), self.rays * 1.5)
+        self.rays = int(min(max(wanted, self.method.rays_least), RAYS_MOST))
+
+    def coarse_state(self) -> dict[str, Tensor]:
+        """What a rollback within stage 1 restores: all but the reconstruction module, which has not moved."""
+        return {name: tensor for name, tensor in self.state().items() if "reconstruction" not in name}
+
+    def load_coarse_state(self, state: dict[str, Tensor]) -> None:
+        """Undo the steps since `coarse_state`, but not the random draws: other pixels may do better."""
+        drawn = self.generator.get_state()
+        self._load_tensors({**self.state(), **state})
+        self.generator.set_state(drawn)
+
+    def state(self) -> dict[str, Tensor]:
+        """All tensors of the run (shared, not copied)."""
+        return {"generator": self.generator.get_state(), **state_of(self._parts())}
+
+    def _parts(self) -> dict[str, Part]:
+        return {
+            "field": self.field,
+            "poses": self.poses,
+            "lenses": self.lenses,
+            "occupancy": self.occupancy,
+            "camera_errors": self.camera_errors,
+            "exposure": self.exposure,
+        }
+
+    def notes(self) -> dict[str, float | int | None]:
+        """The numbers of the run that are not tensors."""
+        return {
+            "step_index": self.step_index,
+            "switch": self.switch,
+            "rays": self.rays,
+            "pose_scale": self.pose_scale,
+        }
+
+    def load_state(self, tensors: dict[str, Tensor], notes: dict[str, Any]) -> None:
+        """Restore what `state` and `notes` gave; the next step is then the one that would have come."""
+        self._load_tensors(tensors)
+        self.step_index, self.switch = notes["step_index"], notes["switch"]
+        self.rays, self.pose_scale = notes["rays"], notes["pose_scale"]
+        if self.draws is not self.generator:
+            self.draws.manual_seed(self.options.seed + self.step_index)  # its state is not kept
+        self.field.reach(self.step_index / self.schedule.steps)
+
+    def _load_tensors(self, tensors: dict[str, Tensor]) -> None:
+        self.generator.set_state(tensors["generator"])
+        load_state_of(self._parts(), tensors)

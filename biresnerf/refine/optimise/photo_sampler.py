@@ -1,0 +1,200 @@
+"""Random pixels of the photos, with their colour at a chosen sharpness. Photos stay bytes in memory.
+
+Masked pixels are never drawn, and no blurred colour holds any of theirs: levels of the pyramid know how much of each
+of their pixels counts, and are averaged by it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from biresnerf.data.photos.area_resize import area_resize
+from biresnerf.data.photos.images import ImageSet
+
+PYRAMID_LEVELS = 5
+LEVEL_SIGMA = 0.5  # blur of level k, in px: 0.5 * 2**k (a box of 2**k px and the bilinear taps)
+
+
+@dataclass(frozen=True)
+class PixelBatch:
+    """`image` [rays] indices, pixel centres `xy` [rays, 2] px, colours [rays, 3] in 0..1: blurred and sharp.
+
+    The first `trained` rays belong to training views, the rest to held-out ones.
+    """
+
+    image: Tensor
+    xy: Tensor
+    target: Tensor
+    sharp: Tensor
+    trained: int
+
+
+class PhotoSampler:
+    """Draws the same number of pixels from every image; keeps an image pyramid for coarse-to-fine targets.
+
+    Attributes:
+        shares: how much of each of the pyramid's pixels counts, uint8 of 255; None where there are no masks.
+    """
+
+    def __init__(self, images: ImageSet, held_out: list[int], device: torch.device) -> None:
+        count = len(images)
+        training = [i for i in range(count) if i not in set(held_out)]
+        self.order = torch.tensor(training + sorted(held_out), device=device)
+        self.training, self.device = len(training), device
+        levels, offsets, sizes, base = [], [], [], 0
+        current = [images.image(i) for i in range(count)]
+        masks, shares = _masks(images), []
+        for level in range(PYRAMID_LEVELS):
+            if level:
+                halves = [_half(image, mask) for image, mask in zip(current, masks, strict=True)]
+                current, masks = [image for image, _ in halves], [mask for _, mask in halves]
+            shares += [mask.reshape(-1) for mask in masks if mask is not None]
+            offsets.append(
+                [base + n for n in np.cumsum([0, *(im.shape[0] * im.shape[1] for im in current)])[:-1]]
+            )
+            sizes.append([(im.shape[1], im.shape[0]) for im in current])
+            levels.append(np.concatenate([im.reshape(-1, 3) for im in current]))
+            base += len(levels[-1])
+        self.pixels = torch.from_numpy(np.concatenate(levels)).to(device)
+        self.shares = torch.from_numpy(np.concatenate(shares)).to(device) if shares else None
+        self._counted = self._counted_pixels(images) if shares else None
+        self.offsets = torch.tensor(offsets, device=device)
+        self.sizes = torch.tensor(sizes, device=device)
+        self.long_side = float(self.sizes[0].max())
+        self._corners = torch.tensor([[[0, 0], [0, 1]], [[1, 0], [1, 1]]], device=device)
+        self._host: torch.Generator | None = None
+
+    def _counted_pixels(self, images: ImageSet) -> tuple[Tensor, Tensor]:
+        """Which pixels count, int32 image after image, and where each image's begin [n + 1]."""
+        masks = (images.counts_image(i) for i in range(len(images)))
+        parts = [np.flatnonzero(mask).astype(np.int32) for mask in masks if mask is not None]
+        begin = torch.from_numpy(np.cumsum([0, *map(len, parts)]))
+        return torch.from_numpy(np.concatenate(parts)).to(self.device), begin.to(self.device)
+
+    def draw(
+        self, rays: int, blur_px: float, generator: torch.Generator, *, held_out_only: bool = False
+    ) -> PixelBatch:
+        """`rays` pixels, spread evenly over all images or the held-out ones, blurred by a random share of `blur_px`."""
+        position, trained = self._positions(rays, generator, held_out_only)
+        image = self.order[position]
+        size = self.sizes[0][image]
+        xy = self.random_pixels(image, generator)
+        index = self.offsets[0][image] + (xy[:, 1].floor() * size[:, 0] + xy[:, 0].floor()).long()
+        sharp = self.pixels[index].float() / 255
+        sigma = blur_px * self._share(generator)
+        target = sharp if sigma <= LEVEL_SIGMA else self._blurred(image, xy, sigma)
+        return PixelBatch(image, xy, target, sharp, trained)
+
+    def random_pixels(self, image: Tensor, generator: torch.Generator) -> Tensor:
+        """The centre [rays, 2] (px) of a random pixel that counts, of each of the images `image` [rays]."""
+        size = self.sizes[0][image]
+        if self._counted is None:
+            share = torch.rand(len(image), 2, generator=generator, device=generator.device).to(self.device)
+            return (share * size).floor() + 0.5
+        pixels, begin = self._counted
+        first, count = begin[image], begin[image + 1] - begin[image]
+        drawn = torch.rand(len(image), generator=generator, device=generator.device, dtype=torch.float64)
+        pixel = pixels[first + (drawn.to(self.device) * count).long()].long()
+        return torch.stack([pixel % size[:, 0], pixel // size[:, 0]], 1) + 0.5
+
+    def counting(self, image: Tensor, xy: Tensor) -> Tensor | None:
+        """Whether pixels with centres `xy` [rays, 2] count, 0 or 1 [rays]; None where there are no masks."""
+        if self.shares is None:
+            return None
+        pixel = xy.floor().long()
+        index = self.offsets[0][image] + pixel[:, 1] * self.sizes[0][image][:, 0] + pixel[:, 0]
+        return (self.shares[index] > 0).float()
+
+    def _positions(self, rays: int, generator: torch.Generator, held_out_only: bool) -> tuple[Tensor, int]:
+        """Places in `order`, evenly spread and in turn, and how many are of training views."""
+        views = len(self.order)
+        if held_out_only:
+            return self._spread(rays, self.training, views, generator), 0
+        if generator.device.type == "cpu":
+            position = self._spread(rays, 0, views, generator)
+            return position, int((position < self.training).sum())
+        # On a GPU the host would have to wait for that sum, so it chooses it: the same to a ray.
+        trained = round(rays * self.training / views)
+        parts = (
+            self._spread(trained, 0, self.training, generator),
+            self._spread(rays - trained, self.training, views, generator),
+        )
+        return torch.cat(parts), trained
+
+    def _spread(self, rays: int, first: int, end: int, generator: torch.Generator) -> Tensor:
+        """`rays` places in [first, end): one at random in each of as many equal parts."""
+        at = generator.device
+        where = torch.arange(rays, device=at) + torch.rand(rays, generator=generator, device=at)
+        where = where * ((end - first) / max(1, rays))
+        return first + where.long().clamp(max=end - first - 1).to(self.device)
+
+    def _share(self, generator: torch.Generator) -> float:
+        """A random number in [0, 1); on a GPU from a generator of the host's, which need not wait for it."""
+        if generator.device.type == "cpu":
+            return float(torch.rand((), generator=generator))
+        if self._host is None:
+            self._host = torch.Generator().manual_seed(generator.initial_seed())
+        return float(torch.rand((), generator=self._host))
+
+    def colours(self, image: Tensor, xy: Tensor, sigma: float) -> Tensor:
+        """Colours [rays, 3] of pixels with centres `xy` [rays, 2], blurred by `sigma` px."""
+        return self._blurred(image, xy, sigma) if sigma > LEVEL_SIGMA else self._bilinear(0, image, xy)
+
+    def _blurred(self, image: Tensor, xy: Tensor, sigma: float) -> Tensor:
+        level = min(math.log2(sigma / LEVEL_SIGMA), PYRAMID_LEVELS - 1.0)
+        lower = int(level)
+        share = level - lower
+        colour = self._bilinear(lower, image, xy) * (1 - share)
+        if share > 0:
+            colour = colour + self._bilinear(lower + 1, image, xy) * share
+        return colour
+
+    def _bilinear(self, level: int, image: Tensor, xy: Tensor) -> Tensor:
+        size = self.sizes[level][image]
+        at = xy * (size / self.sizes[0][image]) - 0.5
+        low = at.floor()
+        fraction = at - low
+        total = torch.zeros(len(image), 3, device=self.device)
+        weight = torch.zeros(len(image), 1, device=self.device)
+        for dx in (0, 1):
+            for dy in (0, 1):
+                corner = (low + self._corners[dx, dy]).long()
+                corner = torch.minimum(corner.clamp(min=0), size - 1)
+                index = self.offsets[level][image] + corner[:, 1] * size[:, 0] + corner[:, 0]
+                wx = fraction[:, 0] if dx else 1 - fraction[:, 0]
+                wy = fraction[:, 1] if dy else 1 - fraction[:, 1]
+                share = (wx * wy)[:, None]
+                if self.shares is not None:
+                    share = share * self.shares[index, None]
+                    weight += share
+                total += share * self.pixels[index].float()
+        if self.shares is not None:
+            total = total / weight.clamp(min=1e-6)
+        return total / 255
+
+
+def _masks(images: ImageSet) -> list[NDArray[np.uint8] | None]:
+    counts = [images.counts_image(i) for i in range(len(images))]
+    return [None if c is None else c.astype(np.uint8) * 255 for c in counts]
+
+
+def _half(
+    image: NDArray[np.uint8], share: NDArray[np.uint8] | None
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """Image and mask at half the size; colours averaged over what counts, the share of it never rounded to nothing."""
+    height, width = max(1, image.shape[0] // 2), max(1, image.shape[1] // 2)
+    if share is None:
+        return _bytes(area_resize(image, width, height)), None
+    weighed = np.concatenate([image * (share[..., None] / np.float32(255)), share[..., None]], 2)
+    small = area_resize(weighed, width, height)
+    return _bytes(small[..., :3] * 255 / np.maximum(small[..., 3:], 1e-6)), _bytes(np.ceil(small[..., 3]))
+
+
+def _bytes(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)

@@ -1,0 +1,140 @@
+"""How bright each photo is against the others: three factors a photo, one a channel, found with poses and field.
+
+Cameras choose their exposure and white balance anew for each photo. A field that has one colour for a point explains
+that away by haze before the cameras and by moving them. Three numbers a photo cannot do what a pose does: a factor
+moves no edge. A photo's colours are powers of the light, so a change of exposure is a factor on them, too.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.field.adam_state import adam_state, load_adam_state
+from biresnerf.field.radiance_field import Rendering
+from biresnerf.options.refine_options import ExposureChoice
+
+# Standard deviation of the photos' logarithmic brightness from which on `auto` compensates: a tripod's photos of one
+# scene stay below (0.02 to 0.03 in fern, horns, lund_door), and there is nothing to gain.
+AUTO_FROM = 0.03
+RATE_SHARE = 1.0  # of the networks' learning rate
+PRIOR = 1e-4  # weight of the squared logarithms: what nothing is known of stays as the others are
+MOST = 3.0  # factor; a camera that has lost the scene would take any
+SATURATED = 0.99  # a photo as bright as this may have been brighter
+
+
+def brightness_spread(images: ImageSet) -> float:
+    """Standard deviation over the photos of the logarithm of their mean colour, where pixels count."""
+    means = []
+    for i in range(len(images)):
+        counts = images.counts_image(i)
+        photo = images.image(i).reshape(-1, 3) if counts is None else images.image(i)[counts]
+        means.append(np.log(max(float(photo.mean()), 1.0)))
+    return float(np.std(means))
+
+
+def compensates(images: ImageSet, choice: ExposureChoice) -> bool:
+    """Whether exposures are optimised: as asked; `auto` where opaque photos differ in brightness."""
+    if choice == "auto":
+        return images.alpha is None and brightness_spread(images) >= AUTO_FROM
+    return choice == "on"
+
+
+class Exposure:
+    """The photos' factors and their optimiser. Over the training photos, the factors' mean logarithm is zero.
+
+    Args:
+        background: colour [3] behind the scene, which no exposure changes (it is none of the photo's light, or burnt
+            out, or black); None where the scene has surroundings.
+
+    Attributes:
+        on: whether there is any compensation; otherwise all factors are and stay 1.
+        log_gain: logarithm of the factors [n, 3].
+    """
+
+    def __init__(
+        self,
+        images: ImageSet,
+        choice: ExposureChoice,
+        held_out: list[int],
+        background: Tensor | None,
+        device: torch.device,
+    ) -> None:
+        self.on = compensates(images, choice)
+        self.log_gain = torch.zeros(len(images), 3, device=device, requires_grad=self.on)
+        self._background = background
+        self._training = torch.ones(len(images), 1, device=device)
+        self._training[held_out] = 0
+        self.restart_adam()
+
+    def restart_adam(self) -> None:
+        """Forget the momentum of the steps so far."""
+        self._adam = torch.optim.Adam([self.log_gain], betas=(0.9, 0.99), eps=1e-8)
+
+    def shown(self, rendering: Rendering, image: Tensor) -> Tensor:
+        """Colours [rays, 3] that the photos `image` [rays] show of what was rendered."""
+        return self._lit(rendering, self.log_gain[image].exp()) if self.on else rendering.colour
+
+    def refitted(self, rendering: Rendering, target: Tensor, weight: Tensor | None, groups: int) -> Tensor:
+        """Colours [rays, 3] with factors for each of `groups` equal parts of the rays, fitted to `target` [rays, 3].
+
+        For poses that are being tried: the factors at hand fit the pose that the camera has. No gradient to factors.
+        """
+        if not self.on:
+            return rendering.colour
+        with torch.no_grad():
+            colour = rendering.colour.reshape(groups, -1, 3)
+            wanted = target.reshape(groups, -1, 3)
+            share = torch.ones_like(colour) if weight is None else weight.reshape(groups, -1, 1)
+            gain = (share * colour * wanted).sum(1) / (share * colour**2).sum(1).clamp(min=1e-6)
+            gain = gain.clamp(1 / MOST, MOST).repeat_interleave(colour.shape[1], 0)
+        return self._lit(rendering, gain)
+
+    def _lit(self, rendering: Rendering, gain: Tensor) -> Tensor:
+        if self._background is None:
+            return gain * rendering.colour
+        behind = (1 - rendering.opacity)[:, None] * self._background
+        return gain * (rendering.colour - behind) + behind
+
+    def forgiven(self, colour: Tensor, target: Tensor) -> Tensor:
+        """`colour`, or the target's where that is saturated and the colour brighter still: no error then."""
+        if not self.on:
+            return colour
+        return torch.where((target >= SATURATED) & (colour > target), target, colour)
+
+    @torch.no_grad()
+    def step(self, rate: float) -> None:
+        """One step of Adam from the gradients of the last backward; `rate` is the networks'."""
+        if self.log_gain.grad is None:
+            return
+        self.log_gain.grad += PRIOR / len(self.log_gain) * self.log_gain
+        self._adam.param_groups[0]["lr"] = RATE_SHARE * rate
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+        mean = (self.log_gain * self._training).sum(0) / self._training.sum()
+        self.log_gain.sub_(mean).clamp_(-math.log(MOST), math.log(MOST))
+
+    @torch.no_grad()
+    def forget(self, camera: int) -> None:
+        """Start over with one photo: its pose is another one now."""
+        self.log_gain[camera] = 0
+        for moment in self._adam.state.get(self.log_gain, {}).values():
+            if moment.shape == self.log_gain.shape:
+                moment[camera] = 0
+
+    def gains(self) -> NDArray[np.float64] | None:
+        """The factors [n, 3]; None without compensation."""
+        return self.log_gain.detach().double().exp().cpu().numpy() if self.on else None
+
+    def state(self) -> dict[str, Tensor]:
+        return {"log_gain": self.log_gain.detach(), **adam_state("adam", self._adam)}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        with torch.no_grad():
+            self.log_gain.copy_(state["log_gain"])
+        load_adam_state("adam", self._adam, state)

@@ -1,0 +1,164 @@
+"""Cameras that must not move, and cameras that move together: what the optimiser takes as one rigid body.
+
+A fixed camera ends where it began, to the bit, and ties the frame of the result. The cameras of one moment of a rig
+share one motion, so their places in the rig stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.errors import InputError
+from biresnerf.geometry.similarity import Similarity, align_robust
+from biresnerf.options.refine_options import RefineOptions
+
+# Fixed centres nearer to each other than this share of the rig's spread leave its scale open.
+_APART = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class RigidBodies:
+    """Which cameras are one body.
+
+    Attributes:
+        of: int64 [n], each camera's body, numbered from 0 without gaps.
+        fixed: bool [n]; a body's cameras are all fixed or none.
+    """
+
+    of: NDArray[np.int64]
+    fixed: NDArray[np.bool_]
+
+    @classmethod
+    def free(cls, count: int) -> RigidBodies:
+        """Every camera a body of its own, none fixed."""
+        return cls(np.arange(count), np.zeros(count, dtype=np.bool_))
+
+    @property
+    def shared(self) -> list[NDArray[np.int64]]:
+        """The cameras of each body that has several."""
+        groups = [np.flatnonzero(self.of == body) for body in range(int(self.of.max(initial=-1)) + 1)]
+        return [group for group in groups if len(group) > 1]
+
+    @property
+    def tied(self) -> bool:
+        """Whether any camera may not move for itself."""
+        return bool(self.fixed.any() or self.shared)
+
+    def held(self, world_from_cam: NDArray[np.float64], given: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Poses [n, 4, 4] with every body as it is in ``given``, and the fixed ones where they are there.
+
+        Where fixed cameras stand elsewhere, the whole rig is carried along first, so that the others keep their place
+        beside them.
+        """
+        poses = np.array(world_from_cam, dtype=np.float64)
+        if self.fixed.any() and not np.array_equal(poses[self.fixed], given[self.fixed]):
+            carried = align_robust(poses[self.fixed], given[self.fixed], with_rotations=True)
+            poses = carried.apply_to_poses(poses)
+        return self.restored(poses, given)
+
+    def restored(
+        self, world_from_cam: NDArray[np.float64], given: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Poses [n, 4, 4] without what rounding moved: bodies as in ``given`` to all digits, fixed ones to the bit."""
+        poses = world_from_cam.copy()
+        for group in self.shared:
+            if not np.array_equal(poses[group], given[group]):
+                moved = align_robust(given[group], poses[group], with_rotations=True, with_scale=False)
+                poses[group] = moved.apply_to_poses(given[group])
+        poses[self.fixed] = given[self.fixed]
+        return poses
+
+    def input_from_optimised(
+        self, optimised: NDArray[np.float64], given: NDArray[np.float64]
+    ) -> Similarity | None:
+        """What carries an optimised rig [n, 4, 4] to the input's frame where bodies leave less than a similarity open.
+
+        None where they leave all of it open. Fixed cameras have not moved, so the frame is the input's already; one of
+        them alone leaves the scale about its centre. Rigs leave no scale, unless their cameras share one centre.
+        """
+        if self.fixed.any():
+            centres = given[self.fixed][:, :3, 3]
+            spread = np.linalg.norm(given[:, :3, 3] - given[:, :3, 3].mean(0), axis=1).mean()
+            if self.shared or np.linalg.norm(centres - centres[0], axis=1).max() > _APART * spread:
+                return Similarity.identity()
+            scale = _scale_about(centres[0], optimised[:, :3, 3], given[:, :3, 3])
+            return Similarity(scale, np.eye(3), (1.0 - scale) * centres[0])
+        if self.shared:
+            return align_robust(optimised, given, with_rotations=True, with_scale=False)
+        return None
+
+
+def _scale_about(centre: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Median ratio of the distances of points b and a [n, 3] from ``centre``."""
+    far_a, far_b = np.linalg.norm(a - centre, axis=1), np.linalg.norm(b - centre, axis=1)
+    some = (far_a > _APART * far_a.max(initial=0.0)) & (far_b > 0)
+    return float(np.median(far_b[some] / far_a[some])) if some.any() else 1.0
+
+
+def rigid_bodies(dataset: Dataset, options: RefineOptions) -> RigidBodies:
+    """The bodies of a set: one for each moment of a COLMAP rig with several cameras, one for every other image.
+
+    ``options.fixed`` names images as the input writes them or by their path relative to its folder.
+
+    Raises:
+        InputError: ``fixed_not_found``, ``fixed_without_pose``, or ``invalid_options`` for a parametrisation that
+            cannot hold a rig.
+    """
+    rows = _fixed_rows(dataset, options.fixed)
+    of = np.arange(len(dataset))
+    moments = _moments(dataset)
+    if moments and options.pose_parametrisation == "so3xr3_camp":
+        raise InputError(
+            "invalid_options",
+            "so3xr3_camp moves every camera for itself, and this set's cameras belong to a rig.",
+            where="pose_parametrisation",
+            mend="Take se3_world or so3xr3, or a model without rigs.bin and frames.bin.",
+        )
+    for group in moments:
+        of[group] = group[0]
+    _, of = np.unique(of, return_inverse=True)
+    held = np.zeros(len(dataset), dtype=np.bool_)
+    held[np.isin(of, of[rows])] = True
+    return RigidBodies(of.astype(np.int64), held)
+
+
+def _fixed_rows(dataset: Dataset, fixed: Sequence[str]) -> list[int]:
+    row_of = {name: i for names in (dataset.file_names, dataset.names) for i, name in enumerate(names)}
+    missing = [name for name in fixed if name not in row_of]
+    if missing:
+        raise InputError(
+            "fixed_not_found",
+            f"there is no image {missing[0]!r}.",
+            where="fixed",
+            mend="Name images as the input does, or by their path relative to its folder.",
+        )
+    rows = [row_of[name] for name in fixed]
+    for row, name in zip(rows, fixed, strict=True):
+        if dataset.frames[row].pose_source != "given":
+            raise InputError(
+                "fixed_without_pose",
+                f"{name!r} is to be kept where it is, but the input does not say where that is.",
+                where="fixed",
+                mend="Give its pose, or leave it out of fixed.",
+            )
+    return rows
+
+
+def _moments(dataset: Dataset) -> list[list[int]]:
+    """Rows of the images that one frame of a COLMAP rig took, where there are several."""
+    model = dataset.source.colmap
+    if model is None:
+        return []
+    row_of = {frame.name: i for i, frame in enumerate(dataset.frames) if frame.pose_source == "given"}
+    moments = []
+    for moment in model.frames.values():
+        names = [model.images[image].name for sensor, image in moment.data_ids if sensor[0] == "CAMERA"]
+        rows = sorted(row_of[name] for name in names if name in row_of)
+        if len(rows) > 1:
+            moments.append(rows)
+    return moments

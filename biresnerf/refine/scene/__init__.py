@@ -1,0 +1,1 @@
+"""The scene's frame, depth and overlap, as the cameras tell them. Nothing here is optimised."""

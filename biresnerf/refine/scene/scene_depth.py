@@ -1,0 +1,39 @@
+"""How far away the scene is, by feature matches: for rigs whose axes do not meet."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.points.feature_matches import FeatureMatches
+from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.epipolar import epipolar_angles, match_depths
+from biresnerf.refine.scene.match_rays import match_rays
+
+AGREE_DEG = 1.0  # matches off by more say nothing: the poses or they are wrong
+LEAST_PARALLAX_DEG = 1.0  # between the rays of a match; below, noise makes the depth
+LEAST_MATCHES = 30
+
+
+def matched_depth(
+    dataset: Dataset, world_from_cam: NDArray[np.float64], matches: FeatureMatches | None
+) -> float | None:
+    """Median depth of matched points in front of the cameras at poses [n, 4, 4], in their unit.
+
+    None where too few matches agree with the poses, or all points lie beyond what the rig's width can tell.
+    """
+    if matches is None:
+        return None
+    intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
+    a, b = matches.images.T
+    ray_a, ray_b = match_rays(intrinsics, matches)
+    errors = np.degrees(epipolar_angles(world_from_cam, a, b, ray_a, ray_b))
+    world_a = np.einsum("mij,mj->mi", world_from_cam[a, :3, :3], ray_a)
+    world_b = np.einsum("mij,mj->mi", world_from_cam[b, :3, :3], ray_b)
+    parallax = np.degrees(
+        np.arctan2(np.linalg.norm(np.cross(world_a, world_b), axis=1), (world_a * world_b).sum(1))
+    )
+    depths = match_depths(world_from_cam, a, b, ray_a, ray_b)
+    usable = (errors < AGREE_DEG) & (parallax > LEAST_PARALLAX_DEG) & (depths > 0).all(1)
+    return float(np.median(depths[usable])) if usable.sum() >= LEAST_MATCHES else None

@@ -1,0 +1,61 @@
+"""The curve of a run, one line at each check of the detector: ``history.jsonl``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from biresnerf.data.model.atomic_file import whole_file
+
+if TYPE_CHECKING:
+    from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+
+HISTORY = "history.jsonl"
+Line = Mapping[str, float | str]
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Lets a comparison look into a run that it has the true poses of; the run itself never does.
+
+    Attributes:
+        at_check: what it returns at each check joins that check's line of the history.
+        at_end: called once, when all steps are taken and the run's own views are scored.
+    """
+
+    at_check: Callable[[JointOptimiser], dict[str, float]] = lambda _optimiser: {}
+    at_end: Callable[[JointOptimiser], None] = lambda _optimiser: None
+
+
+class History:
+    """Appends lines to ``folder``/history.jsonl; a continued run drops those after its checkpoint first."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / HISTORY
+
+    def cut(self, step: int) -> None:
+        """Keep the lines up to `step` alone: what came later will come again."""
+        if not self.path.is_file():
+            return
+        kept = [line for line in read_history(self.path) if float(line["step"]) <= step]
+        with whole_file(self.path) as temporary:
+            temporary.write_text("".join(json.dumps(line) + "\n" for line in kept), "utf-8")
+
+    def append(self, line: Line) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line, allow_nan=False) + "\n")
+
+
+def read_history(path: Path) -> list[dict[str, float | str]]:
+    """The lines of a history; one that a kill tore off in the middle is left out."""
+    lines = []
+    for text in path.read_text("utf-8").splitlines():
+        try:
+            lines.append(json.loads(text))
+        except ValueError:
+            continue
+    return lines

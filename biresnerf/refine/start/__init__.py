@@ -1,0 +1,1 @@
+"""Which poses the optimisation starts from, decided by short trials."""

@@ -1,0 +1,131 @@
+"""Equal short trainings on sets of poses held still: which set lets a field predict photos it was not shown?
+
+Everything but the poses (and the lenses, where they were refined too) is the same in each: photos, unseen views, scene
+box, steps, samples and random seed. Unseen views are rendered from the poses as they stand, fitted to no field: a fit
+would forgive what is asked about. Each set is scored within its own field, so it need not share its frame's last
+digits with the others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import Camera
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.errors import Interrupted
+from biresnerf.options.refine_options import RefineOptions
+from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.optimise.photo_sampler import PhotoSampler
+from biresnerf.refine.scene.scene_frame import scene_frame
+from biresnerf.refine.views.evaluation import render_view
+from biresnerf.refine.views.image_metrics import psnr, ssim
+
+SAMPLES = 1 << 14  # a step
+# Until a field of an open scene has formed, good poses predict unseen views no better than bad ones (fountain-P11: no
+# difference after 200 steps, 4 dB after 400).
+OPEN_STEPS = 2  # times the steps of a scene with a background
+ONE_IN, VIEWS_MOST = 5, 16  # unseen views: one in so many, but no more than that
+RAYS_PER_STEP = 100  # pixels of all unseen views that are rendered at the end, for each step of the training
+
+
+def trial_views(count: int) -> list[int]:
+    """Indices of the views of `count` that a trial does not train on, evenly spread."""
+    return list(range(ONE_IN // 2, count, max(ONE_IN, -(-count // VIEWS_MOST))))
+
+
+@dataclass(frozen=True, eq=False)
+class TrialScores:
+    """PSNR (dB) and SSIM of each unseen view, float64 [views]."""
+
+    psnr: NDArray[np.float64]
+    ssim: NDArray[np.float64]
+
+
+def joined(parts: Sequence[TrialScores]) -> TrialScores:
+    """The scores of several trials, one after the other."""
+    return TrialScores(np.concatenate([p.psnr for p in parts]), np.concatenate([p.ssim for p in parts]))
+
+
+class FrozenTrials:
+    """Scores sets of poses, one after the other, under the same conditions.
+
+    Args:
+        images: photos at working size.
+        unseen: indices of the views that no field is trained on.
+        rigs: sets of poses [n, 4, 4] that the scene box is taken from, all of them alike; in one frame.
+        options: resolved; the field's sizes and rates.
+        steps: of each training; an open scene takes `OPEN_STEPS` times as many.
+        should_stop: asked after every step.
+    """
+
+    def __init__(
+        self,
+        images: ImageSet,
+        unseen: Sequence[int],
+        rigs: Sequence[NDArray[np.float64]],
+        options: RefineOptions,
+        steps: int,
+        device: torch.device,
+        threads: int,
+        should_stop: Callable[[], bool],
+        sampler: PhotoSampler | None = None,
+    ) -> None:
+        self.images, self.unseen = images, list(unseen)
+        self.frame = scene_frame(np.concatenate(list(rigs)), images)
+        self.steps = steps * (OPEN_STEPS if self.frame.unbounded else 1)
+        # All of it stage 1, and the rates fall to their end: with the rates of a longer run's first half, trainings on
+        # the same poses differ by 0.25 dB from seed to seed (lego at 100 px, 200 steps), so by 0.04.
+        self._options = options.model_copy(
+            update={
+                "steps": self.steps,
+                "coarse_steps_min": self.steps,
+                "coarse_steps_max": self.steps,
+                "samples_per_step": min(SAMPLES, int(options.samples_per_step or SAMPLES)),
+            }
+        )
+        self._device, self._threads, self._should_stop = device, threads, should_stop
+        self._sampler = sampler or PhotoSampler(images, self.unseen, device)
+        pixels = int(sum(images.widths[v] * images.heights[v] for v in self.unseen))
+        self._stride = max(1, math.ceil(math.sqrt(pixels / (RAYS_PER_STEP * self.steps))))
+
+    def score(
+        self, world_from_cam: NDArray[np.float64], cameras: tuple[Camera, ...] | None = None
+    ) -> TrialScores:
+        """Train a field on all but the unseen views, from these poses and lenses, and score it on the unseen.
+
+        Args:
+            world_from_cam: [n, 4, 4], in the frame of the rigs.
+            cameras: of each image at working size; the photos' own where left out.
+
+        Raises:
+            Interrupted: ``should_stop`` said so.
+        """
+        images = self.images if cameras is None else replace(self.images, cameras=cameras)
+        poses = self.frame.unit_from_world.apply_to_poses(world_from_cam)
+        optimiser = JointOptimiser(
+            images, self.frame, poses, self._options, self.unseen, self._device, self._threads,
+            sampler=self._sampler,
+        )  # fmt: skip
+        optimiser.pose_scale = 0.0
+        for _ in range(self.steps):
+            if self._should_stop():
+                raise Interrupted("stopped while sets of poses were compared")
+            optimiser.step()
+        matrices = optimiser.poses.matrices().detach()
+        scores = []
+        for view in self.unseen:
+            view_of = render_view(optimiser, matrices[view], view, stride=self._stride, as_photo=True)
+            rendered = torch.from_numpy(view_of.colour)
+            sampled = images.image(view)[:: self._stride, :: self._stride]
+            photo = torch.from_numpy(sampled.astype(np.float32) / 255)
+            mask = images.counts_image(view)
+            counts = None if mask is None else torch.from_numpy(mask[:: self._stride, :: self._stride].copy())
+            scores.append((psnr(rendered, photo, counts), ssim(rendered, photo, counts)))
+        table = np.array(scores, dtype=np.float64).reshape(-1, 2)
+        return TrialScores(table[:, 0], table[:, 1])

@@ -1,0 +1,169 @@
+"""The account of a run: everything that report.json says."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.photos.named_images import few_names
+from biresnerf.geometry.similarity import Similarity
+from biresnerf.refine.parameters.intrinsics_parameters import IntrinsicsParameters
+from biresnerf.refine.stages.two_stages import TwoStages
+from biresnerf.refine.verdict.judgement import Judgement, motion
+from biresnerf.refine.verdict.run_input import RunInput
+from biresnerf.refine.views.evaluation import ViewScore
+from biresnerf.report import CameraReport, HeldOut, ImageReport, Report, SimilarityReport
+
+
+def run_report(
+    given: RunInput,
+    stages: TwoStages,
+    scores: list[ViewScore],
+    judgement: Judgement | None,
+    refined: np.ndarray,
+    similarity: Similarity,
+    *,
+    threads: int,
+    state: Literal["complete", "partial"],
+) -> Report:
+    """The report of a run whose refined poses, in the input's frame, are `refined` [n, 4, 4].
+
+    Args:
+        similarity: carries optimised poses to the input's frame.
+        judgement: None where no verdict has been passed.
+    """
+    from biresnerf import __version__
+
+    dataset, optimiser, record = given.dataset, stages.optimiser, stages.record
+    lost = [i for i, flag in enumerate(optimiser.camera_errors.lost.tolist()) if flag]
+    return Report(
+        version=__version__,
+        state=state,
+        options=optimiser.options,
+        verdict=judgement.verdict if judgement is not None else None,
+        images=_image_reports(given, stages, scores, judgement, refined),
+        cameras=camera_reports(dataset, optimiser.lenses),
+        heldout=HeldOut(
+            count=len(scores),
+            psnr=float(np.mean([s.psnr for s in scores])),
+            ssim=float(np.mean([s.ssim for s in scores])),
+        )
+        if scores
+        else None,
+        start_trials=given.start.trials,
+        steps_done=optimiser.step_index,
+        switch_step=optimiser.switch if optimiser.method.two_stages else None,
+        switch_reason=record.switch_reason,
+        resumed=record.resumed,
+        seconds={stage: round(seconds, 3) for stage, seconds in record.seconds.items()},
+        backend=optimiser.field.backend,
+        device=str(optimiser.device),
+        threads=threads,
+        working_size=(int(given.images.widths.max()), int(given.images.heights.max())),
+        input_from_optimised=SimilarityReport(
+            scale=similarity.scale,
+            rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
+            translation=tuple(float(v) for v in similarity.translation),
+        ),
+        warnings=dataset.warnings
+        + _stray_warnings(given)
+        + _lost_warnings(dataset, lost)
+        + (unsure_warnings(dataset, judgement.unsure_deg) if judgement is not None else ()),
+    )
+
+
+def camera_reports(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[CameraReport, ...]:
+    """The set's cameras before and after."""
+    used = [frame.camera for frame in dataset.frames]
+    return tuple(
+        CameraReport(
+            model=old.model,
+            width=old.width,
+            height=old.height,
+            source=dataset.source_of_intrinsics(i),
+            refined=lenses.parts[i] if lenses.moving else "none",
+            images=used.count(i),
+            params_before=old.params,
+            params_after=new.params,
+        )
+        for i, (old, new) in enumerate(zip(dataset.cameras, lenses.refined(dataset).cameras, strict=True))
+    )
+
+
+def _stray_warnings(given: RunInput) -> tuple[str, ...]:
+    strays = np.flatnonzero(given.start.stray).tolist()
+    if not strays:
+        return ()
+    names = ", ".join(given.dataset.names[i] for i in strays)
+    return (
+        f"Feature matches placed all but {len(strays)} of {len(given.dataset)} images: of {names} only the photo "
+        "tells where it was taken from. Look at these poses before you rely on them.",
+    )
+
+
+def _lost_warnings(dataset: Dataset, lost: list[int]) -> tuple[str, ...]:
+    if not lost:
+        return ()
+    names = ", ".join(dataset.names[i] for i in lost)
+    return (f"{len(lost)} of {len(dataset)} images agree with no pose that was found: {names}.",)
+
+
+def unsure_warnings(dataset: Dataset, unsure_deg: np.ndarray) -> tuple[str, ...]:
+    """One that names the images whose `Judgement.unsure_deg` [n] is not zero; none of none."""
+    unsure = np.flatnonzero(unsure_deg).tolist()
+    if not unsure:
+        return ()
+    named = [f"{dataset.names[i]} ({unsure_deg[i]:.0f} degrees)" for i in unsure]
+    return (
+        f"{len(unsure)} of {len(dataset)} photos fit as well with their camera carried far round the scene, which "
+        f"looks alike from there: {few_names(named, 20)}. Look at these poses before you rely on them.",
+    )
+
+
+def _image_reports(
+    given: RunInput,
+    stages: TwoStages,
+    scores: list[ViewScore],
+    judgement: Judgement | None,
+    refined: np.ndarray,
+) -> tuple[ImageReport, ...]:
+    optimiser, repaired = stages.optimiser, stages.repair.repaired
+    lost, exposures = optimiser.camera_errors.lost, optimiser.exposure.gains()
+    turn, shift = motion(given.dataset.world_from_cam, refined)
+    scored = {score.image: score for score in scores}
+    return tuple(
+        ImageReport(
+            name=frame.name,
+            pose_source=given.start.sources[i],
+            held_out=i in given.held_out,
+            fixed=bool(optimiser.bodies.fixed[i]),
+            moved_deg=float(turn[i]),
+            moved_units=float(shift[i]),
+            lost=bool(lost[i]),
+            repaired=i in repaired,
+            exposure=None if exposures is None else tuple(exposures[i].tolist()),
+            psnr=scored[i].psnr if i in scored else None,
+            ssim=scored[i].ssim if i in scored else None,
+            **_judged(judgement, i),
+        )
+        for i, frame in enumerate(given.dataset.frames)
+    )
+
+
+def _judged(judgement: Judgement | None, image: int) -> dict[str, float | bool | None]:
+    """What a judgement says of one image, by the names of `ImageReport`."""
+    if judgement is None:
+        return {}
+    figures = {
+        "sharpness": judgement.sharpness[image],
+        "gain": judgement.gain[image],
+        "unsure_deg": judgement.unsure_deg[image] or np.nan,
+        "trial_psnr_before": judgement.trial_psnr[0, image],
+        "trial_psnr_after": judgement.trial_psnr[1, image],
+        "epipolar_px_before": judgement.epipolar_px[0, image],
+        "epipolar_px_after": judgement.epipolar_px[1, image],
+    }
+    flags = {name: bool(getattr(judgement, name)[image]) for name in ("moved_far", "blurred", "exposure_off")}
+    return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | flags

@@ -1,0 +1,150 @@
+"""One cell of a comparison as data: a scene, the poses it starts from, and the options; and what came out."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from biresnerf.geometry.pose_error import PoseError
+from biresnerf.options.refine_options import RefineOptions
+from biresnerf.report import SwitchReason
+
+_FROZEN = ConfigDict(frozen=True, extra="forbid")
+LOST_FROM_DEG = 1.0  # a camera this far off after a run counts as not found
+CELL, RESULT, LOG, RUN = "cell.json", "result.json", "log.txt", "run"  # in the folder of a cell
+
+
+class Perturbation(BaseModel):
+    """How the poses that a run starts from are made of the true ones."""
+
+    model_config = _FROZEN
+
+    kind: Literal["noise", "identity"] = "noise"
+    noise: float = Field(0.15, ge=0, le=2, description="BARF's sigma.")
+    seed: int = Field(1, ge=0)
+    turn_one_deg: float = Field(0.0, description="One camera is turned in place by so much.")
+    lose_share: float = Field(0.0, ge=0, le=1, description="Share of the cameras turned about the scene.")
+
+    @property
+    def label(self) -> str:
+        """All but the seed, for people."""
+        parts = ["identity" if self.kind == "identity" else f"noise {self.noise:g}"]
+        if self.turn_one_deg:
+            parts.append(f"one camera turned by {self.turn_one_deg:g}°")
+        if self.lose_share:
+            parts.append(f"{100 * self.lose_share:g} % of the cameras lost")
+        return ", ".join(parts)
+
+
+class Scene(BaseModel):
+    """A set of true poses. ``digest`` is of its transforms files: other poses make another scene."""
+
+    model_config = _FROZEN
+
+    name: str
+    file: Path = Field(description="Transforms file with true poses.")
+    test_file: Path | None = Field(description="Views that no run sees, with true poses.")
+    digest: str
+    every: int = Field(1, ge=1, description="Every so many-th view is used.")
+    test_views: int = Field(0, ge=0, description="At most so many of the test file's views are rendered.")
+
+
+class EqualTime(BaseModel):
+    """Why a run has the number of steps it has, where it was given another's time."""
+
+    model_config = _FROZEN
+
+    seconds: float = Field(description="What the first variant took to optimise.")
+    calibration_steps: int
+    calibration_ms_per_step: float
+
+
+class Cell(BaseModel):
+    """One run of a comparison."""
+
+    model_config = _FROZEN
+
+    scene: Scene
+    start: Perturbation
+    options: RefineOptions
+    equal_time: EqualTime | None = None
+
+    @property
+    def key(self) -> str:
+        """Differs whenever the result may: of the scene's content, the start and the options, presets filled in."""
+        content = [
+            self.scene.model_dump_json(exclude={"name", "file", "test_file"}),
+            self.start.model_dump_json(),
+            self.options.resolved().model_dump_json(exclude={"checkpoint_every_s"}),
+        ]
+        return hashlib.sha256("\n".join(content).encode()).hexdigest()[:12]
+
+    @property
+    def folder_name(self) -> str:
+        return f"{self.scene.name}-{self.key}"
+
+
+class CameraResult(BaseModel):
+    """Rotation error of one camera after an alignment that lost cameras do not drag along."""
+
+    model_config = _FROZEN
+
+    name: str
+    displaced: bool = Field(description="Was turned or lost on purpose, on top of the noise.")
+    before_deg: float
+    after_deg: float
+
+
+class ViewQuality(BaseModel):
+    """Means over views the field never saw, their poses fitted to it first (BARF's test-time refinement)."""
+
+    model_config = _FROZEN
+
+    kind: Literal["held out", "test"]
+    count: int
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+    lpips_absent: str | None = Field(None, description="Why there is no LPIPS.")
+
+
+class Outcome(BaseModel):
+    """What a run that came to its end gave."""
+
+    model_config = _FROZEN
+
+    version: str
+    options: RefineOptions = Field(description="As used, with everything filled in.")
+    before: PoseError
+    after: PoseError
+    cameras: tuple[CameraResult, ...]
+    views: ViewQuality | None
+    switch_step: int | None
+    switch_reason: SwitchReason | None
+    seconds: dict[str, float] = Field(description="Wall time per stage.")
+    peak_memory_bytes: int
+    backend: str
+    device: str
+    threads: int
+    resumed: int
+
+    @property
+    def optimisation_s(self) -> float:
+        return self.seconds["coarse"] + self.seconds["fine"]
+
+    @property
+    def not_found(self) -> int:
+        return sum(camera.after_deg > LOST_FROM_DEG for camera in self.cameras)
+
+
+class CellResult(BaseModel):
+    """``result.json`` of a cell: its outcome, or why there is none."""
+
+    model_config = _FROZEN
+
+    cell: Cell
+    outcome: Outcome | None = None
+    error: str | None = None

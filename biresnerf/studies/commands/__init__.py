@@ -1,0 +1,1 @@
+"""`biresnerf compare` and `biresnerf study`."""

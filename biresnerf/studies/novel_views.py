@@ -1,0 +1,80 @@
+"""Views that no run saw, rendered from their true poses and scored: the test-time refinement of BARF."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.photos.images import load_images
+from biresnerf.field.radiance_field import PositionGradient
+from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.perturb import RIG_DISTANCE
+from biresnerf.geometry.similarity import align_robust
+from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.parameters.pose_parameters import PoseParameters
+from biresnerf.refine.views.evaluation import FIT_RATE, FIT_STEPS, fit_rays, render_view
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoAndRender:
+    """Both [h, w, 3] in 0..1, at working size; `counts` [h, w] says where they may be compared, None: anywhere."""
+
+    photo: Tensor
+    render: Tensor
+    counts: Tensor | None = None
+
+
+def render_test_views(
+    optimiser: JointOptimiser, views: Dataset, truth: NDArray[np.float64]
+) -> Iterator[PhotoAndRender]:
+    """Each test view from its true pose, carried into the optimised frame and fitted there to the frozen field.
+
+    A similarity from the true training poses `truth` [n, 4, 4] to the optimised ones (robust: one lost camera
+    must not spoil all views) carries the poses; then 100 steps on 1024 rays each, as BARF does.
+    """
+    options = optimiser.options
+    images = load_images(views, options.max_image_size, options.background)
+    unit_from_true = align_robust(truth, optimiser.poses.poses().numpy())
+    unit_from_cam = unit_from_true.apply_to_poses(views.world_from_cam)
+    intrinsics = Intrinsics.from_cameras(images.cameras).to(optimiser.device)
+    for index in range(len(images)):
+        photo = torch.from_numpy(images.image(index).astype(np.float32) / 255)
+        mask = images.counts_image(index)
+        counts = None if mask is None else torch.from_numpy(mask)
+        matrix = _fitted(optimiser, unit_from_cam[index], photo, counts, index, intrinsics)
+        colour = render_view(optimiser, matrix, index, intrinsics).colour
+        yield PhotoAndRender(photo, torch.from_numpy(colour), counts)
+
+
+def _fitted(
+    optimiser: JointOptimiser,
+    unit_from_cam: NDArray[np.float64],
+    photo: Tensor,
+    counts: Tensor | None,
+    index: int,
+    intrinsics: Intrinsics,
+) -> Tensor:
+    """unit_from_cam [3, 4] of one view, moved to where its photo fits the field best."""
+    device = optimiser.device
+    length = optimiser.frame.distance / RIG_DISTANCE
+    pose = PoseParameters(torch.from_numpy(unit_from_cam[None]), "se3_world", length, device)
+    pixels = torch.nonzero(torch.ones(photo.shape[:2]) if counts is None else counts)
+    rays = fit_rays(optimiser)
+    which = torch.full((rays,), index, device=device)
+    for step in range(FIT_STEPS):
+        y, x = pixels[torch.randint(len(pixels), (rays,), generator=optimiser.generator)].T
+        xy = torch.stack([x, y], 1).to(device) + 0.5
+        matrices = pose.matrices().expand(rays, 3, 4)
+        origin, direction = optimiser.cast(matrices, which, xy, intrinsics)
+        rendering = optimiser.render(
+            origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=True
+        )
+        optimiser.method.loss(rendering.colour, photo[y, x].to(device)).backward()
+        pose.step(FIT_RATE * 0.1 ** (step / FIT_STEPS))
+    return pose.matrices().detach()[0]

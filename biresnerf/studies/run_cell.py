@@ -1,0 +1,197 @@
+"""The process of one cell: `python -m biresnerf.studies.run_cell FOLDER` reads cell.json there, writes result.json."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf import __version__
+from biresnerf.data.formats.read_poses import read_poses
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.errors import Interrupted
+from biresnerf.geometry.pose_error import camera_errors, pose_error
+from biresnerf.geometry.similarity import align_by_spread, align_robust
+from biresnerf.pipeline import refine_poses
+from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.stages.checkpoint import CHECKPOINT
+from biresnerf.refine.stages.history import Observer
+from biresnerf.refine.views.image_metrics import psnr, ssim
+from biresnerf.report import Report
+from biresnerf.studies.cell import CELL, RESULT, RUN, CameraResult, Cell, CellResult, Outcome, ViewQuality
+from biresnerf.studies.novel_views import render_test_views
+from biresnerf.studies.perceptual import lpips_absent, lpips_vgg
+from biresnerf.studies.scenes import StartingRig, read_scene, read_test_views, starting_rig, with_poses
+
+EXIT_STOPPED = 143
+
+
+class StopRequest:
+    """A wish to stop: SIGINT, SIGTERM, or the end of the process that waits for the result."""
+
+    def __init__(self) -> None:
+        self._asked, self._parent = False, os.getppid()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, *_: object) -> None:
+        self._asked = True
+
+    def __call__(self) -> bool:
+        return self._asked or os.getppid() != self._parent
+
+
+class TruthObserver:
+    """Measures a run against the true poses [n, 4, 4]: at each check, and on test views at its end."""
+
+    def __init__(self, truth: NDArray[np.float64], test_views: Dataset | None) -> None:
+        self.truth, self.test_views = truth, test_views
+        self.quality: ViewQuality | None = None
+        self.seconds = 0.0
+
+    def at_check(self, optimiser: JointOptimiser) -> dict[str, float]:
+        """Errors after BARF's alignment, as tables have them: mean rotation and mean centre."""
+        poses = optimiser.poses.poses().numpy()
+        errors = camera_errors(align_by_spread(poses, self.truth).apply_to_poses(poses), self.truth)
+        return {
+            "rotation_deg": float(errors.rotation_deg.mean()),
+            "rotation_median_deg": float(np.median(errors.rotation_deg)),
+            "centre": float(errors.centre.mean()),
+        }
+
+    def at_end(self, optimiser: JointOptimiser) -> None:
+        if self.test_views is None:
+            return
+        started = time.monotonic()
+        views = list(render_test_views(optimiser, self.test_views, self.truth))
+        pairs = [(view.render, view.photo) for view in views]
+        masked = [(view.render, view.photo, view.counts) for view in views]
+        distances, absent = _perceptual(pairs)
+        self.quality = ViewQuality(
+            kind="test",
+            count=len(pairs),
+            psnr=float(np.mean([psnr(*view) for view in masked])),
+            ssim=float(np.mean([ssim(*view) for view in masked])),
+            lpips=distances,
+            lpips_absent=absent,
+        )
+        self.seconds = time.monotonic() - started
+
+
+def run_cell(folder: Path, should_stop: Callable[[], bool]) -> CellResult:
+    """Run the cell that `folder`/cell.json describes and measure what it gives; goes on from a checkpoint."""
+    cell = Cell.model_validate_json((folder / CELL).read_text("utf-8"))
+    run = folder / RUN
+    if not (run / CHECKPOINT).is_file():
+        shutil.rmtree(run, ignore_errors=True)
+    dataset = read_scene(cell.scene)
+    truth = dataset.world_from_cam
+    rig = starting_rig(truth, cell.start)
+    observer = TruthObserver(truth, read_test_views(cell.scene))
+    report = refine_poses(
+        with_poses(dataset, rig.world_from_cam),
+        run,
+        cell.options,
+        should_stop=should_stop,
+        observer=Observer(observer.at_check, observer.at_end),
+    )
+    # What a user would be given is measured, read back from the file.
+    refined = np.stack(list(read_poses(run / "transforms.json").values()))
+    outcome = Outcome(
+        version=__version__,
+        options=report.options,
+        before=pose_error(rig.world_from_cam, truth),
+        after=pose_error(refined, truth),
+        cameras=_cameras(dataset.names, rig, refined, truth),
+        views=observer.quality or _held_out_quality(report, run),
+        switch_step=report.switch_step,
+        switch_reason=report.switch_reason,
+        seconds={**report.seconds, "test views": round(observer.seconds, 3)},
+        peak_memory_bytes=peak_memory_bytes(),
+        backend=report.backend,
+        device=report.device,
+        threads=report.threads,
+        resumed=report.resumed,
+    )
+    return CellResult(cell=cell, outcome=outcome)
+
+
+def _cameras(
+    names: tuple[str, ...], rig: StartingRig, refined: NDArray[np.float64], truth: NDArray[np.float64]
+) -> tuple[CameraResult, ...]:
+    before, after = (
+        camera_errors(align_robust(poses, truth).apply_to_poses(poses), truth).rotation_deg
+        for poses in (rig.world_from_cam, refined)
+    )
+    return tuple(
+        CameraResult(
+            name=name, displaced=i in rig.displaced, before_deg=float(before[i]), after_deg=float(after[i])
+        )
+        for i, name in enumerate(names)
+    )
+
+
+def _held_out_quality(report: Report, run: Path) -> ViewQuality | None:
+    if report.heldout is None:
+        return None
+    pairs = []
+    for render in sorted((run / "renders").glob("*_render.png")):
+        photo = render.with_name(render.name.replace("_render.png", "_photo.png"))
+        images = [torch.from_numpy(imageio.imread(path)[..., :3] / 255.0) for path in (render, photo)]
+        pairs.append((images[0], images[1]))
+    distances, absent = _perceptual(pairs)
+    return ViewQuality(
+        kind="held out",
+        count=report.heldout.count,
+        psnr=report.heldout.psnr,
+        ssim=report.heldout.ssim,
+        lpips=distances,
+        lpips_absent=absent,
+    )
+
+
+def _perceptual(pairs: list[tuple[torch.Tensor, torch.Tensor]]) -> tuple[float | None, str | None]:
+    """Mean LPIPS, or why there is none."""
+    absent = lpips_absent()
+    if absent is not None:
+        return None, absent
+    distance = lpips_vgg()
+    return float(np.mean([distance(*pair) for pair in pairs])), None
+
+
+def peak_memory_bytes() -> int:
+    """The most this process ever held. Linux's VmHWM, as ru_maxrss begins with what the parent held."""
+    status = Path("/proc/self/status")
+    if status.is_file():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    import resource
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def main() -> int:
+    folder = Path(sys.argv[1])
+    try:
+        result = run_cell(folder, StopRequest())
+    except Interrupted:
+        return EXIT_STOPPED
+    with whole_file(folder / RESULT) as temporary:
+        temporary.write_text(result.model_dump_json(indent=1) + "\n", "utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,73 @@
+"""Runs cells one after the other, each in its own process, and keeps what they gave."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.errors import Interrupted
+from biresnerf.studies.cell import CELL, LOG, RESULT, RUN, Cell, CellResult
+
+EXIT_STOPPED = 143  # of a cell's process that was asked to stop
+LAST_LINES = 12  # of a failed process's output
+STOPPING_S = 60.0  # that a process is given to write its checkpoint
+
+
+def finished(cells: Path, cell: Cell) -> CellResult | None:
+    """The result that an earlier run of the comparison left, outcome or failure."""
+    path = cells / cell.folder_name / RESULT
+    return CellResult.model_validate_json(path.read_text("utf-8")) if path.is_file() else None
+
+
+def run_in_child(cells: Path, cell: Cell) -> CellResult:
+    """Run a cell in a process of its own; goes on where an interrupted one stopped.
+
+    A process that fails in any way leaves a result that says so.
+
+    Raises:
+        Interrupted: the cell was stopped from outside; it keeps its checkpoint.
+    """
+    folder = cells / cell.folder_name
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / RESULT).unlink(missing_ok=True)
+    _write(folder / CELL, cell.model_dump_json(indent=1))
+    with (folder / LOG).open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "biresnerf.studies.run_cell", str(folder)],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
+        try:
+            status = process.wait()
+        except BaseException:
+            _stop(process)
+            raise
+    result = finished(cells, cell)
+    if result is not None and status == 0:
+        return result
+    if status == EXIT_STOPPED:
+        raise Interrupted(f"{folder.name} was stopped; run again to go on")
+    said = (folder / LOG).read_text("utf-8", errors="replace").strip().splitlines()[-LAST_LINES:]
+    reason = f"killed by signal {-status}" if status < 0 else f"exit status {status}"
+    failure = CellResult(cell=cell, error="\n".join([reason, *said]))
+    shutil.rmtree(folder / RUN, ignore_errors=True)
+    _write(folder / RESULT, failure.model_dump_json(indent=1))
+    return failure
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(STOPPING_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _write(path: Path, text: str) -> None:
+    with whole_file(path) as temporary:
+        temporary.write_text(text + "\n", "utf-8")

@@ -1,0 +1,84 @@
+"""The paper's studies as predefined comparisons (Guo et al. 2023, Sections 4.1 to 4.3), and a sweep of noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from biresnerf.options.refine_options import parse_options
+from biresnerf.studies.plan import Variant
+
+RESOLUTIONS = (32, 48, 64, 72, 96, 128, 256, 512, 1024, 4096)
+LEVELS = (1, 2, 3, 4, 6, 8, 16)
+NOISES = (0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.35)
+CHECKS_PER_WARMUP = 10  # so that a curve shows what happens in it
+
+
+@dataclass(frozen=True)
+class Study:
+    """A predefined comparison.
+
+    Attributes:
+        about: what is swept, for the help and the plot's axis.
+        swept: the option that differs between the variants; None where it is not one number.
+        variants: of the study; none where the caller's own are compared.
+        noises: default noise levels.
+        settings: options of all variants, given the caller's.
+    """
+
+    about: str
+    swept: str | None
+    variants: tuple[Variant, ...]
+    noises: tuple[float, ...]
+    settings: Callable[[dict[str, Any]], dict[str, Any]]
+
+
+def _stage_1_only(given: dict[str, Any]) -> dict[str, Any]:
+    """All steps belong to the pose-estimation module."""
+    steps = parse_options(given).resolved().steps
+    return {**given, "steps": steps, "coarse_steps_min": steps, "coarse_steps_max": steps}
+
+
+def _same_switch(given: dict[str, Any]) -> dict[str, Any]:
+    """Stage 2 begins at the cap in all variants, so that their curves part there and not before."""
+    options = parse_options(given).resolved()
+    return {
+        **given,
+        "steps": options.steps,
+        "coarse_steps_min": options.coarse_steps_max,
+        "coarse_steps_max": options.coarse_steps_max,
+        "check_every": max(5, int(options.warmup_steps or 0) // CHECKS_PER_WARMUP),
+    }
+
+
+STUDIES = {
+    "resolution": Study(
+        about="largest resolution of the pose-estimation module (cells a side), stage 1 alone",
+        swept="pose_resolution_max",
+        variants=tuple(Variant(f"N_max {n}", {"pose_resolution_max": n}) for n in RESOLUTIONS),
+        noises=(0.15,),
+        settings=_stage_1_only,
+    ),
+    "levels": Study(
+        about="levels of the pose-estimation module, stage 1 alone",
+        swept="pose_levels",
+        variants=tuple(Variant(f"L {n}", {"pose_levels": n}) for n in LEVELS),
+        noises=(0.15,),
+        settings=_stage_1_only,
+    ),
+    "warm-up": Study(
+        about="smooth warm-up of the learning rate after the switch, against none",
+        swept=None,
+        variants=(Variant("smooth warm-up", {}), Variant("no warm-up", {"warmup_steps": 1})),
+        noises=(0.15,),
+        settings=_same_switch,
+    ),
+    "noise": Study(
+        about="noise of the given poses",
+        swept=None,
+        variants=(),
+        noises=NOISES,
+        settings=lambda given: given,
+    ),
+}

@@ -1,0 +1,238 @@
+"""The tables of a comparison as data: per scene, over all scenes, and the tests between variants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from biresnerf.studies.cell import Outcome
+from biresnerf.studies.plan import Entry
+from biresnerf.studies.statistics import PairedTest, paired_wilcoxon
+
+_FROZEN = ConfigDict(frozen=True, extra="forbid")
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One column. ``of`` gives None where a run has no such figure; ``over_seeds`` joins those of several seeds."""
+
+    key: str
+    title: str
+    digits: int
+    of: Callable[[Outcome], float | None]
+    over_seeds: Callable[[Sequence[float]], float] = lambda values: float(np.mean(values))
+    tested: bool = False
+
+
+def _most(values: Sequence[float]) -> float:
+    return float(max(values))
+
+
+# Rotation and translation as BARF and BAA-NGP define them, after BARF's alignment.
+METRICS = (
+    Metric("start_deg", "start °", 2, lambda o: o.before.aligned.rotation_deg.mean),
+    Metric("rotation_deg", "rotation °", 3, lambda o: o.after.aligned.rotation_deg.mean, tested=True),
+    Metric("rotation_median_deg", "median", 3, lambda o: o.after.aligned.rotation_deg.median),
+    Metric("rotation_max_deg", "max", 2, lambda o: o.after.aligned.rotation_deg.max, _most),
+    Metric("not_found", "over 1°", 1, lambda o: float(o.not_found)),
+    Metric("translation", "t ×100", 3, lambda o: o.after.aligned.translation_table.mean, tested=True),
+    Metric("centre_percent", "centre %", 3, lambda o: o.after.aligned.centre_percent.mean),
+    Metric("psnr", "PSNR", 2, lambda o: o.views.psnr if o.views else None, tested=True),
+    Metric("ssim", "SSIM", 4, lambda o: o.views.ssim if o.views else None, tested=True),
+    Metric("lpips", "LPIPS", 4, lambda o: o.views.lpips if o.views else None, tested=True),
+    Metric("preparing_s", "before s", 1, lambda o: o.seconds["preparing"]),
+    Metric("coarse_s", "stage 1 s", 1, lambda o: o.seconds["coarse"]),
+    Metric("fine_s", "stage 2 s", 1, lambda o: o.seconds["fine"]),
+    Metric("optimisation_s", "both s", 1, lambda o: o.optimisation_s, tested=True),
+    Metric("peak_mb", "memory MB", 0, lambda o: o.peak_memory_bytes / 2**20, _most),
+    Metric("steps", "steps", 0, lambda o: float(o.options.steps or 0)),
+    # A method of one stage is in its last from the first step: no reason, no switch.
+    Metric("switch_step", "switch", 0, lambda o: float(o.switch_step or 0) if o.switch_reason else None),
+)
+
+
+class Row(BaseModel):
+    """One variant on one scene from one kind of start, over the seeds: means; of max and memory the largest."""
+
+    model_config = _FROZEN
+
+    scene: str
+    start: str
+    variant: str
+    seeds: tuple[int, ...] = Field(description="Of the runs that came to their end.")
+    failed: int
+    values: dict[str, float | None]
+
+
+class Summary(BaseModel):
+    """One variant from one kind of start over the scenes: mean and median of the rows."""
+
+    model_config = _FROZEN
+
+    start: str
+    variant: str
+    scenes: int
+    mean: dict[str, float | None]
+    median: dict[str, float | None]
+
+
+class Difference(BaseModel):
+    """The test of one metric between the first variant and another, over all scenes, starts and seeds."""
+
+    model_config = _FROZEN
+
+    metric: str
+    first: str
+    other: str
+    test: PairedTest
+
+
+class Failure(BaseModel):
+    model_config = _FROZEN
+
+    scene: str
+    start: str
+    seed: int
+    variant: str
+    error: str
+
+
+class Tables(BaseModel):
+    """``tables.json``."""
+
+    model_config = _FROZEN
+
+    variants: dict[str, dict[str, object]] = Field(description="Settings of each, over the shared ones.")
+    settings: dict[str, object] = Field(description="Settings that all variants share.")
+    machine: str
+    rows: tuple[Row, ...]
+    summaries: tuple[Summary, ...]
+    differences: tuple[Difference, ...]
+    failures: tuple[Failure, ...]
+    notes: tuple[str, ...]
+
+
+def rows_of(entries: Sequence[Entry]) -> tuple[Row, ...]:
+    """A row for every scene, kind of start and variant, in the order of the entries."""
+    grouped: dict[tuple[str, str, str], list[Entry]] = {}
+    for entry in entries:
+        grouped.setdefault((entry.scene, entry.start.label, entry.variant), []).append(entry)
+    rows = []
+    for (scene, start, variant), group in grouped.items():
+        outcomes = [entry.result.outcome for entry in group if entry.result.outcome is not None]
+        rows.append(
+            Row(
+                scene=scene,
+                start=start,
+                variant=variant,
+                seeds=tuple(entry.start.seed for entry in group if entry.result.outcome is not None),
+                failed=len(group) - len(outcomes),
+                values={metric.key: _joined(metric, outcomes) for metric in METRICS},
+            )
+        )
+    return tuple(rows)
+
+
+def _joined(metric: Metric, outcomes: Sequence[Outcome]) -> float | None:
+    values = [value for value in map(metric.of, outcomes) if value is not None]
+    return metric.over_seeds(values) if values else None
+
+
+def summaries_of(rows: Sequence[Row]) -> tuple[Summary, ...]:
+    """Mean and median over the scenes, for every kind of start and variant."""
+    grouped: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        if row.seeds:
+            grouped.setdefault((row.start, row.variant), []).append(row)
+    summaries = []
+    for (start, variant), group in grouped.items():
+        columns = {
+            metric.key: [v for row in group if (v := row.values[metric.key]) is not None]
+            for metric in METRICS
+        }
+        mean = {key: float(np.mean(values)) if values else None for key, values in columns.items()}
+        median = {key: float(np.median(values)) if values else None for key, values in columns.items()}
+        summaries.append(Summary(start=start, variant=variant, scenes=len(group), mean=mean, median=median))
+    return tuple(summaries)
+
+
+def differences_of(entries: Sequence[Entry]) -> tuple[Difference, ...]:
+    """Wilcoxon's test of every other variant against the first, for each metric that says which is better."""
+    variants = list(dict.fromkeys(entry.variant for entry in entries))
+    outcomes = {
+        (entry.scene, entry.start, entry.variant): entry.result.outcome
+        for entry in entries
+        if entry.result.outcome is not None
+    }
+    differences = []
+    for other in variants[1:]:
+        pairs = [
+            (outcome, outcomes[scene, start, other])
+            for (scene, start, variant), outcome in outcomes.items()
+            if variant == variants[0] and (scene, start, other) in outcomes
+        ]
+        for metric in (metric for metric in METRICS if metric.tested):
+            both = [(metric.of(a), metric.of(b)) for a, b in pairs]
+            known = [(a, b) for a, b in both if a is not None and b is not None]
+            test = paired_wilcoxon([a for a, _ in known], [b for _, b in known])
+            if test is not None:
+                differences.append(Difference(metric=metric.key, first=variants[0], other=other, test=test))
+    return tuple(differences)
+
+
+def failures_of(entries: Sequence[Entry]) -> tuple[Failure, ...]:
+    return tuple(
+        Failure(
+            scene=entry.scene,
+            start=entry.start.label,
+            seed=entry.start.seed,
+            variant=entry.variant,
+            error=entry.result.error,
+        )
+        for entry in entries
+        if entry.result.error is not None
+    )
+
+
+def notes_of(entries: Sequence[Entry]) -> tuple[str, ...]:
+    """What a reader of the tables must know: which views were scored, why LPIPS is absent, how time was equalled."""
+    notes: dict[str, None] = {}
+    for entry in entries:
+        outcome, equal = entry.result.outcome, entry.result.cell.equal_time
+        if outcome is not None and outcome.views is not None:
+            notes[f"{entry.scene}: PSNR and SSIM over {outcome.views.count} {outcome.views.kind} views"] = (
+                None
+            )
+            if outcome.views.lpips_absent:
+                notes[f"no LPIPS: {outcome.views.lpips_absent}"] = None
+        if equal is not None:
+            took = f", took {outcome.optimisation_s:.1f} s" if outcome is not None else ""
+            notes[
+                f"{entry.scene}, {entry.start.label}, seed {entry.start.seed}, {entry.variant}: "
+                f"{equal.seconds:.1f} s to fill at {equal.calibration_ms_per_step:.1f} ms a step "
+                f"(measured over {equal.calibration_steps} steps) gave {entry.result.cell.options.steps} steps{took}"
+            ] = None
+    return tuple(notes)
+
+
+def make_tables(
+    entries: Sequence[Entry],
+    variants: dict[str, dict[str, object]],
+    settings: dict[str, object],
+    machine: str,
+) -> Tables:
+    """All tables of a comparison."""
+    rows = rows_of(entries)
+    return Tables(
+        variants=variants,
+        settings=settings,
+        machine=machine,
+        rows=rows,
+        summaries=summaries_of(rows),
+        differences=differences_of(entries),
+        failures=failures_of(entries),
+        notes=notes_of(entries),
+    )

@@ -1,0 +1,1 @@
+"""Results, previews and partial results in the output folder. Formats are in `data.formats`."""

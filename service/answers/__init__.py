@@ -1,0 +1,1 @@
+"""What routes answer with: jobs, files of results, signed links."""

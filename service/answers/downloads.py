@@ -1,0 +1,112 @@
+"""One file of a result as an answer: whole, in part, unchanged, or at the store itself."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+from urllib.parse import quote
+
+from fastapi import Depends, Header, Query
+from fastapi.responses import Response, StreamingResponse
+
+from service.http.dependencies import Service
+from service.http.http_conditionals import byte_range, none_match
+from service.http.problems import ProblemError, declared
+from workers.jobs.jobs import JobStore
+from workers.records import Artifact
+
+_BINARY: dict[str, Any] = {
+    # Each file in its own media type, which the list of artifacts tells.
+    "content": {"*/*": {"schema": {"description": "The bytes."}}}
+}
+ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The file.", **_BINARY},
+    206: {"description": "The bytes asked for.", **_BINARY},
+    304: {"description": "As you have it."},
+    307: {
+        "description": "The file is at the signed address in `Location`, for some minutes and without a key.",
+        "headers": {"Location": {"schema": {"type": "string"}}},
+    },
+    **declared(
+        *("bad_range", "not_found", "expired", "range_not_satisfiable"),
+        *("database_unavailable", "storage_unavailable", "internal_error"),
+    ),
+}
+
+
+class Conditions:
+    """What a download may depend on; HEAD takes no part of it but ``If-None-Match``."""
+
+    def __init__(
+        self,
+        range_: Annotated[str | None, Header(alias="Range", description="`bytes=first-last`")] = None,
+        if_range: Annotated[str | None, Header()] = None,
+        if_none_match: Annotated[str | None, Header()] = None,
+        redirect: Annotated[
+            bool,
+            Query(description="`false`: never to the store, also where this service sends clients there."),
+        ] = True,
+    ) -> None:
+        self.range, self.if_range, self.if_none_match = range_, if_range, if_none_match
+        self.redirect = redirect
+
+
+Asked = Annotated[Conditions, Depends()]
+
+
+async def find_artifact(jobs: JobStore, job_id: str, name: str) -> Artifact:
+    """The file of that name; raises ``ProblemError`` (``not_found``)."""
+    for artifact in await jobs.artifacts(job_id):
+        if artifact.name == name:
+            return artifact
+    raise ProblemError("not_found", f"The job has no file {name[:200]!r}.")
+
+
+async def answer_with(service: Service, artifact: Artifact, asked: Conditions, *, reading: bool) -> Response:
+    """The answer to a GET (``reading``) or HEAD of the file."""
+    etag = f'"{artifact.sha256}"'
+    headers = _headers(artifact, etag)
+    if not none_match(asked.if_none_match, etag):
+        return Response(status_code=304, headers=headers)
+    if reading and asked.redirect and service.settings.storage_presign:
+        valid_s = service.settings.storage_presign_s
+        found = await service.stores.files.signed_urls("GET", [artifact.key], valid_s)
+        if found is not None:
+            # Whoever keeps the answer must not keep the address longer than it is good.
+            seen = {"ETag": etag, "Repr-Digest": headers["Repr-Digest"], "Cache-Control": "no-store"}
+            return Response(status_code=307, headers={**seen, "Location": found[0]})
+    part = byte_range(asked.range, asked.if_range, etag, artifact.size) if reading else None
+    first, last = part or (0, artifact.size - 1)
+    headers["Content-Length"] = str(last - first + 1)
+    if part:
+        headers["Content-Range"] = f"bytes {first}-{last}/{artifact.size}"
+    status = 206 if part else 200
+    if not reading:
+        return Response(status_code=status, headers=headers, media_type=artifact.media_type)
+    content = await _opened(service, artifact, first, last + 1)
+    return StreamingResponse(content, status_code=status, headers=headers, media_type=artifact.media_type)
+
+
+async def _opened(service: Service, artifact: Artifact, start: int, end: int) -> AsyncIterator[bytes]:
+    """The byte stream, begun: a file that is gone makes a 404, not a broken answer."""
+    await service.stores.files.head(artifact.key)
+    return service.stores.files.read(artifact.key, start, end)
+
+
+def _headers(artifact: Artifact, etag: str) -> dict[str, str]:
+    base = artifact.name.rsplit("/", 1)[-1]
+    plain = "".join(
+        char if char.isascii() and char.isprintable() and char not in '"\\' else "_" for char in base
+    )
+    digest = base64.b64encode(bytes.fromhex(artifact.sha256)).decode()
+    return {
+        "ETag": etag,
+        "Accept-Ranges": "bytes",
+        # Another preview will have the same name.
+        "Cache-Control": "no-cache" if artifact.preview else "private, max-age=31536000, immutable",
+        "Repr-Digest": f"sha-256=:{digest}:",
+        # As an attachment always: what users sent must not run as a page of this origin.
+        "Content-Disposition": f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(base, safe='')}",
+        "X-Content-Type-Options": "nosniff",
+    }

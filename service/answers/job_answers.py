@@ -1,0 +1,60 @@
+"""A job as an answer: body, entity tag, where it is, when to ask again."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+
+from fastapi.responses import JSONResponse, Response
+
+from biresnerf.wire.jobs import Job, JobView, job_url
+from service.http.problems import ProblemError
+from workers.jobs.jobs import JobStore
+from workers.process.waiting import first_done
+
+POLL_S = "2"
+WAIT_MAX_S = 60.0
+_KEY = re.compile(r"^[\x21-\x7e]{1,255}$")
+_WAIT = re.compile(r"(?:^|[,;])\s*wait\s*=\s*\"?(\d{1,6})\"?\s*(?=$|[,;])", re.IGNORECASE)
+
+
+def checked_key(idempotency_key: str | None) -> str | None:
+    """The key; raises `ProblemError` ``bad_idempotency_key``."""
+    if idempotency_key is not None and not _KEY.match(idempotency_key):
+        raise ProblemError("bad_idempotency_key", "The key must be 1 to 255 visible ASCII characters.")
+    return idempotency_key
+
+
+def job_etag(job: Job) -> str:
+    """A weak tag of the job as it is."""
+    # Others move a queued job's place without touching the job.
+    return f'W/"{job.revision}-{job.queue_position or 0}"'
+
+
+def job_answer(
+    job: Job, *, status: int = 200, new: bool = True, headers: dict[str, str] | None = None
+) -> Response:
+    """The job; ``new`` is False where an earlier request made it."""
+    made = {"ETag": job_etag(job), "Cache-Control": "no-cache"}
+    if status == 202:
+        made |= {"Location": job_url(job.id), "Retry-After": POLL_S}
+    if not new:
+        made["Idempotent-Replayed"] = "true"
+    body = JobView.of(job).model_dump(mode="json")
+    return JSONResponse(body, status_code=status, headers={**made, **(headers or {})})
+
+
+def preferred_wait_s(prefer: str | None) -> float | None:
+    """How long the client is ready to wait (RFC 7240, `Prefer: wait=N`), as far as we are; none if it said nothing."""
+    found = _WAIT.search(prefer or "")
+    return None if found is None else min(float(found[1]), WAIT_MAX_S)
+
+
+async def waited_for(jobs: JobStore, job_id: str, seconds: float, closing: asyncio.Event) -> Job:
+    """The job when it is over, after so many seconds, or when the service stops."""
+    waiting = asyncio.create_task(jobs.wait(job_id, timeout_s=seconds))
+    try:
+        await first_done(waiting, closing.wait())
+        return await (waiting if waiting.done() else jobs.get(job_id))
+    finally:
+        waiting.cancel()

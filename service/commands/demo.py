@@ -1,0 +1,188 @@
+"""`biresnerf demo`: the whole way, from images with bad poses to images with good ones, over HTTP.
+
+Starts a service of its own, sends a scene whose true poses are known (or the user's), shows the progress,
+fetches the results, measures them, and stops the service.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+
+from biresnerf.client.scene import look_at
+from biresnerf.commands.jobs.follow_job import fetch, require_success
+from biresnerf.commands.jobs.job_progress import JobProgressView, SendingView, watch
+from biresnerf.commands.jobs.service_options import service_at
+from biresnerf.errors import BiresnerfError, InputError
+from biresnerf.options.refine_options import RefineOptions
+from biresnerf.report import Report
+from workers.process.die_with_parent import tethered
+
+# By this file a later run knows that it may clear the folder.
+_MARK = ".made-by-biresnerf-demo"
+_STOP_S = 40.0
+_READY = re.compile(r"ready at (\S+)")
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Where everything of one run lies."""
+
+    output: Path
+
+    @property
+    def scene(self) -> Path:
+        """What is sent, where the demo makes the scene."""
+        return self.output / "scene"
+
+    @property
+    def truth(self) -> Path:
+        """The true poses of the made scene."""
+        return self.output / "scene.truth.json"
+
+    @property
+    def result(self) -> Path:
+        """What came back."""
+        return self.output / "result"
+
+
+def run_demo(scene: Path | None, output: Path, options: RefineOptions, views: int, size: int) -> None:
+    """Runs the demo; raises `BiresnerfError` where a part of it fails."""
+    folders = Folders(output.resolve())
+    if scene is not None:
+        look_at(scene)  # what is wrong with it is said before anything starts
+    _clear(folders.output)
+    given = scene or _made_scene(folders, views, size)
+    with _service() as url:
+        click.echo(f"service, while this runs: {url}  (its page; API docs: {url}/docs)")
+        _send_and_fetch(url, given, folders.result, options)
+    _tell(folders, None if scene else folders.truth, given)
+
+
+def _clear(output: Path) -> None:
+    if output.exists() and not (output / _MARK).exists() and (not output.is_dir() or any(output.iterdir())):
+        raise InputError(
+            "output_not_empty",
+            "holds files that the demo did not write.",
+            where=str(output),
+            mend="Name another folder with --output.",
+        )
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir(parents=True)
+    (output / _MARK).touch()
+
+
+def _made_scene(folders: Folders, views: int, size: int) -> Path:
+    click.echo(f"making a scene of {views} views with known poses, and turning each camera at random …")
+    _biresnerf("make-scene", folders.scene, "--views", views, "--size", size, "--noise", 0.15, "--seed", 1)
+    return folders.scene
+
+
+def _biresnerf(*arguments: object) -> str:
+    """Output of another command of ours, in a process of its own: it loads what the service must not."""
+    command = [sys.executable, "-m", "biresnerf.command_line", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode != 0:
+        raise BiresnerfError(f"`biresnerf {arguments[0]}` failed: {done.stderr.strip()}")
+    return done.stdout
+
+
+@contextmanager
+def _service() -> Iterator[str]:
+    """A whole service on a free port, with a database of its own; gone at the end."""
+    home = Path(tempfile.mkdtemp(prefix="biresnerf-demo-"))
+    home.chmod(0o711)  # the database runs as another user where root starts it
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("BIRESNERF_")}
+    environment["BIRESNERF_DATA_DIR"] = str(home / "data")
+    log = home / "service.log"
+    command = [sys.executable, "-m", "biresnerf.command_line", "up", "--port", "0", "--slots", "1"]
+    with log.open("wb") as errors:
+        # Its own session: Ctrl-C reaches us alone, and we end it in order. Where we are killed it ends by itself.
+        process = subprocess.Popen(
+            tethered(command, signal_number=signal.SIGINT),
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            start_new_session=True,
+        )
+    try:
+        found = _READY.match(process.stdout.readline().decode()) if process.stdout else None
+        if found is None:
+            raise BiresnerfError(f"The service did not start:\n{log.read_text(errors='replace')[-3000:]}")
+        yield found[1]
+    finally:
+        _stop(process)
+        shutil.rmtree(home, ignore_errors=True)
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    process.send_signal(signal.SIGINT)
+    try:
+        process.wait(_STOP_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    if process.stdout:
+        process.stdout.close()
+
+
+def _send_and_fetch(url: str, scene: Path, target: Path, options: RefineOptions) -> None:
+    with service_at(url, None) as client:
+        with SendingView() as view:
+            job = client.submit(scene, options, on_progress=view.sending)
+        with JobProgressView() as progress:
+            job = watch(client, job, progress)
+        require_success(job)
+        click.echo(f"fetched {len(fetch(client, job, target))} files")
+
+
+def _tell(folders: Folders, truth: Path | None, scene: Path) -> None:
+    """The outcome in numbers."""
+    report = Report.model_validate_json((folders.result / "report.json").read_bytes())
+    click.echo()
+    for line in report.verdict.in_words() if report.verdict is not None else []:
+        click.echo(line)
+    if truth is not None:
+        before, after = (_pose_error(path, truth) for path in (scene, folders.result))
+        click.echo("pose error (mean over the cameras)   before      after")
+        click.echo(f"  rotation                        {before[0]:8.3f}°  {after[0]:8.3f}°")
+        click.echo(f"  position, of camera distance    {before[1]:8.3f}%  {after[1]:8.3f}%")
+    else:
+        turned = [image.moved_deg for image in report.images]
+        moved = [image.moved_units for image in report.images]
+        click.echo("how far the poses moved              median     largest")
+        click.echo(
+            f"  rotation                        {statistics.median(turned):8.3f}°  {max(turned):8.3f}°"
+        )
+        click.echo(f"  position, in the scene's units  {statistics.median(moved):9.4g}  {max(moved):9.4g}")
+    held_out = report.heldout
+    if held_out is not None:
+        click.echo(
+            f"held-out views ({held_out.count}): PSNR {held_out.psnr:.2f} dB, SSIM {held_out.ssim:.3f}"
+        )
+    click.echo(f"\nfiles: {os.path.relpath(folders.result)}")
+    for name in ("report.html", "transforms.json", "colmap/sparse/0", "renders", "report.json"):
+        if (folders.result / name).exists():
+            click.echo(f"  {name}")
+    click.echo("the service's page, for sets of your own: run `biresnerf up` and open http://127.0.0.1:8000")
+
+
+def _pose_error(poses: Path, truth: Path) -> tuple[float, float]:
+    """Mean rotation error (deg) and centre error (% of the camera distance), after alignment."""
+    values: dict[str, Any] = json.loads(_biresnerf("evaluate", poses, truth, "--json"))
+    aligned = values["aligned"]
+    return aligned["rotation_deg"]["mean"], aligned["centre_percent"]["mean"]

@@ -1,0 +1,178 @@
+"""The commands of the service, found by `biresnerf` through their entry points. Imports happen when one runs."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.jobs.service_options import json_option
+from biresnerf.commands.settings_option import settings_option
+from biresnerf.errors import InputError
+
+if TYPE_CHECKING:
+    from workers.settings.settings import Settings
+
+
+def free_port() -> int:
+    """A port that nobody listens on just now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def settings_with(**given: Any) -> Settings:
+    """The settings of the environment, with those given (not None) in their place."""
+    from workers.settings.settings import Settings
+
+    return Settings(**{name: value for name, value in given.items() if value is not None})
+
+
+@contextmanager
+def setup_problems() -> Iterator[None]:
+    """Turns what the operator has to change into an `InputError`."""
+    from pydantic import ValidationError
+
+    from workers.settings.errors import SetupError
+
+    try:
+        yield
+    except SetupError as error:
+        raise InputError(error.code, error.what) from None
+    except ValidationError as error:
+        lines = [
+            f"BIRESNERF_{'_'.join(map(str, item['loc'])).upper()}: {item['msg']}." for item in error.errors()
+        ]
+        raise InputError(
+            "invalid_settings", " ".join(lines), mend="Change these environment variables."
+        ) from None
+
+
+@click.command("up")
+@click.option("--host", help="Address to listen on. Default: BIRESNERF_HOST, else 127.0.0.1.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), help="0 takes a free one. Default: BIRESNERF_PORT, else 8000."
+)
+@click.option(
+    "--slots", type=click.IntRange(0, 64), help="Jobs at the same time. Default: BIRESNERF_SLOTS, else 1."
+)
+@click.option("--data-dir", type=click.Path(path_type=Path), help="Files and private database.")
+def up_command(host: str | None, port: int | None, slots: int | None, data_dir: Path | None) -> None:
+    """Run everything on this machine: database, API, dispatcher and workers.
+
+    Without BIRESNERF_DATABASE_URL a private PostgreSQL is started from the installed package. Ctrl-C stops
+    everything; running jobs write a checkpoint and go on at the next start.
+    """
+    import asyncio
+
+    from workers.settings.logs import set_up_logging
+    from workers.upkeep.supervise import ChildSpec, dispatcher_spec, slot_specs, supervise
+
+    with setup_problems():
+        settings = settings_with(host=host, port=port, slots=slots, data_dir=data_dir)
+        set_up_logging("up", settings)
+        if settings.port == 0:
+            settings = settings.model_copy(update={"port": free_port()})
+        variables = {"BIRESNERF_HOST": settings.host, "BIRESNERF_PORT": str(settings.port)}
+        api = ChildSpec("api", (sys.executable, "-m", "service.server"), variables)
+        ready = _announcer(settings.host, settings.port)
+        children = [api, dispatcher_spec(settings), *slot_specs(settings)]
+        sys.exit(asyncio.run(supervise(settings, children, on_ready=ready)))
+
+
+def _announcer(host: str, port: int) -> Callable[[str], Coroutine[None, None, None]]:
+    async def announce(_: str) -> None:
+        import asyncio
+
+        shown = f"[{host}]" if ":" in host else host
+        url = f"http://{'127.0.0.1' if host in {'0.0.0.0', '::'} else shown}:{port}"
+        while not await asyncio.to_thread(_answers, url):
+            await asyncio.sleep(0.1)
+        click.echo(f"ready at {url}  (the page; API docs: {url}/docs)")
+
+    return announce
+
+
+def _answers(url: str) -> bool:
+    from biresnerf.client import Client
+
+    with Client(url) as client:
+        return client.ready()
+
+
+@click.command("api")
+@click.option("--host", help="Address to listen on.")
+@click.option("--port", type=click.IntRange(0, 65535), help="0 takes a free one.")
+def api_command(host: str | None, port: int | None) -> None:
+    """Run the web process alone (needs BIRESNERF_DATABASE_URL and `biresnerf migrate`)."""
+    from service.server import serve
+    from workers.settings.logs import set_up_logging
+
+    with setup_problems():
+        settings = settings_with(host=host, port=port)
+        set_up_logging("api", settings)
+        serve(settings)
+
+
+@click.command("worker")
+@click.option("--slot", default="cpu0", show_default=True, help="cpuN, or gpuN for the GPU of that number.")
+def worker_command(slot: str) -> None:
+    """Run one worker slot: one job at a time (needs BIRESNERF_DATABASE_URL and `biresnerf migrate`)."""
+    from workers.queue.slot import main
+
+    with setup_problems():
+        settings_with().require_database_url()
+    sys.argv = ["biresnerf worker", "--slot", slot]
+    sys.exit(main())
+
+
+@click.command("migrate")
+@json_option
+def migrate_command(as_json: bool) -> None:
+    """Bring the database at BIRESNERF_DATABASE_URL up to date."""
+    from workers.database.migrate import migrate
+
+    with setup_problems():
+        applied = migrate(settings_with().require_database_url())
+    if as_json:
+        print_json({"applied": applied})
+    else:
+        click.echo("\n".join(f"applied {name}" for name in applied) or "The database is up to date.")
+
+
+@click.command("demo")
+@click.option("--scene", type=click.Path(path_type=Path), help="Your own folder or transforms.json.")
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("demo-output"),
+    show_default=True,
+    help="For all of its files.",
+)
+@click.option("--preset", default="fast", show_default=True, help="fast, balanced, quality or paper.")
+@click.option(
+    "--views", type=click.IntRange(6, 400), default=60, show_default=True, help="Of the made scene."
+)
+@click.option(
+    "--size", type=click.IntRange(32, 800), default=100, show_default=True, help="Of its images, px."
+)
+@settings_option
+def demo_command(
+    scene: Path | None, output: Path, preset: str, views: int, size: int, settings: dict[str, Any]
+) -> None:
+    """Show a whole job: a service of its own, bad poses in, good poses out.
+
+    Without --scene a synthetic scene is made, whose true poses are known; each camera is then turned and
+    shifted at random (14 degrees on average). Everything lies in OUTPUT afterwards.
+    """
+    from biresnerf.options.refine_options import parse_options
+    from service.commands.demo import run_demo
+
+    run_demo(scene, output, parse_options({**settings, "preset": preset}), views, size)

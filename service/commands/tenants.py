@@ -1,0 +1,73 @@
+"""`biresnerf tenants`: what share of the service each tenant gets, and how much at most."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from service.commands.keys import as_json_option, data_dir_option, with_database
+
+if TYPE_CHECKING:
+    from biresnerf.wire.service import TenantShare
+
+_LIMIT = click.IntRange(min=-1)
+
+
+@click.group("tenants")
+def tenants_command() -> None:
+    """List tenants and set their shares and limits.
+
+    A limit of 0 is none, one of -1 is what BIRESNERF_TENANT_MAX_RUNNING, …_QUEUED and …_STORED_BYTES say.
+    """
+
+
+@tenants_command.command("list")
+@as_json_option
+@data_dir_option
+def list_command(as_json: bool, data_dir: Path | None) -> None:
+    """List the tenants with what they use."""
+    from workers.tenants.tenants import TenantStore
+
+    found = with_database(data_dir, lambda database: TenantStore(database).shares())
+    if as_json:
+        click.echo(json.dumps([share.model_dump(mode="json") for share in found]))
+        return
+    for share in found:
+        click.echo(_line(share))
+
+
+@tenants_command.command("set")
+@click.argument("name")
+@click.option("--weight", type=click.FloatRange(0.1, 10), help="Share of the slots where tenants wait.")
+@click.option(
+    "--top-priority", type=click.Choice(["low", "normal", "high"]), help="The highest its jobs may have."
+)
+@click.option("--max-running", type=_LIMIT, help="Jobs at the same time.")
+@click.option("--max-queued", type=_LIMIT, help="Jobs that wait.")
+@click.option("--max-stored-bytes", type=_LIMIT, help="Bytes of datasets, uploads and results.")
+@as_json_option
+@data_dir_option
+def set_command(name: str, as_json: bool, data_dir: Path | None, **changes: Any) -> None:
+    """Change what is given of the tenant NAME; a new name is a new tenant."""
+    from workers.tenants.tenants import TenantStore
+
+    share = with_database(data_dir, lambda database: TenantStore(database).set(name, **changes))
+    click.echo(json.dumps(share.model_dump(mode="json")) if as_json else _line(share))
+
+
+def _line(share: TenantShare) -> str:
+    def used(now: int, limit: int) -> str:
+        return f"{now} of {limit}" if limit else f"{now}"
+
+    parts = (
+        share.id,
+        f"weight {share.weight:g}",
+        f"up to {share.top_priority} priority",
+        f"running {used(share.running, share.max_running)}",
+        f"queued {used(share.queued, share.max_queued)}",
+        f"bytes {used(share.stored_bytes, share.max_stored_bytes)}",
+    )
+    return "  ".join(parts)

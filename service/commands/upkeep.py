@@ -1,0 +1,83 @@
+"""The commands for what has to be done beside requests and jobs. Imports happen when one runs."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from biresnerf.commands.answers import print_json
+from biresnerf.commands.jobs.service_options import json_option
+from service.commands.serve import settings_with, setup_problems
+
+if TYPE_CHECKING:
+    from workers.upkeep.backup_folder import BackupIndex
+
+MIB = 2**20
+
+
+@click.command("dispatcher")
+def dispatcher_command() -> None:
+    """Run what sends webhooks (needs BIRESNERF_DATABASE_URL and `biresnerf migrate`).
+
+    Several may run. SIGTERM or Ctrl-C ends it once the messages under way are delivered.
+    """
+    from workers.upkeep.dispatcher import main
+
+    with setup_problems():
+        settings_with().require_database_url()
+    sys.exit(main())
+
+
+@click.command("backup")
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
+@click.option("--data-dir", type=click.Path(path_type=Path), help="Default: BIRESNERF_DATA_DIR.")
+@json_option
+def backup_command(folder: Path, data_dir: Path | None, as_json: bool) -> None:
+    """Bring FOLDER up to date with the database and all files, while the service runs or not.
+
+    The same folder again takes only what is new. It holds secrets: keep it as safe as the service.
+    """
+    from workers.database.reach_database import reached_database
+    from workers.upkeep.backup import make_backup
+
+    with setup_problems():
+        settings = settings_with(data_dir=data_dir)
+        with reached_database(settings) as url:
+            index = asyncio.run(make_backup(settings, url, folder))
+    _tell(index, as_json)
+    if index.gone and not as_json:
+        click.echo(f"Deleted by the service meanwhile: {len(index.gone)} files.")
+
+
+@click.command("restore")
+@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--data-dir", type=click.Path(path_type=Path), help="Default: BIRESNERF_DATA_DIR.")
+@json_option
+def restore_command(folder: Path, data_dir: Path | None, as_json: bool) -> None:
+    """Put the backup in FOLDER into an empty installation; nothing of the service may run yet.
+
+    Every file is checked against its digest. Jobs that were running go on from their last checkpoints.
+    """
+    from workers.database.reach_database import reached_database
+    from workers.upkeep.backup_folder import read_index
+    from workers.upkeep.restore import restore_backup
+
+    with setup_problems():
+        settings = settings_with(data_dir=data_dir)
+        read_index(folder)  # before a database is made for it
+        with reached_database(settings, migrated=False) as url:
+            index = asyncio.run(restore_backup(settings, url, folder))
+    _tell(index, as_json)
+
+
+def _tell(index: BackupIndex, as_json: bool) -> None:
+    made_at, files, gone = index.made_at, len(index.files), len(index.gone)
+    if as_json:
+        print_json({"made_at": made_at.isoformat(), "files": files, "bytes": index.bytes, "gone": gone})
+    else:
+        size = f"{index.bytes / MIB:.1f} MiB"
+        click.echo(f"Backup of {made_at:%Y-%m-%d %H:%M:%S} UTC: database and {files} files, {size}.")

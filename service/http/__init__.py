@@ -1,0 +1,1 @@
+"""HTTP for every route alike: access, limits, errors, logs and metrics of requests."""

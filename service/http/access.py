@@ -1,0 +1,290 @@
+"""Who calls, for whom, and what they may do.
+
+Every request but those of `OPEN` is identified before anything of it is read (`Access`), so a route that
+forgets to ask is closed, not open. A route says with its parameter what it needs: `CallerHere` (scope
+``read``), `DatasetWriterHere`, `JobWriterHere`, `AdminHere`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hmac
+import ipaddress
+import logging
+import re
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import Security
+from fastapi.security import HTTPBearer, SecurityScopes
+from starlette.datastructures import MutableHeaders
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.http.dependencies import Service, service_of
+from service.http.problems import ProblemError
+from service.http.rate_limits import Allowance, Buckets
+from workers.datasets.datasets import DatasetStore
+from workers.datasets.uploads import UploadStore
+from workers.jobs.jobs import JobStore
+from workers.settings.errors import Unavailable
+from workers.settings.settings import Settings
+from workers.tenants.api_keys import ALL_SCOPES, KeyRefused
+from workers.tenants.api_keys import Scope as KeyScope
+from workers.tenants.tenants import LOCAL_TENANT
+from workers.webhooks.webhooks import WebhookStore
+
+log = logging.getLogger(__name__)
+
+# Health, the docs page and the schema say nothing of anybody; /metrics asks itself (`may_scrape`), and what is
+# shared was signed by us.
+OPEN = re.compile(r"/(livez|readyz|startupz|metrics|openapi\.json|docs(/.*)?|web/[^/]*|v1/shared/.*)?")
+# What any guarded operation may answer before it is reached.
+REFUSALS = (
+    *("missing_credentials", "invalid_api_key", "scope_required", "cross_site"),
+    *("rate_limited", "database_unavailable"),
+)
+# Requests with no or a wrong key, of one address.
+STRANGERS_PER_S, STRANGERS_BURST = 1.0, 200
+_BEARER = re.compile(r"Bearer +(\S+) *", re.IGNORECASE)
+_CHALLENGE = 'Bearer realm="biresnerf"'
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Whom a request acts for. ``key_id`` is none for whoever needs no key."""
+
+    tenant: str
+    scopes: frozenset[KeyScope]
+    key_id: str | None = None
+
+
+@dataclass(frozen=True)
+class Caller:
+    """The identified client of a request; its stores hold what belongs to its tenant, and nothing else.
+
+    ``client`` is what limits are counted by: the key, or the address where none is shown; none on loopback.
+    """
+
+    service: Service
+    identity: Identity
+    client: str | None
+
+    @property
+    def tenant(self) -> str:
+        """Whose things the caller handles."""
+        return self.identity.tenant
+
+    @property
+    def scopes(self) -> frozenset[KeyScope]:
+        """What the caller may do."""
+        return self.identity.scopes
+
+    def require(self, scope: KeyScope) -> None:
+        """Raises ``ProblemError`` (``scope_required``) where the caller may not do that."""
+        if scope not in self.scopes:
+            challenge = f'{_CHALLENGE}, error="insufficient_scope", scope="{scope}"'
+            raise ProblemError(
+                "scope_required", f"The key lacks the scope {scope}.", headers={"WWW-Authenticate": challenge}
+            )
+
+    def sending(self) -> AbstractContextManager[None]:
+        """A place to send files from; raises ``ProblemError`` (``too_many_uploads``) where all are taken."""
+        return self.service.sending.taken(self.client)
+
+    @property
+    def jobs(self) -> JobStore:
+        """The tenant's jobs."""
+        return self.service.stores.jobs.of(self.tenant)
+
+    @property
+    def datasets(self) -> DatasetStore:
+        """The tenant's datasets."""
+        return self.service.stores.datasets.of(self.tenant)
+
+    @property
+    def uploads(self) -> UploadStore:
+        """The uploads into the tenant's datasets."""
+        return self.service.stores.uploads.of(self.tenant)
+
+    @property
+    def webhooks(self) -> WebhookStore:
+        """The tenant's webhooks."""
+        return self.service.stores.webhooks.of(self.tenant)
+
+
+class Access:
+    """ASGI middleware: identifies the client of each request, before its body is read or its route sought."""
+
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+        self._app, self._settings = app, settings
+        self._keys = Buckets("key", settings.key_requests_per_s, settings.key_requests_burst)
+        self._strangers = Buckets("address", STRANGERS_PER_S, STRANGERS_BURST)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or OPEN.fullmatch(scope["path"]):
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope)
+        request.state.identity = identity = await self._identified(request)
+        nameless = None if on_loopback(self._settings.host) else _address(request)
+        request.state.client = client = identity.key_id or nameless
+        if client is None:
+            await self._app(scope, receive, send)
+            return
+        allowance = self._keys.take(client)
+        _require_allowed(allowance)
+
+        async def send_with_allowance(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(allowance.headers())
+            await send(message)
+
+        await self._app(scope, receive, send_with_allowance)
+
+    async def _identified(self, request: Request) -> Identity:
+        try:
+            return await identify(service_of(request), request)
+        except Unavailable as error:  # here, above the routes, nobody else makes a 503 of it
+            raise ProblemError(error.code, error.what) from None
+        except ProblemError as refusal:
+            # Who shows a key that holds is never stopped for what others send from the same address.
+            if refusal.status == 401:
+                _require_allowed(self._strangers.take(_address(request)))
+            raise
+
+
+def _require_allowed(allowance: Allowance) -> None:
+    if allowance.wait_s:
+        raise ProblemError(
+            "rate_limited",
+            f"At most {allowance.limit} requests are taken at once.",
+            headers={**allowance.headers(), "Retry-After": str(allowance.wait_s)},
+        )
+
+
+def _address(request: Request) -> str:
+    return request.client.host if request.client else ""
+
+
+async def identify(service: Service, request: Request) -> Identity:
+    """Whom the request acts for.
+
+    Raises:
+        ProblemError: ``missing_credentials``, ``invalid_api_key``, ``cross_site``.
+    """
+    text = request.headers.get("authorization")
+    if text is None:
+        return await _nameless(service, request)
+    bearer = _BEARER.fullmatch(text)
+    if bearer is None:
+        raise _unknown("The Authorization header is not of the form `Bearer brn_…`.")
+    try:
+        key = await service.stores.keys.recognise(bearer[1])
+    except KeyRefused:
+        raise _unknown("The key is unknown, expired or revoked.") from None
+    scopes = ALL_SCOPES if "admin" in key.scopes else frozenset(key.scopes)
+    return Identity(key.tenant, scopes, key.id)
+
+
+async def _nameless(service: Service, request: Request) -> Identity:
+    """The identity of who shows no key, where none is needed."""
+    mode = service.settings.auth
+    if mode == "auto":
+        if not on_loopback(service.settings.host) or await service.stores.keys.any_made():
+            mode = "required"
+        elif _is_public_name(request.url.hostname or ""):
+            # A page may have its own name point at this machine, and would then be of the same site.
+            raise ProblemError(
+                "cross_site",
+                "Without an API key only requests to this machine by its own name are taken.",
+                where="Host",
+                mend="Use http://127.0.0.1 or localhost, or make a key: biresnerf keys create.",
+            )
+    if mode == "required":
+        raise ProblemError(
+            "missing_credentials",
+            "This service wants an API key.",
+            where="Authorization",
+            mend="Send the header `Authorization: Bearer brn_…`; `biresnerf keys create` makes a key.",
+            headers={"WWW-Authenticate": _CHALLENGE},
+        )
+    return Identity(LOCAL_TENANT, ALL_SCOPES)
+
+
+def _is_public_name(host: str) -> bool:
+    """Whether somebody elsewhere could have this name point anywhere: it has a dot and is no loopback address."""
+    return "." in host.rstrip(".") and not on_loopback(host)
+
+
+async def say_who_is_let_in(service: Service) -> None:
+    """Logs at the start what an operator could otherwise find out too late."""
+    settings = service.settings
+    if settings.auth == "off" and not on_loopback(settings.host):
+        log.warning("BIRESNERF_AUTH=off: whoever reaches %s may do everything", settings.host)
+    elif settings.auth == "required" or (settings.auth == "auto" and not on_loopback(settings.host)):
+        with contextlib.suppress(Unavailable):
+            if not await service.stores.keys.any_made():
+                log.warning("nobody can use this service yet; make a key: biresnerf keys create NAME")
+
+
+def on_loopback(host: str) -> bool:
+    """Whether the address or name is this machine's alone."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+async def may_scrape(service: Service, authorization: str) -> bool:
+    """Whether /metrics is for this client: it is the loopback's while no token is set, else the token's.
+
+    A key with the scope ``admin`` opens it too. Asks the database only where nothing else says yes.
+    """
+    token = service.settings.metrics_token
+    if token is None and on_loopback(service.settings.host):
+        return True
+    bearer = _BEARER.fullmatch(authorization)
+    if bearer is None:
+        return False
+    if token is not None and hmac.compare_digest(token.get_secret_value().encode(), bearer[1].encode()):
+        return True
+    try:
+        return "admin" in (await service.stores.keys.recognise(bearer[1])).scopes
+    except KeyRefused:
+        return False
+
+
+def _unknown(detail: str) -> ProblemError:
+    return ProblemError(
+        "invalid_api_key",
+        detail,
+        where="Authorization",
+        headers={"WWW-Authenticate": f'{_CHALLENGE}, error="invalid_token"'},
+    )
+
+
+_bearer = HTTPBearer(
+    auto_error=False,
+    scheme_name="ApiKey",
+    bearerFormat="brn_…",
+    description="An API key. None is needed while the service listens on loopback only and no key was made.",
+)
+
+
+async def _caller(
+    request: Request, needed: SecurityScopes, _documented: Annotated[Any, Security(_bearer)]
+) -> Caller:
+    caller = Caller(service_of(request), request.state.identity, request.state.client)
+    for scope in needed.scopes:
+        caller.require(scope)  # type: ignore[arg-type]
+    return caller
+
+
+CallerHere = Annotated[Caller, Security(_caller, scopes=["read"])]
+DatasetWriterHere = Annotated[Caller, Security(_caller, scopes=["datasets:write"])]
+JobWriterHere = Annotated[Caller, Security(_caller, scopes=["jobs:write"])]
+AdminHere = Annotated[Caller, Security(_caller, scopes=["admin"])]

@@ -1,0 +1,153 @@
+"""Figures for Prometheus.
+
+Two kinds. What this process alone knows (requests, streams) is counted in its own memory: each replica of the
+API is one process and a target of its own, so nothing is shared between processes. What is true of the whole
+installation (queue, jobs, stages, slots) is read from the database when it is asked for; every replica tells
+the same, and workers need no port that can be scraped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, get_args
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
+from prometheus_client.core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    HistogramMetricFamily,
+    InfoMetricFamily,
+    Metric,
+)
+from prometheus_client.exposition import choose_encoder
+from prometheus_client.registry import Collector
+
+from biresnerf import __version__
+from biresnerf.wire.jobs import EventType
+from workers.database.statistics import Statistics, Tally
+
+_ANSWER_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
+# Tally in the database -> metric, what its label is called, what it says.
+_COUNTERS = {
+    "job_events": (
+        "biresnerf_job_events",
+        "type",
+        "Entries of jobs' histories: queued, started, succeeded …",
+    ),
+    "job_failures": ("biresnerf_job_failures", "code", "Failed jobs by the code of their error."),
+    "job_requeues": ("biresnerf_job_requeues", "why", "Jobs given back; why=worker_lost is a take-over."),
+    "webhook_attempts": ("biresnerf_webhook_attempts", "result", "Deliveries of webhook messages tried."),
+    "stored_files": ("biresnerf_stored_files", "", "Files stored in datasets."),
+    "stored_bytes": ("biresnerf_stored_bytes", "", "Bytes of the files stored in datasets."),
+}
+# Told before they first happen: a rate needs the zero that comes before the one.
+_FROM_ZERO: dict[str, tuple[str, ...]] = {
+    "job_events": get_args(EventType),
+    "job_failures": ("engine_error", "timeout", "too_many_crashes"),
+    "job_requeues": ("lost", "receipt_lost", "shutdown", "worker_lost"),
+    "webhook_attempts": ("delivered", "failed"),
+}
+_DURATIONS = {
+    "stage_seconds": ("biresnerf_stage_seconds", "stage", "Time that jobs spent in each stage."),
+    "job_seconds": ("biresnerf_job_seconds", "state", "Time from submission to the end, by final state."),
+    "queue_wait_seconds": ("biresnerf_queue_wait_seconds", "", "Time from submission to the first start."),
+}
+
+
+class WebMetrics:
+    """What one web process counts."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        ProcessCollector(registry=self.registry)
+        at = ("method", "route")
+        self.requests = self._counter("biresnerf_http_requests", "Requests answered.", *at, "status")
+        self.received = self._counter("biresnerf_http_request_bytes", "Bytes of bodies received.", *at)
+        self.sent = self._counter("biresnerf_http_response_bytes", "Bytes of bodies sent.", *at)
+        self.answer_s = Histogram(
+            "biresnerf_http_answer_seconds",
+            "Time until an answer began (its body may stream for long after that).",
+            at,
+            buckets=_ANSWER_S,
+            registry=self.registry,
+        )
+        self.under_way = Gauge(
+            "biresnerf_http_requests_under_way", "Requests not answered in full yet.", registry=self.registry
+        )
+        self.listeners = Gauge(
+            "biresnerf_event_listeners", "Clients that follow a job's events.", registry=self.registry
+        )
+
+    def _counter(self, name: str, says: str, *labels: str) -> Counter:
+        return Counter(name, says, labels, registry=self.registry)
+
+
+class Exposition(Collector):
+    """One scrape: the process's own figures and the installation's; none where the database is away."""
+
+    def __init__(self, web: WebMetrics, installation: Statistics | None) -> None:
+        self._web, self._installation = web, installation
+
+    def collect(self) -> Iterable[Metric]:
+        """All families, by name."""
+        yield InfoMetricFamily("biresnerf_build", "What runs here.", {"version": __version__})
+        yield from self._web.registry.collect()
+        answers = GaugeMetricFamily("biresnerf_database_up", "1 while the database answers this process.")
+        answers.add_metric([], 0 if self._installation is None else 1)
+        yield answers
+        if self._installation is not None:
+            yield from _families(self._installation)
+
+    def rendered(self, accept: str) -> tuple[bytes, str]:
+        """The text and its media type, in the form that the scraper asks for."""
+        encode, media_type = choose_encoder(accept)
+        registry = CollectorRegistry()
+        registry.register(self)
+        return encode(registry), media_type
+
+
+def _families(now: Statistics) -> Iterator[Metric]:
+    yield _gauge("biresnerf_jobs", "Jobs by state.", "state", now.jobs)
+    yield _gauge("biresnerf_datasets", "Datasets by state.", "state", now.datasets)
+    yield _gauge(
+        "biresnerf_queue_oldest_seconds", "Age of the job queued longest.", "", {"": now.oldest_queued_s}
+    )
+    yield _gauge("biresnerf_trash", "Folders of files that wait for deletion.", "", {"": now.trash})
+    yield _gauge("biresnerf_webhooks_pending", "Webhook messages to send.", "", {"": now.webhooks_pending})
+    late = "How long the most urgent webhook message is overdue: grows where no dispatcher runs."
+    yield _gauge("biresnerf_webhooks_late_seconds", late, "", {"": now.webhooks_late_s})
+    slots = GaugeMetricFamily("biresnerf_slots", "Living worker slots.", labels=["kind", "busy"])
+    for slot in now.slots:
+        slots.add_metric([slot.kind, str(slot.busy).lower()], slot.slots)
+    yield slots
+    for tally, (name, label, says) in _COUNTERS.items():
+        counter = CounterMetricFamily(name, says, labels=[label] if label else [])
+        found = {item.label: item.amount for item in now.tallies if item.name == tally}
+        for value in sorted({*found, *_FROM_ZERO.get(tally, () if label else ("",))}):
+            counter.add_metric([value] if label else [], found.get(value, 0.0))
+        yield counter
+    for tally, (name, label, says) in _DURATIONS.items():
+        yield _histogram(
+            name, says, label, [item for item in now.tallies if item.name == tally], now.bounds_s
+        )
+
+
+def _gauge(name: str, says: str, label: str, values: Mapping[Any, float]) -> Metric:
+    family = GaugeMetricFamily(name, says, labels=[label] if label else [])
+    for key, value in values.items():
+        family.add_metric([key] if label else [], value)
+    return family
+
+
+def _histogram(name: str, says: str, label: str, tallies: list[Tally], bounds_s: tuple[float, ...]) -> Metric:
+    family = HistogramMetricFamily(name, says, labels=[label] if label else [])
+    for value in sorted({item.label for item in tallies}):
+        mine = [item for item in tallies if item.label == value]
+        counts = {item.bucket: item.count for item in mine}
+        buckets, below = [], 0
+        # A duration in bucket i is less than bound i; those beyond the last bound are in one bucket more.
+        for index, bound in enumerate((*bounds_s, float("inf"))):
+            below += counts.get(index, 0)
+            buckets.append(("+Inf" if bound == float("inf") else f"{bound:g}", float(below)))
+        family.add_metric([value] if label else [], buckets, sum_value=sum(item.amount for item in mine))
+    return family

@@ -1,0 +1,132 @@
+"""One id per request, in and out, and the last net below every handler."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import re
+import uuid
+from urllib.parse import quote
+
+from starlette.datastructures import MutableHeaders
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.http.problems import MEDIA_TYPE, ProblemError
+from workers.settings.logs import about
+
+logger = logging.getLogger(__name__)
+# A browser sends at most 8 KiB of cookies; a few long headers beside them fit in too.
+HEAD_BYTES_MAX = 32 * 2**10
+_SAFE = {"GET", "HEAD", "OPTIONS"}
+# No answer is a page but the docs, which have a policy of their own; none is for other sites to build in.
+_PRUDENT = {
+    "X-Content-Type-Options": "nosniff",
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+}
+_ID = re.compile(r"^[\w.:-]{1,128}$", re.ASCII)
+
+
+def request_id(request: Request) -> str:
+    """The id of this request."""
+    found: str = request.scope.get("state", {}).get("request_id", "")
+    return found
+
+
+def render(error: ProblemError, request: Request) -> Response:
+    """The answer that tells the problem."""
+    body = error.problem(instance=quote(request.scope["path"]), request_id=request_id(request))
+    return Response(
+        body.model_dump_json(exclude_none=True),
+        status_code=error.status,
+        media_type=MEDIA_TYPE,
+        headers=error.response_headers(),
+    )
+
+
+class RequestContext:
+    """ASGI middleware: request ids, no content sniffing, and a problem for what nobody caught."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope, receive)
+        given = request.headers.get("x-request-id", "")
+        request.state.request_id = given if _ID.match(given) else uuid.uuid4().hex
+        started = False
+
+        async def send_with_headers(message: Message) -> None:
+            nonlocal started
+            if message["type"] == "http.response.start":
+                started = True
+                headers = MutableHeaders(scope=message)
+                headers["X-Request-ID"] = request_id(request)
+                for name, value in _PRUDENT.items():
+                    headers.setdefault(name, value)
+                for name, value in scope.get("state", {}).get("extra_headers", {}).items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        try:
+            _refuse_ambiguous(request)
+            _refuse_other_sites(request)
+            with about(request_id=request_id(request)):
+                await self._app(scope, receive, send_with_headers)
+        except ProblemError as problem:
+            await render(problem, request)(scope, receive, send_with_headers)
+        except asyncio.CancelledError:
+            if started or not _stopping(request):
+                raise
+            # What the server cuts off at its end was not served, and another one, or the next, can serve it.
+            stopping = ProblemError("unavailable", "The service is stopping.")
+            await render(stopping, request)(scope, receive, send_with_headers)
+        except Exception as error:
+            if started:
+                raise
+            await render(_last_net(error, request), request)(scope, receive, send_with_headers)
+
+
+def _refuse_ambiguous(request: Request) -> None:
+    """What the parser lets through, though a proxy before us may have read it differently."""
+    close = {"Connection": "close"}
+    if request.scope["http_version"] not in {"1.0", "1.1"}:
+        raise ProblemError("malformed_request", "This is not HTTP/1.", headers=close)
+    if "content-length" in request.headers and "transfer-encoding" in request.headers:
+        detail = "Content-Length and Transfer-Encoding exclude each other."
+        raise ProblemError("malformed_request", detail, headers=close)
+    # The parser counts only while it waits for more; a head that came in one piece is counted here.
+    head = [request.scope["raw_path"], request.scope["query_string"], *sum(request.scope["headers"], ())]
+    if sum(map(len, head)) > HEAD_BYTES_MAX:
+        detail = f"The head of the request is larger than {HEAD_BYTES_MAX} bytes."
+        raise ProblemError("headers_too_large", detail, headers=close)
+
+
+def _refuse_other_sites(request: Request) -> None:
+    """Browsers send forms to any address, so any page could use a service on the reader's own machine."""
+    if request.method not in _SAFE and request.headers.get("sec-fetch-site") == "cross-site":
+        raise ProblemError("cross_site", "Requests from pages of other sites are not taken.")
+
+
+def _stopping(request: Request) -> bool:
+    service = getattr(request.app.state, "service", None)
+    return service is not None and service.closing.is_set()
+
+
+def _last_net(error: Exception, request: Request) -> ProblemError:
+    if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
+        logger.error("no room left: %s", error)
+        return ProblemError("storage_full", "The disk of the service is full.")
+    logger.exception(
+        "request %s %s %s failed", request_id(request), request.method, quote(request.scope["path"])
+    )
+    return ProblemError(
+        "internal_error", "The request could not be served; the log of the service tells why."
+    )

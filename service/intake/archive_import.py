@@ -1,0 +1,208 @@
+"""From what was uploaded to the files of a dataset."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import logging
+import uuid
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+from biresnerf.errors import InputError
+from biresnerf.wire.datasets import DatasetRecord
+from biresnerf.wire.problems import JobError
+from service.http.dependencies import Service
+from service.http.problems import ProblemError
+from service.intake.sandboxed_child import Limits, run_confined
+from service.intake.unpack import UnpackRequest
+from service.intake.uploads import staging_folder, write_stream
+from workers.records import Upload
+from workers.run.claim import insist
+from workers.settings.errors import Conflict, EngineError, LimitReached, NotFound, Unavailable
+
+logger = logging.getLogger(__name__)
+
+RATIO_MAX = 200.0
+_CHUNK = 2**20
+_LOOK_S = 0.3  # between two looks at an upload that another process brings in
+# Python, zlib and the table of contents of an archive with as many entries as we take.
+_UNPACK_MEMORY_BYTES = 1536 * 2**20
+# What stands for the whole input when it lies in the only folder of an archive.
+_KEPT_FOLDERS = {"images"}
+
+
+async def take_archive(
+    service: Service, dataset_id: str, archive: Path, into: Path, upload_id: str | None = None
+) -> DatasetRecord:
+    """Unpacks ``archive`` in a child, into the empty folder ``into``; then stores what came out.
+
+    ``upload_id``: the upload that it came by. Nothing is stored unless the whole archive is good.
+
+    Raises:
+        ProblemError: what is wrong with the archive, and with which entry.
+    """
+    settings = service.settings
+    dataset = await service.stores.datasets.get(dataset_id)
+    if dataset.state != "open":
+        raise ProblemError(
+            "dataset_not_open", f"The dataset is {dataset.state}.", mend="Create a new dataset."
+        )
+    allowed = min(settings.max_unpacked_bytes, settings.max_dataset_bytes - dataset.bytes)
+    # Twice: unpacked here, and then stored, which may be on the same disk.
+    room = await asyncio.to_thread(service.room.free_bytes) // 2
+    request = UnpackRequest(
+        archive=archive,
+        into=into,
+        files_max=settings.max_files - dataset.files,
+        bytes_max=min(allowed, room),
+        file_bytes_max=settings.max_file_bytes,
+        ratio_max=RATIO_MAX,
+    )
+    limits = Limits(
+        seconds=settings.check_timeout_s,
+        memory_bytes=_UNPACK_MEMORY_BYTES,
+        file_bytes=settings.max_file_bytes + 2**20,
+    )
+    try:
+        async with service.unpacking.turn(dataset.tenant):
+            await run_confined("service.intake.unpack", request, limits)
+    except ProblemError as error:
+        if error.code == "archive_too_large" and room < allowed:
+            raise ProblemError("storage_full", "There is no room to unpack the archive.") from None
+        raise
+    root = await asyncio.to_thread(content_root, into)
+    for path in await asyncio.to_thread(_files_below, root):
+        name = path.relative_to(root).as_posix()
+        await service.stores.datasets.add_file(dataset_id, name, _chunks(path), upload_id=upload_id)
+    return await service.stores.datasets.get(dataset_id)
+
+
+def content_root(folder: Path) -> Path:
+    """The folder that holds the data: single folders that merely wrap everything are passed through."""
+    while True:
+        children = list(folder.iterdir())
+        if len(children) != 1 or not children[0].is_dir() or children[0].name.lower() in _KEPT_FOLDERS:
+            return folder
+        folder = children[0]
+
+
+def _files_below(root: Path) -> list[Path]:
+    return sorted(path for path in root.rglob("*") if path.is_file())
+
+
+def begin_taking(service: Service, upload_id: str) -> None:
+    """Brings a received upload into its dataset, in the background."""
+
+    async def take() -> None:
+        try:
+            await take_upload(service, upload_id)
+        except (ProblemError, EngineError, OSError) as error:
+            logger.warning("upload %s is received but not stored yet: %s", upload_id, error)
+
+    service.keep_running(asyncio.create_task(take(), name=f"take {upload_id}"))
+
+
+async def take_upload(service: Service, upload_id: str) -> None:
+    """Brings a received upload into its dataset unless somebody does so already; its state tells the outcome.
+
+    What is wrong on our side (storage away, disk full) is raised and leaves it received: it is tried again.
+    """
+    uploads, token = service.stores.uploads, uuid.uuid4()
+    if not await insist(lambda: uploads.take(upload_id, token)):
+        return
+    renewing = asyncio.create_task(_renew(service, upload_id, token))
+    wrong: JobError | None = None
+    try:
+        await _bring_in(service, await uploads.get(upload_id))
+    except NotFound:
+        return  # deleted meanwhile
+    except (ProblemError, InputError, EngineError) as error:
+        wrong = _clients_mistake(error)
+        if wrong is None:
+            raise
+    finally:
+        renewing.cancel()
+    await insist(lambda: uploads.conclude(upload_id, token, wrong))
+
+
+async def _renew(service: Service, upload_id: str, token: uuid.UUID) -> None:
+    while True:
+        await asyncio.sleep(service.settings.beat_s / 2)
+        with contextlib.suppress(Unavailable):  # the next time will do
+            await service.stores.uploads.take(upload_id, token)
+
+
+def _clients_mistake(error: ProblemError | InputError | EngineError) -> JobError | None:
+    """The error where sending the same again would end the same; None where it is ours."""
+    if isinstance(error, ProblemError):
+        told = JobError(code=error.code, detail=error.detail, where=error.where or "", mend=error.mend or "")
+        return None if error.retryable or error.status >= 500 else told
+    if isinstance(error, InputError):
+        return JobError(code=error.code, detail=error.what, where=error.where, mend=error.mend)
+    if isinstance(error, Conflict | LimitReached) and error.code != "storage_full":
+        return JobError(code=error.code, detail=error.what)
+    return None
+
+
+async def _bring_in(service: Service, upload: Upload) -> None:
+    uploads, datasets = service.stores.uploads, service.stores.datasets
+    if upload.path is not None:
+        content = uploads.content(upload)
+        await datasets.add_file(
+            upload.dataset_id, upload.path, content, sha256=upload.sha256, upload_id=upload.id
+        )
+        return
+    async with staging_folder(service.staging_dir) as folder:
+        archive, into = folder / "archive", folder / "content"
+        into.mkdir()
+        await write_stream(uploads.content(upload), archive, upload.size, service.room)
+        if upload.sha256 is not None:
+            found = await asyncio.to_thread(file_sha256, archive)
+            if found != upload.sha256:
+                raise ProblemError(
+                    "digest_mismatch",
+                    f"What arrived has SHA-256 {found}, announced was {upload.sha256}.",
+                    mend="Send the archive again.",
+                )
+        await take_archive(service, upload.dataset_id, archive, into, upload.id)
+
+
+async def settle_uploads(service: Service, dataset_id: str) -> None:
+    """Waits until all that was received is in the dataset.
+
+    Raises:
+        ProblemError: ``dataset_not_complete`` where an upload is unfinished; what was wrong with another.
+    """
+    while True:
+        pending = await service.stores.uploads.of_dataset(dataset_id)
+        received = [upload for upload in pending if upload.state == "received"]
+        if not received:
+            break
+        for upload in received:
+            await take_upload(service, upload.id)
+        await asyncio.sleep(_LOOK_S)
+    for upload in pending:
+        give_up = f"or give it up: DELETE /v1/uploads/{upload.id}"
+        if upload.error is not None:
+            error = upload.error
+            mend = f"{error.mend} Send it again, {give_up}.".strip()
+            raise ProblemError(error.code, error.detail, where=error.where or None, mend=mend)
+        raise ProblemError(
+            "dataset_not_complete",
+            f"Of the upload {upload.id}, {upload.received} of {upload.size} bytes have arrived.",
+            mend=f"Send the rest, {give_up}.",
+        )
+
+
+def file_sha256(path: Path) -> str:
+    """The file's SHA-256, in hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+async def _chunks(path: Path) -> AsyncIterator[bytes]:
+    with path.open("rb") as file:
+        while chunk := await asyncio.to_thread(file.read, _CHUNK):
+            yield chunk

@@ -1,0 +1,51 @@
+"""Closing a dataset: its files are frozen, and a check begun and waited for."""
+
+from __future__ import annotations
+
+import asyncio
+
+from biresnerf.errors import InputError
+from biresnerf.wire.datasets import DatasetRecord
+from biresnerf.wire.safe_paths import NameSet
+from service.http.access import Caller
+from service.http.problems import ProblemError
+from service.intake.archive_import import settle_uploads
+
+
+async def begin_check(caller: Caller, dataset_id: str) -> DatasetRecord:
+    """Freezes the dataset and starts its check, which goes on when the client is gone.
+
+    Raises:
+        ProblemError: ``name_collision``; then the dataset stays open.
+    """
+    store = caller.datasets
+    await store.get(dataset_id)  # the caller's own, before anything is done to it
+    await settle_uploads(caller.service, dataset_id)
+    names, cursor = NameSet(), None
+    while True:
+        page = await store.files(dataset_id, cursor=cursor)
+        for file in page.items:
+            try:
+                names.add(file.path)
+            except InputError as error:
+                raise ProblemError.from_input_error(error) from None
+        if (cursor := page.next_cursor) is None:
+            break
+    dataset = await store.finalize(dataset_id)
+    if dataset.state == "finalizing":
+        caller.service.keep_running(asyncio.create_task(store.check(dataset_id), name=f"check {dataset_id}"))
+    return dataset
+
+
+async def finish_check(caller: Caller, dataset_id: str) -> DatasetRecord:
+    """Waits for the check's outcome; raises ``ProblemError`` with what it found wrong."""
+    for task in list(caller.service.background):
+        if task.get_name() == f"check {dataset_id}":
+            await asyncio.shield(task)
+    dataset = await caller.datasets.check(dataset_id)
+    if dataset.state == "rejected":
+        error = dataset.error
+        if error is None:
+            raise ProblemError("dataset_invalid", "The check rejected the dataset.")
+        raise ProblemError(error.code, error.detail, where=error.where or None, mend=error.mend or None)
+    return dataset

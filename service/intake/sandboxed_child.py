@@ -1,0 +1,121 @@
+"""Child programs that read what strangers sent: the parent waits with limits, the child confines itself.
+
+The web process never parses an archive or an image. A child takes one JSON request as its argument and
+answers with one JSON line: ``{"result": ...}`` or ``{"error": {"code", "what", "where", "mend"}}``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import resource
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from biresnerf.errors import InputError
+from service.http.problems import ProblemError
+from workers.process.die_with_parent import tethered
+
+logger = logging.getLogger(__name__)
+
+_ANSWER_BYTES_MAX = 16 * 2**20
+# One thread: numpy's BLAS reserves address space per thread, which the memory limit counts.
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+class Limits(BaseModel):
+    """What a child may use."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    seconds: float = Field(gt=0)
+    memory_bytes: int = Field(gt=0, description="Address space, RLIMIT_AS.")
+    file_bytes: int = Field(gt=0, description="Largest file it may write, RLIMIT_FSIZE.")
+
+
+async def run_confined(module: str, request: BaseModel, limits: Limits) -> dict[str, Any]:
+    """Runs ``python -m module`` on the request and returns its result.
+
+    Raises:
+        ProblemError: what the child found wrong; ``validation_timeout``; ``validation_resources`` where
+            it died by memory or by a signal.
+    """
+    command = [sys.executable, "-P", "-m", module, limits.model_dump_json()]
+    child = await asyncio.create_subprocess_exec(
+        *tethered(command, signal_number=signal.SIGKILL),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+        start_new_session=True,
+        # It reads what strangers sent: no address of the database, no secret.
+        env={**{k: v for k, v in os.environ.items() if not k.startswith("BIRESNERF_")}, **_ONE_THREAD},
+        limit=_ANSWER_BYTES_MAX,
+    )
+    try:
+        async with asyncio.timeout(limits.seconds):
+            answer, log = await child.communicate(request.model_dump_json().encode())
+    except TimeoutError:
+        raise ProblemError(
+            "validation_timeout",
+            f"Reading the files was stopped after {limits.seconds:.0f} s.",
+            mend="Send fewer or smaller images.",
+        ) from None
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)
+        await child.wait()
+    return _read_answer(module, answer, log, child.returncode)
+
+
+def _read_answer(module: str, answer: bytes, log: bytes, status: int | None) -> dict[str, Any]:
+    try:
+        content = json.loads(answer.splitlines()[-1])
+    except (IndexError, ValueError):
+        content = {}
+    if status == 0 and "result" in content:
+        result: dict[str, Any] = content["result"]
+        return result
+    if "error" in content:
+        raise ProblemError.from_input_error(InputError(**content["error"]))
+    logger.error("%s ended with status %s: %s", module, status, log[-2000:].decode(errors="replace"))
+    raise ProblemError(
+        "validation_resources",
+        "Reading the files took more memory than is allowed, or broke the reader.",
+        mend="Look for damaged or enormous files among what was sent.",
+    )
+
+
+def run_child(work: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    """The child's side: sets its limits, works, answers. Called under ``if __name__ == "__main__"``."""
+    limits = Limits.model_validate_json(sys.argv[1])
+    _confine(limits)
+    request = json.loads(sys.stdin.buffer.read())
+    # Whatever libraries print must not mix with the answer.
+    answer_to = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        answer: dict[str, Any] = {"result": work(request)}
+    except InputError as error:
+        answer = {"error": {"code": error.code, "what": error.what, "where": error.where, "mend": error.mend}}
+    with os.fdopen(answer_to, "wb") as out:
+        out.write(json.dumps(answer).encode() + b"\n")
+
+
+def _confine(limits: Limits) -> None:
+    os.nice(5)
+    for kind, amount in (
+        (resource.RLIMIT_AS, limits.memory_bytes),
+        (resource.RLIMIT_FSIZE, limits.file_bytes),
+        (resource.RLIMIT_CPU, int(limits.seconds) + 1),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        _, most = resource.getrlimit(kind)
+        wanted = amount if most == resource.RLIM_INFINITY else min(amount, most)
+        resource.setrlimit(kind, (wanted, wanted))

@@ -1,0 +1,231 @@
+"""Child program: unpacks one uploaded archive (zip, tar, tar.gz) into a fresh folder, or says why not.
+
+Nothing the archive says about itself is believed: bytes and files are counted as they come out.
+"""
+
+from __future__ import annotations
+
+import gzip
+import os
+import stat
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from biresnerf.errors import InputError
+from biresnerf.wire.safe_paths import NameSet, checked_path, is_litter
+from service.intake.sandboxed_child import run_child
+
+_CHUNK = 2**20
+# Small archives of text may shrink far more than photos do; below this size the ratio says nothing.
+RATIO_FREE_BYTES = 16 * 2**20
+_METHODS = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
+_ENCRYPTED = 0x1 | 0x40
+_TAR_BLOCK = 512
+_MEND_PACK = "Pack plain files and folders only, as zip, tar or tar.gz."
+
+
+class UnpackRequest(BaseModel):
+    """What to unpack, where to, and how much may come out."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    archive: Path
+    into: Path = Field(description="An empty folder of our own.")
+    files_max: int
+    bytes_max: int = Field(description="Bytes of all files together.")
+    file_bytes_max: int = Field(description="Bytes of one file.")
+    ratio_max: float = Field(description="Unpacked bytes to archive bytes, above the first 16 MiB.")
+
+
+def unpack(request: UnpackRequest) -> dict[str, Any]:
+    """Unpacks; returns ``{"files": count, "bytes": sum}``.
+
+    Raises:
+        InputError: ``archive_rejected``, ``unsafe_path``, ``name_collision``, ``too_many_files``,
+            ``archive_too_large``; ``where`` names the entry.
+    """
+    sink = _Sink(request)
+    try:
+        with request.archive.open("rb") as file:
+            head = file.read(265)
+            file.seek(0)
+            if head[:4] in {b"PK\x03\x04", b"PK\x05\x06"}:
+                _unpack_zip(file, sink)
+            elif head[:2] == b"\x1f\x8b":
+                with gzip.GzipFile(fileobj=file) as plain:
+                    _unpack_tar(plain, sink)
+            elif head[257:262] == b"ustar":
+                _unpack_tar(file, sink)
+            else:
+                raise _rejected("This is no zip, tar or tar.gz archive.", mend=_MEND_PACK)
+    except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise _rejected(f"The archive is broken: {error}.", where=sink.current) from None
+    except (NotImplementedError, ValueError, OverflowError) as error:
+        raise _rejected(
+            f"The archive is damaged or of an unknown kind: {error}.", where=sink.current
+        ) from None
+    except MemoryError:
+        raise _rejected(
+            "The archive's table of contents is unreasonably large.", where=sink.current
+        ) from None
+    if sink.files == 0:
+        raise _rejected("The archive holds no files.", mend="Pack the images and transforms.json.")
+    return {"files": sink.files, "bytes": sink.bytes}
+
+
+class _Sink:
+    """Writes entries under the folder and keeps the counts."""
+
+    def __init__(self, request: UnpackRequest) -> None:
+        self.request = request
+        self.files = self.bytes = 0
+        self.current = ""
+        self._names = NameSet()
+        self._entries = 0
+        ratio_bytes = int(request.archive.stat().st_size * request.ratio_max)
+        self.budget = min(request.bytes_max, max(ratio_bytes, RATIO_FREE_BYTES))
+        self._by_ratio = self.budget < request.bytes_max
+
+    def entry(self, name: str) -> str | None:
+        """The safe path of an entry about to be read; None for what desktops add by themselves."""
+        self.current = name.encode("unicode_escape").decode()[:300]
+        self._entries += 1
+        # Folders count too: they cost inodes just as files do.
+        if self._entries > 2 * self.request.files_max + 64:
+            raise self._too_many()
+        path = checked_path(name)
+        return None if is_litter(path) else path
+
+    def write(self, path: str, content: IO[bytes]) -> None:
+        self._names.add(path)
+        self.files += 1
+        if self.files > self.request.files_max:
+            raise self._too_many()
+        target = self.request.into / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+        written = 0
+        with os.fdopen(os.open(target, flags, 0o600), "wb") as out:
+            while chunk := content.read(_CHUNK):
+                written += len(chunk)
+                self._count(len(chunk), written)
+                out.write(chunk)
+
+    def _count(self, more: int, in_file: int) -> None:
+        self.bytes += more
+        if in_file > self.request.file_bytes_max:
+            raise InputError(
+                "archive_too_large",
+                f"The file unpacks to more than {self.request.file_bytes_max} bytes.",
+                where=self.current,
+                mend="Send smaller files.",
+            )
+        if self.bytes > self.budget:
+            raise self.over_budget()
+
+    def over_budget(self) -> InputError:
+        """More came out than may."""
+        what = f"The archive unpacks to more than {self.budget} bytes."
+        if self._by_ratio:
+            what = f"The archive unpacks to more than {self.request.ratio_max:g} times its size."
+        return InputError("archive_too_large", what, where=self.current, mend="Send fewer or smaller images.")
+
+    def _too_many(self) -> InputError:
+        return InputError(
+            "too_many_files",
+            f"The archive holds more than {self.request.files_max} files.",
+            where=self.current,
+            mend="Send fewer images; leave out what is neither an image nor a pose file.",
+        )
+
+
+def _unpack_zip(file: IO[bytes], sink: _Sink) -> None:
+    with zipfile.ZipFile(file) as archive:
+        for info in archive.infolist():
+            # zipfile cuts names at NUL and turns separators; the original tells what was meant.
+            path = sink.entry(info.orig_filename.removesuffix("/") if info.is_dir() else info.orig_filename)
+            mode = info.external_attr >> 16
+            if info.flag_bits & _ENCRYPTED:
+                raise _rejected(
+                    "The entry is encrypted.", where=sink.current, mend="Pack without a password."
+                )
+            if stat.S_IFMT(mode) not in {0, stat.S_IFREG, stat.S_IFDIR}:
+                raise _rejected("The entry is a link or a device.", where=sink.current, mend=_MEND_PACK)
+            if info.is_dir() or path is None:
+                continue
+            if info.compress_type not in _METHODS:
+                raise _rejected(
+                    f"The entry is packed by method {info.compress_type}.",
+                    where=sink.current,
+                    mend="Use deflate.",
+                )
+            with archive.open(info) as content:
+                sink.write(path, content)
+
+
+def _unpack_tar(plain: IO[bytes] | gzip.GzipFile, sink: _Sink) -> None:
+    counted = _CountedReader(plain, sink)
+    with tarfile.open(fileobj=counted, mode="r|", bufsize=_TAR_BLOCK * 128) as archive:  # type: ignore[call-overload]
+        for member in _members(archive):
+            path = sink.entry(member.name)
+            if member.isdir():
+                continue
+            if not member.isreg() or member.issparse():
+                raise _rejected(
+                    "The entry is a link, a device or sparse.", where=sink.current, mend=_MEND_PACK
+                )
+            if member.size < 0:
+                raise _rejected("The entry has a size below nothing.", where=sink.current)
+            content = archive.extractfile(member)
+            if content is None:
+                raise _rejected("The entry has no content.", where=sink.current)
+            if path is not None:
+                sink.write(path, content)
+    # tarfile takes any end of the file for the end of the archive; a whole archive ends in zero blocks.
+    while counted.read(_CHUNK):
+        pass
+    if counted.tail.strip(b"\0") or len(counted.tail) < _TAR_BLOCK:
+        raise _rejected("The archive is cut short: its end mark is missing.", where=sink.current)
+
+
+def _members(archive: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
+    while (member := archive.next()) is not None:
+        # A streamed archive keeps all members otherwise: memory that grows with the archive.
+        archive.members = []  # type: ignore[attr-defined]
+        # `.` itself is what `tar czf x.tgz .` begins with.
+        if member.isdir() and member.name in {".", "./"}:
+            continue
+        yield member
+
+
+class _CountedReader:
+    """Bytes of a tar as they come out of the decompressor, headers and padding included, with a cap."""
+
+    def __init__(self, plain: IO[bytes] | gzip.GzipFile, sink: _Sink) -> None:
+        self._plain, self._sink = plain, sink
+        self._left = sink.budget + 4096 * (sink.request.files_max + 64)
+        self.tail = b""
+
+    def read(self, size: int) -> bytes:
+        data = self._plain.read(size)
+        self._left -= len(data)
+        if self._left < 0:
+            raise self._sink.over_budget()
+        self.tail = (self.tail + data)[-_TAR_BLOCK:]
+        return data
+
+
+def _rejected(
+    what: str, *, where: str = "", mend: str = "Pack the archive anew and send it again."
+) -> InputError:
+    return InputError("archive_rejected", what, where=where, mend=mend)
+
+
+if __name__ == "__main__":
+    run_child(lambda request: unpack(UnpackRequest.model_validate(request)))

@@ -1,0 +1,250 @@
+"""Request bodies on their way to disk: counted as they come, never gathered in memory."""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import re
+import shutil
+import time
+import uuid
+from collections.abc import AsyncIterator, Callable, Collection
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import IO
+
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+
+from biresnerf.wire.problems import FieldProblem
+from service.http.problems import ProblemError
+from workers.process.disk_space import Room
+
+_FIELD_BYTES_MAX = 256 * 1024
+_HEADER_BYTES_MAX = 8 * 1024
+_LOCK = ".in-use"
+# A client that sends nothing for so long holds a connection and a folder for nothing.
+IDLE_S = 60.0
+_LOOK_BYTES = 16 * 2**20  # between two looks at the disk
+
+
+def too_large(limit_bytes: int) -> ProblemError:
+    """The answer to a body beyond the limit."""
+    return ProblemError(
+        "body_too_large",
+        f"The body is larger than {limit_bytes} bytes.",
+        mend="Send fewer or smaller images, or single files; GET /v1/info tells the limits.",
+    )
+
+
+def refuse_announced_excess(content_length: str | None, limit_bytes: int, room: Room | None = None) -> None:
+    """Refuses by Content-Length before a byte is read; the count while reading holds in any case."""
+    if content_length is not None and content_length.isdigit():
+        if int(content_length) > limit_bytes:
+            raise too_large(limit_bytes)
+        if room is not None:
+            room.require(int(content_length))
+
+
+async def capped(
+    stream: AsyncIterator[bytes], limit_bytes: int, idle_s: float = IDLE_S, room: Room | None = None
+) -> AsyncIterator[bytes]:
+    """The stream.
+
+    Raises:
+        ProblemError: ``body_too_large`` at the first byte beyond the limit; ``body_timeout`` where nothing
+            comes for ``idle_s``.
+        LimitReached: ``storage_full`` where ``room`` says so, at the start or on the way.
+    """
+    total, looked_at = 0, -_LOOK_BYTES
+    while True:
+        try:
+            async with asyncio.timeout(idle_s):
+                chunk = await anext(stream)
+        except StopAsyncIteration:
+            return
+        except TimeoutError:
+            raise ProblemError("body_timeout", f"No byte of the body came for {idle_s:g} s.") from None
+        total += len(chunk)
+        if total > limit_bytes:
+            raise too_large(limit_bytes)
+        if room is not None and total - looked_at >= _LOOK_BYTES:
+            await asyncio.to_thread(room.require)
+            looked_at = total
+        yield chunk
+
+
+async def write_stream(
+    stream: AsyncIterator[bytes], target: Path, limit_bytes: int, room: Room | None = None
+) -> int:
+    """Writes the stream into a new file; returns its bytes. Raises as `capped` does."""
+    total = 0
+    with target.open("xb") as out:
+        async for chunk in capped(stream, limit_bytes, room=room):
+            total += len(chunk)
+            await asyncio.to_thread(out.write, chunk)
+    return total
+
+
+@asynccontextmanager
+async def staging_folder(root: Path) -> AsyncIterator[Path]:
+    """A private folder that goes away in any case: at the end of the block, or at the next start."""
+    folder = root / uuid.uuid4().hex
+    folder.mkdir(parents=True, mode=0o700)
+    with (folder / _LOCK).open("wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        try:
+            yield folder
+        finally:
+            await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)
+
+
+def sweep_staging(root: Path) -> int:
+    """Removes staging folders whose process is gone (its lock with it); returns how many."""
+    removed = 0
+    for folder in root.iterdir() if root.is_dir() else ():
+        try:
+            with (folder / _LOCK).open("rb") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            continue
+        except OSError:
+            # No lock file: made a moment ago by a living process, or a torn removal; age tells.
+            if _younger_than(folder, 3600):
+                continue
+        shutil.rmtree(folder, ignore_errors=True)
+        removed += 1
+    return removed
+
+
+def _younger_than(path: Path, seconds: float) -> bool:
+    try:
+        return time.time() - path.stat().st_mtime < seconds
+    except OSError:
+        return True
+
+
+class Form:
+    """A multipart form read from a stream: one file part to disk, small text fields to memory."""
+
+    def __init__(
+        self,
+        file_field: str,
+        text_fields: Collection[str],
+        target: Path,
+        limit_bytes: int,
+        room: Room | None = None,
+    ) -> None:
+        self.texts: dict[str, str] = {}
+        self.has_file = False
+        self._file_field, self._text_fields = file_field, text_fields
+        self._target, self._limit, self._room = target, limit_bytes, room
+        self._out: IO[bytes] | None = None
+        self._pending: list[bytes] = []
+        self._header_name = self._header_value = b""
+        self._headers: dict[bytes, bytes] = {}
+        self._field = ""
+        self._text = bytearray()
+        self._complete = False
+
+    async def read(self, content_type: str, stream: AsyncIterator[bytes]) -> None:
+        """Reads the whole body.
+
+        Raises:
+            ProblemError: ``malformed_body``, ``invalid_request`` (unknown or repeated field),
+                ``body_too_large``.
+            LimitReached: ``storage_full``.
+        """
+        _, parameters = parse_options_header(content_type)
+        boundary = parameters.get(b"boundary")
+        if not boundary:
+            raise ProblemError("malformed_body", "The Content-Type has no boundary.", where="Content-Type")
+        try:
+            parser = MultipartParser(boundary, self._callbacks())  # type: ignore[arg-type]
+            async for chunk in capped(stream, self._limit, room=self._room):
+                parser.write(chunk)
+                await self._flush()
+            parser.finalize()
+        except FormParserError as error:
+            raise ProblemError("malformed_body", f"The form is malformed: {error}.") from None
+        finally:
+            if self._out is not None:
+                self._out.close()
+        if not self._complete:
+            raise ProblemError("malformed_body", "The form is cut short: its end mark is missing.")
+
+    async def _flush(self) -> None:
+        """Moves what the parser gave for the file to disk, outside of the event loop."""
+        if self._pending and self._out is not None:
+            block, self._pending = b"".join(self._pending), []
+            await asyncio.to_thread(self._out.write, block)
+
+    def _callbacks(self) -> dict[str, Callable[..., None]]:
+        return {
+            "on_part_begin": self._on_part_begin,
+            "on_header_field": self._on_header_field,
+            "on_header_value": self._on_header_value,
+            "on_header_end": self._on_header_end,
+            "on_headers_finished": self._on_headers_finished,
+            "on_part_data": self._on_part_data,
+            "on_part_end": self._on_part_end,
+            "on_end": self._on_end,
+        }
+
+    def _on_part_begin(self) -> None:
+        self._headers, self._field, self._text = {}, "", bytearray()
+        self._header_name = self._header_value = b""
+
+    def _on_header_field(self, data: bytes, start: int, end: int) -> None:
+        self._header_name += data[start:end]
+        self._guard_header(self._header_name)
+
+    def _on_header_value(self, data: bytes, start: int, end: int) -> None:
+        self._header_value += data[start:end]
+        self._guard_header(self._header_value)
+
+    def _guard_header(self, value: bytes) -> None:
+        if len(value) > _HEADER_BYTES_MAX or len(self._headers) > 16:
+            raise ProblemError("malformed_body", "The header of a form field is too large.")
+
+    def _on_header_end(self) -> None:
+        self._headers[self._header_name.lower()] = self._header_value
+        self._header_name = self._header_value = b""
+
+    def _on_headers_finished(self) -> None:
+        _, parameters = parse_options_header(self._headers.get(b"content-disposition", b""))
+        self._field = parameters.get(b"name", b"").decode(errors="replace")
+        if self._field in self.texts or (self._field == self._file_field and self.has_file):
+            raise _bad_field(self._field, "The field is there twice.")
+        if self._field == self._file_field:
+            self.has_file = True
+            self._out = self._target.open("xb")
+        elif self._field not in self._text_fields:
+            known = ", ".join([self._file_field, *sorted(self._text_fields)])
+            raise _bad_field(self._field, f"The field is unknown; there are {known}.")
+
+    def _on_part_data(self, data: bytes, start: int, end: int) -> None:
+        if self._field == self._file_field:
+            self._pending.append(bytes(data[start:end]))
+            return
+        self._text += data[start:end]
+        if len(self._text) > _FIELD_BYTES_MAX:
+            raise _bad_field(self._field, f"The field is longer than {_FIELD_BYTES_MAX} bytes.")
+
+    def _on_part_end(self) -> None:
+        if self._field == self._file_field:
+            return
+        try:
+            self.texts[self._field] = self._text.decode()
+        except UnicodeDecodeError:
+            raise _bad_field(self._field, "The field is not UTF-8 text.") from None
+
+    def _on_end(self) -> None:
+        self._complete = True
+
+
+def _bad_field(field: str, detail: str) -> ProblemError:
+    shown = re.sub(r"[^\w.-]", "?", field)[:100]
+    return ProblemError(
+        "invalid_request", f"{shown}: {detail}", errors=[FieldProblem(pointer=f"#/{shown}", detail=detail)]
+    )

@@ -1,0 +1,186 @@
+"""What grows out of a job: its log and rows for each image, forks of its work, exports of its result."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Header, Query, Request
+from fastapi.responses import Response
+
+from biresnerf.wire.jobs import ForkJob, JobList, JobView, LogLine, NewExport, job_url
+from biresnerf.wire.problems import FieldProblem
+from biresnerf.wire.results import IMAGE_COLUMNS, ImageList
+from service.answers.job_answers import POLL_S, checked_key, job_answer
+from service.answers.report_rows import image_rows
+from service.http.access import Caller, CallerHere, JobWriterHere
+from service.http.dependencies import JobId
+from service.http.problems import ProblemError, declared
+from service.intake.json_body import json_content, read_json
+from service.routes.artifacts import find_report, whole_file
+from workers.jobs.derived_jobs import DerivedJobs
+
+router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
+_ALWAYS = ("not_found", "expired", "invalid_request", "database_unavailable", "internal_error")
+_BODY = ("malformed_json", "body_too_large", "unsupported_media", "body_timeout")
+LINES = "application/x-ndjson"
+_LOG: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "Lines, the oldest first. `Link: rel=next` leads to what comes after them, if more can come.",
+        "content": {
+            LINES: {"schema": {"type": "string"}, "example": '{"n": 1, "attempt": 1, "text": "6 images"}\n'},
+            "text/plain": {"schema": {"type": "string"}, "example": "6 images\n"},
+        },
+    }
+}
+
+
+@router.get(
+    "/logs", operation_id="getJobLog", response_class=Response, responses={**_LOG, **declared(*_ALWAYS)}
+)
+async def get_job_log(
+    job_id: JobId,
+    caller: CallerHere,
+    after: Annotated[int, Query(ge=0, le=2**31, description="Lines after this one.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=10_000)] = 1000,
+    form: Annotated[
+        Literal["text", "ndjson"] | None, Query(alias="format", description="Default: as `Accept` says.")
+    ] = None,
+    accept: Annotated[str, Header()] = "",
+) -> Response:
+    """What the job's process has written so far, while it runs too."""
+    # The state first: what is written between the two looks is not missed.
+    job = await caller.jobs.get(job_id)
+    lines = await caller.jobs.log(job_id, after=after, limit=limit)
+    headers = {"Cache-Control": "no-cache"}
+    if not job.final or len(lines) == limit:
+        last = lines[-1].n if lines else after
+        chosen = f"&format={form}" if form else ""
+        headers["Link"] = f'<{job_url(job_id)}/logs?after={last}&limit={limit}{chosen}>; rel="next"'
+    if not job.final:
+        headers["Retry-After"] = POLL_S
+    if (form or ("ndjson" if LINES in accept else "text")) == "text":
+        return Response("".join(f"{line.text}\n" for line in lines), media_type="text/plain", headers=headers)
+    return Response("".join(map(_json_line, lines)), media_type=LINES, headers=headers)
+
+
+def _json_line(line: LogLine) -> str:
+    return line.model_dump_json() + "\n"
+
+
+@router.get(
+    "/images",
+    operation_id="listImages",
+    responses=declared("result_not_ready", "storage_unavailable", *_ALWAYS),
+    tags=["results"],
+)
+async def list_images(
+    job_id: JobId,
+    caller: CallerHere,
+    sort: Annotated[
+        str,
+        Query(
+            max_length=60,
+            description="A column, with `-` before it for the largest first.",
+            examples=["-moved_deg"],
+        ),
+    ] = "",
+    limit: Annotated[int, Query(ge=1, le=100_000)] = 100_000,
+) -> ImageList:
+    """What the report says of each image, in the set's order or sorted; what a column does not know comes last."""
+    column = sort.removeprefix("-")
+    if column and column not in IMAGE_COLUMNS:
+        detail = f"There is no column {column!r}; there are {', '.join(sorted(IMAGE_COLUMNS))}."
+        raise ProblemError(
+            "invalid_request", detail, errors=[FieldProblem(pointer="/query/sort", detail=detail)]
+        )
+    report = json.loads(await whole_file(caller, await find_report(caller, job_id)))
+    return image_rows(report, column, descending=sort.startswith("-"), limit=limit)
+
+
+@router.post(
+    "/fork",
+    status_code=202,
+    operation_id="forkJob",
+    response_model=JobView,
+    openapi_extra={"requestBody": {"content": {"application/json": json_content(ForkJob)}}},
+    responses=declared(
+        *(
+            "fork_not_possible",
+            "dataset_not_ready",
+            "invalid_options",
+            "queue_full",
+            "quota_exhausted",
+            "bad_idempotency_key",
+        ),
+        *("idempotency_key_reused", "storage_unavailable", "storage_full", *_BODY, *_ALWAYS),
+    ),
+)
+async def fork_job(
+    job_id: JobId,
+    request: Request,
+    caller: JobWriterHere,
+    idempotency_key: Annotated[
+        str | None, Header(description="The same key with the same request answers with the same job.")
+    ] = None,
+) -> Response:
+    """Queues a job on the same dataset with other options, that takes over the work of a stage of this one."""
+    key = checked_key(idempotency_key)
+    body = await read_json(
+        request.headers.get("content-type", ""),
+        request.headers.get("content-length"),
+        request.stream(),
+        ForkJob,
+    )
+    changes = body.options.model_dump(mode="json", exclude_unset=True)
+    job, new = await _derived(caller).fork(
+        job_id, changes, body.from_stage, labels=body.labels, idempotency_key=key
+    )
+    return job_answer(job, status=202, new=new)
+
+
+@router.post(
+    "/exports",
+    status_code=202,
+    operation_id="exportJob",
+    response_model=JobView,
+    tags=["results"],
+    openapi_extra={"requestBody": {"content": {"application/json": json_content(NewExport)}}},
+    responses={
+        200: {"model": JobView, "description": "It was asked for before, and is there."},
+        **declared(
+            "result_not_ready",
+            "state_conflict",
+            "queue_full",
+            "quota_exhausted",
+            "storage_full",
+            *_BODY,
+            *_ALWAYS,
+        ),
+    },
+)
+async def export_job(job_id: JobId, request: Request, caller: JobWriterHere) -> Response:
+    """Writes the result in further forms; its files then stand among those of the job.
+
+    The answer is a job of its own, to be followed and cancelled as any other. The same request finds the same
+    export.
+    """
+    body = await read_json(
+        request.headers.get("content-type", ""),
+        request.headers.get("content-length"),
+        request.stream(),
+        NewExport,
+    )
+    job, new = await _derived(caller).export(job_id, body.formats)
+    return job_answer(job, status=200 if job.final else 202, new=new)
+
+
+@router.get("/exports", operation_id="listExports", tags=["results"], responses=declared(*_ALWAYS))
+async def list_exports(job_id: JobId, caller: CallerHere) -> JobList:
+    """All exports of the job, the oldest first."""
+    page = await _derived(caller).exports(job_id)
+    return JobList(items=[JobView.of(job) for job in page.items])
+
+
+def _derived(caller: Caller) -> DerivedJobs:
+    return DerivedJobs(caller.jobs, caller.service.stores.files)

@@ -1,0 +1,98 @@
+"""One multipart request that is a whole job: archive in, dataset checked, job queued."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from pathlib import Path
+
+from fastapi import Request
+
+from biresnerf.wire.jobs import Job, JobTexts
+from biresnerf.wire.problems import FieldProblem
+from service.http.access import Caller
+from service.http.problems import ProblemError
+from service.intake.archive_import import file_sha256, take_archive
+from service.intake.dataset_finalize import begin_check, finish_check
+from service.intake.json_body import fit, load_json
+from service.intake.uploads import Form, refuse_announced_excess, staging_folder
+from workers.settings.errors import EngineError
+from workers.webhooks.webhook_records import request_with
+
+# Room for the text fields and the form's own lines beside the archive.
+_FORM_BYTES = 2**20
+TEXTS = frozenset(JobTexts.model_fields)
+# A word as it stands; the other texts are JSON.
+PLAIN = "priority"
+
+
+async def submit_form(caller: Caller, request: Request, idempotency_key: str | None) -> tuple[Job, bool]:
+    """Takes the form (`archive`, JSON `options`, `labels`, `webhook`, the word `priority`).
+
+    Returns the job and whether it is new. A repeated request with the same key is known by the archive's digest,
+    before anything is unpacked. Where anything is wrong, the dataset made for it is deleted again. Needs the scope
+    ``datasets:write``.
+    """
+    caller.require("datasets:write")
+    limit = caller.service.settings.max_archive_bytes + _FORM_BYTES
+    refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.room)
+    with caller.sending():
+        return await _taken(caller, request, idempotency_key, limit)
+
+
+async def _taken(
+    caller: Caller, request: Request, idempotency_key: str | None, limit: int
+) -> tuple[Job, bool]:
+    async with staging_folder(caller.service.staging_dir) as folder:
+        archive = folder / "archive"
+        form = Form("archive", TEXTS, archive, limit, caller.service.room)
+        await form.read(request.headers["content-type"], request.stream())
+        if not form.has_file:
+            detail = "The form has no file field `archive`."
+            raise ProblemError(
+                "invalid_request", detail, errors=[FieldProblem(pointer="#/archive", detail=detail)]
+            )
+        texts = _texts(form)
+        digest = await asyncio.to_thread(file_sha256, archive)
+        if idempotency_key is not None:
+            subject = request_with(digest, texts.webhook)
+            known = await caller.jobs.repeated(
+                subject, texts.options, texts.labels, idempotency_key, texts.priority
+            )
+            if known is not None:
+                return known, False
+        into = folder / "content"
+        into.mkdir()
+        return await _make_job(caller, archive, into, texts, digest, idempotency_key)
+
+
+async def _make_job(
+    caller: Caller, archive: Path, into: Path, texts: JobTexts, digest: str, idempotency_key: str | None
+) -> tuple[Job, bool]:
+    datasets = caller.datasets
+    dataset = await datasets.create("one-shot")
+    used = False
+    try:
+        await take_archive(caller.service, dataset.id, archive, into)
+        await begin_check(caller, dataset.id)
+        await finish_check(caller, dataset.id)
+        job, used = await caller.jobs.submit(
+            dataset.id,
+            texts.options,
+            labels=texts.labels,
+            idempotency_key=idempotency_key,
+            request_digest=digest,
+            webhook=texts.webhook,
+            priority=texts.priority,
+        )
+        return job, used
+    finally:
+        if not used:
+            with contextlib.suppress(EngineError):
+                await datasets.delete(dataset.id)
+
+
+def _texts(form: Form) -> JobTexts:
+    said = {name: text.strip() for name, text in form.texts.items() if text.strip()}
+    values = {name: text if name == PLAIN else load_json(text) for name, text in said.items()}
+    return fit(values, JobTexts)

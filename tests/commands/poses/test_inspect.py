@@ -1,0 +1,82 @@
+"""`biresnerf inspect` and `biresnerf bench`, on real files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from biresnerf.commands.machine.bench import bench_command
+from biresnerf.commands.poses.inspect import inspect_command
+from biresnerf.data.seeding.match_poses import can_match
+from biresnerf.errors import InputError
+from tests.data.formats.tables import trajectories
+from tests.data.scenes import write_image
+
+
+def inspected(*arguments: object) -> dict[str, Any]:
+    result = CliRunner().invoke(inspect_command, [*map(str, arguments), "--json"])
+    assert result.exit_code == 0, (result.output, result.exception)
+    return json.loads(result.stdout)
+
+
+def test_a_model_with_masks_and_unregistered_images_is_told_as_it_is(tmp_path: Path) -> None:
+    trajectories.colmap_set(tmp_path, registered=3)
+    write_image(tmp_path / "masks/a.png.png", mode="L")
+    found = inspected(tmp_path, "--preset", "fast", "--set", "max_image_size=16", "--set", "steps=100")
+    assert (found["form"], found["images"], found["with_pose"], found["masks"]) == ("colmap", 4, 3, 1)
+    assert [Path(name).name for name in found["without_pose"]] == ["d.png"]
+    lens = found["cameras"][0]
+    assert (lens["model"], lens["width"], lens["height"], lens["images"]) == ("PINHOLE", 20, 16, 4)
+    plan = found["plan"]
+    assert (plan["preset"], plan["steps"], plan["working_size"]) == ("fast", 100, [16, 13])
+    assert plan["photo_bytes"] == 4 * 3 * 16 * 13
+    text = CliRunner().invoke(inspect_command, [str(tmp_path)]).output
+    assert "3 with a pose, 1 without" in text
+    assert "no pose: " in text
+
+
+@pytest.mark.parametrize(
+    ("start", "said"),
+    [
+        ("auto", "COLMAP finds" if can_match() else "not installed"),
+        ("none", "4 poses are guessed"),
+        ("given", "refused: start=given, and 4 images"),
+    ],
+)
+def test_photos_alone_are_told_where_their_poses_would_come_from(
+    tmp_path: Path, start: str, said: str
+) -> None:
+    trajectories.write_images(tmp_path)
+    found = inspected(tmp_path, "--set", f"start={start}")
+    assert (found["form"], found["with_pose"]) == ("images", 0)
+    assert said in found["plan"]["start"]
+
+
+def test_damage_is_found_where_pixels_are_asked_for(tmp_path: Path) -> None:
+    trajectories.colmap_set(tmp_path)
+    photo = tmp_path / "images/b.png"
+    photo.write_bytes(photo.read_bytes()[:-30])
+    assert inspected(tmp_path)["pixels_checked"] is False
+    result = CliRunner().invoke(inspect_command, [str(tmp_path), "--pixels"])
+    assert isinstance(result.exception, InputError)
+    assert "b.png" in result.exception.where
+
+
+def test_a_fixed_image_that_is_not_there_is_warned_of(tmp_path: Path) -> None:
+    trajectories.colmap_set(tmp_path)
+    assert inspected(tmp_path, "--set", "fixed=a.png,z.png")["warnings"] == ["fixed names no image: z.png"]
+
+
+def test_bench_measures_both_stages() -> None:
+    arguments = ["--steps", "4", "--views", "6", "--size", "24", "--device", "cpu", "--json"]
+    result = CliRunner().invoke(bench_command, arguments)
+    assert result.exit_code == 0, (result.output, result.exception)
+    found = json.loads(result.stdout)
+    assert [stage["stage"] for stage in found["stages"]] == ["coarse", "fine"]
+    for stage in found["stages"]:
+        assert 0 < stage["step_ms"] <= stage["step_ms_90"]
+        assert stage["samples_per_s"] == pytest.approx(1000 * stage["samples"] / stage["step_ms"], rel=0.01)

@@ -1,0 +1,137 @@
+"""What came in one form goes out in it; and transforms.json made anew keeps to nerfstudio's rules."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from biresnerf.data.formats.input_format import POSES_BOUNDS, forms_of_input, write_input_form
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.formats.tables.read_llff import read_llff, read_llff_poses
+from biresnerf.data.formats.transforms.write_transforms import transforms_notes, write_transforms
+from biresnerf.data.formats.write_formats import write_packs
+from biresnerf.data.model.dataset import Camera, Dataset, Frame, SourceFormat
+from biresnerf.data.model.refined_set import refined_set
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.geometry.perturb import perturb_poses
+from tests.data.formats.random_sets import random_camera, random_model, random_poses
+from tests.data.formats.readers import ours, seen_points, through_json_frame
+from tests.data.scenes import write_image
+
+# What nerfstudio 1.1.5 knows (nerfstudio/cameras/cameras.py, CAMERA_MODEL_TO_TYPE).
+NERFSTUDIO_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"}
+LENS = ("fl_x", "fl_y", "cx", "cy", "h", "w")
+
+
+def posed_dataset(*models: str) -> Dataset:
+    """Images of a set that was no transforms file, by a camera of each model in turn."""
+    rng = np.random.default_rng(0)
+    cameras = tuple(random_camera(rng, model) for model in models)
+    poses = random_poses(rng, 6)
+    frames = tuple(
+        Frame(f"{i}.jpg", Path(f"/none/images/{i}.jpg"), i % len(models), pose, "given")
+        for i, pose in enumerate(poses)
+    )
+    return Dataset(Path("/none"), cameras, frames, SourceFormat("images", None, {}, np.eye(4)))
+
+
+def lint_for_nerfstudio(document):
+    """What its parser asserts, and what it takes silently in another way than meant (data/dataparsers)."""
+    assert document["camera_model"] in NERFSTUDIO_MODELS
+    for key in LENS:
+        assert key in document or all(key in frame for frame in document["frames"])
+    shared = {"k1", "k2", "k3", "k4", "p1", "p2"} & set(document)
+    for frame in document["frames"]:
+        assert np.array(frame["transform_matrix"]).shape == (4, 4)
+        assert "camera_model" not in frame  # it looks for one at the top only
+        if shared:  # then it looks for none in frames
+            assert not {"k1", "k2", "k3", "k4", "p1", "p2"} & set(frame)
+    assert len({frame["file_path"] for frame in document["frames"]}) == len(document["frames"])
+
+
+@pytest.mark.parametrize("model", sorted(set(MODEL_PARAMETERS) - {"FULL_OPENCV"}))
+@pytest.mark.parametrize("several", [False, True])
+def test_nerfstudio_sees_points_where_we_do(tmp_path, model, several):
+    dataset = posed_dataset(*[model] * (2 if several else 1))
+    refined = perturb_poses(dataset.world_from_cam, 0.05, 1)
+    write_transforms(dataset, refined, tmp_path / "transforms.json")
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    lint_for_nerfstudio(document)
+    result = refined_set(dataset, refined)
+    for index, frame in enumerate(document["frames"]):
+        points = seen_points(result, index)
+        assert np.abs(through_json_frame(document, frame, points) - ours(result, index, points)).max() < 0.01
+
+
+def test_lenses_of_several_kinds_are_told_of():
+    mixed = posed_dataset("OPENCV", "OPENCV_FISHEYE")
+    [note] = transforms_notes(mixed, mixed.world_from_cam)
+    assert "several kinds" in note
+    plain = posed_dataset("OPENCV", "PINHOLE")
+    assert transforms_notes(plain, plain.world_from_cam) == ()
+
+
+def llff_folder(folder: Path) -> np.ndarray:
+    """Five images with poses_bounds.npy; returns the file's rows."""
+    rng = np.random.default_rng(3)
+    for i in range(5):
+        write_image(folder / f"images/{i}.jpg", i, (64, 48))
+    poses = random_poses(rng, 5)[:, :3]
+    lens = np.tile([[48.0], [64.0], [70.5]], (5, 1, 1))
+    down, right, back, centre = poses[..., 1:2], poses[..., 0:1], -poses[..., 2:3], poses[..., 3:4]
+    rows = np.concatenate([down, right, back, centre, lens], axis=2).reshape(5, 15)
+    rows = np.column_stack([rows, rng.uniform(1, 2, 5), rng.uniform(5, 9, 5)])
+    np.save(folder / "poses_bounds.npy", rows)
+    return rows
+
+
+def test_llff_comes_back_as_its_own_file(tmp_path):
+    rows = llff_folder(tmp_path / "in")
+    dataset = read_llff(tmp_path / "in", tmp_path / "in/poses_bounds.npy")
+    same = refined_set(dataset, dataset.world_from_cam)
+    write_input_form(dataset, same, tmp_path / "same")
+    np.testing.assert_allclose(np.load(tmp_path / "same" / POSES_BOUNDS), rows, atol=1e-12)
+    moved = perturb_poses(dataset.world_from_cam, 0.1, 2)
+    write_input_form(dataset, refined_set(dataset, moved), tmp_path / "moved")
+    np.testing.assert_allclose(read_llff_poses(tmp_path / "moved" / POSES_BOUNDS), moved, atol=1e-12)
+    np.testing.assert_array_equal(np.load(tmp_path / "moved" / POSES_BOUNDS)[:, 14:], rows[:, 14:])
+
+
+@pytest.mark.parametrize("form", ["tum", "kitti", "bundler"])
+def test_trajectories_and_bundles_read_back_from_what_is_written(tmp_path, form):
+    folder = tmp_path / "in"
+    for i in range(5):
+        write_image(folder / f"images/{i}.jpg", i, (64, 48))
+    dataset = posed_dataset("SIMPLE_PINHOLE")
+    camera = Camera("SIMPLE_PINHOLE", 64, 48, (70.5, 32.0, 24.0))
+    frames = tuple(
+        replace(f, name=f"{i}.jpg", path=folder / f"images/{i}.jpg", timestamp_s=1e9 + i / 30)
+        for i, f in enumerate(dataset.frames[:5])
+    )
+    dataset = replace(dataset, root=folder / "images", cameras=(camera,), frames=frames)
+    write_packs(refined_set(dataset, dataset.world_from_cam), tmp_path / "out", ["kitti", "bundler"])
+    for name in {
+        "tum": ["tum.txt"],
+        "kitti": ["kitti.txt"],
+        "bundler": ["bundler/bundle.out", "bundler/list.txt"],
+    }[form]:
+        (folder / Path(name).name).write_bytes((tmp_path / "out" / name).read_bytes())
+    (folder / "camera.json").write_text(json.dumps({"w": 64, "h": 48, "fl_x": 70.5, "cx": 32, "cy": 24}))
+    again = read_dataset(folder)
+    assert again.source.dialect == form
+    assert [Path(name).name for name in again.names] == [f"{i}.jpg" for i in range(5)]
+    np.testing.assert_allclose(again.world_from_cam, dataset.world_from_cam, atol=1e-9)
+    if form == "tum":
+        assert [frame.timestamp_s for frame in again.frames] == [frame.timestamp_s for frame in frames]
+    assert forms_of_input(again) == {"tum": (), "kitti": ("kitti",), "bundler": ("bundler",)}[form]
+
+
+def test_a_text_model_comes_back_as_text():
+    dataset = posed_dataset("PINHOLE")
+    for form, packs in (("text", ("colmap-text",)), ("binary", ())):
+        model = replace(random_model(0, rigs=False), form=form)
+        assert forms_of_input(replace(dataset, source=replace(dataset.source, colmap=model))) == packs

@@ -1,0 +1,323 @@
+"""transforms.json that cannot be used: refused by code, file, field and mend, whatever is wrong with it."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.formats.transforms.read_transforms import read_transforms
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.errors import InputError
+from tests.data.scenes import (
+    HEIGHT,
+    WIDTH,
+    assert_complete,
+    blender_scene,
+    nerfstudio_scene,
+    save,
+    write_image,
+)
+
+
+# Each case: the code, what the place must name, and what is done to a good document.
+def _frame(index, **values):
+    return lambda document: document["frames"][index].update(values)
+
+
+def _matrix(index, row, column, value):
+    def change(document):
+        document["frames"][index]["transform_matrix"][row][column] = value
+
+    return change
+
+
+def _scaled_rotation(document):
+    matrix = np.array(document["frames"][1]["transform_matrix"])
+    matrix[:3, :3] *= 1.5
+    document["frames"][1]["transform_matrix"] = matrix.tolist()
+
+
+def _mirrored(document):
+    matrix = np.array(document["frames"][1]["transform_matrix"])
+    matrix[:3, 0] *= -1
+    document["frames"][1]["transform_matrix"] = matrix.tolist()
+
+
+def _transposed(document):
+    matrix = np.array(document["frames"][3]["transform_matrix"])
+    document["frames"][3]["transform_matrix"] = matrix.T.tolist()
+
+
+def _same_place(document):
+    for row in document["frames"]:
+        for axis in range(3):
+            row["transform_matrix"][axis][3] = 1.0
+
+
+def _angle(value):
+    def change(document):
+        del document["fl_x"], document["fl_y"]
+        document["camera_angle_x"] = value
+
+    return change
+
+
+def _without(*keys):
+    def change(document):
+        for key in keys:
+            del document[key]
+
+    return change
+
+
+BAD = {
+    "nan in a pose": ("pose_not_finite", "frames[2].transform_matrix[0][3]", _matrix(2, 0, 3, math.nan)),
+    "infinite pose": ("pose_not_finite", "frames[1].transform_matrix[2][1]", _matrix(1, 2, 1, math.inf)),
+    "text in a pose": ("pose_shape", "frames[1].transform_matrix", _matrix(1, 2, 1, "0.5")),
+    "true in a pose": ("pose_shape", "frames[1].transform_matrix", _matrix(1, 2, 1, True)),
+    "huge number": ("pose_shape", "frames[1].transform_matrix", _matrix(1, 2, 1, 10**400)),
+    "far away": ("pose_out_of_range", "frames[1].transform_matrix", _matrix(1, 2, 3, 1e12)),
+    "flat matrix": ("pose_shape", "frames[0].transform_matrix", _frame(0, transform_matrix=[1.0] * 16)),
+    "two rows": ("pose_shape", "frames[0].transform_matrix", _frame(0, transform_matrix=[[1, 0, 0, 0]] * 2)),
+    "short rows": ("pose_shape", "frames[0].transform_matrix", _frame(0, transform_matrix=[[1, 0, 0]] * 3)),
+    "last row": ("pose_shape", "frames[0].transform_matrix", _matrix(0, 3, 3, 2.0)),
+    "transposed": ("pose_shape", "frames[3].transform_matrix", _transposed),
+    "sheared": ("pose_not_rotation", "frames[0].transform_matrix", _matrix(0, 0, 0, 3.0)),
+    "zeros": ("pose_not_rotation", "frames[0]", _frame(0, transform_matrix=[[0] * 4] * 3 + [[0, 0, 0, 1]])),
+    "scaled": ("pose_not_rotation", "frames[1].transform_matrix", _scaled_rotation),
+    "mirrored": ("pose_not_rotation", "frames[1].transform_matrix", _mirrored),
+    "one place": ("poses_coincide", "frames", _same_place),
+    "no such mask": ("mask_missing", "frames[2].mask_path", _frame(2, mask_path="masks/2.png")),
+    "number for a mask": ("mask_missing", "frames[2].mask_path", _frame(2, mask_path=7)),
+    "no image name": (
+        "frame_without_image",
+        "frames[1].file_path",
+        lambda d: d["frames"][1].pop("file_path"),
+    ),
+    "empty image name": ("frame_without_image", "frames[1].file_path", _frame(1, file_path="")),
+    "number for a name": ("frame_without_image", "frames[1].file_path", _frame(1, file_path=7)),
+    "missing image": ("image_missing", "frames[1].file_path", _frame(1, file_path="images/none.jpg")),
+    "folder for an image": ("image_missing", "frames[1].file_path", _frame(1, file_path="images")),
+    "nul in a name": ("image_missing", "frames[1].file_path", _frame(1, file_path="images/\0.jpg")),
+    "long name": ("image_missing", "frames[1].file_path", _frame(1, file_path="x" * 5000)),
+    "twice": ("duplicate_image", "frames[3].file_path", _frame(3, file_path="./images/001.jpg")),
+    "two frames": ("too_few_images", "frames", lambda d: d["frames"].__delitem__(slice(2, None))),
+    "no frames": ("too_few_images", "frames", lambda d: d.update(frames=[])),
+    "frames is text": ("pose_file_invalid", "frames", lambda d: d.update(frames="images")),
+    "frame is a list": ("pose_file_invalid", "frames[1]", lambda d: d["frames"].__setitem__(1, [])),
+    "frames missing": ("pose_file_invalid", "frames", _without("frames")),
+    "another fisheye": (
+        "camera_model_unsupported",
+        "camera_model",
+        lambda d: d.update(camera_model="THIN_PRISM_FISHEYE"),
+    ),
+    "own fisheye": ("camera_model_unsupported", "frames[2].camera_model", _frame(2, camera_model="FISHEYE")),
+    "odd model": ("camera_model_unsupported", "camera_model", lambda d: d.update(camera_model=["OPENCV"])),
+    "two lenses": ("camera_model_unsupported", "is_fisheye", lambda d: d.update(is_fisheye=True)),
+    "fisheye perhaps": ("camera_model_unsupported", "is_fisheye", lambda d: d.update(is_fisheye="no")),
+    "panorama": ("camera_model_unsupported", "equirectangular", lambda d: d.update(equirectangular=True)),
+    "tangential fisheye": (
+        "camera_model_unsupported",
+        "p2",
+        lambda d: d.update(camera_model="OPENCV_FISHEYE", p2=0.001),
+    ),
+    "k5 of OPENCV": ("camera_model_unsupported", "k5", lambda d: d.update(k5=0.01)),
+    "fisheye all around": (
+        "intrinsics_invalid",
+        "k1",
+        lambda d: d.update(camera_model="OPENCV_FISHEYE", fl_x=4.0, fl_y=4.0),
+    ),
+    "own k4": ("camera_model_unsupported", "frames[1].k4", _frame(1, k4=0.01)),
+    "negative focal": ("intrinsics_invalid", "fl_x", lambda d: d.update(fl_x=-18.0)),
+    "zero focal": ("intrinsics_invalid", "frames[2].fl_y", _frame(2, fl_y=0)),
+    "focal is text": ("intrinsics_invalid", "fl_x", lambda d: d.update(fl_x="18")),
+    "nan focal": ("pose_not_finite", "fl_x", lambda d: d.update(fl_x=math.nan)),
+    "huge focal": ("intrinsics_invalid", "fl_x", lambda d: d.update(fl_x=10**400)),
+    "centre without focal": ("intrinsics_missing", "frames[0]", _without("fl_x", "fl_y")),
+    "negative angle": ("intrinsics_invalid", "camera_angle_x", _angle(-0.7)),
+    "angle in degrees": ("intrinsics_invalid", "camera_angle_x", _angle(40.0)),
+    "endless focal": ("intrinsics_invalid", "camera_angle_x", _angle(1e-9)),
+    "wild lens": ("intrinsics_invalid", "k1", lambda d: d.update(k1=1000.0)),
+    "wild tangential": ("intrinsics_invalid", "k1", lambda d: d.update(p1=50.0)),
+    "centre outside": ("intrinsics_invalid", "cx", lambda d: d.update(cx=500.0)),
+    "folding lens": ("intrinsics_invalid", "k1", lambda d: d.update(k1=-3.0)),
+    "other shape": ("image_size_mismatch", "w", lambda d: d.update(w=40, h=20)),
+    "turned": ("image_size_mismatch", "w", lambda d: d.update(w=HEIGHT, h=WIDTH)),
+    "size zero": ("intrinsics_invalid", "w", lambda d: d.update(w=0)),
+    "bad applied": ("pose_shape", "applied_transform", lambda d: d.update(applied_transform=[1, 2, 3])),
+    "scaled applied": (
+        "pose_not_rotation",
+        "applied_transform",
+        lambda d: d.update(applied_transform=[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]),
+    ),
+    "applied scale": ("pose_file_invalid", "applied_scale", lambda d: d.update(applied_scale=0)),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files_are_refused_with_file_field_and_mend(tmp_path, case):
+    code, place, change = BAD[case]
+    document = nerfstudio_scene(tmp_path)
+    read_dataset(save(tmp_path, copy.deepcopy(document)))  # good before the change
+    change(document)
+    with pytest.raises(InputError) as caught:
+        read_dataset(save(tmp_path, document))
+    assert_complete(caught.value, code, "transforms.json", place)
+
+
+def test_mixed_sizes_with_shared_intrinsics_are_refused(tmp_path):
+    for document in (nerfstudio_scene(tmp_path), blender_scene(tmp_path)):
+        document.pop("w", None), document.pop("h", None)
+        name = document["frames"][2]["file_path"]
+        suffix = "" if name.endswith(".jpg") else ".png"
+        write_image(tmp_path / (name + suffix), size=(WIDTH + 4, HEIGHT))
+        with pytest.raises(InputError) as caught:
+            read_dataset(save(tmp_path, document))
+        assert_complete(caught.value, "mixed_sizes", "transforms.json", "frames[2]")
+
+
+@pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n", b"GIF89a" + b"\0" * 50])
+def test_files_that_are_no_images_are_refused(tmp_path, content):
+    document = nerfstudio_scene(tmp_path)
+    (tmp_path / "images/001.jpg").write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_dataset(save(tmp_path, document))
+    assert_complete(caught.value, "not_an_image", "images/001.jpg")
+
+
+def test_an_image_that_would_unpack_to_gigabytes_is_refused_from_its_header(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    Image.new("1", (30_000, 20_000)).save(tmp_path / "images/001.png")
+    document["frames"][1]["file_path"] = "images/001.png"
+    with pytest.raises(InputError) as caught:
+        read_dataset(save(tmp_path, document))
+    assert_complete(caught.value, "image_too_large", "images/001.png")
+
+
+@pytest.mark.parametrize(
+    "name", ["../secret.png", "/etc/passwd", "images/../../secret.png", "link.png", "a\\..\\..\\x"]
+)
+def test_names_that_lead_out_of_a_strangers_folder_are_refused_whether_or_not_the_file_is_there(
+    tmp_path, name
+):
+    folder = tmp_path / "set"
+    folder.mkdir()
+    write_image(tmp_path / "secret.png")
+    (folder / "link.png").symlink_to(tmp_path / "secret.png")
+    document = nerfstudio_scene(folder)
+    path = save(folder, document)
+    read_transforms(path, within=folder)
+    document["frames"][1]["file_path"] = name
+    with pytest.raises(InputError) as caught:
+        read_transforms(save(folder, document), within=folder)
+    assert_complete(caught.value, "unsafe_path", "transforms.json", "frames[1].file_path")
+    document["frames"][1] |= {"file_path": "images/001.jpg", "mask_path": name}
+    with pytest.raises(InputError) as caught:
+        read_transforms(save(folder, document), within=folder)
+    assert_complete(caught.value, "unsafe_path", "transforms.json", "frames[1].mask_path")
+
+
+def test_a_file_that_is_no_json_is_refused_by_its_name(tmp_path):
+    (tmp_path / "video.mp4").touch()
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path / "video.mp4")
+    assert_complete(caught.value, "input_unsupported", "video.mp4")
+
+
+def test_a_path_that_does_not_exist_is_refused(tmp_path):
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path / "nothing")
+    assert_complete(caught.value, "input_missing", "nothing")
+
+
+anything = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.sampled_from(
+        [
+            "",
+            "OPENCV",
+            "OPENCV_FISHEYE",
+            "FULL_OPENCV",
+            "images/000.jpg",
+            "..",
+            "\0",
+            "x" * 300,
+            1e308,
+            -1,
+            0,
+            1e-300,
+        ]
+    ),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+KNOWN_KEYS = (
+    *("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "x_fov", "camera_angle_x"),
+    *("camera_angle_y", "camera_model", "applied_transform", "applied_scale", "is_fisheye", "mask_path"),
+    *("k5", "k6", "equirectangular"),
+    *("rolling_shutter", "frames", "file_path", "transform_matrix", "aabb_scale", "ftheta_p0"),
+)
+
+
+def places(value, found):
+    """Every list and object inside a document."""
+    if isinstance(value, dict | list):
+        found.append(value)
+        for item in value.values() if isinstance(value, dict) else value:
+            places(item, found)
+    return found
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    return folder, nerfstudio_scene(folder), blender_scene(folder)
+
+
+@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(st.data())
+def test_any_document_gives_a_dataset_or_a_complete_error(scene, data):
+    folder, *documents = scene
+    document = copy.deepcopy(data.draw(st.sampled_from(documents)))
+    for _ in range(data.draw(st.integers(1, 3))):
+        place = data.draw(st.sampled_from(places(document, [])))
+        key = data.draw(
+            st.sampled_from(KNOWN_KEYS) if isinstance(place, dict) else st.integers(0, max(0, len(place) - 1))
+        )
+        if isinstance(place, dict) or place:
+            place[key] = data.draw(anything)
+    try:
+        dataset = read_dataset(save(folder, document))
+    except InputError as error:
+        assert_complete(error, error.code)
+    else:
+        check_sound(dataset)
+
+
+def check_sound(dataset: Dataset) -> None:
+    """What everything after the reader relies on."""
+    assert len(dataset) >= 3
+    given = [frame.world_from_cam for frame in dataset.frames if frame.world_from_cam is not None]
+    poses = np.reshape(given, (-1, 4, 4))
+    assert np.isfinite(poses).all()
+    turned = poses[:, :3, :3] @ poses[:, :3, :3].swapaxes(1, 2)
+    np.testing.assert_allclose(turned, np.broadcast_to(np.eye(3), turned.shape), atol=1e-12)
+    for camera in dataset.cameras:
+        full = camera.full()
+        assert np.isfinite(full).all()
+        assert full.fx > 0
+        assert full.fy > 0
+        assert camera.width > 0
+        assert camera.height > 0
+    json.dumps(dataset.source.document, allow_nan=False)

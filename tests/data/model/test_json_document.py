@@ -1,0 +1,95 @@
+"""Strict JSON: whatever the bytes are, an object comes out or an error that says what to mend."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from biresnerf.data.model import json_document
+from biresnerf.data.model.json_document import first_non_finite, read_json_object
+from biresnerf.errors import InputError
+from tests.data.scenes import assert_complete
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return tmp_path_factory.mktemp("json") / "transforms.json"
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.dictionaries(st.text(), json_values, max_size=5))
+def test_any_finite_object_reads_back_equal(file, document):
+    file.write_text(json.dumps(document, ensure_ascii=False), "utf-8", errors="replace")
+    expected = json.loads(file.read_text("utf-8"))
+    assert read_json_object(file) == expected
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.binary(max_size=200)
+    | st.text(alphabet='{}[]",:0123456789eE.-+ntfINa\\u ', max_size=60).map(str.encode)
+)
+def test_any_bytes_give_an_object_or_a_complete_error(file, content):
+    file.write_bytes(content)
+    try:
+        assert isinstance(read_json_object(file), dict)
+    except InputError as error:
+        assert_complete(error, error.code, "transforms.json")
+
+
+def test_a_byte_order_mark_is_read_over(file):
+    file.write_bytes(b"\xef\xbb\xbf" + b'{"frames": []}')
+    assert read_json_object(file) == {"frames": []}
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "words"),
+    [
+        ('{"a": 1, "frames": [', "pose_file_invalid", "line 1"),
+        ("", "pose_file_invalid", "line 1"),
+        ('{"a": 1, "a": 2}', "pose_file_invalid", "'a'"),
+        ('{"frames": [{"file_path": "x.png", "k1": 1, "k1": 2}]}', "pose_file_invalid", "'x.png'"),
+        ("[1, 2]", "pose_file_invalid", "list"),
+        ('{"a": NaN}', "pose_not_finite", "NaN"),
+        ('{"a": [0, {"b": -Infinity}]}', "pose_not_finite", "infinite"),
+        ('{"a": 1e999}', "pose_not_finite", "infinite"),
+        ("[" * 100_000, "pose_file_invalid", "deeply"),
+        ('{"a": ' + "9" * 5000 + "}", "pose_file_invalid", "digit"),
+    ],
+)
+def test_broken_json_is_refused_with_the_place(file, text, code, words):
+    file.write_text(text, "utf-8")
+    with pytest.raises(InputError) as caught:
+        read_json_object(file)
+    assert_complete(caught.value, code, "transforms.json")
+    assert words in caught.value.what
+
+
+def test_other_encodings_are_refused(file):
+    file.write_bytes('{"a": "é"}'.encode("latin-1"))
+    with pytest.raises(InputError, match="UTF-8"):
+        read_json_object(file)
+
+
+def test_a_file_beyond_the_limit_is_not_even_read(file, monkeypatch):
+    monkeypatch.setattr(json_document, "MAX_JSON_BYTES", 100)
+    file.write_text('{"a": "' + "x" * 100 + '"}')
+    with pytest.raises(InputError) as caught:
+        read_json_object(file)
+    assert_complete(caught.value, "pose_file_invalid", "transforms.json")
+
+
+def test_the_first_number_that_is_not_finite_is_named_by_its_path():
+    document = {"a": 1, "frames": [{"m": [[0.0, 1.0]]}, {"m": [[0.0, math.nan]]}]}
+    assert first_non_finite(document) == "frames[1].m[0][1]"
+    assert first_non_finite({"a": [1.0, "NaN"]}) is None

@@ -1,0 +1,274 @@
+"""COLMAP guided by given poses, on rendered scenes whose true poses are known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from biresnerf.data.model.dataset import Camera, Dataset, Frame, SourceFormat
+from biresnerf.data.model.image_order import pose_distances
+from biresnerf.data.seeding import cached_mapping as remembered_mapping
+from biresnerf.data.seeding import map_images
+from biresnerf.data.seeding.map_images import MappedModel
+from biresnerf.data.seeding.match_poses import carry_model
+from biresnerf.data.seeding.seed_poses import PoseCandidate, Seeding, seed_poses
+from biresnerf.data.synthetic.scene import synthetic_focal
+from biresnerf.errors import Interrupted, RefinementError
+from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.geometry.pose_error import rotation_angle_deg, turned_deg
+from biresnerf.geometry.similarity import Similarity, align_by_spread
+from tests.data.scenes import plain_features, textured_arc
+
+pytest.importorskip("pycolmap", reason="needs pycolmap (pip install 'biresnerf[colmap]')")
+VIEWS, SIZE = 10, 200
+MISSING, BLANK = (2, 6), 5
+
+
+def with_poses(dataset: Dataset, poses: np.ndarray) -> Dataset:
+    frames = tuple(replace(f, world_from_cam=p) for f, p in zip(dataset.frames, poses, strict=True))
+    return replace(dataset, frames=frames)
+
+
+def errors_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    aligned = align_by_spread(found, truth).apply_to_poses(found)
+    return turned_deg(aligned, truth)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    with plain_features():
+        yield
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory) -> Dataset:
+    folder = tmp_path_factory.mktemp("arc")
+    poses = textured_arc(folder, VIEWS, SIZE)
+    camera = Camera("SIMPLE_PINHOLE", SIZE, SIZE, (synthetic_focal(SIZE), SIZE / 2, SIZE / 2))
+    frames = tuple(
+        Frame(path.name, path, 0, pose, "given")
+        for path, pose in zip(sorted(folder.iterdir()), poses, strict=True)
+    )
+    return Dataset(folder, (camera,), frames, SourceFormat("nerfstudio", None, {}, np.eye(4)))
+
+
+@pytest.fixture(scope="module")
+def noisy(truth) -> Dataset:
+    return with_poses(truth, perturb_poses(truth.world_from_cam, 0.1, seed=2))
+
+
+@pytest.fixture(scope="module")
+def found(noisy) -> Seeding:
+    return seed_poses(noisy)
+
+
+@pytest.fixture(scope="module")
+def completed(noisy) -> Seeding:
+    """What becomes of the noisy set where two poses are missing and a photo is blank."""
+    frames = list(noisy.frames)
+    for i in MISSING:
+        frames[i] = replace(frames[i], world_from_cam=None, pose_source=None)
+    blank = frames[BLANK].path.with_name("blank.jpg")
+    Image.new("RGB", (SIZE, SIZE), (90, 90, 90)).save(blank)
+    frames[BLANK] = replace(frames[BLANK], path=blank, world_from_cam=None, pose_source=None)
+    return seed_poses(replace(noisy, frames=tuple(frames)))
+
+
+def placed(candidate: PoseCandidate) -> np.ndarray:
+    return np.array([source.startswith("matches") for source in candidate.sources])
+
+
+def test_matches_bring_noisy_poses_near_the_truth(found, noisy, truth):
+    given, best = found.candidates[:2]
+    assert set(given.sources) == {"given"}
+    np.testing.assert_array_equal(given.world_from_cam, noisy.world_from_cam)
+    at = placed(best)
+    before = errors_deg(noisy.world_from_cam[at], truth.world_from_cam[at])
+    after = errors_deg(best.world_from_cam[at], truth.world_from_cam[at])
+    assert before.mean() > 5
+    assert np.median(after) < 0.15 * np.median(before)
+
+
+def test_the_result_lies_in_the_frame_of_the_given_poses(found, noisy):
+    best = found.candidates[1]
+    between = align_by_spread(best.world_from_cam, noisy.world_from_cam)
+    assert between.scale == pytest.approx(1, abs=0.1)
+    assert rotation_angle_deg(between.rotation[None])[0] < 15
+
+
+def test_the_same_request_gives_the_same_poses(found, noisy):
+    again = seed_poses(noisy)
+    assert [c.name for c in again.candidates] == [c.name for c in found.candidates]
+    for one, other in zip(found.candidates, again.candidates, strict=True):
+        np.testing.assert_array_equal(one.world_from_cam, other.world_from_cam)
+
+
+def test_missing_poses_are_found_by_matches_in_the_frame_of_the_noisy_ones(completed, noisy, truth):
+    given, best = completed.candidates[:2]
+    for i in MISSING:
+        assert given.sources[i].startswith("matches")
+        assert best.sources[i].startswith("matches")
+    kept = [i for i in range(VIEWS) if i not in (*MISSING, BLANK)]
+    np.testing.assert_array_equal(given.world_from_cam[kept], noisy.world_from_cam[kept])
+    at = [*kept, *MISSING]
+    assert np.median(errors_deg(best.world_from_cam[at], truth.world_from_cam[at])) < 1.0
+
+
+def test_what_matches_cannot_place_is_guessed_and_said(completed, truth):
+    for candidate in completed.candidates:
+        assert candidate.sources[BLANK] == "neighbours"
+    best = completed.candidates[1]
+    assert errors_deg(best.world_from_cam, truth.world_from_cam)[BLANK] < 8  # less than a step of the arc
+    assert any("05.png (neighbours)" in text for text in completed.dataset.warnings)
+
+
+def model(truth: Dataset, *, turned: tuple[int, ...] = ()) -> MappedModel:
+    """The true rig, in a frame of its own, with some cameras turned about."""
+    poses = truth.world_from_cam
+    for i in turned:
+        poses[i, :3, :3] = poses[i, :3, :3] @ np.diag([-1.0, 1, -1])
+    moved = Similarity(0.2, np.diag([1.0, -1, -1]), np.array([3.0, 4, 5])).apply_to_poses(poses)
+    return MappedModel("global", np.arange(VIEWS), moved, {}, 100, 300, 0.5)
+
+
+def test_a_camera_that_strays_alone_is_not_believed(noisy, truth):
+    carried = carry_model(model(truth, turned=(3,)), noisy.world_from_cam, noisy.posed)
+    assert carried is not None
+    assert np.flatnonzero(~carried.placed).tolist() == [3]
+    np.testing.assert_array_equal(carried.world_from_cam[3], noisy.world_from_cam[3])
+
+
+def test_a_model_with_many_strays_is_not_offered(noisy, truth):
+    assert carry_model(model(truth, turned=(1, 4, 8)), noisy.world_from_cam, noisy.posed) is None
+
+
+def test_two_given_poses_tie_a_model_to_their_frame(truth):
+    posed = np.zeros(VIEWS, dtype=bool)
+    posed[[2, 6]] = True
+    carried = carry_model(model(truth), truth.world_from_cam, posed)
+    assert carried is not None
+    np.testing.assert_allclose(carried.world_from_cam, truth.world_from_cam, atol=1e-6)
+    assert carry_model(model(truth), truth.world_from_cam, np.zeros(VIEWS, dtype=bool)) is None
+
+
+def test_pictures_without_texture_give_no_poses(noisy, tmp_path):
+    frames = []
+    for i, frame in enumerate(noisy.frames):
+        path = tmp_path / f"{i}.png"
+        Image.new("RGB", (160, 160), (90, 90, 90)).save(path)
+        frames.append(replace(frame, path=path, name=path.name))
+    (candidate,) = seed_poses(replace(noisy, root=tmp_path, frames=tuple(frames))).candidates
+    assert set(candidate.sources) == {"given"}
+
+
+def test_many_images_are_matched_with_those_that_see_nearly_the_same():
+    turn = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    for pose, angle in zip(poses, turn, strict=True):
+        forward = -np.array([np.cos(angle), 0, np.sin(angle)])
+        down = np.array([0.0, 1, 0])
+        pose[:3, :3] = np.stack([np.cross(down, forward), down, forward], 1)
+        pose[:3, 3] = -4 * forward
+    ring = {tuple(sorted((i, (i + 1) % 8))) for i in range(8)}
+    assert map_images.nearest_pairs(pose_distances(poses), 2) == ring
+
+
+def test_matching_stops_when_asked(noisy):
+    with pytest.raises(Interrupted):
+        seed_poses(noisy, should_stop=lambda: True)
+
+
+def test_the_request_is_plain_json(monkeypatch, noisy, tmp_path):
+    """What crosses to the child process holds no arrays: a set of several cameras is listed camera by camera."""
+    asked = {}
+
+    def keep(request, *_):
+        asked.update(json.loads(json.dumps(request)))
+        return {"models": [], "matches": [], "focals": {}}
+
+    monkeypatch.setattr(map_images, "run_colmap", keep)
+    first, second = (
+        noisy.cameras[0],
+        replace(noisy.cameras[0], params=(150.0, 80.0, 80.0), model="SIMPLE_PINHOLE"),
+    )
+    frames = tuple(replace(f, camera=i % 2) for i, f in enumerate(noisy.frames))
+    assert len(seed_poses(replace(noisy, cameras=(first, second), frames=frames)).candidates) == 1
+    assert [len(camera["names"]) for camera in asked["cameras"]] == [VIEWS // 2, VIEWS // 2]
+    assert asked["cameras"][1]["params"] == [150.0, 80.0, 80.0]
+
+
+def test_names_with_spaces_are_matched_when_pairs_are_listed(monkeypatch, noisy, tmp_path):
+    monkeypatch.setattr(map_images, "GUIDED_ALL_PAIRS_UP_TO", 3)
+    frames = []
+    for i, frame in enumerate(noisy.frames):
+        path = tmp_path / f"my photo {i:02}.png"
+        path.write_bytes(frame.path.read_bytes())
+        frames.append(replace(frame, path=path, name=path.name))
+    _, matched, *_ = seed_poses(replace(noisy, root=tmp_path, frames=tuple(frames))).candidates
+    assert placed(matched).all()
+
+
+def test_long_sequences_are_matched_along_their_names_and_where_photos_look_alike(truth, monkeypatch):
+    monkeypatch.setattr(map_images, "ALL_PAIRS_UP_TO", 3)
+    monkeypatch.setattr(map_images, "BY_NAME", 1)
+    monkeypatch.setattr(map_images, "BY_LIKENESS", 1)
+    frames = [replace(f, world_from_cam=None) for f in truth.frames]
+    frames[9] = replace(frames[9], path=frames[0].path)  # the path comes back to where it began
+    pairs = map_images._pairs(replace(truth, frames=tuple(frames)), [str(i) for i in range(VIEWS)])
+    assert pairs is not None
+    assert {(str(i), str(i + 1)) for i in range(VIEWS - 1)} <= set(pairs)
+    assert ("0", "9") in pairs
+    assert len(pairs) < 2 * VIEWS
+
+
+def test_a_failure_of_colmap_leaves_the_given_poses_and_is_told(noisy, monkeypatch):
+    def fail(*_, **__):
+        raise RefinementError("seeding_crashed", "COLMAP ended with -6: out of luck")
+
+    monkeypatch.setattr(remembered_mapping, "ask_colmap", fail)
+    found = seed_poses(noisy)
+    assert set(found.candidates[0].sources) == {"given"}
+    assert any("out of luck" in text for text in found.dataset.warnings)
+
+
+def with_focal(dataset: Dataset, times: float) -> Dataset:
+    camera = dataset.cameras[0]
+    return replace(dataset, cameras=(replace(camera, params=(times * camera.params[0], *camera.params[1:])),))
+
+
+def focal_warnings(found: Seeding) -> list[str]:
+    return [text for text in found.dataset.warnings if "focal length" in text]
+
+
+def test_only_a_clearly_better_focal_length_is_preferred(noisy):
+    placed = [{"name": f"{i:06}.png", "cam_from_world": np.eye(4)[:3].tolist()} for i in range(VIEWS)]
+    model = {"mapper": "incremental", "images": placed, "cameras": {}}
+    answer = {
+        "models": [{**model, "points": 100, "observations": 400, "reprojection_px": 0.3}],
+        "matches": [],
+        "focals": {"ratios": {"0": 0.93}, "errors_px": [0.32, 0.31]},
+    }
+    assert map_images.read_mapping(noisy, answer).models[0].focal_ratios == {0: 0.93}
+    answer["focals"]["errors_px"] = [0.32, 0.319]  # hardly any better
+    assert map_images.read_mapping(noisy, answer).models[0].focal_ratios == {}
+
+
+def test_a_given_focal_length_that_matches_contradict_is_told(noisy, tmp_path):
+    # The arc is short and its texture smooth: it tells gross errors only.
+    kept = tmp_path / "seeding.json"
+    (warning,) = focal_warnings(seed_poses(with_focal(noisy, 1.5), remember=kept))
+    assert "shorter than given" in warning
+    assert "00.png" in warning
+    assert focal_warnings(seed_poses(noisy)) == []
+    # The same focal lengths, preferred by a model of half the images.
+    remembered = json.loads(kept.read_text())
+    for model in remembered["answer"]["models"]:
+        model["images"] = model["images"][: VIEWS // 2]
+    kept.write_text(json.dumps(remembered))
+    few = seed_poses(with_focal(noisy, 1.5), remember=kept)
+    assert [candidate.name for candidate in few.candidates] == ["given"]
+    assert focal_warnings(few) == []

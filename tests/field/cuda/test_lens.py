@@ -1,0 +1,39 @@
+"""Viewing directions from the CUDA backend's kernel against the geometry's own."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+pytest.importorskip("triton", reason="the CUDA backend's kernels need Triton, which exists for Linux only")
+
+from biresnerf.data.model.dataset import Camera
+from biresnerf.field.cuda.lens import directions_in_cam
+from biresnerf.geometry.camera import camera
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+PINHOLE = Camera("PINHOLE", 320, 240, (300.0, 310.0, 160.0, 118.0))
+OPENCV = Camera("OPENCV", 320, 240, (300.0, 310.0, 160.0, 118.0, -0.12, 0.03, 0.002, -0.003))
+FULL = (252.0, 252.0, 160.0, 120.0, 0.52, -2.69, 0.0006, -0.0002, 1.5, 0.4, -2.5, 1.43)
+FISHEYE = Camera("OPENCV_FISHEYE", 320, 240, (110.0, 108.0, 160.0, 118.0, 0.02, -0.004, 0.001, -0.0002))
+
+
+@pytest.mark.parametrize(
+    "cameras",
+    [
+        (PINHOLE, PINHOLE),
+        (OPENCV, PINHOLE),
+        (OPENCV, Camera("FULL_OPENCV", 320, 240, FULL)),
+        (FISHEYE, OPENCV),
+    ],
+)
+def test_directions_equal_those_of_the_geometry(cameras):
+    intrinsics = camera.Intrinsics.from_cameras(cameras).to(DEVICE)
+    generator = torch.Generator().manual_seed(1)
+    xy = (torch.rand(300, 2, generator=generator) * torch.tensor([320, 240])).to(DEVICE)
+    image = torch.randint(0, 2, (300,), generator=generator).to(DEVICE)
+    expected = camera.directions_in_cam(intrinsics, image, xy)
+    torch.testing.assert_close(directions_in_cam(intrinsics, image, xy), expected, rtol=0, atol=2e-7)
+    assert directions_in_cam(intrinsics, image[:0], xy[:0]).shape == (0, 3)

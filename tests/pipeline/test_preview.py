@@ -1,0 +1,66 @@
+"""What a running job shows: poses so far and one view, beside every checkpoint."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.synthetic.scene import write_synthetic_scene
+from biresnerf.errors import Interrupted
+from biresnerf.options.refine_options import RefineOptions
+from biresnerf.pipeline import refine_poses
+from biresnerf.progress import Progress
+from biresnerf.report import Report
+
+OPTIONS = RefineOptions(
+    preset="fast", device="cpu", start="given", steps=400, max_image_size=32, samples_per_step=4096,
+    pose_resolution_max=24, reconstruction_levels=2, reconstruction_resolution_max=256, table_size_log2=12,
+    orbit_frames=0, checkpoint_every_s=0.5,
+)  # fmt: skip
+
+
+def test_a_running_refinement_shows_poses_and_a_view_and_a_finished_one_cleans_up(tmp_path):
+    scene = write_synthetic_scene(tmp_path / "scene", 8, 32, seed=3)
+    output = tmp_path / "out"
+    told: list[Progress] = []
+    with pytest.raises(Interrupted):
+        refine_poses(scene, output, OPTIONS, told.append, lambda: any(p.preview for p in told))
+    (shown,) = [p.preview for p in told if p.preview]
+    assert set(shown) == {f"preview/{path.name}" for path in (output / "preview").iterdir()}
+    poses = json.loads((output / "preview" / "poses.json").read_text())
+    assert [image["name"] for image in poses["images"]] == list(read_dataset(scene).names)
+    report = Report.model_validate_json((output / "preview" / "report.json").read_text())
+    assert (report.state, report.verdict, len(report.images)) == ("partial", None, 8)
+    assert 0 < report.steps_done < 400
+    so_far = json.loads((output / "preview" / "transforms.json").read_text())
+    assert [frame["file_path"] for frame in so_far["frames"]] == list(read_dataset(scene).names)
+    np.testing.assert_allclose(np.linalg.det([f["transform_matrix"] for f in so_far["frames"]]), 1, atol=1e-5)
+    (render,) = (output / "preview").glob("*_render.png")
+    (photo,) = (output / "preview").glob("*_photo.png")
+    seen, wanted = (np.asarray(Image.open(p).convert("RGB"), float) / 255 for p in (render, photo))
+    assert seen.shape == wanted.shape == (16, 16, 3)
+    assert (
+        np.abs(seen - wanted).mean() < np.abs(wanted.mean((0, 1)) - wanted).mean()
+    )  # closer than one colour
+    refine_poses(scene, output, OPTIONS)
+    assert not (output / "preview").exists()
+
+
+@pytest.mark.parametrize("stage", ["evaluating", "exporting"])
+def test_a_run_stopped_after_its_last_step_leaves_a_partial_result_and_goes_on(tmp_path, stage):
+    scene = write_synthetic_scene(tmp_path / "scene", 6, 24, seed=3)
+    output = tmp_path / "out"
+    options = OPTIONS.model_copy(update={"steps": 20, "verdict": False, "packs": ("pinhole",)})
+    told: list[Progress] = []
+    with pytest.raises(Interrupted):
+        refine_poses(scene, output, options, told.append, lambda: told[-1].stage == stage)
+    partial = Report.model_validate_json((output / "report.json").read_text())
+    assert (partial.state, partial.steps_done) == ("partial", 20)
+    assert (output / "poses.json").is_file()
+    assert not (output / "pinhole").exists(), "no half of a pack"
+    assert refine_poses(scene, output, options).state == "complete"
+    assert (output / "pinhole" / "sparse" / "0" / "images.bin").is_file()

@@ -1,0 +1,54 @@
+"""The curve of a run: one line a check, whole again after a kill."""
+
+from __future__ import annotations
+
+import json
+
+from biresnerf.refine.stages.checkpoint import load_checkpoint
+from biresnerf.refine.stages.history import HISTORY, History, Observer, read_history
+from biresnerf.refine.stages.two_stages import TwoStages
+from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set
+
+
+def test_each_check_leaves_a_line_and_a_continued_run_has_them_once(tmp_path):
+    scene, options = tiny_set(tmp_path / "scene"), tiny_options()
+
+    def run(stop_at: int) -> TwoStages:
+        optimiser = tiny_optimiser(*scene, options)
+        observer = Observer(at_check=lambda now: {"observed": float(now.step_index)})
+        stages = TwoStages(
+            optimiser,
+            tmp_path,
+            "fingerprint",
+            lambda _: None,
+            lambda: optimiser.step_index >= stop_at,
+            observer=observer,
+        )
+        checkpoint = load_checkpoint(tmp_path)
+        if checkpoint is not None:
+            stages.resume(*checkpoint)
+        stages.run()
+        return stages
+
+    run(13)
+    # As a kill leaves it: lines from after the checkpoint, the last one torn off.
+    with (tmp_path / HISTORY).open("a") as file:
+        file.write(json.dumps({"step": 15, "stage": "lost"}) + '\n{"step": 20, "sta')
+    stages = run(10_000)
+    seen = read_history(tmp_path / HISTORY)
+    assert [line["step"] for line in seen] == list(range(5, 41, 5))
+    assert [line["stage"] for line in seen] == ["coarse"] * 4 + ["fine"] * 4
+    assert stages.optimiser.switch == 20
+    assert all(line["observed"] == line["step"] for line in seen)
+    assert all(line["reconstruction_rate"] == 0 for line in seen[:4])
+    assert seen[-1]["reconstruction_rate"] > 0
+    assert seen[-1]["pose_rate"] == 0  # frozen at the end
+    assert all(line["samples"] >= line["rays"] > 0 for line in seen)
+
+
+def test_a_run_from_the_start_drops_what_an_older_one_left(tmp_path):
+    history = History(tmp_path)
+    history.append({"step": 5, "stage": "coarse"})
+    history.cut(0)
+    history.append({"step": 5, "stage": "coarse", "psnr": 20.0})
+    assert read_history(history.path) == [{"step": 5, "stage": "coarse", "psnr": 20.0}]

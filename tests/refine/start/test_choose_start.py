@@ -1,0 +1,116 @@
+"""Choosing the poses to start from: a short training tells good poses from noisy ones, whoever found them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from biresnerf.errors import Interrupted
+from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.options.refine_options import RefineOptions
+from biresnerf.refine.start import choose_start as start_module
+from biresnerf.refine.start import frozen_trials
+from biresnerf.refine.start.choose_start import MATCHED_MOBILITY, Start, choose_start
+from tests.refine.tiny_scene import CPU, tiny_options, tiny_set
+
+VIEWS = 9
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return tiny_set(tmp_path_factory.mktemp("scene"), views=VIEWS, size=24)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(start_module, "TRIAL_STEPS", 60)
+    monkeypatch.setattr(frozen_trials, "SAMPLES", 8192)
+
+
+def candidates(dataset, first: np.ndarray, second: np.ndarray) -> list[Start]:
+    return [
+        Start(first, "given", ("given",) * VIEWS),
+        Start(second, "matches-incremental", ("matches-incremental",) * VIEWS),
+    ]
+
+
+def choose(images, tried: list[Start]) -> Start:
+    return choose_start(tried, images, tiny_options(), CPU, 2, lambda: False)
+
+
+def test_good_matches_win_over_noisy_given_poses(scene):
+    dataset, images = scene
+    noisy = perturb_poses(dataset.world_from_cam, 0.15, seed=1)
+    chosen = choose(images, candidates(dataset, noisy, dataset.world_from_cam))
+    assert chosen.source == "matches-incremental"
+    np.testing.assert_array_equal(chosen.world_from_cam, dataset.world_from_cam)
+    assert chosen.trials[1].psnr > chosen.trials[0].psnr + 1
+    np.testing.assert_array_equal(chosen.mobility, np.repeat(MATCHED_MOBILITY, VIEWS).reshape(2, VIEWS))
+
+
+def test_good_given_poses_win_over_wrong_matches(scene):
+    dataset, images = scene
+    wrong = perturb_poses(dataset.world_from_cam, 0.15, seed=2)
+    chosen = choose(images, candidates(dataset, dataset.world_from_cam, wrong))
+    assert chosen.source == "given"
+    np.testing.assert_array_equal(chosen.mobility, 1.0)
+    assert [trial.source for trial in chosen.trials] == ["given", "matches-incremental"]
+
+
+def test_on_a_tie_the_given_poses_stay_if_matches_agree(scene):
+    dataset, images = scene
+    poses = dataset.world_from_cam
+    assert choose(images, candidates(dataset, poses, poses.copy())).source == "given"
+
+
+def test_on_a_tie_matches_are_believed_if_they_do_not_agree(scene, monkeypatch):
+    dataset, images = scene
+    monkeypatch.setattr(start_module, "MARGIN_DB", 50.0)
+    noisy = perturb_poses(dataset.world_from_cam, 0.15, seed=1)
+    assert choose(images, candidates(dataset, noisy, dataset.world_from_cam)).source == "matches-incremental"
+
+
+def test_stage_1_is_shorter_where_matches_placed_the_cameras_and_its_length_was_left_open(scene):
+    dataset, _ = scene
+    given, matched = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
+    open_options = RefineOptions(preset="fast")
+    resolved = open_options.resolved()
+    assert given.stage_lengths(open_options, resolved) == resolved
+    shorter = matched.stage_lengths(open_options, resolved)
+    assert (shorter.coarse_steps_min, shorter.coarse_steps_max) == (400, 800)
+    fixed = RefineOptions(preset="fast", coarse_steps_min=500, coarse_steps_max=900)
+    assert matched.stage_lengths(fixed, fixed.resolved()) == fixed.resolved()
+
+
+def test_cameras_that_matches_left_out_where_they_placed_most_are_not_sound(scene):
+    dataset, _ = scene
+    matched, guess = "matches-incremental", "neighbours"
+    everyone = [False] * 9
+    for sources, doubted, stray in (
+        ((matched,) * 8 + ("given",), everyone, [*everyone[1:], True]),
+        ((matched,) * 2 + ("given",) * 7, everyone, everyone),
+        (("given",) * 8 + (guess,), [*everyone[1:], True], everyone),
+        ((guess,) * 9, everyone, everyone),
+    ):
+        start = Start(dataset.world_from_cam, sources[0], sources)
+        assert start.doubted.tolist() == doubted
+        assert start.stray.tolist() == stray
+        assert start.sound.tolist() == [not (a or b) for a, b in zip(doubted, stray, strict=True)]
+
+
+def test_a_stop_ends_the_trial(scene):
+    dataset, images = scene
+    tried = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
+    with pytest.raises(Interrupted):
+        choose_start(tried, images, tiny_options(), CPU, 2, lambda: True)
+
+
+def test_a_start_survives_its_checkpoint(scene):
+    dataset, images = scene
+    noisy = perturb_poses(dataset.world_from_cam, 0.15, seed=1)
+    chosen = choose(images, candidates(dataset, noisy, dataset.world_from_cam))
+    back = Start.from_json(json.loads(json.dumps(chosen.as_json())))
+    np.testing.assert_array_equal(back.world_from_cam, chosen.world_from_cam)
+    assert (back.source, back.sources, back.trials) == (chosen.source, chosen.sources, chosen.trials)

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import itertools
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from service.http.problems import ProblemError
+from service.intake.uploads import Form, capped, staging_folder, sweep_staging
+
+
+async def pieces(content: bytes, cuts: list[int]) -> AsyncIterator[bytes]:
+    edges = [0, *sorted(cut % (len(content) + 1) for cut in cuts), len(content)]
+    for start, end in itertools.pairwise(edges):
+        yield content[start:end]
+
+
+def test_a_body_that_stands_still_is_given_up() -> None:
+    async def stalled() -> AsyncIterator[bytes]:
+        yield b"x"
+        await asyncio.sleep(30)
+        yield b"y"
+
+    async def read() -> None:
+        async for _ in capped(stalled(), 100, idle_s=0.05):
+            pass
+
+    with pytest.raises(ProblemError) as caught:
+        asyncio.run(read())
+    assert (caught.value.status, caught.value.code) == (408, "body_timeout")
+
+
+@given(st.binary(max_size=200), st.lists(st.integers(0, 500), max_size=6), st.integers(0, 250))
+def test_a_stream_passes_whole_up_to_the_limit_and_never_beyond(
+    content: bytes, cuts: list[int], limit: int
+) -> None:
+    passed = bytearray()
+
+    async def read() -> None:
+        async for chunk in capped(pieces(content, cuts), limit):
+            passed.extend(chunk)
+
+    if len(content) > limit:
+        with pytest.raises(ProblemError):
+            asyncio.run(read())
+        assert len(passed) <= limit
+    else:
+        asyncio.run(read())
+        assert bytes(passed) == content
+
+
+@settings(deadline=None)
+@given(
+    archive=st.binary(max_size=400),
+    text=st.text(max_size=50),
+    cuts=st.lists(st.integers(0, 2000), max_size=8),
+)
+def test_a_form_is_read_the_same_however_it_is_cut(
+    tmp_path_factory: pytest.TempPathFactory, archive: bytes, text: str, cuts: list[int]
+) -> None:
+    target = tmp_path_factory.mktemp("form") / "archive"
+    head = '--b0und\r\nContent-Disposition: form-data; name="{}"{}\r\n\r\n'
+    body = head.format("options", "").encode() + text.encode() + b"\r\n"
+    body += head.format("archive", '; filename="a.zip"').encode() + archive + b"\r\n--b0und--\r\n"
+    form = Form("archive", {"options"}, target, 10_000)
+    if b"--b0und" in archive + text.encode():
+        return
+    asyncio.run(form.read("multipart/form-data; boundary=b0und", pieces(body, cuts)))
+    assert (form.texts, target.read_bytes()) == ({"options": text}, archive)
+
+
+@pytest.mark.parametrize(
+    ("body", "code"),
+    [
+        (b"", "malformed_body"),
+        (b"no form", "malformed_body"),
+        (
+            b'--b\r\nContent-Disposition: form-data; name="options"\r\n\r\n\xff\r\n--b--\r\n',
+            "invalid_request",
+        ),
+        (b'--b\r\nContent-Disposition: form-data; name="x"\r\n\r\n1\r\n--b--\r\n', "invalid_request"),
+        (b"--b\r\nX: " + b"y" * 20_000 + b"\r\n\r\n1\r\n--b--\r\n", "malformed_body"),
+        (
+            b'--b\r\nContent-Disposition: form-data; name="options"\r\n\r\n' + b"1" * 300_000,
+            "invalid_request",
+        ),
+        (2 * b'--b\r\nContent-Disposition: form-data; name="options"\r\n\r\n1\r\n', "invalid_request"),
+    ],
+)
+def test_a_bad_form_is_a_problem(tmp_path: Path, body: bytes, code: str) -> None:
+    form = Form("archive", {"options"}, tmp_path / "archive", 2**20)
+    with pytest.raises(ProblemError) as caught:
+        asyncio.run(form.read("multipart/form-data; boundary=b", pieces(body, [])))
+    assert caught.value.code == code
+
+
+def test_staging_folders_go_away_with_their_use_and_after_a_crash(tmp_path: Path) -> None:
+    async def use() -> None:
+        async with staging_folder(tmp_path) as folder:
+            (folder / "archive").write_bytes(b"x")
+            assert sweep_staging(tmp_path) == 0  # in use
+
+    asyncio.run(use())
+    assert list(tmp_path.iterdir()) == []
+    crashed = tmp_path / "crashed"
+    crashed.mkdir()
+    (crashed / ".in-use").touch()  # its lock went with its process
+    living = tmp_path / "living"
+    living.mkdir()
+    with (living / ".in-use").open("wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert sweep_staging(tmp_path) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["living"]

@@ -1,0 +1,55 @@
+"""A process whose event loop stands still ends; one that was only frozen goes on."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+from tests.workers.conftest import ROOT
+from workers.process.watchdog import EXIT_STUCK
+
+PROGRAM = """
+import asyncio, sys, time
+from workers.process.watchdog import watched
+
+async def main():
+    async with watched(1.0):
+        print("ready", flush=True)
+        if sys.argv[1] == "hangs":
+            time.sleep(60)
+        await asyncio.sleep(4)
+
+asyncio.run(main())
+"""
+
+
+def start(how: str) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, how],
+        cwd=ROOT,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def test_a_loop_that_stands_still_ends_the_process_and_says_where():
+    process = start("hangs")
+    _, said = process.communicate(timeout=40)
+    assert process.returncode == EXIT_STUCK
+    assert "in main" in said
+
+
+def test_a_process_that_was_frozen_goes_on():
+    process = start("works")
+    os.kill(process.pid, signal.SIGSTOP)
+    time.sleep(2.5)
+    os.kill(process.pid, signal.SIGCONT)
+    process.communicate(timeout=40)
+    assert process.returncode == 0

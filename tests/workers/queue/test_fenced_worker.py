@@ -1,0 +1,155 @@
+"""A worker that is late, that lost an answer, or that slept with all the others."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from procrastinate import JobContext
+from procrastinate.jobs import Job, Status
+from procrastinate.retry import RetryDecision
+from procrastinate.utils import utcnow
+
+from biresnerf.options.refine_options import RefineOptions
+from tests.workers.conftest import ready_dataset
+from workers.database.database import QUEUE, Database, open_database
+from workers.engine import Stores
+from workers.queue.fenced_worker import FencedWorker
+from workers.queue.janitor import Janitor
+from workers.run import claim as claims
+from workers.run.attempt import Attempt
+from workers.run.claim import Fenced, claim_job
+from workers.run.ledger import Ledger
+from workers.settings.errors import Unavailable
+from workers.settings.settings import Settings
+from workers.store.file_places import LocalPlace
+from workers.store.files import FileStore
+
+pytestmark = pytest.mark.anyio
+AGAIN = RetryDecision(retry_at=utcnow())
+
+
+@pytest.fixture
+async def database(database_url: str) -> AsyncIterator[Database]:
+    async with open_database(database_url) as opened:
+        yield opened
+
+
+async def registered(database: Database) -> FencedWorker:
+    worker = FencedWorker(database, queues=[QUEUE])
+    worker.worker_id = await database.app.job_manager.register_worker()
+    return worker
+
+
+async def fetched(database: Database, worker: FencedWorker) -> Job:
+    job = await database.app.job_manager.fetch_job(queues=[QUEUE], worker_id=worker.worker_id)
+    assert job is not None
+    return job
+
+
+async def queued(stores: Stores) -> str:
+    dataset_id = await ready_dataset(stores, {"plan.json": b"{}"})
+    job, _ = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"))
+    return job.id
+
+
+async def receipt(worker: FencedWorker, job: Job, status: Status, decision: RetryDecision | None) -> None:
+    context = JobContext(app=worker.app, job=job, abort_reason=lambda: None, start_timestamp=0.0)
+    await worker._persist_job_status(job, status, decision, context, None)
+
+
+@pytest.mark.parametrize("decision", [None, AGAIN])
+async def test_a_late_receipt_leaves_a_row_that_another_worker_has_alone(
+    stores: Stores, database: Database, decision: RetryDecision | None
+):
+    await queued(stores)
+    frozen, other = await registered(database), await registered(database)
+    job = await fetched(database, frozen)
+    await receipt(frozen, job, Status.FAILED, AGAIN)
+    await fetched(database, other)
+    await receipt(frozen, job, Status.SUCCEEDED, decision)
+    (row,) = await database.fetch("SELECT status, worker_id FROM procrastinate_jobs")
+    assert (row["status"], row["worker_id"]) == ("doing", other.worker_id)
+    await receipt(other, job, Status.SUCCEEDED, None)
+    (row,) = await database.fetch("SELECT status FROM procrastinate_jobs")
+    assert row["status"] == "succeeded"
+
+
+async def test_a_job_whose_cancellation_was_answered_is_not_claimed_again(stores: Stores, database: Database):
+    job_id = await queued(stores)
+    assert await claim_job(database, job_id, max_attempts=3) is not None
+    assert (await stores.jobs.cancel(job_id)).state == "running"
+    assert await claim_job(database, job_id, max_attempts=3) is None
+    job = await stores.jobs.get(job_id)
+    assert (job.state, job.attempt) == ("cancelled", 1)
+
+
+async def test_a_claim_whose_acknowledgement_was_lost_counts_once(
+    stores: Stores, database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    job_id = await queued(stores)
+    claim, lost = claims._claim, []
+
+    async def loses_the_first_answer(*arguments):
+        answer = await claim(*arguments)
+        if not lost:
+            lost.append(answer)
+            raise Unavailable("database_unavailable", "the connection broke after the commit")
+        return answer
+
+    monkeypatch.setattr(claims, "_claim", loses_the_first_answer)
+    assert await claim_job(database, job_id, 3) == lost[0]
+    assert (await stores.jobs.get(job_id)).attempt == 1
+    assert [event.type for event in await stores.jobs.events(job_id)] == ["queued", "started"]
+
+
+async def test_a_machine_that_slept_takes_no_job_from_its_workers(
+    stores: Stores, database: Database, settings: Settings, tmp_path: Path
+):
+    """To who looks at the clock afterwards everybody was silent for long; who goes on being silent is dead."""
+    await queued(stores)
+    await fetched(database, await registered(database))
+    quick = settings.model_copy(update={"stall_s": 0.8, "janitor_s": 0.1})
+    janitor = Janitor(database, FileStore(LocalPlace(tmp_path / "files")), quick, lambda: None, ())
+
+    async def status_after_a_round() -> str:
+        await janitor._round()
+        (row,) = await database.fetch("SELECT status FROM procrastinate_jobs")
+        return str(row["status"])
+
+    assert await status_after_a_round() == "doing"
+    await asyncio.sleep(2.0)  # longer than the stall time, with every janitor and every beat asleep
+    assert await status_after_a_round() == "doing"
+    while await status_after_a_round() == "doing":
+        await asyncio.sleep(0.1)
+
+
+async def test_a_result_that_was_stored_in_vain_is_taken_away_again(
+    stores: Stores, database: Database, settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """By who was frozen while storing it: the job has ended since, and its trash was taken out."""
+    claim = await claim_job(database, await queued(stores), 3)
+    assert claim is not None
+    files, folder = stores.files, tmp_path / "job"
+    attempt = Attempt(database, files, settings, claim, folder, {})
+    stored: list[str] = []
+
+    async def another_worker_takes_the_job(_: Attempt) -> int:
+        (folder / "output").mkdir(parents=True)
+        (folder / "output" / "report.json").write_text("{}")
+        assert await claim_job(database, claim.job_id, 3) is not None
+        return 0
+
+    async def published(ledger: Ledger, artifacts, *rest) -> bool:
+        stored.extend(artifact.key for artifact in artifacts)
+        return await publish(ledger, artifacts, *rest)
+
+    publish = Ledger.publish
+    monkeypatch.setattr(Attempt, "_run_process", another_worker_takes_the_job)
+    monkeypatch.setattr(Ledger, "publish", published)
+    with pytest.raises(Fenced):
+        await attempt.run()
+    assert [key.split("/")[2:] for key in stored] == [["results", claim.name, "report.json"]]
+    assert await files.list(f"jobs/{claim.job_id}") == []

@@ -1,0 +1,296 @@
+"""What happens to a job when something dies. Real processes, real signals, real PostgreSQL."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+
+import psutil
+import pytest
+
+from tests.workers.conftest import Counting, Slots, died, quick_settings
+from workers.engine import Stores
+from workers.settings.settings import Settings
+
+pytestmark = pytest.mark.anyio
+
+
+async def assert_one_result(counting: Counting, steps: int) -> None:
+    """Published once, from one attempt, complete."""
+    events = await counting.events()
+    assert events.count("succeeded") == 1
+    assert (await counting.result())["steps"] == steps
+    artifacts = await counting.stores.jobs.artifacts(counting.id)
+    assert {item.name for item in artifacts} == {"log.txt", "renders/one.png", "report.json"}
+    assert len({item.key.split("/")[3] for item in artifacts}) == 1
+    sequence = [event.seq for event in await counting.stores.jobs.events(counting.id)]
+    assert sequence == list(range(1, len(sequence) + 1))
+
+
+async def test_a_job_runs_reports_and_publishes(counting: Counting, settings: Settings, slots: Slots):
+    slots.start(settings, "a")
+    await counting.submit(12, 0.02)
+    job = await counting.until_final()
+    assert (job.state, job.attempt, job.progress.fraction, job.error) == ("succeeded", 1, 1.0, None)
+    assert job.metrics["loss"] == pytest.approx(1 / 13)
+    assert job.started_at is not None
+    assert job.finished_at is not None
+    events = await counting.events()
+    assert events[:2] == ["queued", "started"]
+    assert events[-1] == "succeeded"
+    assert {"stage", "checkpoint"} <= set(events)
+    assert counting.starts()[0]["database"] is False, "the job must not see the database's address"
+    await assert_one_result(counting, 12)
+
+
+async def test_kill_9_of_the_worker_moves_the_job_to_another_one(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    first = slots.start(settings, "a")
+    await counting.submit(100, 0.05)
+    await counting.until(lambda job: job.progress.step >= 20)
+    child = psutil.Process(int(counting.starts()[0]["pid"]))
+    slots.start(settings, "b")
+    first.kill()
+    await died(child)  # the job's process, with its worker
+    job = await counting.until_final()
+    assert (job.state, job.attempt) == ("succeeded", 2)
+    starts = counting.starts()
+    assert len(starts) == 2
+    assert starts[1]["from"] >= 10, "resumed from the checkpoint"
+    assert "requeued" in await counting.events()
+    await assert_one_result(counting, 100)
+
+
+async def test_a_worker_started_again_under_the_same_name_takes_its_job_back_at_once(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    slow = settings.model_copy(update={"stall_s": 60.0, "beat_s": 10.0})
+    first = slots.start(slow, "a")
+    await counting.submit(40, 0.05)
+    await counting.until(lambda job: job.progress.step >= 10)
+    first.kill()
+    first.wait()
+    slots.start(slow, "a")
+    job = await counting.until_final(timeout_s=20)  # a third of the stall time
+    assert (job.state, job.attempt) == ("succeeded", 2)
+
+
+async def test_kill_9_of_the_job_process_resumes_from_the_checkpoint(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    slots.start(settings, "a")
+    await counting.submit(60, 0.03)
+    await counting.until(lambda job: job.progress.step >= 20)
+    os.kill(int(counting.starts()[0]["pid"]), signal.SIGKILL)
+    job = await counting.until_final()
+    assert (job.state, job.attempt) == ("succeeded", 2)
+    assert counting.starts()[1]["from"] >= 10
+    (crash,) = [e for e in await counting.stores.jobs.events(counting.id) if e.type == "attempt_crashed"]
+    assert crash.data["how"] == "exit status -9"
+    assert "counting from 0" in crash.data["log_tail"]
+    await assert_one_result(counting, 60)
+
+
+async def test_a_job_that_always_dies_fails_after_its_attempts(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    slots.start(settings, "a")
+    await counting.submit(10, 0.01, die_at=3)
+    job = await counting.until_final()
+    assert (job.state, job.attempt) == ("failed", settings.max_attempts)
+    assert job.error is not None
+    assert job.error.code == "too_many_crashes"
+    assert "dying now" in job.error.log_tail
+    assert [item.name for item in await counting.stores.jobs.artifacts(counting.id)] == ["log.txt"]
+    assert len(counting.starts()) == settings.max_attempts
+
+
+async def test_a_job_that_kills_its_worker_each_time_fails_too(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    once = settings.model_copy(update={"max_attempts": 1})
+    first = slots.start(once, "a")
+    await counting.submit(100, 0.05)
+    await counting.until(lambda job: job.state == "running")
+    first.kill()
+    first.wait()
+    slots.start(once, "a")
+    job = await counting.until_final()
+    assert job.error is not None
+    assert (job.state, job.error.code) == ("failed", "too_many_crashes")
+
+
+async def test_a_mistake_of_the_user_is_not_tried_again(counting: Counting, settings: Settings, slots: Slots):
+    slots.start(settings, "a")
+    await counting.submit(10, 0.01, refuse=True)
+    job = await counting.until_final()
+    assert (job.state, job.attempt) == ("failed", 1)
+    assert job.error is not None
+    assert (job.error.code, job.error.where) == ("pose_file_invalid", "transforms.json")
+
+
+async def test_a_checkpoint_that_cannot_be_used_is_dropped_and_the_job_starts_over(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    first = slots.start(settings, "a")
+    await counting.submit(40, 0.03, outdated=True)
+    await counting.until(lambda job: job.progress.step >= 10)
+    first.terminate()
+    await asyncio.to_thread(first.wait, 10)
+    slots.start(settings, "a")
+    job = await counting.until_final()
+    assert job.state == "succeeded"
+    assert [start["from"] for start in counting.starts()][::2] == [0, 0]
+
+
+async def test_a_job_that_takes_too_long_ends_with_a_timeout(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    slots.start(settings.model_copy(update={"job_timeout_s": 1.0}), "a")
+    await counting.submit(1000, 0.05)
+    job = await counting.until_final()
+    assert job.error is not None
+    assert (job.state, job.error.code, job.attempt) == ("failed", "timeout", 1)
+
+
+async def test_sigterm_gives_the_job_back_without_counting_the_attempt(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    first = slots.start(settings, "a")
+    await counting.submit(60, 0.05, checkpoint_every=1000)
+    await counting.until(lambda job: job.progress.step >= 10)
+    first.terminate()
+    assert await asyncio.to_thread(first.wait, 10) == 0
+    job = await counting.stores.jobs.get(counting.id)
+    assert (job.state, job.attempt) == ("queued", 0)
+    slots.start(settings, "b")
+    job = await counting.until_final()
+    assert (job.state, job.attempt) == ("succeeded", 1)
+    assert counting.starts()[1]["from"] >= 10, "the checkpoint written at SIGTERM was kept"
+    await assert_one_result(counting, 60)
+
+
+@pytest.mark.parametrize("within_transaction", [False, True])
+async def test_a_frozen_worker_that_wakes_up_is_fenced_and_one_result_is_published(
+    counting: Counting, settings: Settings, slots: Slots, within_transaction: bool
+):
+    """Within a transaction it holds locks on the job or the janitor's office, which the database must end."""
+    first = slots.start(settings, "a")
+    await counting.submit(80, 0.05)
+    await counting.until(lambda job: job.progress.step >= 10)
+    slots.start(settings, "b")
+    await _freeze(first.pid, counting.stores, within_transaction)
+    await counting.until(lambda job: job.attempt == 2)
+    os.kill(first.pid, signal.SIGCONT)
+    assert await asyncio.to_thread(first.wait, 15) == 75
+    job = await counting.until_final()
+    assert (job.state, job.attempt) == ("succeeded", 2)
+    await assert_one_result(counting, 80)
+    await _trash_is_empty(counting.stores)
+    left = {
+        file.key.split("/")[3] for file in await counting.stores.files.list(f"jobs/{counting.id}/results")
+    }
+    assert len(left) == 1, "what the loser wrote was collected"
+    assert await counting.stores.files.list(f"jobs/{counting.id}/checkpoints") == []
+
+
+async def _freeze(pid: int, stores: Stores, within_transaction: bool) -> None:
+    """Stop the process at any moment, or in the middle of a transaction."""
+    os.kill(pid, signal.SIGSTOP)
+    while within_transaction:
+        await asyncio.sleep(0.02)  # what was on its way to the database arrives
+        held = await stores.jobs._database.fetch(
+            "SELECT 1 FROM pg_stat_activity WHERE state = 'idle in transaction'"
+        )
+        if held:
+            return
+        os.kill(pid, signal.SIGCONT)
+        await asyncio.sleep(0.003)
+        os.kill(pid, signal.SIGSTOP)
+
+
+async def _trash_is_empty(stores: Stores) -> None:
+    for _ in range(100):
+        if not await stores.jobs._database.fetch("SELECT 1 FROM trash"):
+            return
+        await asyncio.sleep(0.1)
+    raise AssertionError("the trash was not taken out")
+
+
+async def test_a_running_job_is_cancelled(counting: Counting, settings: Settings, slots: Slots):
+    slots.start(settings, "a")
+    await counting.submit(1000, 0.05)
+    await counting.until(lambda job: job.progress.step >= 5)
+    asked = await counting.stores.jobs.cancel(counting.id)
+    assert asked.cancel_requested
+    job = await counting.until_final(timeout_s=5)
+    assert job.state == "cancelled"
+    assert (await counting.events())[-2:] in (["cancel_requested", "cancelled"], ["checkpoint", "cancelled"])
+    assert not psutil.pid_exists(int(counting.starts()[0]["pid"]))
+    await counting.submit(3, 0.01)
+    assert (await counting.until_final()).state == "succeeded", "the slot is free again"
+
+
+async def test_a_deaf_job_is_killed_when_cancelled(counting: Counting, settings: Settings, slots: Slots):
+    slots.start(settings.model_copy(update={"stop_grace_s": 0.5}), "a")
+    await counting.submit(1000, 0.05, deaf=True)
+    await counting.until(lambda job: job.progress.step >= 5)
+    await counting.stores.jobs.cancel(counting.id)
+    assert (await counting.until_final(timeout_s=5)).state == "cancelled"
+
+
+async def test_cancelling_at_the_finish_line_leaves_one_consistent_end(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    slots.start(settings, "a")
+    ends = set()
+    for tenth in range(6):
+        await counting.submit(6, 0.02)
+        await counting.until(lambda job: job.progress.step >= 1)
+        await asyncio.sleep(0.03 * tenth)
+        await counting.stores.jobs.cancel(counting.id)
+        job = await counting.until_final()
+        events = await counting.events()
+        ends.add(job.state)
+        assert events[-1] == job.state
+        assert sum(event in ("succeeded", "failed", "cancelled") for event in events) == 1
+        if job.state == "succeeded":
+            await assert_one_result(counting, 6)
+    assert ends <= {"succeeded", "cancelled"}
+
+
+async def test_a_cancelled_job_of_a_dead_worker_ends_cancelled(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    first = slots.start(settings, "a")
+    await counting.submit(1000, 0.05)
+    await counting.until(lambda job: job.progress.step >= 1)
+    first.kill()
+    first.wait()
+    await counting.stores.jobs.cancel(counting.id)
+    slots.start(quick_settings(settings.data_dir, database_url=settings.database_url), "b")
+    assert (await counting.until_final()).state == "cancelled"
+    assert len(counting.starts()) == 1
+
+
+async def test_a_store_that_is_away_at_the_end_costs_no_attempt(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    """As where its disk is unmounted: what was computed is kept until it can be stored."""
+    slots.start(settings, "a")
+    await counting.submit(40, 0.05, checkpoint_every=1000)
+    await counting.until(lambda job: job.progress.step >= 5)
+    away = settings.files_dir.with_name("away")
+    settings.files_dir.rename(away)
+    settings.files_dir.touch()
+    program = psutil.Process(int(counting.starts()[0]["pid"]))
+    await asyncio.to_thread(psutil.wait_procs, [program], 20)
+    await asyncio.sleep(1.0)
+    assert (await counting.stores.jobs.get(counting.id)).state == "running"
+    settings.files_dir.unlink()
+    away.rename(settings.files_dir)
+    job = await counting.until_final()
+    assert (job.state, job.attempt, len(counting.starts())) == ("succeeded", 1, 1)
+    await assert_one_result(counting, 40)

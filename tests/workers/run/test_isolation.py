@@ -1,0 +1,42 @@
+"""What processes of ours do not load, and how little memory an idle slot takes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.workers.conftest import ROOT
+
+HEAVY = ("torch", "numpy", "numba", "pycolmap", "PIL")
+
+
+@pytest.mark.parametrize(
+    "module", ["workers.queue.slot", "workers.engine", "workers.upkeep.supervise", "workers.run.job_process"]
+)
+def test_importing_it_loads_no_heavy_library(module: str):
+    program = f"import sys, {module}; print([name for name in {HEAVY!r} if name in sys.modules])"
+    said = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert said.stdout.strip() == "[]"
+
+
+def test_the_tether_kills_the_program_when_its_parent_dies(tmp_path):
+    program = f"""
+import subprocess, sys, time
+from workers.process.die_with_parent import tethered
+child = subprocess.Popen(tethered(["sleep", "600"], signal_number=9))
+open({str(tmp_path / "pid")!r}, "w").write(str(child.pid))
+time.sleep(0.5)
+"""
+    import psutil
+
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True)
+    pid = int((tmp_path / "pid").read_text())
+    for _ in range(50):
+        if not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE:
+            return
+        psutil.wait_procs([psutil.Process(pid)], timeout=0.1)
+    raise AssertionError("the program outlived its parent")

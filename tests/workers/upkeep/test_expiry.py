@@ -1,0 +1,238 @@
+"""What is over goes after its time, and only that: files deleted, records left for a while, each thing once."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from biresnerf.options.refine_options import RefineOptions
+from tests.workers.conftest import ready_dataset
+from workers.database.database import open_database
+from workers.engine import Stores
+from workers.settings.errors import Conflict, Expired, NotFound
+from workers.settings.settings import Settings
+from workers.store.trash import take_trash_out
+from workers.upkeep.dispatcher import dispatch
+from workers.upkeep.expiry import Expiry
+
+pytestmark = pytest.mark.anyio
+PLAN = {"plan.json": json.dumps({"steps": 1, "step_s": 0, "journal": "/dev/null"}).encode()}
+FINISHED = {"a.txt": b"abc", "b/c.txt": b"de"}
+
+
+def aged(settings: Settings, table: str, row_id: str, days: float) -> None:
+    """Pretend that this happened so many days ago."""
+    columns = {"jobs": ("finished_at", "created_at"), "datasets": ("touched_at", "created_at")}[table]
+    changes = ", ".join(f"{name} = {name} - make_interval(secs => {days * 86400})" for name in columns)
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute(f"UPDATE {table} SET {changes} WHERE id = %s".encode(), (row_id,))
+
+
+async def rounds(settings: Settings, stores: Stores, count: int = 1) -> None:
+    async with open_database(settings.require_database_url(), connections=2) as database:
+        for _ in range(count):
+            await Expiry(database, settings).round()
+            await take_trash_out(database, stores.files)
+
+
+async def finished_job(settings: Settings, stores: Stores, dataset_id: str | None = None, **more: str) -> str:
+    """A job with a result in the store, made without a worker."""
+    dataset_id = dataset_id or await ready_dataset(stores, PLAN)
+    job, _ = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"), **more)
+    artifacts = []
+    for name, content in FINISHED.items():
+        key = f"jobs/{job.id}/results/1-aa/{name}"
+        stored = await stores.files.put(key, _once(content), limit_bytes=100)
+        artifacts.append(
+            {
+                "name": name,
+                "key": key,
+                "size": stored.size,
+                "sha256": stored.sha256,
+                "media_type": "text/plain",
+            }
+        )
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute(
+            "UPDATE jobs SET state = 'succeeded', finished_at = clock_timestamp(), artifacts = %s WHERE id = %s",
+            (json.dumps(artifacts), job.id),
+        )
+        connection.execute("SELECT add_job_event(%s, 'succeeded', '{}')", (job.id,))
+    return job.id
+
+
+async def _once(content: bytes):
+    yield content
+
+
+async def test_a_result_goes_when_its_time_is_over_and_the_log_proves_it(
+    stores: Stores, settings: Settings, caplog: pytest.LogCaptureFixture
+):
+    caplog.set_level("INFO")
+    old, young = [await finished_job(settings, stores) for _ in range(2)]
+    aged(settings, "jobs", old, 7.01)
+    aged(settings, "jobs", young, 6.99)
+    await rounds(settings, stores)
+    job = await stores.jobs.get(old)
+    assert (job.state, job.final) == ("expired", True)
+    assert await stores.files.list(f"jobs/{old}") == []
+    with pytest.raises(Expired):
+        await stores.jobs.artifacts(old)
+    last = (await stores.jobs.events(old))[-1]
+    assert (last.type, last.data) == ("expired", {"files": 2, "bytes": 5})
+    assert f"deleted jobs/{old}: 2 files, 5 bytes; none is left" in caplog.text
+    other = await stores.jobs.get(young)
+    assert other.state == "succeeded"
+    assert other.finished_at is not None
+    assert other.expires_at is not None
+    assert (other.expires_at - other.finished_at).days == 7
+    assert len(await stores.jobs.artifacts(young)) == 2
+    assert young not in caplog.text
+    async for update in stores.jobs.subscribe(old):
+        assert update is not None, "who follows it is told and let go"
+    await stores.jobs.delete(old)
+
+
+async def test_a_result_that_an_export_still_reads_stays_until_it_is_done(stores: Stores, settings: Settings):
+    job_id = await finished_job(settings, stores)
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute(
+            "INSERT INTO jobs (id, dataset_id, kind, parent, options, fingerprint)"
+            " SELECT 'job_export', dataset_id, 'export', id, '{}', 'x' FROM jobs WHERE id = %s",
+            (job_id,),
+        )
+    aged(settings, "jobs", job_id, 8)
+    await rounds(settings, stores)
+    assert len(await stores.jobs.artifacts(job_id)) == 2
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute("UPDATE jobs SET state = 'failed', finished_at = now() WHERE id = 'job_export'")
+    await rounds(settings, stores)
+    assert (await stores.jobs.get(job_id)).state == "expired"
+
+
+async def test_a_dataset_goes_when_nothing_used_it_for_long(stores: Stores, settings: Settings):
+    unused, queued, lately, fresh = [await ready_dataset(stores, PLAN) for _ in range(4)]
+    job, _ = await stores.jobs.submit(queued, RefineOptions(preset="fast"))
+    await finished_job(settings, stores, lately)
+    for dataset_id in (unused, queued, lately):
+        aged(settings, "datasets", dataset_id, 30)
+    await rounds(settings, stores, 2)
+    states = {item.id: item.state for item in (await stores.datasets.list()).items}
+    assert states == {unused: "expired", queued: "ready", lately: "ready", fresh: "ready"}
+    assert await stores.files.list(f"datasets/{unused}") == []
+    with pytest.raises(Expired):
+        await stores.datasets.files(unused)
+    with pytest.raises(Conflict):
+        await stores.jobs.submit(unused, RefineOptions(preset="fast"))
+    assert (await stores.datasets.get(queued)).expires_at is None, "a job uses it"
+    assert (await stores.datasets.get(lately)).expires_at is not None
+    await stores.jobs.cancel(job.id)
+    aged(settings, "jobs", job.id, 30)
+    await rounds(settings, stores)
+    assert (await stores.datasets.get(queued)).state == "expired"
+
+
+async def test_an_upload_that_goes_on_keeps_its_dataset(stores: Stores, settings: Settings):
+    dataset = await stores.datasets.create("slow")
+    aged(settings, "datasets", dataset.id, 30)
+    upload = await stores.uploads.create(dataset.id, "archive", 1000)
+    await rounds(settings, stores)
+    assert (await stores.datasets.get(dataset.id)).state == "open"
+    await stores.uploads.delete(upload.id)
+    await rounds(settings, stores)
+    assert (await stores.datasets.get(dataset.id)).state == "expired"
+
+
+async def test_a_file_added_or_a_job_submitted_meanwhile_keeps_the_dataset(
+    stores: Stores, settings: Settings
+):
+    """The date of the last round is old news: what counts is asked again under the dataset's lock."""
+    used, touched = await ready_dataset(stores, PLAN), (await stores.datasets.create("open")).id
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute("UPDATE datasets SET expires_at = now()")
+    await stores.jobs.submit(used, RefineOptions(preset="fast"))
+    await stores.datasets.add_file(touched, "a.txt", _once(b"a"))
+    async with open_database(settings.require_database_url(), connections=2) as database:
+        expiry = Expiry(database, settings)
+        await expiry._expire_datasets()  # as if the dates had been set before
+    assert (await stores.datasets.get(used)).state == "ready"
+    assert (await stores.datasets.get(touched)).state == "open"
+
+
+async def test_nothing_goes_where_things_are_kept_for_ever(stores: Stores, settings: Settings):
+    job_id = await finished_job(settings, stores)
+    dataset_id = (await stores.jobs.get(job_id)).dataset_id
+    aged(settings, "jobs", job_id, 40)
+    aged(settings, "datasets", dataset_id, 40)
+    kept = {"keep_results_days": 0.0, "keep_datasets_days": 0.0, "keep_records_days": 0.0}
+    await rounds(settings.model_copy(update=kept), stores)
+    job, dataset = await stores.jobs.get(job_id), await stores.datasets.get(dataset_id)
+    assert (job.state, job.expires_at, dataset.state, dataset.expires_at) == (
+        "succeeded",
+        None,
+        "ready",
+        None,
+    )
+    await rounds(settings, stores)
+    assert (await stores.jobs.get(job_id)).state == "expired", "a shorter time holds for what is there"
+
+
+async def test_an_idempotency_key_is_known_for_a_day_after_the_end(stores: Stores, settings: Settings):
+    dataset_id = await ready_dataset(stores, PLAN)
+    first = await finished_job(settings, stores, dataset_id, idempotency_key="k")
+    await rounds(settings, stores)
+    again, new = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"), idempotency_key="k")
+    assert (again.id, new) == (first, False)
+    aged(settings, "jobs", first, 1.01)
+    await rounds(settings, stores)
+    later, new = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"), idempotency_key="k")
+    assert new
+    assert later.id != first
+
+
+async def test_records_of_what_expired_go_in_the_end(stores: Stores, settings: Settings):
+    job_id = await finished_job(settings, stores)
+    dataset_id = (await stores.jobs.get(job_id)).dataset_id
+    aged(settings, "jobs", job_id, 90)
+    aged(settings, "datasets", dataset_id, 90)
+    await rounds(settings, stores)
+    assert (await stores.jobs.get(job_id)).state == "expired"
+    with psycopg.connect(settings.require_database_url()) as connection:
+        for table in ("jobs", "datasets"):
+            connection.execute(f"UPDATE {table} SET expires_at = expires_at - interval '8 days'".encode())
+    await rounds(settings, stores)
+    with pytest.raises(NotFound):
+        await stores.jobs.get(job_id)
+    with pytest.raises(NotFound):
+        await stores.datasets.get(dataset_id)
+
+
+async def test_two_dispatchers_expire_each_thing_once(stores: Stores, settings: Settings, tmp_path: Path):
+    dataset_id = await ready_dataset(stores, PLAN)
+    jobs = [await finished_job(settings, stores, dataset_id) for _ in range(12)]
+    for job_id in jobs:
+        aged(settings, "jobs", job_id, 8)
+    stop, busy = asyncio.Event(), settings.model_copy(update={"expiry_s": 0.05})
+    working = [asyncio.create_task(dispatch(busy, stop)) for _ in range(2)]
+    await until(lambda: all_expired(stores, jobs))
+    stop.set()
+    await asyncio.gather(*working)
+    for job_id in jobs:
+        assert [event.type for event in await stores.jobs.events(job_id)].count("expired") == 1
+
+
+async def all_expired(stores: Stores, jobs: list[str]) -> bool:
+    return all([(await stores.jobs.get(job_id)).state == "expired" for job_id in jobs])
+
+
+async def until(holds: Callable[[], Awaitable[bool]]) -> None:
+    end = time.monotonic() + 20
+    while not await holds():
+        assert time.monotonic() < end, "waited too long"
+        await asyncio.sleep(0.05)

@@ -1,0 +1,81 @@
+"""Brings a database up to date: the queue's schema and our numbered files, in one transaction."""
+
+from __future__ import annotations
+
+import logging
+import time
+from importlib import resources
+from importlib.resources.abc import Traversable
+
+import psycopg
+from procrastinate.schema import SchemaManager
+
+from workers.settings.errors import SetupError
+
+log = logging.getLogger(__name__)
+
+# Any fixed number; two migrations that start together take turns on it.
+MIGRATION_LOCK = 7_201_603
+QUEUE_STEP = "000_procrastinate_3.10"
+
+
+def migrate(database_url: str, *, wait_s: float = 30.0) -> list[str]:
+    """Apply what is missing and return the names of the steps applied (none: it was up to date).
+
+    Safe to call from many processes at once. Raises `SetupError` where the database does not answer within
+    ``wait_s`` or was brought up by a newer version.
+    """
+    with _connect(database_url, wait_s) as connection:
+        connection.execute("SELECT pg_advisory_xact_lock(%s)", (MIGRATION_LOCK,))
+        connection.execute(
+            "CREATE TABLE IF NOT EXISTS schema_steps"
+            " (name text PRIMARY KEY, applied_at timestamptz NOT NULL DEFAULT now())"
+        )
+        done = {row[0] for row in connection.execute("SELECT name FROM schema_steps")}
+        steps = _steps()
+        unknown = sorted(done - {name for name, _ in steps})
+        if unknown:
+            raise SetupError(
+                "database_newer",
+                f"The database knows steps that this version lacks ({', '.join(unknown)}). "
+                "Install the newer version.",
+            )
+        applied = []
+        for name, sql in steps:
+            if name not in done:
+                connection.execute(sql.encode())
+                connection.execute("INSERT INTO schema_steps (name) VALUES (%s)", (name,))
+                applied.append(name)
+                log.info("applied %s", name)
+        return applied
+
+
+def step_names() -> list[str]:
+    """The steps that this version knows, in order."""
+    return [QUEUE_STEP, *(file.name.removesuffix(".sql") for file in _files())]
+
+
+def _steps() -> list[tuple[str, str]]:
+    ours = [(file.name.removesuffix(".sql"), file.read_text()) for file in _files()]
+    return [(QUEUE_STEP, SchemaManager.get_schema()), *ours]
+
+
+def _files() -> list[Traversable]:
+    folder = resources.files("workers.database").joinpath("migrations")
+    return sorted(
+        (file for file in folder.iterdir() if file.name.endswith(".sql")), key=lambda file: file.name
+    )
+
+
+def _connect(database_url: str, wait_s: float) -> psycopg.Connection:
+    end = time.monotonic() + wait_s
+    while True:
+        try:
+            return psycopg.connect(database_url, connect_timeout=5)
+        except psycopg.OperationalError as error:
+            if time.monotonic() >= end:
+                raise SetupError(
+                    "database_unreachable",
+                    f"The database does not answer ({error}). Check BIRESNERF_DATABASE_URL.",
+                ) from error
+            time.sleep(0.2)

@@ -1,0 +1,124 @@
+"""What monitoring asks of the whole installation, read from the database in one look."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from biresnerf.wire.datasets import DatasetState
+from biresnerf.wire.jobs import JobState
+from workers.database.database import Connection, Database
+
+
+class Tally(BaseModel):
+    """How often something happened, and what it adds up to. Durations have a bucket, all else is in bucket 0."""
+
+    model_config = ConfigDict(frozen=True)
+
+    name: str
+    label: str
+    bucket: int
+    count: int
+    amount: float
+
+
+class SlotCount(BaseModel):
+    """Living slots of one kind that do, or do not, run a job."""
+
+    model_config = ConfigDict(frozen=True)
+
+    kind: str
+    busy: bool
+    slots: int
+
+
+class Statistics(BaseModel):
+    """The installation at one moment. ``tallies`` only ever grow."""
+
+    model_config = ConfigDict(frozen=True)
+
+    jobs: dict[JobState, int]
+    datasets: dict[DatasetState, int]
+    oldest_queued_s: float
+    slots: tuple[SlotCount, ...]
+    trash: int
+    webhooks_pending: int
+    webhooks_late_s: float
+    bounds_s: tuple[float, ...]
+    tallies: tuple[Tally, ...]
+
+
+_SLOTS = """
+    SELECT CASE WHEN slots.name LIKE 'gpu%%' THEN 'gpu' ELSE 'cpu' END AS kind,
+        EXISTS (SELECT FROM procrastinate_jobs AS job
+            WHERE job.worker_id = worker.id AND job.status = 'doing') AS busy,
+        count(*) AS slots
+    FROM slots JOIN procrastinate_workers AS worker ON worker.id = slots.worker_id
+    WHERE worker.last_heartbeat > now() - make_interval(secs => %s) GROUP BY 1, 2"""
+_TALLIES = """
+    SELECT name, label, bucket, sum(count)::bigint AS count, sum(amount) AS amount FROM (
+        SELECT name, label, bucket, count, amount FROM tallies
+        UNION ALL SELECT name, label, bucket, 1, amount FROM tally_log) AS counted
+    GROUP BY 1, 2, 3 ORDER BY 1, 2, 3"""
+_QUEUED_AGE = """
+    SELECT coalesce(extract(epoch FROM clock_timestamp() - min(created_at)), 0)::float8 AS age_s
+    FROM jobs WHERE state = 'queued'"""
+
+
+_WEBHOOKS = """
+    SELECT count(*) AS pending,
+        greatest(coalesce(extract(epoch FROM clock_timestamp() - min(due_at)), 0), 0)::float8 AS late_s
+    FROM webhook_deliveries WHERE state = 'pending'"""
+
+
+async def read_statistics(database: Database, stall_s: float) -> Statistics:
+    """Everything in one snapshot; raises `Unavailable`."""
+    async with database.transaction() as connection:
+        await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
+        jobs = await _rows(connection, "SELECT state, count(*) AS n FROM jobs GROUP BY state")
+        datasets = await _rows(connection, "SELECT state, count(*) AS n FROM datasets GROUP BY state")
+        (age,) = await _rows(connection, _QUEUED_AGE)
+        (trash,) = await _rows(connection, "SELECT count(*) AS n FROM trash")
+        (webhooks,) = await _rows(connection, _WEBHOOKS)
+        (bounds,) = await _rows(connection, "SELECT tally_bounds() AS bounds_s")
+        return Statistics(
+            jobs={row["state"]: row["n"] for row in jobs},
+            datasets={row["state"]: row["n"] for row in datasets},
+            oldest_queued_s=max(0.0, age["age_s"]),
+            slots=tuple(SlotCount(**row) for row in await _rows(connection, _SLOTS, stall_s)),
+            trash=trash["n"],
+            webhooks_pending=webhooks["pending"],
+            webhooks_late_s=webhooks["late_s"],
+            bounds_s=tuple(bounds["bounds_s"]),
+            tallies=tuple(Tally(**row) for row in await _rows(connection, _TALLIES)),
+        )
+
+
+async def _rows(connection: Connection, sql: Any, *parameters: Any) -> list[dict[str, Any]]:
+    return await (await connection.execute(sql, parameters)).fetchall()
+
+
+async def fold_tallies(connection: Connection) -> None:
+    """Adds the single counts up, in the caller's transaction; one caller at a time."""
+    await connection.execute(
+        "WITH taken AS (DELETE FROM tally_log RETURNING name, label, bucket, amount)"
+        " INSERT INTO tallies (name, label, bucket, count, amount)"
+        " SELECT name, label, bucket, count(*), sum(amount) FROM taken GROUP BY 1, 2, 3 ORDER BY 1, 2, 3"
+        " ON CONFLICT (name, label, bucket) DO UPDATE SET"
+        " count = tallies.count + excluded.count, amount = tallies.amount + excluded.amount"
+    )
+
+
+async def announce_slot(database: Database, host: str, name: str, worker_id: int) -> None:
+    """Writes down which worker of the queue a slot is; forgets those that are gone."""
+    async with database.transaction() as connection:
+        await connection.execute(
+            "DELETE FROM slots WHERE NOT EXISTS"
+            " (SELECT FROM procrastinate_workers WHERE id = slots.worker_id)"
+        )
+        await connection.execute(
+            "INSERT INTO slots (host, name, worker_id) VALUES (%s, %s, %s)"
+            " ON CONFLICT (host, name) DO UPDATE SET worker_id = excluded.worker_id",
+            (host, name, worker_id),
+        )

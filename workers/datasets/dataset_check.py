@@ -1,0 +1,182 @@
+"""Validates datasets in a child process, so that no long-lived process decodes strangers' files."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import json
+import logging
+import shutil
+import tempfile
+import time
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from psycopg.types.json import Jsonb
+
+from biresnerf.wire.problems import JobError
+from workers.database.database import Database
+from workers.process.turns import Turns
+from workers.run.child import Child, log_tail
+from workers.run.claim import insist
+from workers.settings.errors import Unavailable
+from workers.settings.settings import Settings
+from workers.store.files import FileStore
+
+log = logging.getLogger(__name__)
+
+EXIT_INPUT_ERROR = 2
+CHECKS = "checks"
+IN_USE = "in-use"
+SETTLED_S = 1.0
+LOOK_S = 0.5  # between two looks at a check that another process makes
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """``error`` is none for a good dataset; ``report`` is what the check found out."""
+
+    report: dict[str, Any]
+    error: JobError | None
+
+
+class Checker:
+    """Checks ``finalizing`` datasets, one at a time in this process and each by one process only.
+
+    Tenants take turns: many datasets of one hold up another's by one check.
+    """
+
+    def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:
+        self._database, self._files, self._settings = database, files, settings
+        self._turns = Turns(1)  # decoding a thousand photos is enough work for one machine
+
+    async def check(self, dataset_id: str) -> None:
+        """Until the dataset is not ``finalizing`` any more, through our check or another process's."""
+        token = uuid.uuid4()
+        owned = await insist(
+            lambda: self._database.fetch("SELECT tenant FROM datasets WHERE id = %s", dataset_id)
+        )
+        if not owned:
+            return
+        while True:
+            async with self._turns.turn(owned[0]["tenant"]):
+                if await insist(lambda: self._take(dataset_id, token)):
+                    await self._check(dataset_id, token)
+            rows = await insist(
+                lambda: self._database.fetch("SELECT state FROM datasets WHERE id = %s", dataset_id)
+            )
+            if not rows or rows[0]["state"] != "finalizing":
+                return
+            await asyncio.sleep(LOOK_S)
+
+    async def unfinished(self) -> tuple[str, ...]:
+        """Ids of ``finalizing`` datasets that nobody checks just now; clears away what the dead left here."""
+        await asyncio.to_thread(_sweep, self._settings.scratch_dir / CHECKS)
+        rows = await self._database.fetch(
+            "SELECT id FROM datasets WHERE state = 'finalizing'"
+            " AND coalesce(check_until < clock_timestamp(), true) ORDER BY created_at"
+        )
+        return tuple(row["id"] for row in rows)
+
+    async def _take(self, dataset_id: str, token: uuid.UUID) -> bool:
+        """Take or renew the lease. A lease, not a lock: who is frozen or cut off loses it."""
+        rows = await self._database.fetch(
+            "UPDATE datasets SET check_token = %s, check_until = clock_timestamp() + make_interval(secs => %s)"
+            " WHERE id = %s AND state = 'finalizing'"
+            " AND (check_token = %s OR check_until IS NULL OR check_until < clock_timestamp()) RETURNING id",
+            *(token, 2 * self._settings.beat_s, dataset_id, token),
+        )
+        return bool(rows)
+
+    async def _check(self, dataset_id: str, token: uuid.UUID) -> None:
+        rows = await insist(
+            lambda: self._database.fetch(
+                "SELECT key, path FROM dataset_files WHERE dataset_id = %s", dataset_id
+            )
+        )
+        renewing = asyncio.create_task(self._renew(dataset_id, token))
+        try:
+            files = [(row["key"], row["path"]) for row in rows]
+            verdict = await check_files(self._files, files, self._settings)
+        finally:
+            renewing.cancel()
+        await insist(
+            lambda: self._database.fetch(
+                "UPDATE datasets SET state = %s, report = %s, error = %s, revision = revision + 1,"
+                " check_token = NULL, check_until = NULL"
+                " WHERE id = %s AND state = 'finalizing' AND check_token = %s",
+                *("rejected" if verdict.error else "ready", Jsonb(verdict.report)),
+                *(Jsonb(verdict.error.model_dump()) if verdict.error else None, dataset_id, token),
+            )
+        )
+
+    async def _renew(self, dataset_id: str, token: uuid.UUID) -> None:
+        while True:
+            await asyncio.sleep(self._settings.beat_s / 2)
+            with contextlib.suppress(Unavailable):  # the next time will do
+                await self._take(dataset_id, token)
+
+
+async def check_files(files: FileStore, members: Sequence[tuple[str, str]], settings: Settings) -> Verdict:
+    """Run the check program on the files, given as (key, path). Its crash or timeout is a rejection too.
+
+    Where it is killed (by the kernel, say, for another process's hunger) it is tried once more.
+    """
+    parent = settings.scratch_dir / CHECKS
+    parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(dir=parent))
+    lock = (folder / IN_USE).open("w")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel frees it, however we die
+        dataset = folder / "input"
+        await files.stage(members, dataset)
+        verdict, killed = await _run(dataset, folder / "log.txt", settings)
+        if killed:
+            log.warning("the check of %d files was killed; trying once more", len(members))
+            verdict, _ = await _run(dataset, folder / "log.txt", settings)
+        return verdict
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        lock.close()
+
+
+def _sweep(parent: Path) -> None:
+    """Remove folders of processes that were killed."""
+    for folder in parent.iterdir() if parent.is_dir() else ():
+        with contextlib.suppress(OSError):  # in use, or gone by now
+            if time.time() - folder.stat().st_mtime < SETTLED_S:
+                continue  # perhaps made, and not locked yet
+            if (folder / IN_USE).exists():
+                with (folder / IN_USE).open() as lock:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[Verdict, bool]:
+    """The outcome, and whether a signal ended the program."""
+    child = await Child.start(settings.check_command, dataset, errors, {"OMP_NUM_THREADS": "1"})
+    try:
+        async with asyncio.timeout(settings.check_timeout_s):
+            said = b"".join([line async for line in child.lines()])
+            status = await child.wait()
+    except TimeoutError:
+        detail = f"The check took longer than {settings.check_timeout_s:g} s."
+        error = JobError(code="check_timeout", detail=detail, mend="Send fewer or smaller images.")
+        return Verdict({}, error), False
+    finally:
+        child.kill()
+        await child.wait()
+    try:
+        answer = json.loads(said)
+        if status == 0:
+            return Verdict(dict(answer["report"]), None), False
+        if status == EXIT_INPUT_ERROR:
+            return Verdict({}, JobError(**answer["error"])), False
+    except (ValueError, TypeError, KeyError) as error:
+        log.error("the check program's answer is unreadable: %s", error)
+    detail = f"The check of the files ended unexpectedly (status {status})."
+    return Verdict({}, JobError(code="check_crashed", detail=detail, log_tail=log_tail(errors))), status < 0

@@ -1,0 +1,86 @@
+"""The program that validates a dataset: `python -m workers.datasets.dataset_check_process FOLDER`.
+
+Writes one line of JSON to standard output: ``{"report": {...}}`` (exit status 0), or ``{"error":
+{"code", "detail", "where", "mend"}}`` (exit status 2). It reads what strangers sent, so it confines itself
+first: memory, CPU time, no files written. Loads neither torch nor pycolmap; poses that are missing are
+found by the job, not here.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+from pathlib import Path
+from typing import Any
+
+from biresnerf.errors import InputError
+
+EXIT_INPUT_ERROR = 2
+# Address space: numpy and Pillow, and four decoders with pictures of up to 150 million pixels.
+MEMORY_BYTES = 6 * 2**30
+CPU_S = 3600
+# Decoded in full, then kept as thumbnails: the check needs no pixels afterwards.
+THUMBNAIL_PX = 16
+
+
+def main(folder: Path) -> int:
+    """Check ``folder``; returns the exit status."""
+    answer_to = os.dup(1)
+    os.dup2(2, 1)  # whatever a library prints must not mix with the answer
+    try:
+        answer: dict[str, Any] = {"report": check(folder)}
+        status = 0
+    except InputError as error:
+        where = error.where.replace(f"{folder}/", "").replace(str(folder), "the dataset")
+        answer = {"error": {"code": error.code, "detail": error.what, "where": where, "mend": error.mend}}
+        status = EXIT_INPUT_ERROR
+    with os.fdopen(answer_to, "w") as out:
+        out.write(json.dumps(answer) + "\n")
+    return status
+
+
+def check(folder: Path) -> dict[str, Any]:
+    """Read everything in ``folder`` and decode every image; returns what was found.
+
+    Raises:
+        InputError: what is wrong, with which file, and the mend.
+    """
+    from biresnerf.data.formats.read_dataset import read_dataset
+    from biresnerf.data.photos.images import load_images
+
+    dataset = read_dataset(folder, within=folder)
+    images = load_images(dataset, THUMBNAIL_PX)
+    posed = int(dataset.posed.sum())
+    return {
+        "images": len(dataset),
+        "with_pose": posed,
+        "without_pose": len(dataset) - posed,
+        "poses": "missing" if posed == 0 else "given" if posed == len(dataset) else "partial",
+        "cameras": len(dataset.cameras),
+        "camera_models": sorted({camera.model for camera in dataset.cameras}),
+        "intrinsics": sorted(set(dataset.intrinsics_sources) or {"given"}),
+        "format": dataset.source.dialect,
+        "masks": sum(frame.mask is not None for frame in dataset.frames),
+        "transparency": images.alpha is not None,
+        "warnings": list(dataset.warnings),
+    }
+
+
+def confine() -> None:
+    """Take no more than a check needs, whatever the files say."""
+    for kind, amount in (
+        (resource.RLIMIT_AS, MEMORY_BYTES),
+        (resource.RLIMIT_CPU, CPU_S),
+        (resource.RLIMIT_CORE, 0),
+        (resource.RLIMIT_NOFILE, 256),
+    ):
+        _, most = resource.getrlimit(kind)
+        wanted = amount if most == resource.RLIM_INFINITY else min(amount, most)
+        resource.setrlimit(kind, (wanted, wanted))
+
+
+if __name__ == "__main__":
+    confine()
+    sys.exit(main(Path(sys.argv[1])))

@@ -1,0 +1,114 @@
+"""Rows of the tables `datasets` and `dataset_files`, inside the caller's transaction."""
+
+from __future__ import annotations
+
+import re
+
+from biresnerf.errors import InputError
+from biresnerf.wire.datasets import DatasetState
+from workers.database.database import Connection
+from workers.records import DatasetFile
+from workers.settings.errors import Conflict, LimitReached, NotFound
+from workers.settings.settings import Settings
+from workers.store.files import StoredFile
+
+DATASET = """
+    SELECT datasets.*, coalesce(total.files, 0) AS files, coalesce(total.bytes, 0)::bigint AS bytes,
+        ARRAY(SELECT entry ->> 'path'
+            FROM jsonb_array_elements(datasets.manifest) WITH ORDINALITY AS listed(entry, place)
+            WHERE NOT EXISTS (SELECT 1 FROM dataset_files AS file WHERE file.dataset_id = datasets.id
+                AND file.path = entry ->> 'path' AND file.sha256 = coalesce(entry ->> 'sha256', file.sha256))
+            ORDER BY place) AS missing
+    FROM datasets LEFT JOIN LATERAL (SELECT count(*) AS files, sum(size) AS bytes
+        FROM dataset_files WHERE dataset_id = datasets.id) AS total ON true"""
+# With the store's tenant as parameter; none for everybody's.
+MINE = "datasets.tenant = coalesce(%s, datasets.tenant)"
+# Files of the manifest that lack, and a key where the same tenant's same bytes lie.
+KNOWN = f"""
+    SELECT DISTINCT ON (entry.path) entry.path, file.key, file.size, file.sha256
+    FROM datasets, jsonb_to_recordset(datasets.manifest) AS entry(path text, size bigint, sha256 text)
+    JOIN dataset_files AS file ON file.sha256 = entry.sha256 AND file.size = entry.size
+    JOIN datasets AS other ON other.id = file.dataset_id
+    WHERE datasets.id = %s AND {MINE} AND other.tenant = datasets.tenant AND NOT EXISTS (
+        SELECT 1 FROM dataset_files AS own WHERE own.dataset_id = datasets.id AND own.path = entry.path)"""
+# The file store keeps such names for uploads under way.
+RESERVED_NAME = re.compile(r"#\d+$")
+
+
+async def record_file(
+    connection: Connection, dataset_id: str, path: str, stored: StoredFile, upload_id: str | None = None
+) -> tuple[DatasetFile, bool]:
+    """Make a stored file the dataset's at ``path``; also tells whether the path is new. What was there is trash.
+
+    ``upload_id``: the upload that brought it.
+    """
+    if upload_id is not None:
+        await connection.execute(
+            "UPDATE uploads SET brought = least(size, brought + %s) WHERE id = %s", (stored.size, upload_id)
+        )
+    before = await (
+        await connection.execute(
+            "DELETE FROM dataset_files WHERE dataset_id = %s AND path = %s RETURNING key", (dataset_id, path)
+        )
+    ).fetchone()
+    if before is not None:
+        await connection.execute(
+            "INSERT INTO trash (prefix) VALUES (%s)", (before["key"].removesuffix(f"/{path}"),)
+        )
+    cursor = await connection.execute(
+        "INSERT INTO dataset_files (dataset_id, path, key, size, sha256) VALUES (%s, %s, %s, %s, %s)"
+        " RETURNING path, key, size, sha256, created_at",
+        (dataset_id, path, stored.key, stored.size, stored.sha256),
+    )
+    await connection.execute("UPDATE datasets SET revision = revision + 1 WHERE id = %s", (dataset_id,))
+    return DatasetFile.model_validate(await cursor.fetchone()), before is None
+
+
+async def require_open(connection: Connection, dataset_id: str, tenant: str | None) -> None:
+    """Locks the dataset's row; raises `NotFound`, `Conflict` (``dataset_not_open``)."""
+    state = await locked(connection, dataset_id, tenant)
+    if state != "open":
+        raise Conflict("dataset_not_open", f"Dataset {dataset_id} is {state}; it takes no more files.")
+
+
+async def require_place(
+    connection: Connection, settings: Settings, dataset_id: str, path: str, overwrite: bool, size: int
+) -> int:
+    """That ``path`` may be a file of ``size`` bytes; returns the bytes of the dataset's other files.
+
+    Raises `Conflict` (``file_exists``), `LimitReached` (``too_many_files``, ``body_too_large``).
+    """
+    cursor = await connection.execute(
+        "SELECT count(*) FILTER (WHERE path <> %s) AS files, count(*) FILTER (WHERE path = %s) AS same,"
+        " coalesce(sum(size) FILTER (WHERE path <> %s), 0)::bigint AS bytes"
+        " FROM dataset_files WHERE dataset_id = %s",
+        (path, path, path, dataset_id),
+    )
+    row = await cursor.fetchone()
+    assert row is not None, "an aggregate gives a row"
+    if row["same"] and not overwrite:
+        raise Conflict("file_exists", f"{path} is there already.")
+    if row["files"] >= settings.max_files:
+        raise LimitReached("too_many_files", f"A dataset holds at most {settings.max_files} files.")
+    if row["bytes"] + size > settings.max_dataset_bytes:
+        raise LimitReached("body_too_large", f"A dataset holds at most {settings.max_dataset_bytes} bytes.")
+    return int(row["bytes"])
+
+
+async def locked(connection: Connection, dataset_id: str, tenant: str | None) -> DatasetState:
+    """The state of the dataset, which stays as it is until the transaction ends; raises `NotFound`."""
+    sql = f"SELECT state FROM datasets WHERE id = %s AND {MINE} FOR UPDATE"
+    row = await (await connection.execute(sql, (dataset_id, tenant))).fetchone()
+    if row is None:
+        raise NotFound(f"No dataset {dataset_id}.")
+    state: DatasetState = row["state"]
+    return state
+
+
+def file_key(folder: str, path: str) -> str:
+    """The key of a client's path; raises `InputError` (``unsafe_path``)."""
+    parts = path.split("/")
+    bad = any(part in ("", ".", "..") or len(part.encode()) > 255 for part in parts) or "\0" in path
+    if bad or RESERVED_NAME.search(path):
+        raise InputError("unsafe_path", "Not a usable file name.", where=path[:300], mend="Rename the file.")
+    return f"{folder}/{path}"

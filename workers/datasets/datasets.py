@@ -1,0 +1,300 @@
+"""The dataset record: create, fill with files, check, list, delete. For the service; never loads torch."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterable, Awaitable, Callable, Sequence
+from copy import copy
+from typing import Any
+
+from psycopg.types.json import Jsonb
+
+from biresnerf.errors import InputError
+from biresnerf.wire.datasets import DatasetRecord, DatasetState, ManifestEntry
+from workers.database.database import Connection, Database
+from workers.database.ids import cursor_after, cursor_place, cursor_time, new_id
+from workers.datasets.dataset_check import Checker
+from workers.datasets.dataset_rows import (
+    DATASET,
+    KNOWN,
+    MINE,
+    file_key,
+    locked,
+    record_file,
+    require_open,
+    require_place,
+)
+from workers.jobs.quotas import require_byte_quota
+from workers.records import DatasetFile, Page
+from workers.run.claim import insist
+from workers.settings.errors import Conflict, Expired, LimitReached, NotFound
+from workers.settings.settings import Settings
+from workers.store.files import FileStore, StoredFile
+from workers.tenants.tenants import LOCAL_TENANT
+
+COPIES_AT_ONCE = 8
+FILE = "SELECT path, key, size, sha256, created_at FROM dataset_files"
+
+
+class DatasetStore:
+    """Datasets in the database and the file store. Get one from `workers.engine.open_stores`.
+
+    As opened it sees everybody's datasets; `of` gives it as one tenant sees it, to whom a dataset of another
+    is as unknown as one that never was. Every method raises `Unavailable` (``database_unavailable``) where
+    the database does not answer.
+    """
+
+    def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:
+        self._database, self._files, self._settings = database, files, settings
+        self._checker = Checker(database, files, settings)
+        self._tenant: str | None = None
+
+    def of(self, tenant: str | None) -> DatasetStore:
+        """The store as this tenant sees it; none: as the operator does."""
+        bound = copy(self)
+        bound._tenant = tenant
+        return bound
+
+    async def create(self, name: str, manifest: Sequence[ManifestEntry] = ()) -> DatasetRecord:
+        """An empty dataset in state ``open``; raises `LimitReached` (``too_many_files``)."""
+        if len(manifest) > self._settings.max_files:
+            raise LimitReached(
+                "too_many_files", f"The manifest has more than {self._settings.max_files} files."
+            )
+        dataset_id = new_id("ds")
+        async with self._database.transaction() as connection:
+            await connection.execute(
+                "INSERT INTO datasets (id, tenant, name, manifest) VALUES (%s, %s, %s, %s)",
+                (
+                    *(dataset_id, self._tenant or LOCAL_TENANT, name),
+                    Jsonb([entry.model_dump() for entry in manifest]),
+                ),
+            )
+            return await self._required(connection, dataset_id)
+
+    async def get(self, dataset_id: str) -> DatasetRecord:
+        """The dataset; raises `NotFound`."""
+        async with self._database.transaction() as connection:
+            return await self._required(connection, dataset_id)
+
+    async def list(
+        self, *, state: DatasetState | None = None, limit: int = 50, cursor: str | None = None
+    ) -> Page[DatasetRecord]:
+        """Datasets, newest first; raises `InputError` (``bad_cursor``)."""
+        created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
+        rows = await self._database.fetch(
+            DATASET + f" WHERE {MINE} AND (%s::text IS NULL OR state = %s)"
+            " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
+            " ORDER BY created_at DESC, id DESC LIMIT %s",
+            *(self._tenant, state, state),
+            *((cursor_time(created),) * 2 if created else (None, None)),
+            *(last_id, limit + 1),
+        )
+        items = tuple(_record(row) for row in rows[:limit])
+        more = len(rows) > limit
+        return Page(
+            items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
+        )
+
+    async def add_file(
+        self,
+        dataset_id: str,
+        path: str,
+        chunks: AsyncIterable[bytes],
+        *,
+        sha256: str | None = None,
+        overwrite: bool = True,
+        upload_id: str | None = None,
+    ) -> tuple[DatasetFile, bool]:
+        """Store one file under its relative path; returns it and whether the path is new.
+
+        ``upload_id``: the upload that brought the bytes, whose size the tenant's quota has counted already.
+        Raises `NotFound`, `Conflict` (``dataset_not_open``, ``file_exists``), `LimitReached`
+        (``body_too_large``, ``too_many_files``), `InputError` (``unsafe_path``, ``digest_mismatch``).
+        Where it raises, the dataset is as before.
+        """
+
+        async def stored(key: str, room: int) -> StoredFile:
+            return await self._files.put(key, chunks, limit_bytes=room, expected_sha256=sha256)
+
+        return await self._add(dataset_id, path, stored, upload_id, overwrite=overwrite)
+
+    async def add_copy(
+        self,
+        dataset_id: str,
+        path: str,
+        source: str,
+        *,
+        size: int,
+        sha256: str,
+        trusted: bool,
+        upload_id: str | None = None,
+    ) -> tuple[DatasetFile, bool]:
+        """Like `add_file`, from a key of the store that others may write to, unless it is ``trusted``.
+
+        Raises `NotFound` also where there is no ``source``.
+        """
+
+        async def copied(key: str, room: int) -> StoredFile:
+            if size > room:
+                raise LimitReached("body_too_large", f"{path} has more than the {room} bytes left for it.")
+            file = await self._files.copy(source, key)
+            # Of the copy, which nobody else can write to: the source may change while it is read.
+            found = sha256 if trusted else await self._files.sha256(key)
+            if (file.size, found) != (size, sha256):
+                raise InputError(
+                    "digest_mismatch",
+                    f"What arrived has {file.size} bytes and SHA-256 {found}, not {size} and {sha256}.",
+                    where=path,
+                    mend="Send the file again.",
+                )
+            return file.model_copy(update={"sha256": found})
+
+        return await self._add(dataset_id, path, copied, upload_id, overwrite=True)
+
+    async def fill_known(self, dataset_id: str) -> DatasetRecord:
+        """Copy what the manifest names and the same tenant has sent before; returns the dataset.
+
+        By digest and size, within one tenant: nobody learns what others have sent. Raises `NotFound`,
+        `LimitReached`.
+        """
+        known = await self._database.fetch(KNOWN, dataset_id, self._tenant)
+        turns = asyncio.Semaphore(COPIES_AT_ONCE)
+
+        async def copy_one(row: dict[str, Any]) -> None:
+            async with turns:
+                with contextlib.suppress(NotFound):  # deleted just now: it has to be sent after all
+                    await self.add_copy(
+                        *(dataset_id, row["path"], row["key"]),
+                        **{"size": row["size"], "sha256": row["sha256"], "trusted": True},
+                    )
+
+        copies = [asyncio.create_task(copy_one(row)) for row in known]
+        try:
+            await asyncio.gather(*copies)
+        finally:
+            for copying in copies:
+                copying.cancel()
+        return await self.get(dataset_id)
+
+    async def _add(
+        self,
+        dataset_id: str,
+        path: str,
+        store: Callable[[str, int], Awaitable[StoredFile]],
+        upload_id: str | None,
+        *,
+        overwrite: bool,
+    ) -> tuple[DatasetFile, bool]:
+        # A folder of its own for each upload: one that fails or comes too late never touches an older file.
+        folder = f"datasets/{dataset_id}/files/{new_id('v')}"
+        key = file_key(folder, path)
+        async with self._database.transaction() as connection:
+            there = await self._require_place(connection, dataset_id, path, overwrite)
+            await require_byte_quota(connection, dataset_id, 1 if upload_id is None else 0)
+        room = min(self._settings.max_file_bytes, self._settings.max_dataset_bytes - there)
+        try:
+            stored = await store(key, room)
+            async with self._database.transaction() as connection:
+                await self._require_place(connection, dataset_id, path, overwrite, stored.size)
+                recorded = await record_file(connection, dataset_id, path, stored, upload_id)
+                # All is counted now, also what the file replaced and what the upload has left.
+                await require_byte_quota(connection, dataset_id, 0)
+                return recorded
+        except BaseException:
+            await self._files.delete_prefix(folder)
+            raise
+
+    async def _require_place(
+        self, connection: Connection, dataset_id: str, path: str, overwrite: bool, size: int = 0
+    ) -> int:
+        await require_open(connection, dataset_id, self._tenant)
+        return await require_place(connection, self._settings, dataset_id, path, overwrite, size)
+
+    async def file(self, dataset_id: str, path: str) -> DatasetFile:
+        """One file; raises `NotFound`."""
+        rows = await self._database.fetch(
+            FILE + " WHERE dataset_id = %s AND path = %s"
+            f" AND EXISTS (SELECT 1 FROM datasets WHERE id = dataset_files.dataset_id AND {MINE})",
+            *(dataset_id, path, self._tenant),
+        )
+        if not rows:
+            raise NotFound(f"Dataset {dataset_id} has no file {path}.")
+        return DatasetFile.model_validate(rows[0])
+
+    async def files(
+        self, dataset_id: str, *, limit: int = 1000, cursor: str | None = None
+    ) -> Page[DatasetFile]:
+        """The files, by path; raises `NotFound`, `Expired`, `InputError` (``bad_cursor``)."""
+        after = cursor_place(cursor, 1)[0] if cursor else ""
+        async with self._database.transaction() as connection:
+            if (await self._required(connection, dataset_id)).state == "expired":
+                raise Expired(f"The files of dataset {dataset_id} were not used for long and are gone.")
+            found = await connection.execute(
+                FILE + " WHERE dataset_id = %s AND path > %s ORDER BY path LIMIT %s",
+                (dataset_id, after, limit + 1),
+            )
+            rows = await found.fetchall()
+        items = tuple(DatasetFile.model_validate(row) for row in rows[:limit])
+        return Page(items=items, next_cursor=cursor_after(items[-1].path) if len(rows) > limit else None)
+
+    async def finalize(self, dataset_id: str) -> DatasetRecord:
+        """Freeze the content: ``open`` becomes ``finalizing`` (other states come back as they are).
+
+        Raises `NotFound`, `Conflict` (``dataset_not_complete``: manifest files lack, or no file at all).
+        Then call `check` (in a background task, or awaited), which leads to ``ready`` or ``rejected``.
+        """
+        async with self._database.transaction() as connection:
+            await locked(connection, dataset_id, self._tenant)
+            dataset = await self._required(connection, dataset_id)
+            if dataset.state != "open":
+                return dataset
+            if dataset.missing or not dataset.files:
+                lacking = ", ".join(dataset.missing[:5]) or "files"
+                raise Conflict("dataset_not_complete", f"Dataset {dataset_id} still lacks {lacking}.")
+            await connection.execute(
+                "UPDATE datasets SET state = 'finalizing', revision = revision + 1 WHERE id = %s",
+                (dataset_id,),
+            )
+            return await self._required(connection, dataset_id)
+
+    async def check(self, dataset_id: str) -> DatasetRecord:
+        """Validate a ``finalizing`` dataset in a child process and write the outcome; idempotent.
+
+        Only one check of a dataset runs at a time, over all processes; the others wait for its outcome. Other
+        states come back as they are. Raises `NotFound`.
+        """
+        await self._checker.check(dataset_id)
+        return await insist(lambda: self.get(dataset_id))
+
+    async def unfinished(self) -> tuple[str, ...]:
+        """Ids left in ``finalizing`` that nobody checks (their process died, or has others to do first)."""
+        return await self._checker.unfinished()
+
+    async def delete(self, dataset_id: str) -> None:
+        """Delete a dataset with its files; raises `NotFound`, `Conflict` (``dataset_in_use`` by jobs)."""
+        async with self._database.transaction() as connection:
+            await locked(connection, dataset_id, self._tenant)
+            await self._required(connection, dataset_id)
+            cursor = await connection.execute(
+                "SELECT id, state FROM jobs WHERE dataset_id = %s", (dataset_id,)
+            )
+            users = [f"{job['id']} ({job['state']})" for job in await cursor.fetchall()]
+            if users:
+                raise Conflict(
+                    "dataset_in_use", f"Delete first the jobs of {dataset_id}: {', '.join(users[:5])}."
+                )
+            await connection.execute("DELETE FROM datasets WHERE id = %s", (dataset_id,))
+            await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (f"datasets/{dataset_id}",))
+
+    async def _required(self, connection: Connection, dataset_id: str) -> DatasetRecord:
+        sql = DATASET + f" WHERE datasets.id = %s AND {MINE}"
+        row = await (await connection.execute(sql, (dataset_id, self._tenant))).fetchone()
+        if row is None:
+            raise NotFound(f"No dataset {dataset_id}.")
+        return _record(row)
+
+
+def _record(row: dict[str, Any]) -> DatasetRecord:
+    return DatasetRecord.model_validate({key: row[key] for key in DatasetRecord.model_fields})

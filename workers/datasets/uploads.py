@@ -1,0 +1,268 @@
+"""Uploads under way: bytes arrive in pieces, over as many connections, processes and hosts as it takes.
+
+Each piece is stored, then counted by one fenced UPDATE: of two connections that write at the same place, one wins.
+What was counted survives the death of connection, process and host; nothing is kept in memory or on local disk.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import uuid
+from collections.abc import AsyncIterable, AsyncIterator, Iterator
+from copy import copy
+
+from psycopg.types.json import Jsonb
+
+from biresnerf.wire.datasets import UploadKind
+from biresnerf.wire.problems import JobError
+from workers.database.database import Connection, Database
+from workers.database.ids import new_id
+from workers.datasets.dataset_rows import MINE, file_key, require_open
+from workers.jobs.quotas import require_byte_quota
+from workers.records import Upload
+from workers.settings.errors import Conflict, LimitReached, NotFound
+from workers.settings.settings import Settings
+from workers.store.files import FileStore
+
+# Memory of all uploads of this process together, before their pieces are stored; the more uploads, the smaller
+# the pieces of each.
+PIECES_BYTES = 256 * 2**20
+PIECE_MAX_BYTES = 4 * 2**20
+PIECE_MIN_BYTES = 2**18
+EXPIRE_BATCH = 100
+
+_UPLOAD = (
+    "SELECT uploads.id, uploads.dataset_id, uploads.kind, uploads.path, uploads.size, uploads.sha256,"
+    " uploads.state, uploads.received, uploads.error, uploads.created_at, uploads.expires_at, uploads.folder"
+    " FROM uploads JOIN datasets ON datasets.id = uploads.dataset_id"
+)
+
+
+class UploadStore:
+    """Uploads in the database, their pieces in the file store. Get one from `workers.engine.open_stores`.
+
+    As opened it sees everybody's uploads; `of` gives it as one tenant sees it. Every method raises
+    `Unavailable` where database or store does not answer.
+    """
+
+    def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:
+        self._database, self._files, self._settings = database, files, settings
+        self._appending = [0]  # shared by the views of all tenants
+        self._tenant: str | None = None
+
+    def of(self, tenant: str | None) -> UploadStore:
+        """The store as this tenant sees it; none: as the operator does."""
+        bound = copy(self)
+        bound._tenant = tenant
+        return bound
+
+    async def create(
+        self,
+        dataset_id: str,
+        kind: UploadKind,
+        size: int,
+        *,
+        path: str | None = None,
+        sha256: str | None = None,
+    ) -> Upload:
+        """A new upload of ``size`` bytes, of which none has arrived.
+
+        Raises `NotFound`, `Conflict` (``dataset_not_open``), `LimitReached` (``body_too_large``,
+        ``too_many_files``), `InputError` (``unsafe_path``).
+        """
+        limit = self._settings.max_archive_bytes if kind == "archive" else self._settings.max_file_bytes
+        if size > limit:
+            raise LimitReached("body_too_large", f"At most {limit} bytes are taken at once, not {size}.")
+        upload_id = new_id("up")
+        folder = f"datasets/{dataset_id}/uploads/{upload_id}"
+        if path is not None:
+            file_key(folder, path)
+        async with self._database.transaction() as connection:
+            await require_open(connection, dataset_id, self._tenant)
+            await require_byte_quota(connection, dataset_id, size)
+            cursor = await connection.execute(
+                "SELECT count(*) AS n FROM uploads WHERE dataset_id = %s", (dataset_id,)
+            )
+            row = await cursor.fetchone()
+            if row is not None and row["n"] >= self._settings.max_files:
+                raise LimitReached("too_many_files", f"A dataset has at most {row['n']} uploads at a time.")
+            await connection.execute(
+                "INSERT INTO uploads (id, dataset_id, kind, path, size, sha256, folder, state, expires_at)"
+                " VALUES (%s, %s, %s, %s, %s, %s, %s, %s, clock_timestamp() + make_interval(secs => %s))",
+                (
+                    *(upload_id, dataset_id, kind, path, size, sha256, folder),
+                    *(
+                        "receiving" if size or kind == "signed" else "received",
+                        self._settings.upload_expiry_s,
+                    ),
+                ),
+            )
+            return await self._required(connection, upload_id)
+
+    async def get(self, upload_id: str) -> Upload:
+        """The upload; raises `NotFound` (also where it expired)."""
+        async with self._database.transaction() as connection:
+            return await self._required(connection, upload_id)
+
+    async def of_dataset(self, dataset_id: str) -> tuple[Upload, ...]:
+        """The dataset's uploads that are not stored yet, oldest first."""
+        rows = await self._database.fetch(
+            _UPLOAD + f" WHERE dataset_id = %s AND {MINE} AND uploads.state <> 'stored' ORDER BY uploads.id",
+            *(dataset_id, self._tenant),
+        )
+        return tuple(Upload.model_validate(row) for row in rows)
+
+    async def append(self, upload_id: str, start: int, chunks: AsyncIterable[bytes]) -> Upload:
+        """Store what comes from byte ``start`` on; ``received`` of the answer says how far it got.
+
+        Where the stream breaks, what had arrived is kept before the error goes on.
+
+        Raises `NotFound`, `Conflict` (``offset_mismatch``: the next byte is another, or another connection
+        was faster), `LimitReached` (``body_too_large``, ``storage_full``).
+        """
+        upload = await self.get(upload_id)
+        if upload.received != start or upload.kind == "signed":
+            raise _elsewhere(upload)
+        gathered = bytearray()
+        with self._sharing():
+            try:
+                async for chunk in chunks:
+                    gathered += chunk
+                    if upload.received + len(gathered) > upload.size:
+                        gathered.clear()
+                        raise LimitReached("body_too_large", f"The upload has only {upload.size} bytes.")
+                    if len(gathered) >= self._piece_bytes():
+                        piece, gathered = bytes(gathered), bytearray()
+                        upload = await self._add_piece(upload, piece)
+            finally:
+                if gathered:
+                    upload = await self._add_piece(upload, bytes(gathered))
+        return upload
+
+    @contextlib.contextmanager
+    def _sharing(self) -> Iterator[None]:
+        self._appending[0] += 1
+        try:
+            yield
+        finally:
+            self._appending[0] -= 1
+
+    def _piece_bytes(self) -> int:
+        return min(PIECE_MAX_BYTES, max(PIECE_MIN_BYTES, PIECES_BYTES // self._appending[0]))
+
+    async def _add_piece(self, upload: Upload, piece: bytes) -> Upload:
+        start, end = upload.received, upload.received + len(piece)
+        # A name that nobody else uses: a slower connection never touches the piece of a faster one.
+        key = f"{upload.folder}/{start:014d}-{secrets.token_hex(4)}"
+        await self._files.put(key, _once(piece), limit_bytes=len(piece))
+        async with self._database.transaction() as connection:
+            cursor = await connection.execute(
+                "UPDATE uploads SET received = %s, state = CASE WHEN size = %s THEN 'received' ELSE state END,"
+                " expires_at = clock_timestamp() + make_interval(secs => %s)"
+                " WHERE id = %s AND received = %s AND state = 'receiving'",
+                (end, end, self._settings.upload_expiry_s, upload.id, start),
+            )
+            if cursor.rowcount:
+                await connection.execute(
+                    "INSERT INTO upload_pieces (upload_id, start, size, key) VALUES (%s, %s, %s, %s)",
+                    (upload.id, start, len(piece), key),
+                )
+                return await self._required(connection, upload.id)
+        await self._files.delete(key)
+        raise _elsewhere(await self.get(upload.id))
+
+    async def content(self, upload: Upload) -> AsyncIterator[bytes]:
+        """The bytes received, from the first to the last.
+
+        Raises `Conflict` (``upload_incomplete``) where the store has lost some, as after a restore.
+        """
+        pieces = await self._database.fetch(
+            "SELECT key, size FROM upload_pieces WHERE upload_id = %s ORDER BY start", upload.id
+        )
+        for piece in pieces:
+            try:
+                async for chunk in self._files.read(piece["key"]):
+                    yield chunk
+            except NotFound:
+                raise Conflict("upload_incomplete", "Bytes of the upload are lost; send it again.") from None
+
+    async def take(self, upload_id: str, token: uuid.UUID) -> bool:
+        """Take or renew the right to bring a received upload into its dataset. A lease: a dead taker loses it."""
+        rows = await self._database.fetch(
+            "UPDATE uploads SET take_token = %s, take_until = clock_timestamp() + make_interval(secs => %s)"
+            " WHERE id = %s AND state = 'received'"
+            " AND (take_token = %s OR take_until IS NULL OR take_until < clock_timestamp()) RETURNING id",
+            *(token, 2 * self._settings.beat_s, upload_id, token),
+        )
+        return bool(rows)
+
+    async def conclude(self, upload_id: str, token: uuid.UUID, error: JobError | None) -> None:
+        """``received`` becomes ``stored``, or ``rejected`` with the error; the pieces go to the trash."""
+        async with self._database.transaction() as connection:
+            cursor = await connection.execute(
+                "UPDATE uploads SET state = %s, error = %s, take_token = NULL, take_until = NULL"
+                " WHERE id = %s AND state = 'received' AND take_token = %s RETURNING folder",
+                (
+                    *("stored" if error is None else "rejected",),
+                    *(None if error is None else Jsonb(error.model_dump()), upload_id, token),
+                ),
+            )
+            row = await cursor.fetchone()
+            if row is not None:
+                await connection.execute("DELETE FROM upload_pieces WHERE upload_id = %s", (upload_id,))
+                await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (row["folder"],))
+
+    async def conclude_signed(self, upload_id: str, late_s: float) -> None:
+        """A file that went to the store itself is in its dataset. Its address is still good for ``late_s``."""
+        await self._database.fetch(
+            "WITH done AS (UPDATE uploads SET state = 'stored', received = size"
+            " WHERE id = %s AND kind = 'signed' AND state = 'receiving' RETURNING folder)"
+            " INSERT INTO trash (prefix, not_before)"
+            " SELECT folder, clock_timestamp() + make_interval(secs => %s) FROM done",
+            *(upload_id, late_s),
+        )
+
+    async def untaken(self) -> tuple[str, ...]:
+        """Ids of received uploads that nobody brings into their dataset just now."""
+        rows = await self._database.fetch(
+            "SELECT id FROM uploads WHERE state = 'received'"
+            " AND coalesce(take_until < clock_timestamp(), true) ORDER BY created_at"
+        )
+        return tuple(row["id"] for row in rows)
+
+    async def delete(self, upload_id: str) -> None:
+        """Give an upload up, in any state; raises `NotFound`. What it brought into the dataset stays."""
+        async with self._database.transaction() as connection:
+            await self._required(connection, upload_id)
+            await connection.execute(
+                "WITH gone AS (DELETE FROM uploads WHERE id = %s RETURNING folder)"
+                " INSERT INTO trash (prefix) SELECT folder FROM gone",
+                (upload_id,),
+            )
+
+    async def expire(self) -> int:
+        """Give up uploads that did not go on for ``upload_expiry_s``; returns how many."""
+        rows = await self._database.fetch(
+            "WITH gone AS (DELETE FROM uploads WHERE id IN (SELECT id FROM uploads"
+            " WHERE expires_at < clock_timestamp() AND state <> 'received' ORDER BY expires_at LIMIT %s"
+            " FOR UPDATE SKIP LOCKED) RETURNING folder)"
+            " INSERT INTO trash (prefix) SELECT folder FROM gone RETURNING id",
+            EXPIRE_BATCH,
+        )
+        return len(rows)
+
+    async def _required(self, connection: Connection, upload_id: str) -> Upload:
+        sql = _UPLOAD + f" WHERE uploads.id = %s AND {MINE}"
+        row = await (await connection.execute(sql, (upload_id, self._tenant))).fetchone()
+        if row is None:
+            raise NotFound(f"No upload {upload_id}.")
+        return Upload.model_validate(row)
+
+
+def _elsewhere(upload: Upload) -> Conflict:
+    return Conflict("offset_mismatch", f"The upload goes on at byte {upload.received}, state {upload.state}.")
+
+
+async def _once(content: bytes) -> AsyncIterator[bytes]:
+    yield content

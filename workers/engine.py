@@ -1,0 +1,68 @@
+"""One place that opens what a process needs of the engine: `async with open_stores(settings) as stores`."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+
+from workers.database.database import open_database
+from workers.database.shared_keys import shared_key
+from workers.datasets.datasets import DatasetStore
+from workers.datasets.uploads import UploadStore
+from workers.jobs.job_updates import JobListener
+from workers.jobs.jobs import JobStore
+from workers.settings.settings import Settings
+from workers.store.files import FileStore, open_files
+from workers.store.store_identity import require_same_store
+from workers.tenants.api_keys import KeyStore
+from workers.tenants.tenants import TenantStore
+from workers.upkeep.monitor import Monitor
+from workers.webhooks.webhooks import WebhookStore
+
+FOLLOW_POLL_S = 1.5
+
+
+@dataclass(frozen=True)
+class Stores:
+    """The engine as the service sees it; open once per process."""
+
+    jobs: JobStore
+    datasets: DatasetStore
+    files: FileStore
+    uploads: UploadStore
+    keys: KeyStore
+    tenants: TenantStore
+    monitor: Monitor
+    webhooks: WebhookStore
+    share_key: bytes  # signs links to results
+
+
+@asynccontextmanager
+async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
+    """Connect pool, queue and listener; needs ``settings.database_url`` and a migrated database.
+
+    Raises `SetupError`. Opening waits up to 30 s for the database.
+    """
+    files = open_files(settings)
+    async with open_database(
+        settings.require_database_url(), silence_s=settings.stall_s, answer_s=settings.answer_s
+    ) as database:
+        await require_same_store(database, files)
+        listener = JobListener(database, FOLLOW_POLL_S)
+        listening = asyncio.create_task(listener.run())
+        try:
+            given = settings.share_key
+            share_key = given.encode() if given else await shared_key(database, "share")
+            jobs = JobStore(database, listener, settings)
+            monitor = Monitor(database, files, settings.stall_s)
+            uploads = UploadStore(database, files, settings)
+            tenants = TenantStore(database)
+            await tenants.apply_defaults(settings)
+            datasets = DatasetStore(database, files, settings)
+            webhooks = WebhookStore(database, settings)
+            keys = KeyStore(database)
+            yield Stores(jobs, datasets, files, uploads, keys, tenants, monitor, webhooks, share_key)
+        finally:
+            listening.cancel()

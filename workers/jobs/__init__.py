@@ -1,0 +1,1 @@
+"""The record of a job: submitted, listed, followed, ended. Running it is `run`'s."""

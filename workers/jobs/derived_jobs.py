@@ -1,0 +1,176 @@
+"""Jobs that begin where another one is: forks of its work, and exports of its result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from psycopg import sql
+from psycopg.types.json import Jsonb
+
+from biresnerf.options.refine_options import PackName
+from biresnerf.progress import ReusableStage
+from biresnerf.wire.jobs import Job, WantedStage
+from workers.database.database import Connection
+from workers.database.ids import new_id
+from workers.jobs.forks import LATEST_FIRST, plan_fork
+from workers.jobs.job_rows import JOB, fingerprint_of, job_from_row, known_job, one_row
+from workers.jobs.jobs import JobStore
+from workers.jobs.quotas import require_room, submitting_for
+from workers.records import PRIORITIES, Page
+from workers.settings.errors import Conflict, Expired
+from workers.store.files import FileStore
+
+NORMAL = PRIORITIES["normal"]
+# Of a fork that never came to be; long after any request has ended.
+ABANDONED_S = 3600
+EXPORTABLE = ("poses.json", "colmap/sparse/0/cameras.bin", "colmap/sparse/0/images.bin")
+
+
+class DerivedJobs(JobStore):
+    """The same jobs, with the means to make others of them. What is said here raises `NotFound` too."""
+
+    def __init__(self, jobs: JobStore, files: FileStore) -> None:
+        super().__init__(jobs._database, jobs._listener, jobs._settings, jobs._tenant)
+        self._files = files
+
+    async def fork(
+        self,
+        job_id: str,
+        changes: Mapping[str, Any],
+        wanted: WantedStage = "auto",
+        *,
+        labels: Mapping[str, str] | None = None,
+        idempotency_key: str | None = None,
+    ) -> tuple[Job, bool]:
+        """Queue a job on the same dataset with other options, that takes over a stage's work.
+
+        It has its own copy of that work, so that either job can be deleted. Returns the job and whether it is
+        new (False: the same key with the same request came before).
+        Raises `Conflict` (``fork_not_possible``, ``dataset_not_ready``, ``idempotency_key_reused``),
+        `InputError` (``invalid_options``), `LimitReached` (``queue_full``).
+        """
+        async with self._database.transaction() as connection:
+            parent = await self._required(connection, job_id)
+            if parent["kind"] != "refine":
+                raise Conflict("fork_not_possible", f"{job_id} is an export.")
+            options, stage = plan_fork(parent, changes, wanted)
+            resolved = options.resolved().model_dump(mode="json")
+            fingerprint = fingerprint_of(f"fork {job_id} {stage}", resolved, labels)
+            # Before anything is copied, which no quota counts until the fork is there.
+            known = await self._known_or_room(connection, parent, idempotency_key, fingerprint)
+            if known is not None:
+                return known, False
+        fork_id = new_id("job")
+        taken = await self._copied(parent["reusable"], stage, fork_id)
+        async with self._database.transaction() as connection:
+            known = await self._known_or_room(connection, parent, idempotency_key, fingerprint)
+            if known is not None:
+                return known, False
+            values = {
+                "options": Jsonb(resolved),
+                "asked": Jsonb(options.model_dump(mode="json", exclude_unset=True)),
+                "labels": Jsonb(dict(labels or {})),
+                "idempotency_key": idempotency_key,
+                "fingerprint": fingerprint,
+                "reusable": Jsonb(taken),
+                "forked_from": job_id,
+                "forked_stage": stage,
+            }
+            await connection.execute("DELETE FROM trash WHERE prefix = %s", (f"jobs/{fork_id}",))
+            return await self._insert_below(connection, parent, fork_id, values), True
+
+    async def _known_or_room(
+        self,
+        connection: Connection,
+        parent: Mapping[str, Any],
+        idempotency_key: str | None,
+        fingerprint: str,
+    ) -> Job | None:
+        """The job of an earlier request with this key; none where there is room for a new one."""
+        await submitting_for(connection, parent["dataset_id"], self._tenant)
+        if idempotency_key is not None:
+            known = await known_job(connection, parent["tenant"], idempotency_key, fingerprint)
+            if known is not None:
+                return known
+        await require_room(connection, parent["dataset_id"], NORMAL, self._settings.max_queued)
+        return None
+
+    async def _copied(
+        self, reusable: Mapping[str, Any], stage: ReusableStage, fork_id: str
+    ) -> dict[str, Any]:
+        """The work of a stage and those before it, copied for the fork; trash until the fork is there."""
+        async with self._database.transaction() as connection:
+            await connection.execute(
+                "INSERT INTO trash (prefix, not_before)"
+                " VALUES (%s, clock_timestamp() + make_interval(secs => %s))",
+                (f"jobs/{fork_id}", ABANDONED_S),
+            )
+        taken: dict[str, Any] = {}
+        for name in LATEST_FIRST[LATEST_FIRST.index(stage) :]:
+            if name not in reusable:
+                continue
+            source, target = reusable[name]["prefix"], f"jobs/{fork_id}/taken/{name}"
+            for file in reusable[name]["files"]:
+                await self._files.copy(f"{source}/{file}", f"{target}/{file}")
+            taken[name] = {"prefix": target, "files": reusable[name]["files"]}
+        return taken
+
+    async def export(self, job_id: str, formats: Sequence[PackName]) -> tuple[Job, bool]:
+        """Queue an export of the job's result in further forms; the same request finds the same export.
+
+        Raises `Conflict` (``result_not_ready``; ``state_conflict``: there are no poses to export),
+        `LimitReached` (``queue_full``).
+        """
+        options = {"formats": sorted(set(formats))}
+        fingerprint = fingerprint_of(f"export {job_id}", options, None)
+        async with self._database.transaction() as connection:
+            parent = await self._required(connection, job_id)
+            _require_result(parent)
+            await submitting_for(connection, parent["dataset_id"], self._tenant)
+            same = await one_row(
+                connection,
+                JOB + " WHERE parent = %s AND fingerprint = %s AND kind = 'export'"
+                " AND state IN ('queued', 'running', 'succeeded')",
+                *(job_id, fingerprint),
+            )
+            if same is not None:
+                return job_from_row(same), False
+            await require_room(connection, parent["dataset_id"], NORMAL, self._settings.max_queued)
+            values = {
+                "kind": "export",
+                "parent": job_id,
+                "options": Jsonb(options),
+                "fingerprint": fingerprint,
+            }
+            return await self._insert_below(connection, parent, new_id("exp"), values), True
+
+    async def exports(self, job_id: str) -> Page[Job]:
+        """All exports of a job, the oldest first."""
+        async with self._database.transaction() as connection:
+            await self._required(connection, job_id)
+            cursor = await connection.execute(JOB + " WHERE parent = %s ORDER BY created_at, id", (job_id,))
+            return Page(items=tuple(job_from_row(row) for row in await cursor.fetchall()))
+
+    async def _insert_below(
+        self, connection: Connection, parent: Mapping[str, Any], job_id: str, values: Mapping[str, Any]
+    ) -> Job:
+        """A queued job on the dataset of ``parent``, for its tenant."""
+        row = {"id": job_id, "dataset_id": parent["dataset_id"], "tenant": parent["tenant"], **values}
+        statement = sql.SQL("INSERT INTO jobs ({}) VALUES ({})").format(
+            sql.SQL(", ").join(map(sql.Identifier, row)), sql.SQL(", ").join([sql.Placeholder()] * len(row))
+        )
+        await connection.execute(statement, list(row.values()))
+        return await self._queue(connection, job_id)
+
+
+def _require_result(parent: Mapping[str, Any]) -> None:
+    if parent["kind"] != "refine":
+        raise Conflict("state_conflict", f"{parent['id']} is an export itself.")
+    if parent["state"] == "expired":
+        raise Expired(f"The files of job {parent['id']} were kept for their time and are gone.")
+    if parent["state"] in ("queued", "running"):
+        raise Conflict("result_not_ready", f"The job is {parent['state']}.")
+    names = {item["name"] for item in parent["artifacts"]}
+    if not names.issuperset(EXPORTABLE):
+        raise Conflict("state_conflict", f"The job {parent['state']} without a whole set of poses.")

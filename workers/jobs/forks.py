@@ -1,0 +1,58 @@
+"""Which work of a job another one can take over, given what is to be different."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from biresnerf.options.refine_options import STAGE_2_OPTIONS, RefineOptions, parse_options
+from biresnerf.progress import ReusableStage
+from biresnerf.wire.jobs import WantedStage
+from workers.settings.errors import Conflict
+
+LATEST_FIRST: tuple[ReusableStage, ...] = ("coarse", "seeding")
+
+
+def plan_fork(
+    parent: Mapping[str, Any], changes: Mapping[str, Any], wanted: WantedStage
+) -> tuple[RefineOptions, ReusableStage]:
+    """Options of the new job, and the latest stage whose work it can take over.
+
+    Args:
+        parent: the row of the job that it starts from.
+        changes: options that are to be different; all others are as they were asked for.
+        wanted: a stage, or ``auto`` for the latest that the changes allow.
+
+    Raises:
+        Conflict: ``fork_not_possible``, with the reason.
+        InputError: ``invalid_options``.
+    """
+    # What memory did not allow would fail again.
+    asked = {**(parent["asked"] or parent["options"]), **parent["smaller"], **changes}
+    options = parse_options(asked)
+    new, old = options.resolved().model_dump(mode="json"), {**parent["options"], **parent["smaller"]}
+    changed = {name for name in new if new[name] != old.get(name)}
+    reasons = []
+    for stage in LATEST_FIRST if wanted == "auto" else (wanted,):
+        reason = _why_not(stage, parent["reusable"], changed, new)
+        if reason is None:
+            return options, stage
+        reasons.append(reason)
+    raise Conflict("fork_not_possible", " ".join(reasons))
+
+
+def _why_not(
+    stage: ReusableStage, reusable: Mapping[str, Any], changed: set[str], new: Mapping[str, Any]
+) -> str | None:
+    if stage == "coarse":
+        if stage not in reusable:
+            return "The job has not come to the end of stage 1."
+        earlier = sorted(changed - STAGE_2_OPTIONS)
+        return f"Stage 1 depends on {', '.join(earlier)}." if earlier else None
+    if stage not in reusable:
+        return "The job has no poses from COLMAP."
+    if new["start"] not in ("auto", "colmap"):
+        return f"start={new['start']} does not ask COLMAP."
+    if "seeding_effort" in changed and new["seeding_effort"] == "full":
+        return "COLMAP's answer was found with seeding_effort=low."
+    return "COLMAP's answer depends on seed." if "seed" in changed else None

@@ -1,0 +1,94 @@
+"""Rows of the table `jobs`: as the record that clients see, and found again by an idempotency key."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from biresnerf.wire.jobs import Job, JobEvent, JobProgress, PriorityName
+from biresnerf.wire.problems import JobError
+from workers.database.database import Connection
+from workers.records import PREVIEW_FOLDER, THUMBNAIL_NAME, priority_name
+from workers.settings.errors import Conflict
+
+JOB = """
+    SELECT jobs.*, CASE WHEN jobs.state = 'queued' THEN
+        (SELECT count(*) FROM jobs AS ahead WHERE ahead.state = 'queued'
+            AND (ahead.queue_order, ahead.queue_id) <= (jobs.queue_order, jobs.queue_id))
+        END AS queue_position
+    FROM jobs"""
+# The same for many at once: counting for each who is ahead of it takes seconds where thousands wait.
+PLACES = """places AS (SELECT queue_id, row_number() OVER (ORDER BY queue_order, queue_id) AS queue_position
+    FROM jobs WHERE state = 'queued')"""
+# With the store's tenant as parameter; none for everybody's.
+MINE = "jobs.tenant = coalesce(%s, jobs.tenant)"
+
+
+def job_from_row(row: dict[str, Any]) -> Job:
+    """The public record of a row of `JOB`."""
+    same = (
+        "id",
+        "tenant",
+        "dataset_id",
+        "state",
+        "stage",
+        "queue_position",
+        "attempt",
+        "cancel_requested",
+        "created_at",
+    )
+    also = ("started_at", "finished_at", "options", "metrics", "message", "verdict", "labels", "revision")
+    life = ("expires_at", "kind", "parent", "forked_from", "forked_stage", "smaller", "partial")
+    progress = JobProgress(**{key: row[key] for key in ("fraction", "step", "steps_total", "eta_s")})
+    error = JobError.model_validate(row["error"]) if row["error"] else None
+    values = {key: row[key] for key in same + also + life} | {"priority": priority_name(row["priority"])}
+    return Job(**values, progress=progress, error=error, thumbnail=_thumbnail(row))
+
+
+def _thumbnail(row: dict[str, Any]) -> str | None:
+    files = [*row["artifacts"], *(row["previews"] or {}).get("artifacts", [])]
+    names = {item["name"] for item in files}
+    return next(
+        (name for name in (THUMBNAIL_NAME, f"{PREVIEW_FOLDER}/{THUMBNAIL_NAME}") if name in names), None
+    )
+
+
+async def one_row(connection: Connection, sql: Any, *parameters: Any) -> dict[str, Any] | None:
+    """The first row of a statement, if there is one."""
+    return await (await connection.execute(sql, parameters)).fetchone()
+
+
+def fingerprint_of(
+    subject: str,
+    options: dict[str, Any],
+    labels: Mapping[str, str] | None,
+    priority: PriorityName = "normal",
+) -> str:
+    """By which a repeated request is told from another one with the same key."""
+    said = [subject, options, dict(labels or {}), *([priority] if priority != "normal" else [])]
+    request = json.dumps(said, sort_keys=True)
+    return hashlib.sha256(request.encode()).hexdigest()
+
+
+async def known_job(
+    connection: Connection, tenant: str, idempotency_key: str, fingerprint: str
+) -> Job | None:
+    """The job of an earlier request with this key; raises `Conflict` where that was a different one."""
+    row = await one_row(
+        connection, JOB + " WHERE tenant = %s AND idempotency_key = %s", *(tenant, idempotency_key)
+    )
+    if row is not None and row["fingerprint"] != fingerprint:
+        raise Conflict("idempotency_key_reused", f"The key was used for another request ({row['id']}).")
+    return None if row is None else job_from_row(row)
+
+
+async def events_of(connection: Connection, job_id: str, after: int, limit: int) -> tuple[JobEvent, ...]:
+    """The job's history after ``seq == after``."""
+    cursor = await connection.execute(
+        "SELECT seq, at, attempt, type, data FROM job_events WHERE job_id = %s AND seq > %s"
+        " ORDER BY seq LIMIT %s",
+        (job_id, after, limit),
+    )
+    return tuple(JobEvent.model_validate(row) for row in await cursor.fetchall())

@@ -1,0 +1,291 @@
+"""The job record: submit, look, cancel, delete, follow. Used by the service; never loads torch."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncGenerator, Mapping
+from datetime import datetime
+from typing import Any
+
+from psycopg.types.json import Jsonb
+
+from biresnerf.options.refine_options import RefineOptions
+from biresnerf.wire.jobs import Job, JobEvent, JobState, LogLine, PriorityName
+from biresnerf.wire.webhooks import JobWebhook
+from workers.database.database import Connection, Database
+from workers.database.ids import cursor_after, cursor_place, cursor_time, new_id
+from workers.jobs.job_completion import finish_cancelled
+from workers.jobs.job_rows import (
+    JOB,
+    MINE,
+    PLACES,
+    events_of,
+    fingerprint_of,
+    job_from_row,
+    known_job,
+    one_row,
+)
+from workers.jobs.job_updates import JobListener, follow
+from workers.jobs.quotas import require_room, submitting_for
+from workers.records import LOG_NAME, PRIORITIES, Artifact, JobUpdate, Page
+from workers.settings.errors import Conflict, Expired, NotFound
+from workers.settings.settings import Settings
+from workers.settings.traces import traced, traceparent
+from workers.tenants.tenants import LOCAL_TENANT
+from workers.webhooks.webhook_records import request_with
+from workers.webhooks.webhooks import add_job_webhook
+
+
+class JobStore:
+    """Jobs in the database. Get one from `workers.engine.open_stores`.
+
+    As opened it sees everybody's jobs; `of` gives it as one tenant sees it, to whom a job of another is as
+    unknown as one that never was. Every method raises `Unavailable` (``database_unavailable``) where the
+    database does not answer.
+    """
+
+    def __init__(
+        self, database: Database, listener: JobListener, settings: Settings, tenant: str | None = None
+    ) -> None:
+        self._database, self._listener, self._settings = database, listener, settings
+        self._tenant = tenant
+
+    def of(self, tenant: str | None) -> JobStore:
+        """The store as this tenant sees it; none: as the operator does."""
+        return JobStore(self._database, self._listener, self._settings, tenant)
+
+    @traced("submit")
+    async def submit(
+        self,
+        dataset_id: str,
+        options: RefineOptions,
+        *,
+        labels: Mapping[str, str] | None = None,
+        idempotency_key: str | None = None,
+        request_digest: str | None = None,
+        webhook: JobWebhook | None = None,
+        priority: PriorityName = "normal",
+    ) -> tuple[Job, bool]:
+        """Queue a job at its tenant's turn; the job and its queue entry are written in one transaction.
+
+        ``request_digest`` stands for the dataset when requests are compared, where the client sent the
+        files themselves and the dataset was made for them (see `repeated`).
+        Returns the job and whether it is new (False: the same key with the same request came before).
+        Raises `NotFound` (dataset), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``,
+        ``priority_not_allowed``), `LimitReached` (``queue_full``, ``quota_exhausted``),
+        `InputError` (``webhook_url_refused``).
+        """
+        resolved = options.resolved().model_dump(mode="json")
+        subject = request_with(request_digest or dataset_id, webhook)
+        fingerprint = fingerprint_of(subject, resolved, labels, priority)
+        async with self._database.transaction() as connection:
+            tenant = await submitting_for(connection, dataset_id, self._tenant)
+            if idempotency_key is not None:
+                known = await known_job(connection, tenant, idempotency_key, fingerprint)
+                if known is not None:
+                    return known, False
+            await require_room(connection, dataset_id, PRIORITIES[priority], self._settings.max_queued)
+            job_id = new_id("job")
+            await connection.execute(
+                "INSERT INTO jobs (id, dataset_id, tenant, priority, options, asked, labels, idempotency_key,"
+                " fingerprint) VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s)",
+                (
+                    *(job_id, dataset_id, tenant, PRIORITIES[priority], Jsonb(resolved)),
+                    *(Jsonb(options.model_dump(mode="json", exclude_unset=True)), Jsonb(dict(labels or {}))),
+                    *(idempotency_key, fingerprint),
+                ),
+            )
+            if webhook is not None:
+                await add_job_webhook(connection, self._settings, tenant, job_id, webhook)
+            return await self._queue(connection, job_id), True
+
+    async def _queue(self, connection: Connection, job_id: str) -> Job:
+        """Put a job just written into the queue."""
+        queue_id = await self._database.enqueue(connection, job_id)
+        await connection.execute(
+            "UPDATE jobs SET queue_id = %s, trace = %s WHERE id = %s", (queue_id, traceparent(), job_id)
+        )
+        await connection.execute("SELECT add_job_event(%s, 'queued', '{}')", (job_id,))
+        return job_from_row(await self._required(connection, job_id))
+
+    async def repeated(
+        self,
+        request_digest: str,
+        options: RefineOptions,
+        labels: Mapping[str, str],
+        idempotency_key: str,
+        priority: PriorityName = "normal",
+    ) -> Job | None:
+        """The job of an earlier request with this key, before anything is done for this one.
+
+        Raises `Conflict` (``idempotency_key_reused``) where the earlier request was a different one.
+        """
+        resolved = options.resolved().model_dump(mode="json")
+        async with self._database.transaction() as connection:
+            fingerprint = fingerprint_of(request_digest, resolved, labels, priority)
+            return await known_job(connection, self._tenant or LOCAL_TENANT, idempotency_key, fingerprint)
+
+    async def get(self, job_id: str) -> Job:
+        """The job now; raises `NotFound`."""
+        async with self._database.transaction() as connection:
+            return job_from_row(await self._required(connection, job_id))
+
+    async def list(
+        self,
+        *,
+        state: JobState | None = None,
+        label: tuple[str, str] | None = None,
+        created_after: datetime | None = None,
+        limit: int = 50,
+        cursor: str | None = None,
+    ) -> Page[Job]:
+        """Refinements, newest first; raises `InputError` (``bad_cursor``)."""
+        created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
+        rows = await self._database.fetch(
+            f"WITH page AS MATERIALIZED (SELECT * FROM jobs WHERE kind = 'refine' AND {MINE}"
+            " AND (%s::timestamptz IS NULL OR created_at > %s)"
+            " AND (%s::text IS NULL OR state = %s) AND (%s::jsonb IS NULL OR labels @> %s)"
+            " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
+            f" ORDER BY created_at DESC, id DESC LIMIT %s), {PLACES}"
+            " SELECT page.*, places.queue_position FROM page"
+            " LEFT JOIN places ON page.state = 'queued' AND places.queue_id = page.queue_id"
+            " ORDER BY page.created_at DESC, page.id DESC",
+            *(self._tenant, created_after, created_after, state, state),
+            *((Jsonb({label[0]: label[1]}),) * 2 if label else (None, None)),
+            *((cursor_time(created),) * 2 if created else (None, None)),
+            last_id,
+            limit + 1,
+        )
+        items = tuple(job_from_row(row) for row in rows[:limit])
+        more = len(rows) > limit
+        return Page(
+            items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
+        )
+
+    async def cancel(self, job_id: str, *, keep_partial: bool = False) -> Job:
+        """Ask for the end of a job: a queued one is cancelled at once, a running one within seconds.
+
+        With ``keep_partial`` the best poses so far are published, with a report that says that they are
+        partial. The first request decides. A job already final is returned as it is. Raises `NotFound`.
+        """
+        async with self._database.transaction() as connection:
+            changed = await one_row(
+                connection,
+                "UPDATE jobs SET cancel_requested = true, keep_partial = %s"
+                f" WHERE id = %s AND {MINE} AND state IN ('queued', 'running') AND NOT cancel_requested"
+                " RETURNING queue_id, state",
+                *(keep_partial, job_id, self._tenant),
+            )
+            if changed is not None:
+                await connection.execute(
+                    "SELECT procrastinate_cancel_job_v1(%s, true, false)", (changed["queue_id"],)
+                )
+                if changed["state"] == "queued":  # perhaps after an attempt that has shown something
+                    await finish_cancelled(connection, job_id, stall_s=self._settings.stall_s)
+                else:
+                    await connection.execute("SELECT add_job_event(%s, 'cancel_requested', '{}')", (job_id,))
+            return job_from_row(await self._required(connection, job_id))
+
+    async def delete(self, job_id: str) -> None:
+        """Delete a final job with its files; raises `NotFound`, `Conflict` (``state_conflict``)."""
+        async with self._database.transaction() as connection:
+            row = await one_row(
+                connection,
+                f"SELECT state FROM jobs WHERE id = %s AND {MINE} FOR UPDATE",
+                *(job_id, self._tenant),
+            )
+            if row is None:
+                raise NotFound(f"No job {job_id}.")
+            if row["state"] in ("queued", "running"):
+                raise Conflict("state_conflict", f"Job {job_id} is {row['state']}; cancel it first.")
+            busy = await one_row(
+                connection,
+                "SELECT id FROM jobs WHERE parent = %s AND state IN ('queued', 'running')",
+                job_id,
+            )
+            if busy is not None:
+                raise Conflict("state_conflict", f"Its export {busy['id']} is not over; cancel that first.")
+            # Its files, and its exports with theirs, go with it.
+            await connection.execute("DELETE FROM jobs WHERE id = %s", (job_id,))
+            await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job_id,))
+
+    async def events(self, job_id: str, *, after: int = 0, limit: int = 1000) -> tuple[JobEvent, ...]:
+        """The history after ``seq == after``, gapless and in order; raises `NotFound`."""
+        async with self._database.transaction() as connection:
+            await self._required(connection, job_id)
+            return await events_of(connection, job_id, after, limit)
+
+    async def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
+        """The published files, by name, with those of its exports; while the job runs its previews.
+
+        Raises `NotFound`, `Expired`.
+        """
+        async with self._database.transaction() as connection:
+            own = await self._required(connection, job_id)
+            if own["state"] == "expired":
+                raise Expired(f"The files of job {job_id} were kept for their time and are gone.")
+            cursor = await connection.execute(
+                "SELECT artifacts FROM jobs WHERE parent = %s AND state = 'succeeded'", (job_id,)
+            )
+            exports = await cursor.fetchall()
+        listed = [*own["artifacts"], *(own["previews"] or {}).get("artifacts", [])]
+        listed += [item for row in exports for item in row["artifacts"] if item["name"] != LOG_NAME]
+        # A form that the job wrote itself may have been exported as well: the files are the same.
+        named = {item["name"]: item for item in reversed(listed)}
+        return tuple(Artifact.model_validate(named[name]) for name in sorted(named))
+
+    async def log(self, job_id: str, *, after: int = 0, limit: int = 1000) -> tuple[LogLine, ...]:
+        """What the job's process wrote to standard error, after line ``after``; raises `NotFound`."""
+        async with self._database.transaction() as connection:
+            await self._required(connection, job_id)
+            cursor = await connection.execute(
+                "SELECT n, at, attempt, text FROM job_log WHERE job_id = %s AND n > %s ORDER BY n LIMIT %s",
+                (job_id, after, limit),
+            )
+            return tuple(LogLine.model_validate(row) for row in await cursor.fetchall())
+
+    async def update(self, job_id: str, after: int = 0) -> JobUpdate:
+        """The job and the events after ``after``, seen in one snapshot; raises `NotFound`."""
+        async with self._database.transaction() as connection:
+            await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
+            job = job_from_row(await self._required(connection, job_id))
+            return JobUpdate(job=job, events=await events_of(connection, job_id, after, 10_000))
+
+    def subscribe(
+        self, job_id: str, *, after: int = 0, heartbeat_s: float = 15.0
+    ) -> AsyncGenerator[JobUpdate | None]:
+        """Follow a job: first its state and the events after ``after``, then every change.
+
+        Yields none when nothing changed for ``heartbeat_s`` (time for a keep-alive). Ends after the update
+        that carries a final state. Progress is in ``update.job``, at most once a second. Survives a restart
+        of the database. Raises `NotFound`, also when the job is deleted meanwhile.
+        """
+        return follow(self.update, self._listener, self._tenant, job_id, after, heartbeat_s)
+
+    async def wait(self, job_id: str, *, timeout_s: float) -> Job:
+        """The job as soon as it is final, or as it is after ``timeout_s`` (for long polls)."""
+        job = await self.get(job_id)
+        updates = follow(self.update, self._listener, self._tenant, job_id, 0, timeout_s)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s), contextlib.aclosing(updates):
+                async for update in updates:
+                    job = job if update is None else update.job
+        return job
+
+    async def counts(self) -> dict[JobState, int]:
+        """How many jobs are in each state."""
+        rows = await self._database.fetch(
+            f"SELECT state, count(*) AS n FROM jobs WHERE {MINE} GROUP BY state", self._tenant
+        )
+        return {row["state"]: row["n"] for row in rows}
+
+    async def healthy(self) -> bool:
+        """Whether the database answers in time."""
+        return await self._listener.database_answers(2.0)
+
+    async def _required(self, connection: Connection, job_id: str) -> dict[str, Any]:
+        row = await one_row(connection, JOB + f" WHERE id = %s AND {MINE}", *(job_id, self._tenant))
+        if row is None:
+            raise NotFound(f"No job {job_id}.")
+        return row

@@ -1,0 +1,93 @@
+"""What a tenant may still have: looked up in the transaction that takes it, so that no two take the same."""
+
+from __future__ import annotations
+
+from workers.database.database import Connection
+from workers.settings.errors import Conflict, LimitReached, NotFound
+
+
+async def submitting_for(connection: Connection, dataset_id: str, seen_by: str | None) -> str:
+    """Whose a job on the dataset is. That tenant's submits take turns from here to the end of the transaction.
+
+    So no two of them take its last place, or the same idempotency key. Other tenants' do not wait for them: at the
+    limit of the whole queue as many jobs more can get in as submits run at that moment.
+
+    Raises `NotFound` where the tenant ``seen_by`` does not see the dataset.
+    """
+    # The dataset before the tenant, as uploads lock them.
+    sql = "SELECT tenant FROM datasets WHERE id = %s AND tenant = coalesce(%s, tenant) FOR SHARE"
+    dataset = await (await connection.execute(sql, (dataset_id, seen_by))).fetchone()
+    if dataset is None:
+        raise NotFound(f"No dataset {dataset_id}.")
+    await _lock_tenant(connection, dataset["tenant"])
+    return str(dataset["tenant"])
+
+
+async def require_room(connection: Connection, dataset_id: str, priority: int, max_queued: int) -> None:
+    """What must hold for one more job on the dataset.
+
+    Raises `NotFound`, `Conflict` (``dataset_not_ready``, ``priority_not_allowed``), `LimitReached`
+    (``queue_full``: ``max_queued`` jobs wait already; ``quota_exhausted``).
+    """
+    sql = "SELECT state, tenant FROM datasets WHERE id = %s FOR SHARE"
+    dataset = await (await connection.execute(sql, (dataset_id,))).fetchone()
+    if dataset is None:  # deleted a moment ago
+        raise NotFound(f"No dataset {dataset_id}.")
+    if dataset["state"] != "ready":
+        raise Conflict("dataset_not_ready", f"Dataset {dataset_id} is {dataset['state']}, not ready.")
+    queued = await (
+        await connection.execute("SELECT count(*) AS n FROM jobs WHERE state = 'queued'")
+    ).fetchone()
+    if queued is not None and queued["n"] >= max_queued:
+        raise LimitReached("queue_full", f"{queued['n']} jobs wait already, which is the limit.")
+    await _require_job_quota(connection, dataset["tenant"], priority)
+
+
+async def _require_job_quota(connection: Connection, tenant: str, priority: int) -> None:
+    limits = await _limits(connection, tenant)
+    if priority > limits["top_priority"]:
+        raise Conflict("priority_not_allowed", "Jobs of this tenant may not ask for so high a priority.")
+    if limits["max_queued"]:
+        sql = "SELECT count(*) AS n FROM jobs WHERE tenant = %s AND state = 'queued'"
+        row = await (await connection.execute(sql, (tenant,))).fetchone()
+        if row is not None and row["n"] >= limits["max_queued"]:
+            raise LimitReached(
+                "quota_exhausted", f"{row['n']} of your jobs wait already, which is the limit."
+            )
+    await _require_bytes(connection, tenant, limits["max_stored_bytes"], 1)
+
+
+async def require_byte_quota(connection: Connection, dataset_id: str, size: int) -> None:
+    """Raises `LimitReached` (``quota_exhausted``) where the dataset's tenant may not store so much more.
+
+    From here to the end of the transaction nothing else of the tenant is counted.
+    """
+    sql = "SELECT tenant FROM datasets WHERE id = %s"
+    row = await (await connection.execute(sql, (dataset_id,))).fetchone()
+    if row is not None:
+        limits = await _limits(connection, row["tenant"])
+        await _require_bytes(connection, row["tenant"], limits["max_stored_bytes"], size)
+
+
+async def _limits(connection: Connection, tenant: str) -> dict[str, int]:
+    await _lock_tenant(connection, tenant)
+    sql = "SELECT top_priority, max_queued, max_stored_bytes FROM tenant_limits WHERE id = %s"
+    row = await (await connection.execute(sql, (tenant,))).fetchone()
+    assert row is not None, "referenced by what the tenant owns"
+    return row
+
+
+async def _lock_tenant(connection: Connection, tenant: str) -> None:
+    await connection.execute("SELECT 1 FROM tenants WHERE id = %s FOR NO KEY UPDATE", (tenant,))
+
+
+async def _require_bytes(connection: Connection, tenant: str, limit: int, size: int) -> None:
+    if not limit:
+        return
+    sql = "SELECT stored_bytes_of(%s) AS stored"
+    row = await (await connection.execute(sql, (tenant,))).fetchone()
+    stored = row["stored"] if row is not None else 0
+    if stored + size > limit:
+        raise LimitReached(
+            "quota_exhausted", f"{stored} of your {limit} bytes are stored; delete datasets or jobs first."
+        )

@@ -1,0 +1,45 @@
+"""Room on local disks: what is left is kept for the jobs that run, so that a full disk is refused, not hit."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from workers.settings.errors import LimitReached
+from workers.settings.settings import Settings
+
+
+class Room:
+    """The disks under some folders (which need not exist yet), of which ``reserve_bytes`` each stay free."""
+
+    def __init__(self, folders: Sequence[Path], reserve_bytes: int) -> None:
+        self._folders, self._reserve_bytes = tuple(folders), reserve_bytes
+
+    def free_bytes(self) -> int:
+        """Bytes that may still be written, on the fullest of the disks; not below 0."""
+        free = min(shutil.disk_usage(_existing(folder)).free for folder in self._folders)
+        return max(0, free - self._reserve_bytes)
+
+    def require(self, more_bytes: int = 0) -> None:
+        """Raises `LimitReached` (``storage_full``) where ``more_bytes`` would not leave the reserve free."""
+        free = self.free_bytes()
+        if more_bytes > free or not free:
+            raise LimitReached("storage_full", "The disk is full but for what running jobs need.")
+
+
+def room_for_uploads(settings: Settings) -> Room:
+    """Where bodies lie while they are checked, and where they end up if that is a folder."""
+    local = [settings.files_dir] if settings.storage_url is None else []
+    return Room([settings.data_dir, *local], settings.disk_reserve_bytes)
+
+
+def room_for_jobs(settings: Settings) -> Room:
+    """Where jobs have their working copies."""
+    return Room([settings.scratch_dir], settings.disk_reserve_bytes)
+
+
+def _existing(folder: Path) -> Path:
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder

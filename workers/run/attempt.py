@@ -1,0 +1,247 @@
+"""One attempt at one job: stage the files, run the process, carry its reports, conclude."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import shutil
+import signal
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Literal
+
+from pydantic import ValidationError
+
+from biresnerf.progress import Progress
+from biresnerf.report import Verdict, VerdictName
+from biresnerf.wire.problems import JobError
+from workers.database.database import Database
+from workers.process.waiting import first_done
+from workers.records import LOG_NAME, Artifact
+from workers.run.child import Child, log_tail
+from workers.run.claim import Claim, Fenced, crashed_too_often, insist
+from workers.run.courier import Courier
+from workers.run.ledger import Ledger
+from workers.run.memory import OomKills, out_of_memory, smaller_options
+from workers.run.results import store_result
+from workers.run.staging import stage_job
+from workers.settings.settings import Settings
+from workers.store.files import FileStore
+
+log = logging.getLogger(__name__)
+
+StopReason = Literal["cancel", "shutdown"]
+EXIT_ERRORS = {2: "InputError", 3: "RefinementError"}  # deterministic: another attempt would end the same
+EXIT_MEMORY = 4
+# Of a process that the kernel may have killed for want of memory; the second where it was a process of its own.
+KILLED, CHILD_KILLED = -signal.SIGKILL, "seeding_crashed"
+# Ours to mend, not the user's: a checkpoint of an older version, for example. The job starts over.
+STALE_CHECKPOINT = {"output_not_resumable", "checkpoint_invalid"}
+DISCARDED_GRACE_S = 2.0  # for a cancelled job whose result nobody wants
+
+
+class Attempt:
+    """Runs a claimed job in ``folder`` (fresh, local, ours). `ask_stop` may be called at any time."""
+
+    def __init__(
+        self,
+        database: Database,
+        files: FileStore,
+        settings: Settings,
+        claim: Claim,
+        folder: Path,
+        variables: Mapping[str, str],
+    ) -> None:
+        self._claim, self._settings, self._files = claim, settings, files
+        self._database, self._variables = database, variables
+        self._ledger = Ledger(database, claim)
+        self._folder, self._output, self._log = folder, folder / "output", folder / LOG_NAME
+        self._stop_reason: StopReason | None = None
+        self._stop = asyncio.Event()
+        self._timed_out = False
+        self._oom_kills = OomKills()
+        self._oom_kills_before: int | None = None
+
+    def ask_stop(self, reason: StopReason) -> None:
+        """End soon: the process writes a checkpoint and exits. A cancellation outweighs a shutdown."""
+        if self._stop_reason != "cancel":
+            self._stop_reason = reason
+        self._stop.set()
+
+    async def run(self) -> bool:
+        """Run to the end; True where the job goes back to the queue. Raises `Fenced`.
+
+        Whatever goes wrong on our side counts as a crash of the attempt.
+        """
+        try:
+            return await self._run()
+        except Fenced:
+            # What was stored meanwhile is nobody's; the trash of this job may be gone already.
+            await self._files.delete_prefix(self._result_prefix)
+            raise
+        finally:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    async def _run(self) -> bool:
+        try:
+            return await self._conclude(await self._run_process())
+        except Exception as error:
+            log.exception("attempt %s of %s failed on our side", self._claim.name, self._claim.job_id)
+            return await self._crashed(f"{type(error).__name__}: {error}")
+
+    @property
+    def _result_prefix(self) -> str:
+        return f"jobs/{self._claim.job_id}/results/{self._claim.name}"
+
+    async def _run_process(self) -> int | None:
+        """Exit status of the process; none where a stop came before it was started."""
+        # From the start again where database or store go away, which is no fault of the job.
+        staging = asyncio.create_task(
+            insist(lambda: stage_job(self._database, self._files, self._claim, self._folder))
+        )
+        await first_done(staging, self._stop.wait())
+        if not staging.done():
+            staging.cancel()
+            return None
+        await staging
+        self._oom_kills_before = self._oom_kills.count()
+        # What a job that is killed leaves behind goes with its folder.
+        variables = {**self._variables, "TMPDIR": str(self._folder / "tmp")}
+        child = await Child.start(self._settings.job_command, self._folder, self._log, variables)
+        courier = Courier(self._ledger, self._files, self._output, self._log)
+        carrying = asyncio.create_task(courier.run())
+        pumping = asyncio.create_task(self._pump(child, courier))
+        ended = asyncio.create_task(child.wait())
+        try:
+            async with asyncio.timeout(self._settings.job_timeout_s):
+                await first_done(ended, carrying, self._stop.wait())
+        except TimeoutError:
+            self._timed_out = True
+        try:
+            if carrying.done():
+                await carrying  # Fenced
+            if not ended.done():
+                await child.stop(await self._grace_s())
+            status = await ended
+            await pumping
+            courier.close(last_checkpoint=self._stop_reason != "cancel")
+            await carrying
+            return status
+        finally:
+            child.kill()
+            for task in (carrying, pumping, ended):
+                task.cancel()
+
+    async def _grace_s(self) -> float:
+        """How long the process may take to end."""
+        grace_s = self._settings.stop_grace_s
+        if self._stop_reason != "cancel":
+            return grace_s
+        wanted = await self._ledger.wants_partial()
+        return min(grace_s, self._settings.cancel_grace_s if wanted else DISCARDED_GRACE_S)
+
+    async def _pump(self, child: Child, courier: Courier) -> None:
+        async for line in child.lines():
+            try:
+                courier.offer(Progress.model_validate_json(line))
+            except ValidationError:
+                with self._log.open("ab") as file:  # a library printed something
+                    file.write(line)
+
+    async def _conclude(self, status: int | None) -> bool:
+        keep = (self._claim.name, self._settings.stall_s)
+        if status == 0:
+            artifacts = await self._store(enough=lambda: self._stop_reason == "cancel")
+            if not await self._ledger.publish(artifacts, self._verdict(), *keep):
+                await self._ledger.cancelled(artifacts, *keep)
+            return False
+        if status == EXIT_MEMORY or (status in (KILLED, *EXIT_ERRORS) and self._killed_for_memory(status)):
+            return await self._ran_out_of_memory()
+        if status in EXIT_ERRORS:
+            error = self._reported_error()
+            if error.code in STALE_CHECKPOINT and self._claim.checkpoint is not None:
+                return await self._crashed(error.detail, forget_checkpoint=True)
+            await self._ledger.fail(error, await self._store(log_only=True), *keep)
+            return False
+        if self._stop_reason == "cancel":
+            unwanted = not await self._ledger.wants_partial()
+            await self._ledger.cancelled(await self._store(log_only=unwanted), *keep)
+            return False
+        if self._stop_reason == "shutdown":
+            return await self._ledger.give_back("requeued", {"why": "shutdown"}, counted=False)
+        if self._timed_out:
+            error = JobError(
+                code="timeout",
+                detail=f"The job took longer than {self._settings.job_timeout_s:g} s.",
+                mend="Ask for fewer steps or smaller images, or raise BIRESNERF_JOB_TIMEOUT_S.",
+                log_tail=log_tail(self._log),
+            )
+            await self._ledger.fail(error, await self._store(), *keep)
+            return False
+        return await self._crashed(f"exit status {status}")
+
+    async def _crashed(self, how: str, *, forget_checkpoint: bool = False) -> bool:
+        tail = log_tail(self._log)
+        if self._claim.attempt < self._settings.max_attempts:
+            said = {"how": how, "log_tail": tail}
+            return await self._ledger.give_back(
+                "attempt_crashed", said, counted=True, forget_checkpoint=forget_checkpoint
+            )
+        error = crashed_too_often(self._claim.attempt, tail)
+        error = error.model_copy(update={"detail": f"{error.detail} The last time: {how}."})
+        artifacts = await self._store(log_only=True)
+        await self._ledger.fail(error, artifacts, self._claim.name, self._settings.stall_s)
+        return False
+
+    def _killed_for_memory(self, status: int) -> bool:
+        """Whether the kernel killed a process meanwhile, and this one's end looks like it."""
+        if self._stop_reason is not None or self._timed_out:
+            return False
+        if status != KILLED and self._reported_error().code != CHILD_KILLED:
+            return False
+        now = self._oom_kills.count()
+        return now is not None and now > (self._oom_kills_before or 0)
+
+    async def _ran_out_of_memory(self) -> bool:
+        """Once more with less, from the start: a checkpoint is of the sizes that were too large."""
+        tail, keep = log_tail(self._log), (self._claim.name, self._settings.stall_s)
+        smaller = smaller_options(self._claim.options) if self._claim.kind == "refine" else {}
+        if smaller and not self._claim.smaller and self._claim.attempt < self._settings.max_attempts:
+            said = {"why": "out_of_memory", "options": smaller, "log_tail": tail}
+            return await self._ledger.give_back(
+                "retried_smaller", said, counted=True, forget_checkpoint=True, smaller=smaller
+            )
+        await self._ledger.fail(
+            out_of_memory(self._claim.smaller, tail), await self._store(log_only=True), *keep
+        )
+        return False
+
+    def _verdict(self) -> VerdictName | None:
+        """What the report says of the result; None where it passes no verdict."""
+        if self._claim.kind != "refine":
+            return None
+        try:
+            passed = json.loads((self._output / "report.json").read_bytes()).get("verdict")
+            return None if passed is None else Verdict.model_validate(passed).verdict
+        except (OSError, ValueError) as error:
+            log.error("no verdict of %s: %s", self._claim.job_id, error)
+            return None
+
+    def _reported_error(self) -> JobError:
+        """What the process wrote to ``error.json`` before it exited with 2 or 3."""
+        tail = log_tail(self._log)
+        try:
+            said = json.loads((self._folder / "error.json").read_text())
+            return JobError(**said, log_tail=tail)
+        except (OSError, ValueError, TypeError) as error:
+            detail = f"The job failed and its error report could not be read ({error})."
+            return JobError(code="engine_error", detail=detail, log_tail=tail)
+
+    async def _store(
+        self, *, log_only: bool = False, enough: Callable[[], bool] = lambda: False
+    ) -> list[Artifact]:
+        """The output and the log, under this attempt's own prefix."""
+        return await store_result(
+            self._files, self._result_prefix, self._output, self._log, log_only=log_only, enough=enough
+        )

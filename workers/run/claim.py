@@ -1,0 +1,128 @@
+"""Taking a job over: from the claim on, only its owner can write into the job."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+import uuid
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from psycopg.types.json import Jsonb
+
+from biresnerf.progress import ReusableStage
+from biresnerf.wire.jobs import JobKind
+from biresnerf.wire.problems import JobError
+from workers.database.database import QUIET_S, Database
+from workers.jobs.job_completion import finish, finish_cancelled
+from workers.settings.errors import Unavailable
+
+log = logging.getLogger(__name__)
+
+RETRY_S = 0.5
+T = TypeVar("T")
+
+
+class Fenced(BaseException):
+    """Somebody else has claimed the job since. Not an `Exception`: nothing may swallow it."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One attempt of one job, owned by whoever holds ``token``.
+
+    ``asked`` are the options that were sent, ``options`` the same with all others as the preset has them.
+    """
+
+    job_id: str
+    dataset_id: str
+    attempt: int
+    token: uuid.UUID
+    kind: JobKind
+    parent: str | None
+    options: dict[str, Any]
+    asked: dict[str, Any]
+    smaller: dict[str, Any]
+    checkpoint: dict[str, Any] | None
+    reusable: dict[str, Any]
+    forked_stage: ReusableStage | None
+
+    @property
+    def name(self) -> str:
+        """Folder name of this attempt, never used by another one."""
+        return f"{self.attempt}-{self.token.hex[:8]}"
+
+
+async def claim_job(database: Database, job_id: str, max_attempts: int) -> Claim | None:
+    """Take a job over with a fresh token; none where there is nothing to run.
+
+    A job whose cancellation was asked for ends ``cancelled``, one that had its attempts ends ``failed``.
+    """
+    token = uuid.uuid4()
+    return await insist(lambda: _claim(database, job_id, max_attempts, token))
+
+
+async def _claim(database: Database, job_id: str, max_attempts: int, token: uuid.UUID) -> Claim | None:
+    async with database.transaction() as connection:
+        cursor = await connection.execute("SELECT * FROM jobs WHERE id = %s FOR UPDATE", (job_id,))
+        row = await cursor.fetchone()
+        if row is not None and row["run_token"] == token:
+            # An earlier try got through, though its acknowledgement was lost: the attempt counts once.
+            return _claimed(row, token)
+        if row is None or row["state"] not in ("queued", "running"):
+            return None
+        if row["cancel_requested"]:
+            await finish_cancelled(connection, job_id)
+            return None
+        if row["attempt"] >= max_attempts:
+            await finish(connection, job_id, "failed", crashed_too_often(row["attempt"]))
+            return None
+        cursor = await connection.execute(
+            "UPDATE jobs SET state = 'running', attempt = attempt + 1, run_token = %s, fraction = 0,"
+            " step = 0, stage = NULL, eta_s = NULL, message = '',"
+            " started_at = coalesce(started_at, clock_timestamp()) WHERE id = %s RETURNING *",
+            (token, job_id),
+        )
+        claimed = await cursor.fetchone()
+        assert claimed is not None, "the row is locked"
+        resumed = Jsonb({"resumed": claimed["checkpoint"] is not None})
+        await connection.execute("SELECT add_job_event(%s, 'started', %s)", (job_id, resumed))
+        return _claimed(claimed, token)
+
+
+def _claimed(row: dict[str, Any], token: uuid.UUID) -> Claim:
+    same = ("dataset_id", "attempt", "kind", "parent", "options", "smaller", "checkpoint", "reusable")
+    # What was left open stays open: the run fills it in by its device, and by where its poses come from.
+    asked = row["options"] if row["asked"] is None else row["asked"]
+    return Claim(
+        row["id"],
+        token=token,
+        asked=asked,
+        forked_stage=row["forked_stage"],
+        **{name: row[name] for name in same},
+    )
+
+
+def crashed_too_often(attempts: int, log_tail: str = "") -> JobError:
+    """The error of a job whose every attempt died."""
+    return JobError(
+        code="too_many_crashes",
+        detail=f"The job's process died in each of {attempts} attempts.",
+        mend="Try smaller options (preset fast, a smaller max_image_size) or a machine with more memory.",
+        log_tail=log_tail,
+    )
+
+
+async def insist(write: Callable[[], Awaitable[T]]) -> T:
+    """The answer of ``write``, tried again for as long as the database or the store is away."""
+    said_at = -QUIET_S
+    while True:
+        try:
+            return await write()
+        except Unavailable as error:
+            if time.monotonic() - said_at > QUIET_S:
+                said_at = time.monotonic()
+                log.warning("%s; trying again until it answers", error)
+            await asyncio.sleep(RETRY_S)

@@ -1,0 +1,183 @@
+"""Carries what a job's process reports to the database and the file store, without ever holding it up."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Awaitable, Callable
+from functools import partial
+from pathlib import Path
+
+from obstore.exceptions import BaseError as StoreError
+
+from biresnerf.progress import Progress, ReusableStage
+from workers.run.claim import Fenced
+from workers.run.ledger import Ledger
+from workers.run.log_lines import LogLines
+from workers.run.results import files_inside, store_artifact
+from workers.settings.errors import EngineError
+from workers.settings.traces import StageSpans
+from workers.store.files import FileStore
+
+log = logging.getLogger(__name__)
+
+PERIOD_S = 1.0
+
+
+class Courier:
+    """Delivers every stage change, once a second the latest progress and the log, the latest checkpoint and preview.
+
+    `offer` never waits; `run` delivers until `close` and the last delivery. `run` raises `Fenced`.
+    """
+
+    def __init__(self, ledger: Ledger, files: FileStore, output: Path, log_file: Path) -> None:
+        self._ledger, self._files, self._output = ledger, files, output
+        self._stages: deque[Progress] = deque()
+        self._latest: Progress | None = None
+        self._log = LogLines(log_file)
+        self._checkpoints, self._previews = _Box(), _Box()
+        self._reusable: dict[ReusableStage, _Box] = {"seeding": _Box(), "coarse": _Box()}
+        self._stored = 0
+        self._spans = StageSpans()
+        self._progress_due = asyncio.Event()
+        self._closed = asyncio.Event()
+
+    def offer(self, progress: Progress) -> None:
+        """Take note of a report."""
+        if self._latest is None or progress.stage != self._latest.stage:
+            self._stages.append(progress)
+            self._spans.enter(progress.stage)
+        self._latest = progress
+        self._progress_due.set()
+        if progress.checkpoint is not None:
+            self._checkpoints.put(progress)
+        if progress.preview:
+            self._previews.put(progress)
+        for stage in progress.reusable:
+            self._reusable[stage].put(progress)
+
+    def close(self, *, last_checkpoint: bool = True) -> None:
+        """No more reports will come; nobody goes on from the job's ``last_checkpoint`` where it is cancelled."""
+        if not last_checkpoint:
+            self._checkpoints.latest = None
+        self._closed.set()
+        self._progress_due.set()
+        for box in (self._checkpoints, self._previews, *self._reusable.values()):
+            box.due.set()
+
+    async def run(self) -> None:
+        """Deliver until closed and all is delivered."""
+        deliveries = [
+            asyncio.create_task(self._carry_progress()),
+            asyncio.create_task(self._carry_log()),
+            asyncio.create_task(self._carry(self._checkpoints, self._store_checkpoint)),
+            asyncio.create_task(self._carry(self._previews, self._store_preview)),
+            *(
+                asyncio.create_task(self._carry(box, partial(self._store_reusable, stage)))
+                for stage, box in self._reusable.items()
+            ),
+        ]
+        try:
+            await asyncio.gather(*deliveries)
+        finally:
+            for task in deliveries:
+                task.cancel()
+            self._spans.end()
+
+    async def _carry_progress(self) -> None:
+        delivered: Progress | None = None
+        while True:
+            await self._progress_due.wait()
+            self._progress_due.clear()
+            closed = self._closed.is_set()
+            while self._stages:
+                delivered = self._stages.popleft()
+                await self._ledger.progress(delivered)
+            if self._latest is not None and self._latest is not delivered:
+                delivered = self._latest
+                await self._ledger.progress(delivered)
+            if closed:
+                return
+            await self._pause()
+
+    async def _carry_log(self) -> None:
+        while True:
+            closed = self._closed.is_set()
+            while lines := await asyncio.to_thread(self._log.fresh, last=closed):
+                await self._ledger.log(lines)
+            if closed:
+                return
+            await self._pause()
+
+    async def _pause(self) -> None:
+        """Wakes early for the end only: everything else can wait for the period."""
+        try:
+            await asyncio.wait_for(self._closed.wait(), PERIOD_S)
+        except TimeoutError:
+            return
+
+    async def _carry(self, box: _Box, store: Callable[[Progress], Awaitable[None]]) -> None:
+        while True:
+            await box.due.wait()
+            box.due.clear()
+            closed = self._closed.is_set()
+            progress, box.latest = box.latest, None
+            if progress is not None:
+                try:
+                    await store(progress)
+                except (OSError, ValueError, StoreError, EngineError) as error:
+                    # The job can go on without: another one will come, or the one before will do.
+                    log.error("a file of %s was not stored: %s", self._ledger.claim.job_id, error)
+            if closed:
+                return
+
+    async def _store_checkpoint(self, progress: Progress) -> None:
+        """A new object each time, then the pointer: a checkpoint is never overwritten."""
+        prefix = self._new_prefix("checkpoints")
+        for name, path in files_inside(self._output, [str(progress.checkpoint)]).items():
+            await self._files.put_path(f"{prefix}/{name}", path)
+            await self._point(prefix, self._ledger.checkpoint(prefix, [name], progress.step))
+
+    async def _store_preview(self, progress: Progress) -> None:
+        """The same for the files that show how far the job is."""
+        prefix = self._new_prefix("previews")
+        found = files_inside(self._output, progress.preview)
+        artifacts = [
+            await store_artifact(self._files, prefix, name, path) for name, path in sorted(found.items())
+        ]
+        if artifacts:  # the job may have ended meanwhile, and have cleaned up
+            await self._point(prefix, self._ledger.preview(prefix, artifacts, progress))
+
+    async def _store_reusable(self, stage: ReusableStage, progress: Progress) -> None:
+        """The same for the work of a stage."""
+        prefix = self._new_prefix("stages")
+        found = files_inside(self._output, progress.reusable[stage])
+        for name, path in found.items():
+            await self._files.put_path(f"{prefix}/{name}", path)
+        if len(found) == len(progress.reusable[stage]):
+            await self._point(prefix, self._ledger.reusable(stage, prefix, list(found)))
+
+    async def _point(self, prefix: str, writing: Awaitable[None]) -> None:
+        try:
+            await writing
+        except Fenced:
+            await self._files.delete_prefix(prefix)  # the new owner knows nothing of it, nor does the trash
+            raise
+
+    def _new_prefix(self, kind: str) -> str:
+        self._stored += 1
+        claim = self._ledger.claim
+        return f"jobs/{claim.job_id}/{kind}/{claim.name}-{self._stored}"
+
+
+class _Box:
+    """The latest report that has something to be stored; one that was not fetched in time is dropped."""
+
+    def __init__(self) -> None:
+        self.latest: Progress | None = None
+        self.due = asyncio.Event()
+
+    def put(self, progress: Progress) -> None:
+        self.latest = progress
+        self.due.set()

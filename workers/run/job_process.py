@@ -1,0 +1,150 @@
+"""The program of one job's child process: `python -m workers.run.job_process JOB_FOLDER`.
+
+Reads ``job.json``, writes one line of JSON per report to standard output, everything else to standard error.
+Exit status: 0 done; 2 the user's mistake, 3 the refinement failed (both told in ``error.json``); 4 out of
+memory; 143 stopped by SIGTERM after writing a checkpoint, if there was anything to keep; 1 anything else.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import Literal, TextIO
+
+from pydantic import BaseModel, ConfigDict, TypeAdapter
+
+from biresnerf.errors import InputError, Interrupted, RefinementError
+from biresnerf.openmp import let_waiting_threads_sleep
+from biresnerf.options.refine_options import PackName, RefineOptions, parse_options
+from biresnerf.progress import Progress, Stage
+
+EXIT_BUG = 1
+EXIT_INPUT = 2
+EXIT_REFINEMENT = 3
+EXIT_MEMORY = 4
+EXIT_STOPPED = 128 + signal.SIGTERM
+
+
+class Order(BaseModel):
+    """``job.json``: relative paths are below the job folder."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    task: Literal["refine", "export"] = "refine"
+    input: Path
+    output: Path
+    options: dict[str, object]
+    result: Path | None = None
+
+
+def main(folder: Path) -> int:
+    """Run the job in ``folder``; returns the exit status."""
+    let_waiting_threads_sleep()
+    protocol = _protocol_only()
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s %(message)s")
+    stop = _Stop()
+    signal.signal(signal.SIGTERM, lambda *_: stop.ask())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        os.chdir(folder)
+        order = Order.model_validate_json(Path("job.json").read_bytes())
+        if order.task == "export":
+            _export(order, stop)
+        else:
+            _refine(order, parse_options(order.options), protocol, stop)
+    except Interrupted:
+        return EXIT_STOPPED
+    except InputError as error:
+        _report(error.code, error.what, error.where, error.mend)
+        return EXIT_INPUT
+    except RefinementError as error:
+        _report(error.code, error.what, "", "")
+        return EXIT_REFINEMENT
+    except Exception as error:  # noqa: BLE001 - the last line of defence: a bug ends in the log and in the status
+        traceback.print_exc()
+        return EXIT_MEMORY if is_want_of_memory(error) else EXIT_BUG
+    return 0
+
+
+class _Stop:
+    """What SIGTERM means: stop soon and keep what there is, or end at once where there is nothing to keep."""
+
+    def __init__(self) -> None:
+        self.asked = threading.Event()
+        self.stage: Stage = "preparing"
+
+    def ask(self) -> None:
+        if self.stage == "preparing":
+            os._exit(
+                EXIT_STOPPED
+            )  # loading torch, compiling kernels and reading images take long to come to an end
+        self.asked.set()
+
+
+def is_want_of_memory(error: Exception) -> bool:
+    """Whether less of everything might have gone well."""
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return True
+    # torch's own, of the GPU (a class) and of the CPU (a text); not imported here, as most jobs never fail.
+    said = type(error).__name__ == "OutOfMemoryError" or "DefaultCPUAllocator" in str(error)
+    return isinstance(error, RuntimeError) and said
+
+
+def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop) -> None:
+    from biresnerf.pipeline import refine_poses  # loads torch
+
+    def tell(progress: Progress) -> None:
+        stop.stage = progress.stage
+        protocol.write(progress.model_dump_json() + "\n")
+        protocol.flush()
+
+    refine_poses(
+        order.input,
+        order.output,
+        options,
+        on_progress=tell,
+        should_stop=stop.asked.is_set,
+        keep_reusable=True,
+    )
+
+
+def _export(order: Order, stop: _Stop) -> None:
+    """The result in further forms; the photos lie in the input where a form needs them."""
+    from biresnerf.data.formats.read_result import read_result
+    from biresnerf.data.formats.write_formats import ON_REQUEST
+
+    assert order.result is not None, "said with every export"
+    forms = TypeAdapter(tuple[PackName, ...]).validate_python(order.options["formats"])
+    photos = order.input if any(order.input.iterdir()) else None
+    refined = read_result(order.result, photos)
+    for form in forms:
+        # Nothing of it is kept when it is stopped, so it need not be asked.
+        ON_REQUEST[form](refined, order.output, stop.asked.is_set)
+
+
+def _protocol_only() -> TextIO:
+    """The real standard output, for reports alone: what libraries print goes to standard error."""
+    protocol = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    return protocol
+
+
+def _report(code: str, detail: str, where: str, mend: str) -> None:
+    said = json.dumps({"code": code, "detail": detail, "where": where, "mend": mend})
+    Path("error.json").write_text(said)
+    sys.stderr.write(f"{detail} {mend}\n")
+
+
+if __name__ == "__main__":
+    status = main(Path(sys.argv[1]))
+    logging.shutdown()
+    sys.stderr.flush()
+    # All is on disk and reported. Taking torch apart takes a while, in which whoever cancelled a job would wait.
+    os._exit(status)

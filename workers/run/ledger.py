@@ -1,0 +1,248 @@
+"""What a running attempt writes into its job, each write fenced by the attempt's token.
+
+Of two processes that believe they run a job (one was frozen and taken for dead), only the one that claimed
+last can write. The other gets `Fenced` and must leave without touching the queue.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any, TypeVar
+
+from psycopg.types.json import Jsonb
+
+from biresnerf.progress import Progress, ReusableStage
+from biresnerf.report import VerdictName
+from biresnerf.wire.jobs import EventType
+from biresnerf.wire.problems import JobError
+from workers.database.database import Connection, Database
+from workers.jobs.job_completion import finish, finish_cancelled, trash_attempts
+from workers.records import LOG_NAME, Artifact
+from workers.run.claim import Claim, Fenced, insist
+
+PREVIEW_KEPT_S = 60.0  # after another one took its place: it may be on its way to somebody
+LOG_LINES_MAX = 20_000  # of one job
+T = TypeVar("T")
+
+
+class Ledger:
+    """The fenced writes of one attempt. While the database is away each waits for it, without end."""
+
+    def __init__(self, database: Database, claim: Claim) -> None:
+        self.claim = claim
+        self._database = database
+        self._stage: str | None = None
+
+    async def progress(self, now: Progress) -> None:
+        """Write the progress columns; a new stage is also an event."""
+
+        async def write(connection: Connection) -> None:
+            await connection.execute(
+                "UPDATE jobs SET stage = %s, fraction = greatest(fraction, %s), step = %s, steps_total = %s,"
+                " eta_s = %s, metrics = metrics || %s, message = %s, revision = revision + 1,"
+                " updated_at = clock_timestamp() WHERE id = %s",
+                (
+                    *(now.stage, now.fraction, now.step, now.steps_total, now.eta_s),
+                    *(Jsonb(now.metrics), now.message, self.claim.job_id),
+                ),
+            )
+            if now.stage != self._stage:
+                await _add_event(connection, self.claim.job_id, "stage", {"stage": now.stage})
+            else:
+                await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (self.claim.job_id,))
+
+        await self._fenced(write)
+        self._stage = now.stage
+
+    async def checkpoint(self, prefix: str, files: Sequence[str], step: int) -> None:
+        """Point the job at a new checkpoint and give the one before to the trash."""
+
+        async def write(connection: Connection) -> None:
+            await connection.execute(
+                "INSERT INTO trash (prefix) SELECT checkpoint ->> 'prefix' FROM jobs"
+                " WHERE id = %s AND checkpoint ->> 'prefix' <> %s",
+                (self.claim.job_id, prefix),
+            )
+            await connection.execute(
+                "UPDATE jobs SET checkpoint = %s WHERE id = %s",
+                (Jsonb({"prefix": prefix, "files": list(files)}), self.claim.job_id),
+            )
+            await _add_event(connection, self.claim.job_id, "checkpoint", {"step": step})
+
+        await self._fenced(write)
+
+    async def reusable(self, stage: ReusableStage, prefix: str, files: Sequence[str]) -> None:
+        """Keep the work of a stage for other jobs to start from, in the place of an earlier attempt's."""
+
+        async def write(connection: Connection) -> None:
+            await connection.execute(
+                "INSERT INTO trash (prefix) SELECT reusable -> %s ->> 'prefix' FROM jobs"
+                " WHERE id = %s AND reusable -> %s ->> 'prefix' <> %s",
+                (stage, self.claim.job_id, stage, prefix),
+            )
+            await connection.execute(
+                "UPDATE jobs SET reusable = reusable || %s WHERE id = %s",
+                (Jsonb({stage: {"prefix": prefix, "files": list(files)}}), self.claim.job_id),
+            )
+
+        await self._fenced(write)
+
+    async def preview(self, prefix: str, artifacts: Sequence[Artifact], now: Progress) -> None:
+        """Let the job show these files, in the place of those before."""
+
+        async def write(connection: Connection) -> None:
+            await connection.execute(
+                "INSERT INTO trash (prefix, not_before)"
+                " SELECT previews ->> 'prefix', clock_timestamp() + make_interval(secs => %s) FROM jobs"
+                " WHERE id = %s AND previews ->> 'prefix' <> %s",
+                (PREVIEW_KEPT_S, self.claim.job_id, prefix),
+            )
+            shown = {"prefix": prefix, "artifacts": [item.model_dump() for item in artifacts]}
+            await connection.execute(
+                "UPDATE jobs SET previews = %s WHERE id = %s", (Jsonb(shown), self.claim.job_id)
+            )
+            data = {"stage": now.stage, "step": now.step, "files": [item.name for item in artifacts]}
+            await _add_event(connection, self.claim.job_id, "preview", data)
+
+        await self._fenced(write)
+
+    async def log(self, lines: Sequence[str]) -> None:
+        """Append lines to the job's log; what is more than `LOG_LINES_MAX` is in its log file alone."""
+        before: int | None = None
+
+        async def write(connection: Connection) -> None:
+            nonlocal before
+            cursor = await connection.execute(
+                "SELECT log_lines FROM jobs WHERE id = %s", (self.claim.job_id,)
+            )
+            row = await cursor.fetchone()
+            assert row is not None, "the row is locked"
+            if before is not None and row["log_lines"] != before:
+                return  # an earlier try got through, though its acknowledgement was lost
+            before = row["log_lines"]
+            room = LOG_LINES_MAX - before
+            kept = list(lines[: max(0, room)])
+            if kept and len(kept) == room:
+                kept[-1] = f"(the rest is in {LOG_NAME} alone)"
+            if not kept:
+                return
+            await connection.execute(
+                "INSERT INTO job_log (job_id, n, attempt, text)"
+                " SELECT %s, %s + place, %s, text FROM unnest(%s::text[]) WITH ORDINALITY AS fresh (text, place)",
+                (self.claim.job_id, before, self.claim.attempt, kept),
+            )
+            await connection.execute(
+                "UPDATE jobs SET log_lines = log_lines + %s WHERE id = %s", (len(kept), self.claim.job_id)
+            )
+
+        await self._fenced(write)
+
+    async def wants_partial(self) -> bool:
+        """Whether who cancelled the job wants what there is of its result."""
+
+        async def read(connection: Connection) -> bool:
+            cursor = await connection.execute(
+                "SELECT keep_partial FROM jobs WHERE id = %s", (self.claim.job_id,)
+            )
+            row = await cursor.fetchone()
+            return bool(row and row["keep_partial"])
+
+        return await self._fenced(read, done=False)
+
+    async def publish(
+        self, artifacts: Sequence[Artifact], verdict: VerdictName | None, keep: str, stall_s: float
+    ) -> bool:
+        """Make the result the job's one result; False where a cancellation was asked for first.
+
+        What other attempts left is deleted once nobody can be writing it any more.
+        """
+
+        async def write(connection: Connection) -> bool:
+            if await _cancel_requested(connection, self.claim.job_id):
+                return False
+            await connection.execute(
+                "UPDATE jobs SET verdict = %s WHERE id = %s", (verdict, self.claim.job_id)
+            )
+            await finish(connection, self.claim.job_id, "succeeded", None, artifacts)
+            await trash_attempts(connection, self.claim.job_id, keep, stall_s)
+            return True
+
+        return await self._fenced(write, done=True)
+
+    async def fail(self, error: JobError, artifacts: Sequence[Artifact], keep: str, stall_s: float) -> None:
+        """End the job as failed (or cancelled, if that was asked for)."""
+
+        async def write(connection: Connection) -> None:
+            if await _cancel_requested(connection, self.claim.job_id):
+                await finish_cancelled(connection, self.claim.job_id, artifacts, keep, stall_s)
+                return
+            await finish(connection, self.claim.job_id, "failed", error, artifacts)
+            await trash_attempts(connection, self.claim.job_id, keep, stall_s)
+
+        await self._fenced(write, done=None)
+
+    async def cancelled(self, artifacts: Sequence[Artifact], keep: str, stall_s: float) -> None:
+        """End the job as cancelled, with what is wanted of the files."""
+
+        async def write(connection: Connection) -> None:
+            await finish_cancelled(connection, self.claim.job_id, artifacts, keep, stall_s)
+
+        await self._fenced(write, done=None)
+
+    async def give_back(
+        self,
+        event: EventType,
+        data: dict[str, Any],
+        *,
+        counted: bool,
+        forget_checkpoint: bool = False,
+        smaller: dict[str, Any] | None = None,
+    ) -> bool:
+        """Back to the queue, the attempt counted or not; False if the job was cancelled instead.
+
+        ``smaller``: options that attempts to come use in the place of those asked for.
+        """
+
+        async def write(connection: Connection) -> bool:
+            if await _cancel_requested(connection, self.claim.job_id):
+                await finish_cancelled(connection, self.claim.job_id)
+                return False
+            await connection.execute(
+                "UPDATE jobs SET state = 'queued', attempt = attempt - %s, eta_s = NULL,"
+                " checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END, smaller = smaller || %s WHERE id = %s",
+                (0 if counted else 1, forget_checkpoint, Jsonb(smaller or {}), self.claim.job_id),
+            )
+            await _add_event(connection, self.claim.job_id, event, data)
+            return True
+
+        return await self._fenced(write, done=True)
+
+    async def _fenced(self, write: Callable[[Connection], Awaitable[T]], *, done: T | None = None) -> T:
+        """Run ``write`` under the job's row lock if the token still holds.
+
+        ``done`` is the answer where an earlier try got through, though its acknowledgement was lost.
+        """
+
+        async def once() -> T:
+            async with self._database.transaction() as connection:
+                cursor = await connection.execute(
+                    "SELECT run_token, state FROM jobs WHERE id = %s FOR UPDATE", (self.claim.job_id,)
+                )
+                row = await cursor.fetchone()
+                if row is None or row["run_token"] != self.claim.token:
+                    raise Fenced(f"job {self.claim.job_id} has a new owner")
+                if row["state"] != "running":
+                    return done  # type: ignore[return-value]
+                return await write(connection)
+
+        return await insist(once)
+
+
+async def _add_event(connection: Connection, job_id: str, event: str, data: dict[str, Any]) -> None:
+    await connection.execute("SELECT add_job_event(%s, %s, %s)", (job_id, event, Jsonb(data)))
+
+
+async def _cancel_requested(connection: Connection, job_id: str) -> bool:
+    cursor = await connection.execute("SELECT cancel_requested FROM jobs WHERE id = %s", (job_id,))
+    row = await cursor.fetchone()
+    return bool(row and row["cancel_requested"])

@@ -1,0 +1,64 @@
+"""What a job's process finds in its folder: the order, its input, and what it goes on from."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from workers.database.database import Database
+from workers.run.claim import Claim
+from workers.settings.errors import NotFound
+from workers.store.files import FileStore
+
+NEEDS_PHOTOS = frozenset({"pinhole"})
+EXPORTED_FROM = ("poses.json", "colmap/sparse/0/")  # of a result; all other forms can be made from these
+
+
+async def stage_job(database: Database, files: FileStore, claim: Claim, folder: Path) -> None:
+    """Fill the fresh job folder. Paths in the order are relative, so that an attempt elsewhere is the same job.
+
+    Raises `NotFound` where a file is gone, `Unavailable`.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    for name in ("input", "output", "tmp"):
+        (folder / name).mkdir(parents=True)
+    options = {**claim.asked, **claim.smaller}
+    order: dict[str, Any] = {"input": "input", "output": "output", "options": options}
+    if claim.kind == "export":
+        order |= {"task": "export", "result": "result"}
+        await _stage_result(database, files, claim, folder / "result")
+    if claim.kind == "refine" or NEEDS_PHOTOS & set(claim.asked["formats"]):
+        rows = await database.fetch(
+            "SELECT key, path FROM dataset_files WHERE dataset_id = %s", claim.dataset_id
+        )
+        await files.stage(((row["key"], row["path"]) for row in rows), folder / "input")
+    await files.stage(_gone_on_from(claim), folder / "output")
+    (folder / "job.json").write_text(json.dumps(order, indent=1))
+
+
+def _gone_on_from(claim: Claim) -> Iterator[tuple[str, str]]:
+    """The last checkpoint; before there is one, the work of stages that is to be taken over."""
+    if claim.checkpoint is not None:
+        parts = [claim.checkpoint]
+    else:
+        # Of its own stages a job repeats the first alone: another device could not take over the others. And
+        # with less memory, the sizes differ.
+        wanted = ["seeding"]
+        if claim.forked_stage == "coarse" and not claim.smaller:
+            wanted.append("coarse")
+        parts = [claim.reusable[stage] for stage in wanted if stage in claim.reusable]
+    for part in parts:
+        for name in part["files"]:
+            yield f"{part['prefix']}/{name}", name
+
+
+async def _stage_result(database: Database, files: FileStore, claim: Claim, folder: Path) -> None:
+    folder.mkdir()
+    rows = await database.fetch("SELECT artifacts FROM jobs WHERE id = %s", claim.parent)
+    if not rows:
+        raise NotFound(f"No job {claim.parent}.")
+    found = [(item["key"], item["name"]) for item in rows[0]["artifacts"]]
+    await files.stage((pair for pair in found if pair[1].startswith(EXPORTED_FROM)), folder)

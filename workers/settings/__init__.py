@@ -1,0 +1,1 @@
+"""What the operator sets, and what every process has: logs, traces, errors."""

@@ -1,0 +1,160 @@
+"""The two kinds of places files can lie: a folder of this machine, or a bucket of an S3-compatible store."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, Literal, Protocol
+from urllib.parse import urlsplit
+
+import obstore
+from obstore.store import LocalStore, ObjectStore, S3Store
+
+from workers.settings.errors import SetupError
+
+Method = Literal["GET", "PUT"]
+DELETE_BATCH = 1000
+# A slow reader must not hold a request to the store open: a bucket is read in requests of so many bytes.
+WINDOW_BYTES = 4 * 2**20
+WHOLE = 2**62
+
+
+class Place(Protocol):
+    """What differs between kinds of stores; `workers.store.files.FileStore` does all the rest."""
+
+    store: ObjectStore
+    window_bytes: int
+
+    async def delete_folder(self, folder: str, keep: str | None) -> None:
+        """Delete all below the folder, except the sub-folder named ``keep``."""
+
+    async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
+        """Addresses at which a stranger may read or write these keys; none where the place has no such thing."""
+
+    def attributes(self, media_type: str | None) -> dict[str, str] | None:
+        """What is stored beside the bytes, for who reads the file from the place itself."""
+
+
+class LocalPlace:
+    """A folder, created where it is missing; raises `SetupError` where it cannot be used."""
+
+    window_bytes = WHOLE
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.resolve()
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            self.store: ObjectStore = LocalStore(str(self.root))
+        except OSError as error:
+            raise SetupError(
+                "storage_unusable",
+                f"Cannot use {root}: {error}. Set BIRESNERF_DATA_DIR to a writable folder.",
+            ) from error
+
+    async def delete_folder(self, folder: str, keep: str | None) -> None:
+        """By folders, not by listing: this also takes what an upload that was killed left half-written."""
+        await asyncio.to_thread(self._remove, self.root / folder, keep)
+
+    @staticmethod
+    def _remove(folder: Path, keep: str | None) -> None:
+        for child in folder.iterdir() if folder.is_dir() else ():
+            if child.name == keep:
+                continue
+            if child.is_dir():
+                shutil.rmtree(child, ignore_errors=True)
+            else:
+                child.unlink(missing_ok=True)
+        if keep is None and folder.is_dir():
+            shutil.rmtree(folder, ignore_errors=True)
+
+    async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
+        """None: nobody but us serves a folder."""
+        return None
+
+    def attributes(self, media_type: str | None) -> dict[str, str] | None:
+        """None: a folder keeps bytes only."""
+        return None
+
+
+@dataclass(frozen=True)
+class Bucket:
+    """A bucket and how to get in. Without keys the environment's own are used (``AWS_…``, instance roles)."""
+
+    name: str
+    prefix: str = ""
+    endpoint: str | None = None
+    public_endpoint: str | None = None
+    region: str = "us-east-1"
+    access_key_id: str | None = None
+    secret_access_key: str | None = None
+
+    @classmethod
+    def at(cls, url: str, **rest: Any) -> Bucket:
+        """The bucket of ``s3://bucket/prefix``; raises `SetupError`."""
+        parts = urlsplit(url)
+        if parts.scheme != "s3" or not parts.hostname or parts.query or "@" in parts.netloc:
+            raise SetupError(
+                "storage_url_unknown",
+                f"BIRESNERF_STORAGE_URL is {parts.scheme}://…; it must be s3://bucket or s3://bucket/prefix.",
+            )
+        return cls(parts.netloc, parts.path.strip("/"), **rest)
+
+
+class BucketPlace:
+    """A bucket of an S3-compatible store; nothing is asked of it before the first use.
+
+    Args:
+        patience_s: how long a request is tried again while the store does not answer.
+    """
+
+    window_bytes = WINDOW_BYTES
+
+    def __init__(self, bucket: Bucket, patience_s: float) -> None:
+        self._bucket, self._patience_s = bucket, patience_s
+        self.store: ObjectStore = self._opened(bucket.endpoint)
+        self._signer = self._opened(bucket.public_endpoint or bucket.endpoint)
+
+    def _opened(self, endpoint: str | None) -> S3Store:
+        bucket = self._bucket
+        config: dict[str, Any] = {
+            "endpoint": endpoint,
+            "access_key_id": bucket.access_key_id,
+            "secret_access_key": bucket.secret_access_key,
+        }
+        plain = bool(endpoint and endpoint.startswith("http://"))
+        try:
+            return S3Store(
+                bucket.name,
+                prefix=bucket.prefix or None,
+                region=bucket.region,
+                virtual_hosted_style_request=False,
+                client_options={"allow_http": plain, "connect_timeout": "5s", "timeout": "60s"},
+                retry_config={"max_retries": 20, "retry_timeout": timedelta(seconds=self._patience_s)},
+                **{name: value for name, value in config.items() if value is not None},
+            )
+        except (obstore.exceptions.BaseError, ValueError) as error:
+            raise SetupError("storage_unusable", f"Cannot use the bucket {bucket.name}: {error}") from error
+
+    async def delete_folder(self, folder: str, keep: str | None) -> None:
+        """By listing. Parts of uploads that were killed are the bucket's to expire (its lifecycle rule)."""
+        kept = None if keep is None else f"{folder}/{keep}/"
+        async for batch in obstore.list(self.store, prefix=folder, chunk_size=DELETE_BATCH):
+            keys = [meta["path"] for meta in batch]
+            doomed = [key for key in keys if kept is None or not key.startswith(kept)]
+            if doomed:
+                await obstore.delete_async(self.store, doomed)
+
+    async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
+        """Signed here, with the secret key; the store is not asked."""
+        return await obstore.sign_async(self._signer, method, keys, timedelta(seconds=valid_s))
+
+    def attributes(self, media_type: str | None) -> dict[str, str] | None:
+        """As an attachment always: what users sent must not run as a page of the store's origin."""
+        return {
+            "Content-Type": media_type or "application/octet-stream",
+            "Content-Disposition": "attachment",
+        }

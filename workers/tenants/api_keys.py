@@ -1,0 +1,139 @@
+"""API keys: made, found again by what a client sends, listed, revoked. Only their SHA-256 is stored."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import re
+import secrets
+from collections.abc import Iterable
+from datetime import datetime, timedelta
+from typing import Any, Literal, get_args
+
+from pydantic import Field
+
+from biresnerf.errors import InputError
+from biresnerf.wire.base import Record
+from workers.database.database import Database
+from workers.database.ids import CROCKFORD, new_id
+from workers.settings.errors import NotFound
+from workers.tenants.tenants import ensure_tenant
+
+Scope = Literal["read", "datasets:write", "jobs:write", "admin"]
+ALL_SCOPES: frozenset[Scope] = frozenset(get_args(Scope))
+USUAL_SCOPES: tuple[Scope, ...] = ("read", "datasets:write", "jobs:write")
+# `brn_`, ten characters that may be shown, and 256 random bits.
+_FORM = re.compile(r"(brn_[0-9A-Z]{10})_[A-Za-z0-9_-]{43}", re.ASCII)
+_NOBODY = bytes(32)
+# Not a write for each request of a busy client.
+_USED_EVERY_S = 60
+
+
+class ApiKey(Record):
+    """A key without its secret."""
+
+    id: str
+    tenant: str
+    name: str
+    prefix: str = Field(description="How the key begins; the rest is known to its holder alone.")
+    scopes: tuple[Scope, ...]
+    created_at: datetime
+    expires_at: datetime | None = None
+    revoked_at: datetime | None = None
+    last_used_at: datetime | None = Field(None, description="To the minute.")
+
+
+class KeyRefused(Exception):
+    """The key is unknown, expired or revoked. Says no more: a caller must not learn which."""
+
+
+class KeyStore:
+    """Keys in the database. Get one from `workers.engine.open_stores`.
+
+    Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    async def create(
+        self, tenant: str, name: str, scopes: Iterable[Scope], *, lives: timedelta | None = None
+    ) -> tuple[ApiKey, str]:
+        """A new key and its text, which is told here and never again; makes the tenant if it is new.
+
+        Raises `InputError` (``bad_tenant``, ``bad_scope``).
+        """
+        wanted = sorted(set(scopes))
+        if not wanted or not ALL_SCOPES.issuperset(wanted):
+            raise InputError(
+                "bad_scope",
+                f"The scopes of a key are some of {', '.join(sorted(ALL_SCOPES))}.",
+                where="scopes",
+            )
+        prefix = "brn_" + "".join(secrets.choice(CROCKFORD) for _ in range(10))
+        text = f"{prefix}_{secrets.token_urlsafe(32)}"
+        async with self._database.transaction() as connection:
+            await ensure_tenant(connection, tenant)
+            cursor = await connection.execute(
+                "INSERT INTO api_keys (id, tenant, name, prefix, sha256, scopes, expires_at)"
+                " VALUES (%s, %s, %s, %s, %s, %s, clock_timestamp() + %s::interval) RETURNING *",
+                (new_id("key"), tenant, name, prefix, _digest(text), wanted, lives),
+            )
+            row = await cursor.fetchone()
+            assert row is not None, "the inserted row"
+            return _key(row), text
+
+    async def recognise(self, text: str) -> ApiKey:
+        """The living key with this text; notes its use. Raises `KeyRefused`."""
+        form = _FORM.fullmatch(text)
+        rows = (
+            await self._database.fetch(
+                "SELECT *, revoked_at IS NULL AND coalesce(expires_at > clock_timestamp(), true) AS living,"
+                " coalesce(last_used_at < clock_timestamp() - make_interval(secs => %s), true) AS stale"
+                " FROM api_keys WHERE prefix = %s",
+                *(_USED_EVERY_S, form[1]),
+            )
+            if form
+            else []
+        )
+        # The same work whether the prefix is known or not; equal in time for each wrong digest.
+        same = hmac.compare_digest(_digest(text), rows[0]["sha256"] if rows else _NOBODY)
+        if not same or not rows or not rows[0]["living"]:
+            raise KeyRefused
+        if rows[0]["stale"]:
+            await self._database.fetch(
+                "UPDATE api_keys SET last_used_at = clock_timestamp() WHERE id = %s", rows[0]["id"]
+            )
+        return _key(rows[0])
+
+    async def any_made(self) -> bool:
+        """Whether a key was ever made. A revoked one counts: revoking the last must not open the doors."""
+        rows = await self._database.fetch("SELECT EXISTS (SELECT 1 FROM api_keys) AS any")
+        return bool(rows[0]["any"])
+
+    async def list(self, tenant: str | None = None) -> tuple[ApiKey, ...]:
+        """The keys of a tenant, or all; oldest first."""
+        rows = await self._database.fetch(
+            "SELECT * FROM api_keys WHERE tenant = coalesce(%s, tenant) ORDER BY created_at, id", tenant
+        )
+        return tuple(_key(row) for row in rows)
+
+    async def revoke(self, key_id: str) -> ApiKey:
+        """End a key for good, from the next request on; raises `NotFound`."""
+        rows = await self._database.fetch(
+            "UPDATE api_keys SET revoked_at = coalesce(revoked_at, clock_timestamp()) WHERE id = %s"
+            " RETURNING *",
+            key_id,
+        )
+        if not rows:
+            raise NotFound(f"No key {key_id}.")
+        return _key(rows[0])
+
+
+def _digest(text: str) -> bytes:
+    # No slow hash: 256 random bits cannot be guessed, however fast one tries.
+    return hashlib.sha256(text.encode()).digest()
+
+
+def _key(row: dict[str, Any]) -> ApiKey:
+    return ApiKey(**{name: row[name] for name in ApiKey.model_fields})

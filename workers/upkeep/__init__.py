@@ -1,0 +1,1 @@
+"""What runs beside requests and jobs: dispatcher, expiry, backup, supervision."""

@@ -1,0 +1,151 @@
+"""Makes a backup while the service runs: all files, then the database as it is at one moment with what it names since.
+
+So little time passes between that moment and the last copy, in which a running job could replace a checkpoint.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import psycopg
+
+from biresnerf import __version__
+from workers.settings.errors import NotFound, SetupError
+from workers.settings.settings import Settings
+from workers.store.files import FileStore, StoredFile, open_files
+from workers.store.store_identity import MARK_KEY
+from workers.upkeep.backup_folder import (
+    FILES_NAME,
+    INDEX_NAME,
+    MARKER_NAME,
+    TOP_FOLDERS,
+    BackupIndex,
+    SavedFile,
+    path_in,
+    read_index,
+    run_postgres_program,
+    sha256_of,
+)
+
+log = logging.getLogger(__name__)
+
+_NAMED = """
+    SELECT key FROM dataset_files
+    UNION SELECT item ->> 'key' FROM jobs, jsonb_array_elements(artifacts) AS item
+    UNION SELECT item ->> 'key' FROM jobs, jsonb_array_elements(previews -> 'artifacts') AS item
+    UNION SELECT (part.value ->> 'prefix') || '/' || name FROM jobs, jsonb_each(reusable) AS part,
+        jsonb_array_elements_text(part.value -> 'files') AS name
+    UNION SELECT (checkpoint ->> 'prefix') || '/' || name
+        FROM jobs, jsonb_array_elements_text(checkpoint -> 'files') AS name WHERE checkpoint IS NOT NULL"""
+_STEPS = "SELECT name FROM schema_steps ORDER BY name"
+
+
+async def make_backup(settings: Settings, url: str, folder: Path) -> BackupIndex:
+    """Bring ``folder`` up to date with the database at ``url`` and its files; returns what it holds then.
+
+    ``gone`` of the result are files that were deleted while the backup was made. Raises `SetupError`,
+    `Unavailable` (the store), `OSError` (the folder); the backup that was there before is then still whole.
+    """
+    _prepare(folder)
+    before = {file.key: file for file in read_index(folder).files} if (folder / INDEX_NAME).exists() else {}
+    store = open_files(settings)
+    saved: dict[str, SavedFile] = {}
+    for found in await _stored(store):
+        with contextlib.suppress(NotFound):  # deleted since it was listed
+            saved[found.key] = await _save(store, found, folder, before.get(found.key))
+    async with await psycopg.AsyncConnection.connect(url, connect_timeout=10) as connection:
+        await connection.set_isolation_level(psycopg.IsolationLevel.REPEATABLE_READ)
+        ((moment,),) = await _rows(connection, "SELECT pg_export_snapshot()")
+        made_at = datetime.now(UTC)
+        named = {key for (key,) in await _rows(connection, _NAMED)}
+        for key in sorted(named - saved.keys()):
+            with contextlib.suppress(NotFound):
+                saved[key] = await _save(store, await store.head(key), folder, None)
+        index = BackupIndex(
+            version=__version__,
+            made_at=made_at,
+            database=f"database-{made_at:%Y%m%dT%H%M%S%f}.dump",
+            schema_steps=tuple(name for (name,) in await _rows(connection, _STEPS)),
+            files=tuple(saved[key] for key in sorted(saved)),
+            gone=tuple(sorted(named - saved.keys())),
+        )
+        options = ("--format=custom", "--no-owner", "--no-privileges", f"--snapshot={moment}")
+        target = f"--file={folder / index.database}"
+        await asyncio.to_thread(run_postgres_program, settings, url, "pg_dump", *options, target)
+    _write_whole(folder / INDEX_NAME, index.model_dump_json(indent=1).encode())
+    _prune(folder, index)
+    return index
+
+
+async def _rows(connection: psycopg.AsyncConnection, sql: str) -> list[tuple[Any, ...]]:
+    return await (await connection.execute(sql.encode())).fetchall()
+
+
+def _prepare(folder: Path) -> None:
+    """The folder, for nobody else: a backup holds everything that the service guards.
+
+    Only one that was made for backups is taken: what a backup does not know is deleted from it.
+    """
+    marker = folder / MARKER_NAME
+    if folder.exists() and any(folder.iterdir()) and not marker.exists():
+        raise SetupError("folder_unusable", f"{folder} holds something that is no backup. Name an empty one.")
+    folder.mkdir(parents=True, exist_ok=True)
+    folder.chmod(0o700)
+    marker.touch()
+    (folder / FILES_NAME).mkdir(exist_ok=True)
+
+
+async def _stored(store: FileStore) -> list[StoredFile]:
+    found = [file for top in TOP_FOLDERS for file in await store.list(top)]
+    try:
+        found.append(await store.head(MARK_KEY))
+    except NotFound:
+        log.warning("the file store has no mark; is this the one the service uses?")
+    return found
+
+
+async def _save(store: FileStore, file: StoredFile, folder: Path, before: SavedFile | None) -> SavedFile:
+    path = path_in(folder, file.key)
+    known = before is not None and (before.size, before.etag) == (file.size, file.etag)
+    if before is not None and known and path.is_file() and path.stat().st_size == file.size:
+        return before
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + "#partial")  # no key has such a name
+    with partial.open("wb") as out:
+        async for chunk in store.read(file.key):
+            await asyncio.to_thread(out.write, chunk)
+        os.fsync(out.fileno())
+    partial.rename(path)
+    digest = await asyncio.to_thread(sha256_of, path)
+    return SavedFile(key=file.key, size=path.stat().st_size, sha256=digest, etag=file.etag)
+
+
+def _write_whole(path: Path, content: bytes) -> None:
+    partial = path.with_name(path.name + ".new")
+    with partial.open("wb") as out:
+        out.write(content)
+        out.flush()
+        os.fsync(out.fileno())
+    partial.rename(path)
+
+
+def _prune(folder: Path, index: BackupIndex) -> None:
+    """What the service has deleted goes from the backup too, as do older dumps."""
+    keep = {path_in(folder, file.key) for file in index.files}
+    root = folder / FILES_NAME
+    for path in sorted(root.rglob("*"), reverse=True):
+        if path.is_dir() and not path.is_symlink():
+            if not any(path.iterdir()):
+                shutil.rmtree(path)
+        elif path not in keep:
+            path.unlink()
+    for dump in folder.glob("database-*.dump"):
+        if dump.name != index.database:
+            dump.unlink()

@@ -1,0 +1,94 @@
+"""What a backup is on disk: a dump of the database, a copy of every file, and what says which belong together.
+
+``backup.json`` is written last and replaced in one step, so a folder holds the last whole backup or none. Files
+are copied once: their keys are never written twice, so the next backup into the folder takes what is new.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from psycopg.conninfo import conninfo_to_dict, make_conninfo
+from pydantic import ValidationError
+
+from biresnerf.wire.base import Record
+from workers.database.postgres_binaries import find_binaries
+from workers.settings.errors import SetupError
+from workers.settings.settings import Settings
+
+MARKER_NAME = "biresnerf-backup"
+INDEX_NAME = "backup.json"
+FILES_NAME = "files"
+TOP_FOLDERS = ("datasets", "jobs")
+
+
+class SavedFile(Record):
+    """One file of a backup, by its key in the store."""
+
+    key: str
+    size: int
+    sha256: str
+    etag: str
+
+
+class BackupIndex(Record):
+    """One whole backup."""
+
+    version: str
+    made_at: datetime
+    database: str
+    schema_steps: tuple[str, ...]
+    files: tuple[SavedFile, ...]
+    gone: tuple[str, ...] = ()
+
+    @property
+    def bytes(self) -> int:
+        """Size of all files."""
+        return sum(file.size for file in self.files)
+
+
+def read_index(folder: Path) -> BackupIndex:
+    """What lies in ``folder``; raises `SetupError` where it holds no whole backup."""
+    try:
+        return BackupIndex.model_validate_json((folder / INDEX_NAME).read_bytes())
+    except (OSError, ValidationError) as error:
+        raise SetupError("no_backup", f"{folder} holds no whole backup ({error}).") from error
+
+
+def path_in(folder: Path, key: str) -> Path:
+    """Where a file of the store lies in the backup; raises `SetupError` for a key that leads out of it."""
+    parts = key.split("/")
+    if any(part in ("", ".", "..") or "\0" in part for part in parts):
+        raise SetupError("no_backup", f"The backup in {folder} names the file {key!r}.")
+    return folder.joinpath(FILES_NAME, *parts)
+
+
+def sha256_of(path: Path) -> str:
+    """Digest of a local file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def run_postgres_program(settings: Settings, url: str, name: str, *arguments: str) -> None:
+    """Run ``pg_dump`` or ``pg_restore`` on the database at ``url``; raises `SetupError` with what it said."""
+    program = find_binaries(settings.pg_bin) / name
+    if not program.is_file():
+        raise SetupError(
+            "no_pg_dump", f"There is no {program}. Set BIRESNERF_PG_BIN to a folder that has it."
+        )
+    parts: dict[str, Any] = conninfo_to_dict(url)
+    password = parts.pop("password", None)  # not on the command line, which everybody can read
+    variables = {} if password is None else {"PGPASSWORD": str(password)}
+    said = subprocess.run(
+        [str(program), *arguments, f"--dbname={make_conninfo(**parts)}"],
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+    )
+    if said.returncode != 0:
+        raise SetupError(f"{name}_failed", f"{name} failed: {said.stderr.strip()[-1500:]}")

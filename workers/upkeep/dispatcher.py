@@ -1,0 +1,71 @@
+"""The dispatcher: a small process for what has to be done beside the jobs: it sends webhooks and lets things expire.
+
+Several may run at the same time, each on any host: what one has taken, the others leave. Jobs need none of
+them; while no dispatcher runs, messages wait in the database.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import sys
+
+from workers.database.database import open_database
+from workers.database.notifications import Listener
+from workers.process.waiting import first_done
+from workers.process.watchdog import watched
+from workers.settings.errors import SetupError
+from workers.settings.logs import set_up_logging
+from workers.settings.settings import Settings
+from workers.upkeep.expiry import Expiry
+from workers.webhooks.outbound import Outbound, Policy
+from workers.webhooks.webhook_sender import WebhookSender
+
+log = logging.getLogger(__name__)
+
+WEBHOOK_CHANNEL = "biresnerf_webhooks"
+
+
+async def dispatch(settings: Settings, stop: asyncio.Event) -> None:
+    """Work until ``stop``, then finish what is under way; raises `SetupError`."""
+    async with (
+        watched(),
+        open_database(settings.require_database_url(), connections=4, silence_s=settings.stall_s) as database,
+    ):
+        listener = Listener(database, settings.poll_s, WEBHOOK_CHANNEL)
+        listening = asyncio.create_task(listener.run())
+        sender = WebhookSender(database, listener, Outbound(Policy.of(settings)), settings)
+        expiry = Expiry(database, settings)
+        working = [asyncio.create_task(duty.run(stop)) for duty in (sender, expiry)]
+        try:
+            log.info("dispatcher is ready")
+            await first_done(*working)  # before `stop` only by a fault of ours
+            stop.set()
+            await asyncio.gather(*working)
+        finally:
+            for task in (listening, *working):
+                task.cancel()
+
+
+async def _until_told(settings: Settings) -> None:
+    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    await dispatch(settings, stop)
+
+
+def main() -> int:
+    """`python -m workers.upkeep.dispatcher`, settings from the environment; SIGTERM ends it within a delivery."""
+    settings = Settings()
+    set_up_logging("dispatcher", settings)
+    try:
+        asyncio.run(_until_told(settings))
+    except SetupError as error:
+        sys.stderr.write(f"{error.what}\n")
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

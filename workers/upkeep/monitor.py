@@ -1,0 +1,60 @@
+"""Whether what the service needs is there, and the figures of the whole installation."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable
+from typing import Literal
+
+from workers.database.database import Database
+from workers.database.migrate import step_names
+from workers.database.statistics import Statistics, read_statistics
+from workers.settings.errors import Unavailable
+from workers.store.files import FileStore
+
+Need = Literal["database", "storage", "queue"]
+# A probe that waits longer than its caller tells nothing.
+CHECK_S = 2.0
+
+
+class Monitor:
+    """Looks without changing anything. Get one from `workers.engine.open_stores`."""
+
+    def __init__(self, database: Database, files: FileStore, stall_s: float) -> None:
+        self._database, self._files, self._stall_s = database, files, stall_s
+
+    async def statistics(self) -> Statistics:
+        """The figures; raises `Unavailable`."""
+        return await read_statistics(self._database, self._stall_s)
+
+    async def lacking(self) -> dict[Need, str]:
+        """What is not as it has to be, and why; empty where jobs can be taken. Answers within seconds."""
+        needs: dict[Need, Awaitable[str]] = {
+            "database": self._database_lacks(),
+            "storage": self._storage_lacks(),
+            "queue": self._queue_lacks(),
+        }
+        found = await asyncio.gather(*(_in_time(need) for need in needs.values()))
+        return {need: why for need, why in zip(needs, found, strict=True) if why}
+
+    async def _database_lacks(self) -> str:
+        await self._database.fetch("SELECT 1")
+        return ""
+
+    async def _storage_lacks(self) -> str:
+        return "" if await self._files.healthy() else "Files cannot be written."
+
+    async def _queue_lacks(self) -> str:
+        await self._database.fetch("SELECT 1 FROM procrastinate_jobs LIMIT 1")
+        done = {row["name"] for row in await self._database.fetch("SELECT name FROM schema_steps")}
+        missing = [name for name in step_names() if name not in done]
+        return f"The database lacks {', '.join(missing)}: run `biresnerf migrate`." if missing else ""
+
+
+async def _in_time(check: Awaitable[str]) -> str:
+    try:
+        return await asyncio.wait_for(check, CHECK_S)
+    except TimeoutError:
+        return f"No answer within {CHECK_S:g} s."
+    except Unavailable as error:
+        return error.what

@@ -1,0 +1,198 @@
+"""The only way out: one POST to an address that a user named, without being led anywhere else.
+
+The name is resolved once, every address it has is judged, and the connection goes to a judged address; TLS
+and the Host header keep the name. Redirects are not followed, the answer's body is not read.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import re
+import socket
+import ssl
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import httpcore
+import httpx
+
+from biresnerf.errors import InputError
+from workers.settings.addresses import Network, may_connect, parsed
+from workers.settings.settings import Settings
+
+URL_MAX = 2000
+# More names than this being resolved at once wait for each other.
+RESOLVER_THREADS = 32
+_HOST = re.compile(rb"(?=.{1,253}$)([A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?\.)*[A-Za-z0-9-]{1,63}\.?")
+_LOCAL_SUFFIXES = (".localhost", ".local", ".internal", ".home.arpa")
+Resolve = Callable[[str, int], Awaitable[Sequence[str]]]
+
+
+class Refused(Exception):
+    """Nothing was sent; ``code`` says why: ``address_refused``, ``name_not_found``, ``url_refused``."""
+
+    def __init__(self, code: str) -> None:
+        self.code = code
+        super().__init__(code)
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Where the service may connect to."""
+
+    plain_http: bool = False
+    ports: tuple[int, ...] = (443,)  # none: any
+    networks: tuple[Network, ...] = ()
+
+    @classmethod
+    def of(cls, settings: Settings) -> Policy:
+        """As the operator set it."""
+        return cls(settings.webhook_http, settings.webhook_ports, settings.webhook_networks)
+
+
+def checked_url(text: str, policy: Policy) -> httpx.URL:
+    """An address that may be given to `Outbound.post`; its name is judged again whenever it is resolved.
+
+    Raises `InputError` (``webhook_url_refused``).
+    """
+    try:
+        url = httpx.URL(text)
+        port = url.port if url.port is not None else {"https": 443}.get(url.scheme, 80)
+        reason = "It is longer than 2,000 characters." if len(text) > URL_MAX else _fault(url, port, policy)
+    except (httpx.InvalidURL, ValueError, TypeError):
+        reason = "It is no URL."
+    if reason:
+        mend = "Give the https address of a public host." if not policy.plain_http else ""
+        raise InputError("webhook_url_refused", f"This address cannot be used. {reason}", mend=mend)
+    return url
+
+
+def _fault(url: httpx.URL, port: int, policy: Policy) -> str:
+    host = url.raw_host
+    if url.scheme != "https" and not (policy.plain_http and url.scheme == "http"):
+        return "The scheme must be https."
+    if url.userinfo or url.fragment:
+        return "It must hold neither a user nor a fragment."
+    if not 0 < port < 65536 or (policy.ports and port not in policy.ports):
+        return f"Its port must be one of {', '.join(map(str, policy.ports)) or '1 to 65535'}."
+    literal = _literal(host)
+    if literal is None and (not _HOST.fullmatch(host) or _looks_like_a_number(host)):
+        return "Its host is no name and no address in the usual form."
+    name = url.host.lower().rstrip(".")
+    local = name == "localhost" or name.endswith(_LOCAL_SUFFIXES)
+    if (literal is not None and not may_connect(literal, policy.networks)) or (local and not policy.networks):
+        return "Its host is not a public one."
+    return ""
+
+
+def _literal(host: bytes) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host.decode("ascii"))
+    except ValueError:
+        return None
+
+
+def _looks_like_a_number(host: bytes) -> bool:
+    """Old spellings of IPv4 addresses, which resolvers take: 0x7f.1, 2130706433, 0177.0.0.1."""
+    last = host.rstrip(b".").rpartition(b".")[2]
+    return last.isdigit() or bool(re.fullmatch(rb"0[xX][0-9a-fA-F]*", last))
+
+
+class SystemResolver:
+    """Asks the system, in threads of its own, so that names that take long to fail hold up nothing else."""
+
+    def __init__(self) -> None:
+        self._threads = ThreadPoolExecutor(RESOLVER_THREADS, "resolve")
+
+    async def __call__(self, host: str, port: int) -> Sequence[str]:
+        """Numeric addresses; raises `OSError`."""
+        ask = partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
+        found = await asyncio.get_running_loop().run_in_executor(self._threads, ask)
+        return list(dict.fromkeys(str(entry[4][0]) for entry in found))
+
+
+class _JudgedBackend(httpcore.AsyncNetworkBackend):
+    """Connects to no address that was not judged. TLS is told the name afterwards, by the caller."""
+
+    def __init__(self, policy: Policy, resolve: Resolve) -> None:
+        self._policy, self._resolve = policy, resolve
+        self._network = httpcore.AnyIOBackend()
+
+    async def connect_tcp(
+        self,
+        host: str,
+        port: int,
+        timeout: float | None = None,
+        local_address: str | None = None,
+        socket_options: Iterable[Any] | None = None,
+    ) -> httpcore.AsyncNetworkStream:
+        try:
+            addresses = [parsed(text) for text in await self._resolve(host, port)]
+        except (OSError, UnicodeError) as error:
+            raise Refused("name_not_found") from error
+        # One bad address is enough: a name that leads inside now and then leads inside.
+        if not addresses or not all(may_connect(item, self._policy.networks) for item in addresses):
+            raise Refused("address_refused" if addresses else "name_not_found")
+        for number, address in enumerate(addresses):
+            try:
+                return await self._network.connect_tcp(str(address), port, timeout)
+            except (httpcore.ConnectError, httpcore.ConnectTimeout):
+                if number + 1 == len(addresses):
+                    raise
+        raise AssertionError("unreachable: the last address returns or raises")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came back: the status and when to try again (`Retry-After`), never a body."""
+
+    status: int
+    retry_after: str | None
+
+
+class Outbound:
+    """Sends to addresses that users named."""
+
+    def __init__(
+        self,
+        policy: Policy,
+        *,
+        resolve: Resolve | None = None,
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
+        self._policy = policy
+        self._backend = _JudgedBackend(policy, resolve or SystemResolver())
+        # Honours SSL_CERT_FILE and SSL_CERT_DIR, for installations with an authority of their own.
+        self._tls = tls or httpx.create_ssl_context()
+
+    async def post(
+        self, address: str, body: bytes, headers: Mapping[str, str], *, timeout_s: float
+    ) -> Answer:
+        """POST ``body`` and return the first answer, whatever its status.
+
+        Raises `Refused`, `TimeoutError` (all of it took longer than ``timeout_s``), and httpcore's
+        `NetworkError` and `ProtocolError`.
+        """
+        try:
+            url = checked_url(address, self._policy)
+        except InputError:
+            raise Refused("url_refused") from None
+        # From the parts that were checked: a second parser may read the same text otherwise.
+        target = httpcore.URL(
+            scheme=url.raw_scheme, host=url.raw_host, port=url.port, target=url.raw_path or b"/"
+        )
+        wire = [(b"Host", url.netloc), *((key.encode(), value.encode()) for key, value in headers.items())]
+        # A connection for each message: one that is kept would outlive the judgement of its address.
+        pool = httpcore.AsyncConnectionPool(
+            ssl_context=self._tls, network_backend=self._backend, max_connections=1
+        )
+        async with asyncio.timeout(timeout_s), pool:
+            wire.append((b"Content-Length", str(len(body)).encode()))
+            async with pool.stream("POST", target, headers=wire, content=body) as response:
+                found = {key.lower(): value for key, value in response.headers}
+                after = found.get(b"retry-after")
+                return Answer(response.status, after.decode("latin-1") if after else None)

@@ -1,0 +1,240 @@
+"""Sends what waits in the outbox: each message is claimed by one process, signed, posted, and written down.
+
+A claim is a lease, so no transaction waits for a receiver, and what a killed process had claimed is sent again
+once the lease is over. Receivers see a message at least once, under the same id.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+import ssl
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from functools import partial
+from typing import Any, Literal
+
+import httpcore
+import psycopg
+
+from biresnerf import __version__
+from workers.database.database import Connection, Database
+from workers.database.notifications import Listener
+from workers.process.waiting import first_done
+from workers.settings.errors import Unavailable
+from workers.settings.settings import Settings
+from workers.webhooks.outbound import Outbound, Refused
+from workers.webhooks.webhook_records import signed_headers
+from workers.webhooks.webhooks import drop_pending
+
+log = logging.getLogger(__name__)
+
+# At the same time: by this process, to one receiver, to one that failed last time, to all of one tenant.
+IN_FLIGHT_MAX = 32
+PER_WEBHOOK, PER_FAILING, PER_TENANT = 4, 1, 8
+ROUNDS_MAX = 12
+PAUSE_FACTOR, PAUSE_MAX_S = 4.0, 12 * 3600.0
+JITTER = 0.2
+# Beyond the longest delivery: time to write down what came of it.
+LEASE_SPARE_S = 30.0
+AGAIN = {408, 409, 429}
+Outcome = Literal["delivered", "again", "failed", "gone"]
+_CLAIM = """
+    WITH waiting AS (
+        SELECT delivery.id, delivery.due_at, hook.tenant, hook.failing_since, delivery.leased_until > now() AS busy,
+            row_number() OVER (PARTITION BY hook.id
+                ORDER BY delivery.leased_until > now() DESC NULLS LAST, delivery.due_at) AS of_webhook
+        FROM webhook_deliveries AS delivery JOIN webhooks AS hook ON hook.id = delivery.webhook_id
+        WHERE delivery.state = 'pending' AND (delivery.due_at <= now() OR delivery.leased_until > now())
+    ), fair AS (
+        SELECT id, due_at, busy, row_number() OVER (PARTITION BY tenant
+            ORDER BY busy DESC NULLS LAST, due_at) AS of_tenant
+        FROM waiting WHERE of_webhook <= CASE WHEN failing_since IS NULL THEN %s ELSE %s END
+    )
+    UPDATE webhook_deliveries AS delivery SET leased_until = now() + make_interval(secs => %s)
+    FROM webhooks AS hook WHERE hook.id = delivery.webhook_id AND delivery.id IN (
+        SELECT free.id FROM webhook_deliveries AS free WHERE free.id IN (
+            SELECT id FROM fair WHERE busy IS NOT TRUE AND of_tenant <= %s ORDER BY due_at LIMIT %s)
+        AND free.state = 'pending' AND free.due_at <= now()
+        AND (free.leased_until > now()) IS NOT TRUE FOR UPDATE SKIP LOCKED)
+    RETURNING delivery.id, delivery.round, delivery.leased_until, delivery.body, hook.id AS webhook_id, hook.url,
+        hook.secret, CASE WHEN hook.previous_until > now() THEN hook.previous_secret END AS previous"""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of one attempt."""
+
+    outcome: Outcome
+    status: int | None = None
+    error: str | None = None
+    retry_after_s: float = 0.0
+
+
+class WebhookSender:
+    """Runs in every dispatcher; several may."""
+
+    def __init__(
+        self, database: Database, listener: Listener, outbound: Outbound, settings: Settings
+    ) -> None:
+        self._database, self._listener = database, listener
+        self._outbound, self._settings = outbound, settings
+        self._sending: set[asyncio.Task[None]] = set()
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Claim and send until ``stop``; then what is under way is finished."""
+        with self._listener.waiting("") as woken:
+            while not stop.is_set():
+                woken.clear()  # before looking: what comes during the look is not missed
+                room = IN_FLIGHT_MAX - len(self._sending)
+                try:
+                    claimed = await self._claim(room) if room else []
+                except (Unavailable, psycopg.Error) as error:
+                    log.warning("webhooks wait: %s", error)
+                    claimed = []
+                for row in claimed:
+                    task = asyncio.create_task(self._send(row))
+                    self._sending.add(task)
+                    task.add_done_callback(partial(self._sent, woken))
+                if len(claimed) < room or not room:
+                    await first_done(woken.wait(), stop.wait(), asyncio.sleep(self._settings.poll_s))
+        await asyncio.gather(*self._sending)
+
+    def _sent(self, woken: asyncio.Event, task: asyncio.Task[None]) -> None:
+        self._sending.discard(task)
+        woken.set()
+
+    async def _claim(self, room: int) -> list[dict[str, Any]]:
+        lease_s = self._settings.webhook_timeout_s + LEASE_SPARE_S
+        return await self._database.fetch(_CLAIM, PER_WEBHOOK, PER_FAILING, lease_s, PER_TENANT, room)
+
+    async def _send(self, row: dict[str, Any]) -> None:
+        began, at = time.monotonic(), datetime.now(UTC)
+        body = row["body"].encode()
+        valid = [secret for secret in (row["secret"], row["previous"]) if secret]
+        headers = {
+            "Content-Type": "application/json",
+            "User-Agent": f"BiResNeRF/{__version__}",
+            **signed_headers(row["id"], int(at.timestamp()), body, valid),
+        }
+        result = await self._post(row["url"], body, headers)
+        seconds = time.monotonic() - began
+        try:
+            async with self._database.transaction() as connection:
+                await self._conclude(connection, row, result, at, seconds)
+        except (Unavailable, psycopg.Error) as error:
+            log.warning("webhook message %s is going to be sent again: %s", row["id"], error)
+
+    async def _post(self, url: str, body: bytes, headers: dict[str, str]) -> Result:
+        limit = self._settings.webhook_timeout_s
+        try:
+            answer = await self._outbound.post(url, body, headers, timeout_s=limit)
+        except Refused as refused:
+            return Result("again" if refused.code == "name_not_found" else "failed", error=refused.code)
+        except (TimeoutError, httpcore.TimeoutException):
+            return Result("again", error="timeout")
+        except httpcore.NetworkError as error:
+            return Result("again", error="tls_failed" if _of_tls(error) else "connection_failed")
+        except httpcore.ProtocolError:
+            return Result("again", error="not_http")
+        except Exception:
+            # A fault of ours with this one message must not be met again every minute for ever.
+            log.exception("webhook message %s could not be sent", headers["webhook-id"])
+            return Result("again", error="internal")
+        return Result(outcome_of(answer.status), answer.status, None, retry_after(answer.retry_after))
+
+    async def _conclude(
+        self, connection: Connection, row: dict[str, Any], result: Result, at: datetime, seconds: float
+    ) -> None:
+        """Write down what came of it. What it means for the message counts only while the lease is ours."""
+        cursor = await connection.execute(
+            "UPDATE webhook_deliveries SET attempts = attempts + 1 WHERE id = %s RETURNING attempts",
+            (row["id"],),
+        )
+        written = await cursor.fetchone()
+        if written is None:  # deleted meanwhile, with its webhook
+            return
+        await connection.execute(
+            "INSERT INTO webhook_attempts (delivery_id, number, at, seconds, status, error)"
+            " VALUES (%s, %s, %s, %s, %s, %s)",
+            (row["id"], written["attempts"], at, seconds, result.status, result.error),
+        )
+        round_ = row["round"] + 1
+        if result.outcome == "again" and round_ < ROUNDS_MAX:
+            pause_s = max(pause(round_, self._settings.webhook_retry_s), result.retry_after_s)
+            change, values = "round = %s, due_at = now() + make_interval(secs => %s)", [round_, pause_s]
+        else:
+            end = "delivered" if result.outcome == "delivered" else "failed"
+            change, values = "round = %s, state = %s, finished_at = clock_timestamp()", [round_, end]
+        await connection.execute(
+            f"UPDATE webhook_deliveries SET leased_until = NULL, {change}"
+            " WHERE id = %s AND leased_until = %s AND state = 'pending'".encode(),
+            (*values, row["id"], row["leased_until"]),
+        )
+        await self._note_health(connection, row["webhook_id"], result)
+
+    async def _note_health(self, connection: Connection, webhook_id: str, result: Result) -> None:
+        """Remember since when a receiver only fails; switch it off after days of that, or when it is gone."""
+        if result.outcome == "delivered":
+            await connection.execute(
+                "UPDATE webhooks SET failing_since = NULL WHERE id = %s AND failing_since IS NOT NULL",
+                (webhook_id,),
+            )
+            return
+        gone = result.outcome == "gone"
+        cursor = await connection.execute(
+            "UPDATE webhooks SET failing_since = coalesce(failing_since, clock_timestamp()),"
+            " enabled = enabled AND NOT (%s OR coalesce(failing_since < clock_timestamp()"
+            " - make_interval(secs => %s), false)) WHERE id = %s AND enabled RETURNING enabled",
+            (gone, self._settings.webhook_give_up_days * 86_400, webhook_id),
+        )
+        row = await cursor.fetchone()
+        if row is None or row["enabled"]:
+            return
+        why = "410 Gone" if gone else f"no success in {self._settings.webhook_give_up_days:g} days"
+        log.warning("webhook %s is switched off: %s", webhook_id, why)
+        await connection.execute("UPDATE webhooks SET disabled_why = %s WHERE id = %s", (why, webhook_id))
+        await drop_pending(connection, webhook_id)
+
+
+def outcome_of(status: int) -> Outcome:
+    """What a status means for a message; redirects are not followed, so they are as final as a refusal."""
+    if 200 <= status < 300:
+        return "delivered"
+    if status == 410:
+        return "gone"
+    return "again" if status in AGAIN or status >= 500 else "failed"
+
+
+def pause(round_: int, first_s: float) -> float:
+    """Seconds after so many failures: four times as long each, up to 12 h, and a little at random.
+
+    Receivers that failed together are not asked again together.
+    """
+    return min(first_s * PAUSE_FACTOR ** (round_ - 1), PAUSE_MAX_S) * random.uniform(1 - JITTER, 1 + JITTER)
+
+
+def retry_after(header: str | None) -> float:
+    """Seconds the receiver asks for, at most 12 h; 0 where it asks for none that can be read."""
+    text = (header or "").strip()
+    if text.isdecimal() and len(text) < 10:
+        return min(float(text), PAUSE_MAX_S)
+    try:
+        at = parsedate_to_datetime(text)
+    except (TypeError, ValueError):
+        return 0.0
+    wait_s = ((at if at.tzinfo else at.replace(tzinfo=UTC)) - datetime.now(UTC)).total_seconds()
+    return min(max(wait_s, 0.0), PAUSE_MAX_S)
+
+
+def _of_tls(error: BaseException) -> bool:
+    while error.__cause__ is not None or error.__context__ is not None:
+        cause = error.__cause__ or error.__context__
+        assert cause is not None, "one of the two is there"
+        if isinstance(cause, ssl.SSLError):
+            return True
+        error = cause
+    return False

@@ -1,0 +1,283 @@
+"""Webhooks as their owners see them: make, change, delete, test, look what was delivered, send again.
+
+Messages come into the outbox by triggers (migration 005), in the transaction of what they tell of; who sends
+them is `workers.webhooks.webhook_sender`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from biresnerf.wire.webhooks import (
+    JobWebhook,
+    Webhook,
+    WebhookAttempt,
+    WebhookDelivery,
+    WebhookEvent,
+    new_secret,
+)
+from workers.database.database import Connection, Database
+from workers.database.ids import cursor_after, cursor_place, cursor_time, new_id
+from workers.records import Page
+from workers.settings.errors import Conflict, LimitReached, NotFound
+from workers.settings.settings import Settings
+from workers.webhooks.outbound import Policy, checked_url
+from workers.webhooks.webhook_records import TEST_EVENT
+
+ROTATION_HOURS = 24
+_MINE = "tenant = coalesce(%s, tenant)"
+_DELIVERY = """
+    SELECT webhook_deliveries.*, (SELECT coalesce(jsonb_agg(to_jsonb(attempt) - 'delivery_id' ORDER BY number), '[]')
+        FROM webhook_attempts AS attempt WHERE attempt.delivery_id = webhook_deliveries.id) AS log
+    FROM webhook_deliveries"""
+
+
+class WebhookStore:
+    """Webhooks in the database. Get one from `workers.engine.open_stores`.
+
+    `of` gives it as one tenant sees it. Every method raises `Unavailable` where the database is away.
+    """
+
+    def __init__(self, database: Database, settings: Settings, tenant: str | None = None) -> None:
+        self._database, self._settings, self._tenant = database, settings, tenant
+
+    def of(self, tenant: str | None) -> WebhookStore:
+        """The store as this tenant sees it; none: as the operator does."""
+        return WebhookStore(self._database, self._settings, tenant)
+
+    async def create(
+        self, tenant: str, url: str, events: Sequence[WebhookEvent], description: str = ""
+    ) -> tuple[Webhook, str]:
+        """A new webhook and its secret.
+
+        Raises `InputError` (``webhook_url_refused``), `LimitReached` (``too_many_webhooks``).
+        """
+        target = str(checked_url(url, Policy.of(self._settings)))
+        secret = new_secret()
+        async with self._database.transaction() as connection:
+            await connection.execute("SELECT 1 FROM tenants WHERE id = %s FOR NO KEY UPDATE", (tenant,))
+            cursor = await connection.execute(
+                "SELECT count(*) AS n FROM webhooks WHERE tenant = %s AND job_id IS NULL", (tenant,)
+            )
+            have = await cursor.fetchone()
+            if have is None or have["n"] >= self._settings.max_webhooks:
+                raise LimitReached(
+                    "too_many_webhooks", f"There are {self._settings.max_webhooks} webhooks already."
+                )
+            cursor = await connection.execute(
+                "INSERT INTO webhooks (id, tenant, url, events, description, secret)"
+                " VALUES (%s, %s, %s, %s, %s, %s) RETURNING *",
+                (new_id("wh"), tenant, target, list(dict.fromkeys(events)), description, secret),
+            )
+            return _webhook(await cursor.fetchone()), secret
+
+    async def get(self, webhook_id: str) -> Webhook:
+        """The webhook; raises `NotFound`."""
+        async with self._database.transaction() as connection:
+            return _webhook(await self._required(connection, webhook_id))
+
+    async def list(
+        self, *, job_id: str | None = None, limit: int = 50, cursor: str | None = None
+    ) -> Page[Webhook]:
+        """Webhooks, newest first: those for all jobs, or those of one; raises `InputError` (``bad_cursor``)."""
+        created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
+        rows = await self._database.fetch(
+            f"SELECT * FROM webhooks WHERE {_MINE} AND job_id IS NOT DISTINCT FROM %s"
+            " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
+            " ORDER BY created_at DESC, id DESC LIMIT %s",
+            *(self._tenant, job_id),
+            *((cursor_time(created),) * 2 if created else (None, None)),
+            *(last_id, limit + 1),
+        )
+        items = tuple(_webhook(row) for row in rows[:limit])
+        more = len(rows) > limit
+        return Page(
+            items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
+        )
+
+    async def change(
+        self,
+        webhook_id: str,
+        *,
+        url: str | None = None,
+        events: Sequence[WebhookEvent] | None = None,
+        description: str | None = None,
+        enabled: bool | None = None,
+    ) -> Webhook:
+        """Change what is given. Switching on (again) forgets that it failed; switching off drops what waits.
+
+        Raises `NotFound`, `InputError` (``webhook_url_refused``).
+        """
+        target = None if url is None else str(checked_url(url, Policy.of(self._settings)))
+        async with self._database.transaction() as connection:
+            await self._required(connection, webhook_id, lock=True)
+            cursor = await connection.execute(
+                "UPDATE webhooks SET url = coalesce(%s, url), events = coalesce(%s, events),"
+                " description = coalesce(%s, description), enabled = coalesce(%s, enabled),"
+                " disabled_why = CASE WHEN %s::boolean IS NULL THEN disabled_why END,"
+                " failing_since = CASE WHEN %s THEN NULL ELSE failing_since END WHERE id = %s RETURNING *",
+                (
+                    *(target, None if events is None else list(dict.fromkeys(events)), description),
+                    *(enabled, enabled, enabled is True, webhook_id),
+                ),
+            )
+            row = await cursor.fetchone()
+            if enabled is False:
+                await drop_pending(connection, webhook_id)
+            return _webhook(row)
+
+    async def rotate(self, webhook_id: str) -> tuple[Webhook, str]:
+        """A new secret; for a day messages carry signatures of both. Raises `NotFound`."""
+        secret = new_secret()
+        async with self._database.transaction() as connection:
+            await self._required(connection, webhook_id, lock=True)
+            cursor = await connection.execute(
+                "UPDATE webhooks SET previous_secret = secret, secret = %s,"
+                " previous_until = clock_timestamp() + make_interval(hours => %s)"
+                " WHERE id = %s RETURNING *",
+                (secret, ROTATION_HOURS, webhook_id),
+            )
+            return _webhook(await cursor.fetchone()), secret
+
+    async def delete(self, webhook_id: str) -> None:
+        """Delete it with its deliveries; what waits is not sent. Raises `NotFound`."""
+        rows = await self._database.fetch(
+            f"DELETE FROM webhooks WHERE id = %s AND {_MINE} RETURNING id", webhook_id, self._tenant
+        )
+        if not rows:
+            raise NotFound(f"No webhook {webhook_id}.")
+
+    async def test(self, webhook_id: str) -> WebhookDelivery:
+        """Queue a message ``webhook.test``; raises `NotFound`, `Conflict` (``state_conflict``)."""
+        delivery_id = new_id("msg")
+        said = {
+            "type": TEST_EVENT,
+            "timestamp": datetime.now(UTC).isoformat().replace("+00:00", "Z"),
+            "data": {"webhook_id": webhook_id},
+        }
+        async with self._database.transaction() as connection:
+            await self._require_enabled(connection, webhook_id)
+            await connection.execute(
+                "INSERT INTO webhook_deliveries (id, webhook_id, event, body) VALUES (%s, %s, %s, %s)",
+                (delivery_id, webhook_id, TEST_EVENT, json.dumps(said)),
+            )
+            await connection.execute("SELECT pg_notify('biresnerf_webhooks', '')")
+            return await _delivery(connection, webhook_id, delivery_id)
+
+    async def deliveries(
+        self, webhook_id: str, *, limit: int = 50, cursor: str | None = None
+    ) -> Page[WebhookDelivery]:
+        """What was sent or is to be, newest first; raises `NotFound`, `InputError` (``bad_cursor``)."""
+        created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
+        async with self._database.transaction() as connection:
+            await self._required(connection, webhook_id)
+            found = await connection.execute(
+                _DELIVERY + " WHERE webhook_id = %s"
+                " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
+                " ORDER BY created_at DESC, id DESC LIMIT %s",
+                (
+                    *(webhook_id, *((cursor_time(created),) * 2 if created else (None, None))),
+                    *(last_id, limit + 1),
+                ),
+            )
+            rows = await found.fetchall()
+        items = tuple(_delivery_record(row) for row in rows[:limit])
+        more = len(rows) > limit
+        return Page(
+            items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
+        )
+
+    async def delivery(self, webhook_id: str, delivery_id: str) -> WebhookDelivery:
+        """One message; raises `NotFound`."""
+        async with self._database.transaction() as connection:
+            await self._required(connection, webhook_id)
+            return await _delivery(connection, webhook_id, delivery_id)
+
+    async def redeliver(self, webhook_id: str, delivery_id: str) -> WebhookDelivery:
+        """Send a message again, under the id it had, at once and with a fresh count of attempts.
+
+        One that waits already comes at once; one under way comes twice.
+        Raises `NotFound`, `Conflict` (``state_conflict``).
+        """
+        async with self._database.transaction() as connection:
+            await self._require_enabled(connection, webhook_id)
+            await _delivery(connection, webhook_id, delivery_id)
+            await connection.execute(
+                "UPDATE webhook_deliveries SET state = 'pending', round = 0, due_at = clock_timestamp(),"
+                " leased_until = NULL, finished_at = NULL WHERE id = %s",
+                (delivery_id,),
+            )
+            await connection.execute("SELECT pg_notify('biresnerf_webhooks', '')")
+            return await _delivery(connection, webhook_id, delivery_id)
+
+    async def _require_enabled(self, connection: Connection, webhook_id: str) -> None:
+        row = await self._required(connection, webhook_id, lock=True)
+        if not row["enabled"]:
+            raise Conflict("state_conflict", f"Webhook {webhook_id} is switched off; switch it on first.")
+
+    async def _required(
+        self, connection: Connection, webhook_id: str, *, lock: bool = False
+    ) -> dict[str, Any]:
+        end = " FOR NO KEY UPDATE" if lock else ""
+        cursor = await connection.execute(
+            f"SELECT * FROM webhooks WHERE id = %s AND {_MINE}{end}".encode(), (webhook_id, self._tenant)
+        )
+        row = await cursor.fetchone()
+        if row is None:
+            raise NotFound(f"No webhook {webhook_id}.")
+        return row
+
+
+async def add_job_webhook(
+    connection: Connection, settings: Settings, tenant: str, job_id: str, wanted: JobWebhook
+) -> None:
+    """The webhook of one job, in the transaction that makes the job and before its first event.
+
+    Raises `InputError` (``webhook_url_refused``).
+    """
+    target = str(checked_url(wanted.url, Policy.of(settings)))
+    await connection.execute(
+        "INSERT INTO webhooks (id, tenant, job_id, url, events, secret) VALUES (%s, %s, %s, %s, %s, %s)",
+        (new_id("wh"), tenant, job_id, target, list(dict.fromkeys(wanted.events)), wanted.secret),
+    )
+
+
+async def drop_pending(connection: Connection, webhook_id: str) -> None:
+    """What waits for a webhook that was switched off is not going to be sent."""
+    await connection.execute(
+        "UPDATE webhook_deliveries SET state = 'failed', finished_at = clock_timestamp()"
+        " WHERE webhook_id = %s AND state = 'pending'",
+        (webhook_id,),
+    )
+
+
+async def _delivery(connection: Connection, webhook_id: str, delivery_id: str) -> WebhookDelivery:
+    cursor = await connection.execute(
+        _DELIVERY + " WHERE id = %s AND webhook_id = %s", (delivery_id, webhook_id)
+    )
+    row = await cursor.fetchone()
+    if row is None:
+        raise NotFound(f"Webhook {webhook_id} has no delivery {delivery_id}.")
+    return _delivery_record(row)
+
+
+def _webhook(row: dict[str, Any] | None) -> Webhook:
+    assert row is not None, "RETURNING gives the row that was written"
+    same = ("id", "tenant", "url", "description", "events", "job_id", "enabled", "disabled_why")
+    rotating = row["previous_until"] is not None and row["previous_until"] > datetime.now(UTC)
+    return Webhook(
+        **{key: row[key] for key in (*same, "failing_since", "created_at")},
+        previous_secret_until=row["previous_until"] if rotating else None,
+    )
+
+
+def _delivery_record(row: dict[str, Any]) -> WebhookDelivery:
+    same = ("id", "webhook_id", "event", "state", "created_at", "finished_at", "body")
+    return WebhookDelivery(
+        **{key: row[key] for key in same},
+        next_attempt_at=row["due_at"] if row["state"] == "pending" else None,
+        attempts=tuple(WebhookAttempt.model_validate(item) for item in row["log"]),
+    )
