@@ -106,7 +106,7 @@ def _missing(package: str | None, command: str) -> InputError:
         "extra_missing",
         f"needs the package {package}, which is not installed.",
         where=f"biresnerf {command}",
-        mend=f"Install it with: pip install 'biresnerf[{extra}]'",
+        hint=f"Install it with: pip install 'biresnerf[{extra}]'",
     )
 
 

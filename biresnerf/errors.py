@@ -8,18 +8,18 @@ class BiresnerfError(Exception):
 
 
 class InputError(BiresnerfError):
-    """Something the user can mend.
+    """Something the user can fix.
 
     Args:
         code: stable machine-readable name, snake_case (for example ``pose_file_invalid``).
         what: what is wrong, in one sentence.
         where: the file, and the field inside it where there is one.
-        mend: what to do about it.
+        hint: what to do about it.
     """
 
-    def __init__(self, code: str, what: str, *, where: str = "", mend: str = "") -> None:
-        self.code, self.what, self.where, self.mend = code, what, where, mend
-        super().__init__(" ".join(part for part in (f"{where}:" if where else "", what, mend) if part))
+    def __init__(self, code: str, what: str, *, where: str = "", hint: str = "") -> None:
+        self.code, self.what, self.where, self.hint = code, what, where, hint
+        super().__init__(" ".join(part for part in (f"{where}:" if where else "", what, hint) if part))
 
 
 class RefinementError(BiresnerfError):

@@ -83,7 +83,7 @@ def refine_poses(
         keep_reusable: leave in `output`/checkpoint what other runs of the set can start from.
 
     Raises:
-        InputError: the user can mend it.
+        InputError: the user can fix it.
         RefinementError: the optimisation diverged.
         Interrupted: stopped by `should_stop`; the checkpoint and a partial result are in `output`, or nothing
             yet where poses to start from were still being looked for.
@@ -132,7 +132,7 @@ def _begin(
             "stage_1_not_usable",
             "is of other images, poses or options, or of another kind of device.",
             where=COARSE.as_posix(),
-            mend="Start from its seeding, or from the beginning.",
+            hint="Start from its seeding, or from the beginning.",
         )
     if begun is not None:
         start = Start.from_json(notes["start"])

@@ -42,7 +42,7 @@ async def index(request: Request) -> Response:
         raise ProblemError(
             "unavailable",
             "The page was not built; the interface under /v1 and its description at /docs are there.",
-            mend="Run `make web` in the source tree, or install a wheel.",
+            hint="Run `make web` in the source tree, or install a wheel.",
         )
     headers = {"Content-Security-Policy": CSP, "Cache-Control": "no-cache", "X-Frame-Options": "DENY"}
     return _file("index.html", request, headers)

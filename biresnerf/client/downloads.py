@@ -150,7 +150,7 @@ def chosen_files(found: Sequence[ArtifactView], names: Sequence[str]) -> list[Ar
                 "no_such_file",
                 "is no file of the result.",
                 where=name,
-                mend=f"There are {', '.join(a.name for a in found[:30])}."
+                hint=f"There are {', '.join(a.name for a in found[:30])}."
                 if found
                 else "There are none yet.",
             )
@@ -168,5 +168,5 @@ def _there(artifact: ArtifactView, target: Path, replace: bool) -> bool:
     if replace and target.is_file():
         return False
     raise InputError(
-        "output_not_empty", "is there with other content.", where=str(target), mend="Name another folder."
+        "output_not_empty", "is there with other content.", where=str(target), hint="Name another folder."
     )

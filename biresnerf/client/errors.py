@@ -26,7 +26,7 @@ class ServiceError(BiresnerfError):
             ``download_damaged`` and ``stopped``.
         detail: what is wrong, in one sentence.
         status: the HTTP status; 0 where there was no answer.
-        where, mend: the file or field at fault, and what to do about it; empty where the service does not say.
+        where, hint: the file or field at fault, and what to do about it; empty where the service does not say.
         errors: every wrong field by its pointer.
         request_id: by which the service's log knows the request; none where there was no answer.
         retry_after_s: how long the service asks to wait.
@@ -39,16 +39,16 @@ class ServiceError(BiresnerfError):
         *,
         status: int = 0,
         where: str = "",
-        mend: str = "",
+        hint: str = "",
         errors: tuple[FieldProblem, ...] = (),
         request_id: str | None = None,
         retry_after_s: float | None = None,
         untouched: bool = False,
     ) -> None:
-        self.code, self.detail, self.status, self.where, self.mend = code, detail, status, where, mend
+        self.code, self.detail, self.status, self.where, self.hint = code, detail, status, where, hint
         self.errors, self.request_id, self.retry_after_s = errors, request_id, retry_after_s
         self._untouched = untouched
-        super().__init__(" ".join(part for part in (f"{where}:" if where else "", detail, mend) if part))
+        super().__init__(" ".join(part for part in (f"{where}:" if where else "", detail, hint) if part))
 
     @property
     def retryable(self) -> bool:
@@ -78,7 +78,7 @@ class ServiceError(BiresnerfError):
             problem.detail,
             status=status,
             where=problem.where or "",
-            mend=problem.mend or "",
+            hint=problem.hint or "",
             errors=tuple(problem.errors),
             request_id=problem.request_id,
             retry_after_s=wait_s,
@@ -93,7 +93,7 @@ class ServiceError(BiresnerfError):
             "unexpected_answer",
             f"The answer has status {status} and is none that a BiResNeRF service gives.",
             status=status,
-            mend="Look whether the address is right.",
+            hint="Look whether the address is right.",
             request_id=request_id,
             retry_after_s=retry_after_s,
         )
@@ -101,7 +101,7 @@ class ServiceError(BiresnerfError):
     @classmethod
     def of_failure(cls, error: JobError) -> ServiceError:
         """What the check of a dataset or upload found wrong, as if it had been answered at once."""
-        return cls(error.code, error.detail, status=422, where=error.where, mend=error.mend)
+        return cls(error.code, error.detail, status=422, where=error.where, hint=error.hint)
 
 
 class JobFailed(BiresnerfError):
@@ -114,7 +114,7 @@ class JobFailed(BiresnerfError):
             super().__init__(f"The job {job.id} is {job.state}.")
             return
         parts = (f"The job {job.id} failed ({error.code}):", f"{error.where}:" if error.where else "")
-        super().__init__(" ".join(part for part in (*parts, error.detail, error.mend) if part))
+        super().__init__(" ".join(part for part in (*parts, error.detail, error.hint) if part))
 
 
 class JobNotOver(BiresnerfError, TimeoutError):

@@ -89,13 +89,13 @@ def broken(url: str, call: Call, error: httpx.TransportError) -> ServiceError:
             "file_changed",
             "is not what it was when it was first read.",
             where=str(call.content.path),
-            mend="Send again what does not change meanwhile.",
+            hint="Send again what does not change meanwhile.",
             status=422,
         )
     return ServiceError(
         "unreachable",
         f"No service answers at {url} ({str(error) or type(error).__name__}).",
-        mend="Start one with `biresnerf up`, or give its address (--url, BIRESNERF_URL).",
+        hint="Start one with `biresnerf up`, or give its address (--url, BIRESNERF_URL).",
         untouched=isinstance(error, _NOT_SENT),
     )
 

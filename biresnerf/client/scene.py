@@ -61,7 +61,7 @@ def _name_below(root: Path, path: Path) -> str:
             "image_outside",
             "lies outside of the folder of the pose file, and cannot be sent with it.",
             where=str(path),
-            mend="Move it below that folder, or run `biresnerf refine` on this machine.",
+            hint="Move it below that folder, or run `biresnerf refine` on this machine.",
         ) from None
     return checked_path(name)
 

@@ -39,7 +39,7 @@ def choose_device(device: Device) -> torch.device:
             "device_unavailable",
             f"CUDA was asked for, but {problem}.",
             where="device",
-            mend="Use --device auto or cpu, or install torch with CUDA and, where it does not bring it, Triton.",
+            hint="Use --device auto or cpu, or install torch with CUDA and, where it does not bring it, Triton.",
         )
     if torch.cuda.is_available():
         logger.warning("computing on the CPU: %s", problem)

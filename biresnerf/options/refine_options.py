@@ -241,5 +241,5 @@ def parse_options(values: dict[str, Any]) -> RefineOptions:
             "invalid_options",
             "; ".join(problems) + ".",
             where="options",
-            mend="`biresnerf refine --help` and GET /v1/options list what there is.",
+            hint="`biresnerf refine --help` and GET /v1/options list what there is.",
         ) from None

@@ -44,11 +44,11 @@ def find_scene(path: Path, every: int, test_views: int) -> Scene:
                 "poses_missing",
                 "has no true poses to compare with.",
                 where=str(path),
-                mend="Give a folder with a transforms.json.",
+                hint="Give a folder with a transforms.json.",
             )
         file = contents.transforms
     elif not path.is_file():
-        raise InputError("input_missing", "does not exist.", where=str(path), mend="Name a scene's folder.")
+        raise InputError("input_missing", "does not exist.", where=str(path), hint="Name a scene's folder.")
     beside = file.with_name(TEST_NAME)
     test_file = beside if file.name == TRAIN_NAME and beside.is_file() and test_views else None
     digest = hashlib.sha256(file.read_bytes())
@@ -70,7 +70,7 @@ def find_scene(path: Path, every: int, test_views: int) -> Scene:
             "poses_missing",
             f"{int((~views.posed).sum())} of {len(views)} frames have no true pose to compare with.",
             where=str(file),
-            mend="Remove these frames.",
+            hint="Remove these frames.",
         )
     read_test_views(scene)
     return scene

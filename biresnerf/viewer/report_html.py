@@ -91,14 +91,14 @@ def read_report(folder: Path) -> Report:
             "result_missing",
             "holds no report.json.",
             where=str(folder),
-            mend="Name the output folder of a finished `biresnerf refine`.",
+            hint="Name the output folder of a finished `biresnerf refine`.",
         ) from None
     except ValueError as error:
         raise InputError(
             "report_invalid",
             str(error).splitlines()[0],
             where=str(path),
-            mend="Give a result of this version, as it was written.",
+            hint="Give a result of this version, as it was written.",
         ) from None
 
 

@@ -35,7 +35,7 @@ class Problem(BaseModel):
                     "request_id": "5f1c0d9e6a0b4a3c",
                     "retryable": False,
                     "where": "../evil.png",
-                    "mend": "Pack the archive with relative names inside one folder.",
+                    "hint": "Pack the archive with relative names inside one folder.",
                     "errors": [],
                 }
             ]
@@ -53,7 +53,7 @@ class Problem(BaseModel):
     where: str | None = Field(
         None, description="The file or entry at fault, and the field in it where there is one."
     )
-    mend: str | None = Field(None, description="What to do about it.")
+    hint: str | None = Field(None, description="What to do about it.")
     errors: list[FieldProblem] = Field(default_factory=list)
 
 
@@ -67,6 +67,6 @@ class JobError(Record):
     code: str
     detail: str
     where: str = ""
-    mend: str = ""
+    hint: str = ""
     retryable: bool = False
     log_tail: str = ""

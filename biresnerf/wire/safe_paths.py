@@ -29,7 +29,7 @@ def checked_path(name: str) -> str:
     """
     fault = _fault(name)
     if fault:
-        raise InputError("unsafe_path", fault, where=_printable(name), mend=_MEND)
+        raise InputError("unsafe_path", fault, where=_printable(name), hint=_MEND)
     return "/".join(part for part in name.split("/") if part != ".")
 
 
@@ -107,5 +107,5 @@ def _collision(path: str, other: str) -> InputError:
         f"The name meets another one, {_printable(other)}: they are equal but for case or accents, "
         "the same twice, or a file and a folder at once.",
         where=_printable(path),
-        mend="Give every file a name of its own.",
+        hint="Give every file a name of its own.",
     )

@@ -59,7 +59,7 @@ class OutputFolder:
     def refuse_finished(self) -> None:
         """Raise `InputError` unless the folder is new, empty, or holds an unfinished run."""
         if self.path.exists() and not self.path.is_dir():
-            raise InputError("output_not_a_folder", "is a file.", where=str(self.path), mend="Name a folder.")
+            raise InputError("output_not_a_folder", "is a file.", where=str(self.path), hint="Name a folder.")
         if not self.path.is_dir() or (self.path / CHECKPOINT).is_file():
             return
         if not {path.name for path in self.path.iterdir()} - {CHECKPOINT.parent.name, HISTORY, PREVIEW}:
@@ -67,13 +67,13 @@ class OutputFolder:
         report = self.path / REPORT
         if report.is_file():
             raise InputError(
-                "output_finished", "holds a finished result.", where=str(self.path), mend=_ANOTHER
+                "output_finished", "holds a finished result.", where=str(self.path), hint=_ANOTHER
             )
         raise InputError(
             "output_not_empty",
             "is not empty, and nothing in it can be resumed.",
             where=str(self.path),
-            mend=_ANOTHER,
+            hint=_ANOTHER,
         )
 
     @property
@@ -108,7 +108,7 @@ class OutputFolder:
                 "output_not_resumable",
                 "holds an unfinished run of other images, poses or options.",
                 where=str(self.path),
-                mend=_ANOTHER,
+                hint=_ANOTHER,
             )
         self.path.mkdir(parents=True, exist_ok=True)
 

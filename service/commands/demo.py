@@ -79,7 +79,7 @@ def _clear(output: Path) -> None:
             "output_not_empty",
             "holds files that the demo did not write.",
             where=str(output),
-            mend="Name another folder with --output.",
+            hint="Name another folder with --output.",
         )
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)

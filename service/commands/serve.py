@@ -51,7 +51,7 @@ def setup_problems() -> Iterator[None]:
             f"BIRESNERF_{'_'.join(map(str, item['loc'])).upper()}: {item['msg']}." for item in error.errors()
         ]
         raise InputError(
-            "invalid_settings", " ".join(lines), mend="Change these environment variables."
+            "invalid_settings", " ".join(lines), hint="Change these environment variables."
         ) from None
 
 

@@ -58,7 +58,7 @@ def _static_folder() -> Path:
     spec = importlib.util.find_spec("fastapi_offline")
     if spec is None or spec.origin is None:
         raise ProblemError(
-            "unavailable", "The package fastapi-offline is missing.", mend="pip install biresnerf[service]"
+            "unavailable", "The package fastapi-offline is missing.", hint="pip install biresnerf[service]"
         )
     return Path(spec.origin).parent / "static"
 

@@ -200,14 +200,14 @@ async def _nameless(service: Service, request: Request) -> Identity:
                 "cross_site",
                 "Without an API key only requests to this machine by its own name are taken.",
                 where="Host",
-                mend="Use http://127.0.0.1 or localhost, or make a key: biresnerf keys create.",
+                hint="Use http://127.0.0.1 or localhost, or make a key: biresnerf keys create.",
             )
     if mode == "required":
         raise ProblemError(
             "missing_credentials",
             "This service wants an API key.",
             where="Authorization",
-            mend="Send the header `Authorization: Bearer brn_…`; `biresnerf keys create` makes a key.",
+            hint="Send the header `Authorization: Bearer brn_…`; `biresnerf keys create` makes a key.",
             headers={"WWW-Authenticate": _CHALLENGE},
         )
     return Identity(LOCAL_TENANT, ALL_SCOPES)

@@ -87,21 +87,21 @@ class ProblemError(Exception):
         detail: str,
         *,
         where: str | None = None,
-        mend: str | None = None,
+        hint: str | None = None,
         errors: list[FieldProblem] | None = None,
         headers: dict[str, str] | None = None,
     ) -> None:
         super().__init__(f"{code}: {detail}")
         # Validation has codes of its own, which are all mistakes in the content.
         self.status, self.title = CATALOGUE.get(code, (422, "The content cannot be used"))
-        self.code, self.detail, self.where, self.mend = code, detail, where, mend
+        self.code, self.detail, self.where, self.hint = code, detail, where, hint
         self.errors = errors or []
         self.headers = headers or {}
 
     @classmethod
     def from_input_error(cls, error: InputError) -> ProblemError:
         """The same mistake as HTTP tells it."""
-        return cls(error.code, error.what, where=error.where or None, mend=error.mend or None)
+        return cls(error.code, error.what, where=error.where or None, hint=error.hint or None)
 
     @property
     def retryable(self) -> bool:
@@ -128,7 +128,7 @@ class ProblemError(Exception):
             request_id=request_id,
             retryable=self.retryable,
             where=self.where,
-            mend=self.mend,
+            hint=self.hint,
             errors=self.errors,
         )
 

@@ -30,7 +30,7 @@ class UploadPlaces:
             raise ProblemError(
                 "too_many_uploads",
                 f"{self._limit} uploads are under way, which is the limit.",
-                mend="Go on when one of them is done.",
+                hint="Go on when one of them is done.",
             )
         self._taken[client] += 1
         try:

@@ -47,7 +47,7 @@ async def take_archive(
     dataset = await service.stores.datasets.get(dataset_id)
     if dataset.state != "open":
         raise ProblemError(
-            "dataset_not_open", f"The dataset is {dataset.state}.", mend="Create a new dataset."
+            "dataset_not_open", f"The dataset is {dataset.state}.", hint="Create a new dataset."
         )
     allowed = min(settings.max_unpacked_bytes, settings.max_dataset_bytes - dataset.bytes)
     # Twice: unpacked here, and then stored, which may be on the same disk.
@@ -137,10 +137,10 @@ async def _renew(service: Service, upload_id: str, token: uuid.UUID) -> None:
 def _clients_mistake(error: ProblemError | InputError | EngineError) -> JobError | None:
     """The error where sending the same again would end the same; None where it is ours."""
     if isinstance(error, ProblemError):
-        told = JobError(code=error.code, detail=error.detail, where=error.where or "", mend=error.mend or "")
+        told = JobError(code=error.code, detail=error.detail, where=error.where or "", hint=error.hint or "")
         return None if error.retryable or error.status >= 500 else told
     if isinstance(error, InputError):
-        return JobError(code=error.code, detail=error.what, where=error.where, mend=error.mend)
+        return JobError(code=error.code, detail=error.what, where=error.where, hint=error.hint)
     if isinstance(error, Conflict | LimitReached) and error.code != "storage_full":
         return JobError(code=error.code, detail=error.what)
     return None
@@ -164,7 +164,7 @@ async def _bring_in(service: Service, upload: Upload) -> None:
                 raise ProblemError(
                     "digest_mismatch",
                     f"What arrived has SHA-256 {found}, announced was {upload.sha256}.",
-                    mend="Send the archive again.",
+                    hint="Send the archive again.",
                 )
         await take_archive(service, upload.dataset_id, archive, into, upload.id)
 
@@ -187,12 +187,12 @@ async def settle_uploads(service: Service, dataset_id: str) -> None:
         give_up = f"or give it up: DELETE /v1/uploads/{upload.id}"
         if upload.error is not None:
             error = upload.error
-            mend = f"{error.mend} Send it again, {give_up}.".strip()
-            raise ProblemError(error.code, error.detail, where=error.where or None, mend=mend)
+            hint = f"{error.hint} Send it again, {give_up}.".strip()
+            raise ProblemError(error.code, error.detail, where=error.where or None, hint=hint)
         raise ProblemError(
             "dataset_not_complete",
             f"Of the upload {upload.id}, {upload.received} of {upload.size} bytes have arrived.",
-            mend=f"Send the rest, {give_up}.",
+            hint=f"Send the rest, {give_up}.",
         )
 
 

@@ -47,5 +47,5 @@ async def finish_check(caller: Caller, dataset_id: str) -> DatasetRecord:
         error = dataset.error
         if error is None:
             raise ProblemError("dataset_invalid", "The check rejected the dataset.")
-        raise ProblemError(error.code, error.detail, where=error.where or None, mend=error.mend or None)
+        raise ProblemError(error.code, error.detail, where=error.where or None, hint=error.hint or None)
     return dataset

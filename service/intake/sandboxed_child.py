@@ -1,7 +1,7 @@
 """Child programs that read what strangers sent: the parent waits with limits, the child confines itself.
 
 The web process never parses an archive or an image. A child takes one JSON request as its argument and
-answers with one JSON line: ``{"result": ...}`` or ``{"error": {"code", "what", "where", "mend"}}``.
+answers with one JSON line: ``{"result": ...}`` or ``{"error": {"code", "what", "where", "hint"}}``.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ async def run_confined(module: str, request: BaseModel, limits: Limits) -> dict[
         raise ProblemError(
             "validation_timeout",
             f"Reading the files was stopped after {limits.seconds:.0f} s.",
-            mend="Send fewer or smaller images.",
+            hint="Send fewer or smaller images.",
         ) from None
     finally:
         with contextlib.suppress(ProcessLookupError):
@@ -88,7 +88,7 @@ def _read_answer(module: str, answer: bytes, log: bytes, status: int | None) -> 
     raise ProblemError(
         "validation_resources",
         "Reading the files took more memory than is allowed, or broke the reader.",
-        mend="Look for damaged or enormous files among what was sent.",
+        hint="Look for damaged or enormous files among what was sent.",
     )
 
 
@@ -103,7 +103,7 @@ def run_child(work: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
     try:
         answer: dict[str, Any] = {"result": work(request)}
     except InputError as error:
-        answer = {"error": {"code": error.code, "what": error.what, "where": error.where, "mend": error.mend}}
+        answer = {"error": {"code": error.code, "what": error.what, "where": error.where, "hint": error.hint}}
     with os.fdopen(answer_to, "wb") as out:
         out.write(json.dumps(answer).encode() + b"\n")
 

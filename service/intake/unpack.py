@@ -63,7 +63,7 @@ def unpack(request: UnpackRequest) -> dict[str, Any]:
             elif head[257:262] == b"ustar":
                 _unpack_tar(file, sink)
             else:
-                raise _rejected("This is no zip, tar or tar.gz archive.", mend=_MEND_PACK)
+                raise _rejected("This is no zip, tar or tar.gz archive.", hint=_MEND_PACK)
     except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise _rejected(f"The archive is broken: {error}.", where=sink.current) from None
     except (NotImplementedError, ValueError, OverflowError) as error:
@@ -75,7 +75,7 @@ def unpack(request: UnpackRequest) -> dict[str, Any]:
             "The archive's table of contents is unreasonably large.", where=sink.current
         ) from None
     if sink.files == 0:
-        raise _rejected("The archive holds no files.", mend="Pack the images and transforms.json.")
+        raise _rejected("The archive holds no files.", hint="Pack the images and transforms.json.")
     return {"files": sink.files, "bytes": sink.bytes}
 
 
@@ -124,7 +124,7 @@ class _Sink:
                 "archive_too_large",
                 f"The file unpacks to more than {self.request.file_bytes_max} bytes.",
                 where=self.current,
-                mend="Send smaller files.",
+                hint="Send smaller files.",
             )
         if self.bytes > self.budget:
             raise self.over_budget()
@@ -134,14 +134,14 @@ class _Sink:
         what = f"The archive unpacks to more than {self.budget} bytes."
         if self._by_ratio:
             what = f"The archive unpacks to more than {self.request.ratio_max:g} times its size."
-        return InputError("archive_too_large", what, where=self.current, mend="Send fewer or smaller images.")
+        return InputError("archive_too_large", what, where=self.current, hint="Send fewer or smaller images.")
 
     def _too_many(self) -> InputError:
         return InputError(
             "too_many_files",
             f"The archive holds more than {self.request.files_max} files.",
             where=self.current,
-            mend="Send fewer images; leave out what is neither an image nor a pose file.",
+            hint="Send fewer images; leave out what is neither an image nor a pose file.",
         )
 
 
@@ -153,17 +153,17 @@ def _unpack_zip(file: IO[bytes], sink: _Sink) -> None:
             mode = info.external_attr >> 16
             if info.flag_bits & _ENCRYPTED:
                 raise _rejected(
-                    "The entry is encrypted.", where=sink.current, mend="Pack without a password."
+                    "The entry is encrypted.", where=sink.current, hint="Pack without a password."
                 )
             if stat.S_IFMT(mode) not in {0, stat.S_IFREG, stat.S_IFDIR}:
-                raise _rejected("The entry is a link or a device.", where=sink.current, mend=_MEND_PACK)
+                raise _rejected("The entry is a link or a device.", where=sink.current, hint=_MEND_PACK)
             if info.is_dir() or path is None:
                 continue
             if info.compress_type not in _METHODS:
                 raise _rejected(
                     f"The entry is packed by method {info.compress_type}.",
                     where=sink.current,
-                    mend="Use deflate.",
+                    hint="Use deflate.",
                 )
             with archive.open(info) as content:
                 sink.write(path, content)
@@ -178,7 +178,7 @@ def _unpack_tar(plain: IO[bytes] | gzip.GzipFile, sink: _Sink) -> None:
                 continue
             if not member.isreg() or member.issparse():
                 raise _rejected(
-                    "The entry is a link, a device or sparse.", where=sink.current, mend=_MEND_PACK
+                    "The entry is a link, a device or sparse.", where=sink.current, hint=_MEND_PACK
                 )
             if member.size < 0:
                 raise _rejected("The entry has a size below nothing.", where=sink.current)
@@ -222,9 +222,9 @@ class _CountedReader:
 
 
 def _rejected(
-    what: str, *, where: str = "", mend: str = "Pack the archive anew and send it again."
+    what: str, *, where: str = "", hint: str = "Pack the archive anew and send it again."
 ) -> InputError:
-    return InputError("archive_rejected", what, where=where, mend=mend)
+    return InputError("archive_rejected", what, where=where, hint=hint)
 
 
 if __name__ == "__main__":

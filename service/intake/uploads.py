@@ -33,7 +33,7 @@ def too_large(limit_bytes: int) -> ProblemError:
     return ProblemError(
         "body_too_large",
         f"The body is larger than {limit_bytes} bytes.",
-        mend="Send fewer or smaller images, or single files; GET /v1/info tells the limits.",
+        hint="Send fewer or smaller images, or single files; GET /v1/info tells the limits.",
     )
 
 

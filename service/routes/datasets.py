@@ -195,7 +195,7 @@ def _announced_digest(header: str | None) -> str | None:
             "malformed_body",
             "The header holds no SHA-256.",
             where="Repr-Digest",
-            mend="Send sha-256=:BASE64:.",
+            hint="Send sha-256=:BASE64:.",
         )
     return digest.hex()
 
@@ -248,7 +248,7 @@ async def finalize_dataset(
 ) -> Response:
     """Freezes the files and checks them: poses, intrinsics, names, and every pixel.
 
-    Answers when the check is done: 200 with a `ready` dataset, or 422 with what is wrong and how to mend it
+    Answers when the check is done: 200 with a `ready` dataset, or 422 with what is wrong and how to fix it
     (the dataset is then `rejected`, and takes neither files nor jobs).
     """
     view = await begin_check(caller, dataset_id)

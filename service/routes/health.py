@@ -95,6 +95,6 @@ async def _require_scraper(service: Service, authorization: str) -> None:
         raise ProblemError(
             "metrics_token_required",
             "The token of /metrics is missing, wrong, or not set.",
-            mend="Set BIRESNERF_METRICS_TOKEN and send it as Authorization: Bearer; an admin key does too.",
+            hint="Set BIRESNERF_METRICS_TOKEN and send it as Authorization: Bearer; an admin key does too.",
             headers={"WWW-Authenticate": "Bearer"},
         )

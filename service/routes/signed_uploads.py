@@ -66,7 +66,7 @@ async def _addresses(caller: Caller, keys: list[str]) -> list[str]:
         raise ProblemError(
             "direct_upload_unavailable",
             "This service takes files itself only.",
-            mend="Use PUT …/files/{path}, or a resumable upload.",
+            hint="Use PUT …/files/{path}, or a resumable upload.",
         )
     return list(urls)
 

@@ -22,9 +22,9 @@ export function ProblemBox({ problem, heading }: { problem: Problem | JobError; 
           ))}
         </ul>
       )}
-      {problem.mend && (
+      {problem.hint && (
         <p>
-          <strong>What to do:</strong> {problem.mend}
+          <strong>What to do:</strong> {problem.hint}
         </p>
       )}
       <p class="soft">

@@ -72,16 +72,16 @@ def save(folder: Path, document: Any, name: str = "transforms.json") -> Path:
 
 
 def assert_complete(error: InputError, code: str, *where: str) -> None:
-    """The error has the code, names every part of ``where``, and says what and how to mend it."""
+    """The error has the code, names every part of ``where``, and says what and how to fix it."""
     assert error.code == code, f"{error.code}: {error}"
     for part in where:
         assert part in error.where, f"{part!r} is not in {error.where!r}"
     assert error.what.endswith("."), error.what
-    assert error.mend.endswith("."), error.mend
+    assert error.hint.endswith("."), error.hint
 
 
 def refused_at_once(read: Callable[[], object]) -> InputError:
-    """The error that ``read`` raises: within a second and 200 MB, and saying what and how to mend it."""
+    """The error that ``read`` raises: within a second and 200 MB, and saying what and how to fix it."""
     tracemalloc.start()
     started = time.perf_counter()
     with pytest.raises(InputError) as caught:
@@ -90,7 +90,7 @@ def refused_at_once(read: Callable[[], object]) -> InputError:
     assert tracemalloc.get_traced_memory()[1] < 200 * 2**20
     tracemalloc.stop()
     assert caught.value.what.endswith(".")
-    assert caught.value.mend.endswith(".")
+    assert caught.value.hint.endswith(".")
     return caught.value
 
 

@@ -47,7 +47,7 @@ steps, step_s = options["steps"], options["seed"] / 1000
 tell("preparing", 0)
 sys.stderr.write("images read\nline 2\n")
 if options["threads"] == 77:
-    said = {"code": "diverged", "detail": "The loss is not finite.", "where": "", "mend": ""}
+    said = {"code": "diverged", "detail": "The loss is not finite.", "where": "", "hint": ""}
     (folder / "error.json").write_text(json.dumps(said))
     sys.exit(3)
 for step in range(1, steps + 1):

@@ -79,4 +79,4 @@ def test_a_tree_without_the_built_page_says_so(tmp_path: Path, monkeypatch: pyte
         async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
             return await client.get("/")
 
-    assert "make web" in problem(asyncio.run(ask()), 503, "unavailable")["mend"]
+    assert "make web" in problem(asyncio.run(ask()), 503, "unavailable")["hint"]

@@ -66,7 +66,7 @@ if plan.get("outdated") and state.exists():
         "code": "checkpoint_invalid",
         "detail": "was written by another version.",
         "where": "",
-        "mend": "",
+        "hint": "",
     }
     (folder / "error.json").write_text(json.dumps(said))
     sys.exit(2)
@@ -75,7 +75,7 @@ if plan.get("refuse"):
         "code": "pose_file_invalid",
         "detail": "pose 3 has NaN.",
         "where": "transforms.json",
-        "mend": "Mend it.",
+        "hint": "Mend it.",
     }
     (folder / "error.json").write_text(json.dumps(said))
     sys.exit(2)

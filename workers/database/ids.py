@@ -34,7 +34,7 @@ def cursor_place(cursor: str, parts: int) -> list[str]:
         place = None
     if not isinstance(place, list) or len(place) != parts or not all(isinstance(part, str) for part in place):
         raise InputError(
-            "bad_cursor", "This is no cursor of this list.", where="cursor", mend="Start without one."
+            "bad_cursor", "This is no cursor of this list.", where="cursor", hint="Start without one."
         )
     return place
 

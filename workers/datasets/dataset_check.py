@@ -165,7 +165,7 @@ async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[Verdict
             status = await child.wait()
     except TimeoutError:
         detail = f"The check took longer than {settings.check_timeout_s:g} s."
-        error = JobError(code="check_timeout", detail=detail, mend="Send fewer or smaller images.")
+        error = JobError(code="check_timeout", detail=detail, hint="Send fewer or smaller images.")
         return Verdict({}, error), False
     finally:
         child.kill()

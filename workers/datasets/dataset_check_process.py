@@ -1,7 +1,7 @@
 """The program that validates a dataset: `python -m workers.datasets.dataset_check_process FOLDER`.
 
 Writes one line of JSON to standard output: ``{"report": {...}}`` (exit status 0), or ``{"error":
-{"code", "detail", "where", "mend"}}`` (exit status 2). It reads what strangers sent, so it confines itself
+{"code", "detail", "where", "hint"}}`` (exit status 2). It reads what strangers sent, so it confines itself
 first: memory, CPU time, no files written. Loads neither torch nor pycolmap; poses that are missing are
 found by the job, not here.
 """
@@ -34,7 +34,7 @@ def main(folder: Path) -> int:
         status = 0
     except InputError as error:
         where = error.where.replace(f"{folder}/", "").replace(str(folder), "the dataset")
-        answer = {"error": {"code": error.code, "detail": error.what, "where": where, "mend": error.mend}}
+        answer = {"error": {"code": error.code, "detail": error.what, "where": where, "hint": error.hint}}
         status = EXIT_INPUT_ERROR
     with os.fdopen(answer_to, "w") as out:
         out.write(json.dumps(answer) + "\n")
@@ -45,7 +45,7 @@ def check(folder: Path) -> dict[str, Any]:
     """Read everything in ``folder`` and decode every image; returns what was found.
 
     Raises:
-        InputError: what is wrong, with which file, and the mend.
+        InputError: what is wrong, with which file, and a hint.
     """
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.photos.images import load_images

@@ -110,5 +110,5 @@ def file_key(folder: str, path: str) -> str:
     parts = path.split("/")
     bad = any(part in ("", ".", "..") or len(part.encode()) > 255 for part in parts) or "\0" in path
     if bad or RESERVED_NAME.search(path):
-        raise InputError("unsafe_path", "Not a usable file name.", where=path[:300], mend="Rename the file.")
+        raise InputError("unsafe_path", "Not a usable file name.", where=path[:300], hint="Rename the file.")
     return f"{folder}/{path}"

@@ -147,7 +147,7 @@ class DatasetStore:
                     "digest_mismatch",
                     f"What arrived has {file.size} bytes and SHA-256 {found}, not {size} and {sha256}.",
                     where=path,
-                    mend="Send the file again.",
+                    hint="Send the file again.",
                 )
             return file.model_copy(update={"sha256": found})
 

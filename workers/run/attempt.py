@@ -36,7 +36,7 @@ EXIT_ERRORS = {2: "InputError", 3: "RefinementError"}  # deterministic: another 
 EXIT_MEMORY = 4
 # Of a process that the kernel may have killed for want of memory; the second where it was a process of its own.
 KILLED, CHILD_KILLED = -signal.SIGKILL, "seeding_crashed"
-# Ours to mend, not the user's: a checkpoint of an older version, for example. The job starts over.
+# Ours to fix, not the user's: a checkpoint of an older version, for example. The job starts over.
 STALE_CHECKPOINT = {"output_not_resumable", "checkpoint_invalid"}
 DISCARDED_GRACE_S = 2.0  # for a cancelled job whose result nobody wants
 
@@ -174,7 +174,7 @@ class Attempt:
             error = JobError(
                 code="timeout",
                 detail=f"The job took longer than {self._settings.job_timeout_s:g} s.",
-                mend="Ask for fewer steps or smaller images, or raise BIRESNERF_JOB_TIMEOUT_S.",
+                hint="Ask for fewer steps or smaller images, or raise BIRESNERF_JOB_TIMEOUT_S.",
                 log_tail=log_tail(self._log),
             )
             await self._ledger.fail(error, await self._store(), *keep)

@@ -110,7 +110,7 @@ def crashed_too_often(attempts: int, log_tail: str = "") -> JobError:
     return JobError(
         code="too_many_crashes",
         detail=f"The job's process died in each of {attempts} attempts.",
-        mend="Try smaller options (preset fast, a smaller max_image_size) or a machine with more memory.",
+        hint="Try smaller options (preset fast, a smaller max_image_size) or a machine with more memory.",
         log_tail=log_tail,
     )
 

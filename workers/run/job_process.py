@@ -62,7 +62,7 @@ def main(folder: Path) -> int:
     except Interrupted:
         return EXIT_STOPPED
     except InputError as error:
-        _report(error.code, error.what, error.where, error.mend)
+        _report(error.code, error.what, error.where, error.hint)
         return EXIT_INPUT
     except RefinementError as error:
         _report(error.code, error.what, "", "")
@@ -136,10 +136,10 @@ def _protocol_only() -> TextIO:
     return protocol
 
 
-def _report(code: str, detail: str, where: str, mend: str) -> None:
-    said = json.dumps({"code": code, "detail": detail, "where": where, "mend": mend})
+def _report(code: str, detail: str, where: str, hint: str) -> None:
+    said = json.dumps({"code": code, "detail": detail, "where": where, "hint": hint})
     Path("error.json").write_text(said)
-    sys.stderr.write(f"{detail} {mend}\n")
+    sys.stderr.write(f"{detail} {hint}\n")
 
 
 if __name__ == "__main__":

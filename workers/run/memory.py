@@ -33,7 +33,7 @@ def out_of_memory(smaller: Mapping[str, Any], log_tail: str) -> JobError:
         code="out_of_memory",
         detail="The job needs more memory than the machine has"
         + (f", also in a second try with {tried}." if tried else "."),
-        mend="Ask for smaller images (max_image_size), fewer samples_per_step, a smaller table_size_log2 or "
+        hint="Ask for smaller images (max_image_size), fewer samples_per_step, a smaller table_size_log2 or "
         "fewer images, or use a machine (or GPU) with more memory.",
         log_tail=log_tail,
     )

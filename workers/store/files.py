@@ -273,7 +273,7 @@ class _Measured:
                 "digest_mismatch",
                 f"What arrived has SHA-256 {self.sha256}, announced was {self._expected}.",
                 where=self._key.rpartition("/")[2],
-                mend="Send the file again.",
+                hint="Send the file again.",
             )
 
 

@@ -96,7 +96,7 @@ def checked_tenant(name: str) -> str:
             "bad_tenant",
             "is no name of a tenant.",
             where=name[:100],
-            mend="Use 1 to 63 lower-case letters, digits, - and _, the first a letter or digit.",
+            hint="Use 1 to 63 lower-case letters, digits, - and _, the first a letter or digit.",
         )
     return name
 

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 FIRST_PAUSE_S = 0.2
 LONGEST_PAUSE_S = 10.0
-# A process that never lived so long, in so many starts, has a fault that starting it again will not mend.
+# A process that never lived so long, in so many starts, has a fault that starting it again will not fix.
 SETTLED_S = 5.0
 STARTS_MAX = 5
 KILL_AFTER_S = 5.0

@@ -66,8 +66,8 @@ def checked_url(text: str, policy: Policy) -> httpx.URL:
     except (httpx.InvalidURL, ValueError, TypeError):
         reason = "It is no URL."
     if reason:
-        mend = "Give the https address of a public host." if not policy.plain_http else ""
-        raise InputError("webhook_url_refused", f"This address cannot be used. {reason}", mend=mend)
+        hint = "Give the https address of a public host." if not policy.plain_http else ""
+        raise InputError("webhook_url_refused", f"This address cannot be used. {reason}", hint=hint)
     return url
 
 

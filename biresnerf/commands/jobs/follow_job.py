@@ -44,7 +44,7 @@ def require_empty(folder: Path | None) -> None:
             "output_not_empty",
             "is not an empty folder.",
             where=str(folder),
-            mend="Name a new folder for the results.",
+            hint="Name a new folder for the results.",
         )
 
 

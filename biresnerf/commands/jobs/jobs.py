@@ -49,7 +49,7 @@ def described(job: JobView) -> list[str]:
         lines.append(f"  verdict: {job.verdict}")
     if job.error is not None:
         error = job.error
-        lines.append("  " + " ".join(part for part in (f"{error.code}:", error.detail, error.mend) if part))
+        lines.append("  " + " ".join(part for part in (f"{error.code}:", error.detail, error.hint) if part))
     if job.labels:
         lines.append("  " + "  ".join(f"{name}={value}" for name, value in job.labels.items()))
     if job.expires_at is not None:

@@ -68,7 +68,7 @@ def service_at(url: str | None, api_key: str | None, job: JobName | None = None)
         raise InputError(
             "extra_missing",
             f"The package {error.name} is not installed.",
-            mend="Install it with: pip install 'biresnerf[client]'",
+            hint="Install it with: pip install 'biresnerf[client]'",
         ) from None
     try:
         chosen = (job.url if job is not None else None) or url or DEFAULT_URL

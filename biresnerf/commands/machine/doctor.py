@@ -1,4 +1,4 @@
-"""`biresnerf doctor`: what works on this machine, what is missing, and how to mend it."""
+"""`biresnerf doctor`: what works on this machine, what is missing, and how to fix it."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def doctor_command(as_json: bool) -> int:
         found.append(one)
         if not as_json:
             click.echo(f"{one.state:<8} {one.name:<12} {one.detail}")
-            if one.mend:
-                click.echo(f"{'':<22}{one.mend}")
+            if one.hint:
+                click.echo(f"{'':<22}{one.hint}")
     good = all(one.state != "broken" for one in found)
     if as_json:
         print_json({"good": good, "checks": [asdict(one) for one in found]})

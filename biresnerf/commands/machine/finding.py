@@ -17,7 +17,7 @@ class Found:
     name: str
     state: State
     detail: str
-    mend: str = ""
+    hint: str = ""
 
 
 Check: TypeAlias = Callable[[], Found]

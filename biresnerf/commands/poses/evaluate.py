@@ -58,7 +58,7 @@ def evaluate_command(result: Path, truth: Path, as_json: bool, paper_compat: boo
             "no_common_images",
             f"no image with a pose in both files ({len(estimated)} there, {len(true)} in {truth}).",
             where=str(result),
-            mend="Compare files of the same images; file_path decides.",
+            hint="Compare files of the same images; file_path decides.",
         )
     both = np.stack([estimated[name] for name, _ in pairs]), np.stack([true[name] for _, name in pairs])
     error, further = pose_error(*both), trajectory_error(*both)

@@ -111,7 +111,7 @@ def make_scene(
     """
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise InputError(
-            "output_not_empty", "is not an empty folder.", where=str(output), mend="Name a new folder."
+            "output_not_empty", "is not an empty folder.", where=str(output), hint="Name a new folder."
         )
     from biresnerf.data.formats.transforms.read_transforms import read_transforms
 
@@ -148,7 +148,7 @@ def _copied(own: Path, output: Path) -> Path:
             "poses_missing",
             f"{int((~dataset.posed).sum())} of {len(dataset)} images have no pose that could be taken for true.",
             where=str(own),
-            mend="Give a set with all poses, for example a result of `biresnerf refine`.",
+            hint="Give a set with all poses, for example a result of `biresnerf refine`.",
         )
     frames = []
     for name, frame in zip(dataset.file_names, dataset.frames, strict=True):

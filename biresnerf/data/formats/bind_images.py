@@ -122,7 +122,7 @@ def fitted_camera(camera: Camera, header: ImageHeader, image: GivenImage, notes:
             "image_size_mismatch",
             f"{sizes}: {'turned by 90 degrees' if turned else 'not the same shape'}.",
             where=image.where,
-            mend="Give the intrinsics of these images; cropped or turned images need their own.",
+            hint="Give the intrinsics of these images; cropped or turned images need their own.",
         )
     notes.append(
         f"{camera.width} x {camera.height} px in the camera, {size[0]} x {size[1]} in the images: "
@@ -179,7 +179,7 @@ def match_files(
             "image_missing",
             f"{len(missing)} of {len(names)} images not found: {few_names(names[i] for i in missing)}.",
             where=where(missing[0]),
-            mend="Put the images into images/ under the names that the poses are given for.",
+            hint="Put the images into images/ under the names that the poses are given for.",
         )
     return [found[name] for name in names], notes
 

@@ -74,7 +74,7 @@ def convert(
             "no_poses",
             "holds no poses to convert.",
             where=str(dataset.root),
-            mend="Find them with `biresnerf refine`.",
+            hint="Find them with `biresnerf refine`.",
         )
     chosen = replace(dataset, frames=tuple(posed))
     refined = refined_set(chosen, chosen.world_from_cam)
@@ -136,7 +136,7 @@ def _bring_photos(dataset: Dataset, folder: Path, how: Literal["link", "copy"]) 
                 "image_outside",
                 "lies outside of the set's folder, and cannot be brought along.",
                 where=str(file),
-                mend="Leave photos where they are: --photos none.",
+                hint="Leave photos where they are: --photos none.",
             )
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)

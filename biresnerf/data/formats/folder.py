@@ -68,7 +68,7 @@ def look_into(folder: Path) -> FolderContents:
             "no_images",
             "holds neither transforms.json nor images.",
             where=str(folder),
-            mend="Put poses or images (PNG, JPEG, WebP, TIFF, BMP) there, or the images into images/.",
+            hint="Put poses or images (PNG, JPEG, WebP, TIFF, BMP) there, or the images into images/.",
         )
     return FolderContents(root, None, None, tuple(images), ())
 
@@ -95,7 +95,7 @@ def look_at(file: Path) -> FolderContents:
             "input_unsupported",
             "is neither a folder nor a file with poses that is read.",
             where=file.name,
-            mend="Give a transforms.json, or a folder that holds poses or images.",
+            hint="Give a transforms.json, or a folder that holds poses or images.",
         )
     below = suffix == ".out" and folder.name == "bundle"
     return FolderContents(folder.parent if below else folder, forms[suffix], file, (), ())
@@ -158,7 +158,7 @@ def visible(folder: Path) -> list[Path]:
             "input_unreadable",
             f"cannot be read: {error.strerror}.",
             where=str(folder),
-            mend="Check the path and its permissions.",
+            hint="Check the path and its permissions.",
         ) from None
 
 

@@ -40,7 +40,7 @@ def read_dataset(path: Path, within: Path | None = None) -> Dataset:
         within: refuse files outside of this folder; for files of strangers.
 
     Raises:
-        InputError: the input cannot be used; says the file, the field and the mend.
+        InputError: the input cannot be used; says the file, the field and a hint.
     """
     contents = find_input(Path(path))
     if contents.form is None or contents.poses is None:
@@ -59,5 +59,5 @@ def find_input(path: Path) -> FolderContents:
     if path.is_dir():
         return look_into(path)
     raise InputError(
-        "input_missing", "does not exist.", where=str(path), mend="Give a folder, or a file with poses."
+        "input_missing", "does not exist.", where=str(path), hint="Give a folder, or a file with poses."
     )

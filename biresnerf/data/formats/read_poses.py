@@ -47,7 +47,7 @@ def read_poses(path: Path) -> Poses:
             raise _at(path, error, path.name) from None
         file, form = None, None
     if file is None or form is None:
-        raise InputError("pose_file_invalid", "holds no poses that are read.", where=str(path), mend=_MEND)
+        raise InputError("pose_file_invalid", "holds no poses that are read.", where=str(path), hint=_MEND)
     try:
         return _READERS[form](contents.root, file)
     except InputError as error:
@@ -58,7 +58,7 @@ def _at(path: Path, error: InputError, name: str) -> InputError:
     # Two files are compared, often of one name: only the whole path says which.
     own = error.where.startswith((name, str(path)))
     where = str(path) + (error.where.removeprefix(str(path)).removeprefix(name) if own else f"/{error.where}")
-    return InputError(error.code, error.what, where=where, mend=error.mend)
+    return InputError(error.code, error.what, where=where, hint=error.hint)
 
 
 def _colmap(_root: Path, folder: Path) -> Poses:
@@ -102,12 +102,12 @@ def _transforms(_root: Path, file: Path) -> Poses:
         applied, _ = rigid_matrix(document["applied_transform"], f"{file.name} applied_transform")
     if isinstance(scale, bool) or not isinstance(scale, int | float) or scale <= 0:
         raise InputError(
-            "pose_file_invalid", "is not a positive number.", where=f"{file.name} applied_scale", mend=_MEND
+            "pose_file_invalid", "is not a positive number.", where=f"{file.name} applied_scale", hint=_MEND
         )
     rows = document.get("frames")
     if not isinstance(rows, list):
         raise InputError(
-            "pose_file_invalid", "has no list of frames.", where=f"{file.name} frames", mend=_MEND
+            "pose_file_invalid", "has no list of frames.", where=f"{file.name} frames", hint=_MEND
         )
     poses: Poses = {}
     seen: set[str] = set()
@@ -115,11 +115,11 @@ def _transforms(_root: Path, file: Path) -> Poses:
         where = f"{file.name} frames[{index}]"
         name = row.get("file_path") if isinstance(row, dict) else None
         if not isinstance(name, str) or not name:
-            raise InputError("pose_file_invalid", "names no image.", where=f"{where}.file_path", mend=_MEND)
+            raise InputError("pose_file_invalid", "names no image.", where=f"{where}.file_path", hint=_MEND)
         name = posixpath.normpath(name)
         if name in seen:
             raise InputError(
-                "duplicate_image", f"{name!r} stands twice.", where=f"{where}.file_path", mend="Remove one."
+                "duplicate_image", f"{name!r} stands twice.", where=f"{where}.file_path", hint="Remove one."
             )
         seen.add(name)
         if row.get("transform_matrix") is not None:

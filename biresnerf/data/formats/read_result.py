@@ -32,7 +32,7 @@ def read_result(folder: Path, photos: Path | None = None) -> RefinedSet:
             "result_missing",
             f"holds no {POSES}.",
             where=str(folder),
-            mend="Name the output folder of a finished `biresnerf refine`.",
+            hint="Name the output folder of a finished `biresnerf refine`.",
         )
     document = read_poses_json(path)
     model = read_colmap_model(folder / COLMAP)
@@ -67,7 +67,7 @@ def _image(image: PoseImage, photos: Path | None) -> RefinedImage:
             "image_missing",
             f"{image.file_name} is not there.",
             where=str(photos),
-            mend="Name the input's folder, which the file names of poses.json are relative to.",
+            hint="Name the input's folder, which the file names of poses.json are relative to.",
         )
     before = image.world_from_cam_before
     return RefinedImage(
@@ -88,5 +88,5 @@ def _inconsistent(folder: Path, what: str) -> InputError:
         "result_inconsistent",
         f"{POSES} and the model in {COLMAP} do not fit each other: {what!r}.",
         where=str(folder),
-        mend="Leave the files of a result together, as they were written.",
+        hint="Leave the files of a result together, as they were written.",
     )

@@ -63,49 +63,49 @@ def read_json_object(path: Path) -> dict[str, Any]:
         document = json.loads(text, object_pairs_hook=_object)
         not_finite = first_non_finite(document)
     except _DuplicateKeyError as error:
-        raise InputError(_CODE, str(error), where=where, mend="Remove one of the two.") from None
+        raise InputError(_CODE, str(error), where=where, hint="Remove one of the two.") from None
     except json.JSONDecodeError as error:
         raise InputError(
             _CODE,
             f"not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}.",
             where=where,
-            mend="The file may be cut off; export or copy it again.",
+            hint="The file may be cut off; export or copy it again.",
         ) from None
     except RecursionError:
-        raise InputError(_CODE, "nested too deeply.", where=where, mend="Export the poses again.") from None
+        raise InputError(_CODE, "nested too deeply.", where=where, hint="Export the poses again.") from None
     except ValueError as error:  # numbers of thousands of digits
         raise InputError(
-            _CODE, f"not readable: {error}.", where=where, mend="Export the poses again."
+            _CODE, f"not readable: {error}.", where=where, hint="Export the poses again."
         ) from None
     if not isinstance(document, dict):
         raise InputError(
             _CODE,
             f"holds a {type(document).__name__}, not an object with `frames`.",
             where=where,
-            mend="Give a transforms.json as nerfstudio, instant-ngp or Blender write it.",
+            hint="Give a transforms.json as nerfstudio, instant-ngp or Blender write it.",
         )
     if not_finite is not None:
         raise InputError(
             "pose_not_finite",
             "NaN or an infinite number.",
             where=f"{where} {not_finite}",
-            mend="Remove the frame, or its transform_matrix, or export it again.",
+            hint="Remove the frame, or its transform_matrix, or export it again.",
         )
     return document
 
 
-def read_model(model: type[Model], path: Path, *, code: str, mend: str) -> Model:
+def read_model(model: type[Model], path: Path, *, code: str, hint: str) -> Model:
     """The object in the JSON file ``path``, checked against ``model``.
 
     Raises:
-        InputError: ``code`` with ``mend`` and the first wrong field, or a code of `read_json_object`.
+        InputError: ``code`` with ``hint`` and the first wrong field, or a code of `read_json_object`.
     """
     try:
         return model.model_validate(read_json_object(path))
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
-        raise InputError(code, f"{first['msg']}.", where=f"{path.name} {field}", mend=mend) from None
+        raise InputError(code, f"{first['msg']}.", where=f"{path.name} {field}", hint=hint) from None
 
 
 def _read_text(path: Path) -> str:
@@ -116,7 +116,7 @@ def _read_text(path: Path) -> str:
                 _CODE,
                 f"{size / 2**20:.0f} MiB is more than a pose file may have ({MAX_JSON_BYTES // 2**20} MiB).",
                 where=path.name,
-                mend="Leave out what does not describe cameras, or split the set.",
+                hint="Leave out what does not describe cameras, or split the set.",
             )
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -124,9 +124,9 @@ def _read_text(path: Path) -> str:
             _CODE,
             f"cannot be read: {error.strerror}.",
             where=path.name,
-            mend="Check the path and its permissions.",
+            hint="Check the path and its permissions.",
         ) from None
     except UnicodeDecodeError:
         raise InputError(
-            _CODE, "is not UTF-8 text.", where=path.name, mend="Save it as JSON in UTF-8."
+            _CODE, "is not UTF-8 text.", where=path.name, hint="Save it as JSON in UTF-8."
         ) from None

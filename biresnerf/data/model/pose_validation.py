@@ -33,13 +33,13 @@ def _numbers(value: Any, where: str) -> NDArray[np.float64]:
             "pose_shape",
             "holds something that is not a number.",
             where=where,
-            mend="Give 4 rows of 4 numbers.",
+            hint="Give 4 rows of 4 numbers.",
         )
     raise InputError(
         "pose_shape",
         "is not a matrix of 4 x 4 (or 3 x 4) numbers.",
         where=where,
-        mend="Give the camera-to-world matrix as 4 rows of 4 numbers.",
+        hint="Give the camera-to-world matrix as 4 rows of 4 numbers.",
     )
 
 
@@ -59,21 +59,21 @@ def rigid_matrix(value: Any, where: str) -> tuple[NDArray[np.float64], float]:
             "pose_not_finite",
             "NaN or an infinite number.",
             where=where,
-            mend="Remove the frame or export it again.",
+            hint="Remove the frame or export it again.",
         )
     if len(rows) == 4 and not np.allclose(rows[3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-6):
         raise InputError(
             "pose_shape",
             f"the last row is {rows[3].tolist()}, not [0, 0, 0, 1].",
             where=where,
-            mend="Give row vectors of a camera-to-world matrix; it may be transposed.",
+            hint="Give row vectors of a camera-to-world matrix; it may be transposed.",
         )
     if np.abs(rows[:3, 3]).max() > MAX_COORDINATE:
         raise InputError(
             "pose_out_of_range",
             f"the position is farther than {MAX_COORDINATE:g} from the origin.",
             where=where,
-            mend="Move the scene's origin near the scene.",
+            hint="Move the scene's origin near the scene.",
         )
     matrix = np.eye(4)
     matrix[:3, 3] = rows[:3, 3]
@@ -87,14 +87,14 @@ def _nearest_rotation(block: NDArray[np.float64], where: str) -> tuple[NDArray[n
     if deviation > ROTATION_REFUSED:
         if stretch[2] > 1e-12 and stretch[0] < (1.0 + ROTATION_REFUSED) * stretch[2]:
             what = f"the rotation is scaled by {stretch.mean():.6g}."
-            mend = "Divide the 3 x 3 block by that factor; put a change of scale into the positions alone."
+            hint = "Divide the 3 x 3 block by that factor; put a change of scale into the positions alone."
         else:
             what = "the upper left 3 x 3 block is no rotation (its columns are not unit and orthogonal)."
-            mend = "Export the camera-to-world matrix again; rows and columns may be mixed up."
-        raise InputError("pose_not_rotation", what, where=where, mend=mend)
+            hint = "Export the camera-to-world matrix again; rows and columns may be mixed up."
+        raise InputError("pose_not_rotation", what, where=where, hint=hint)
     if np.linalg.det(block) < 0.0:
         raise InputError(
-            "pose_not_rotation", "the rotation mirrors (determinant -1).", where=where, mend=_REFLECTION_MEND
+            "pose_not_rotation", "the rotation mirrors (determinant -1).", where=where, hint=_REFLECTION_MEND
         )
     return u @ vt, deviation
 
@@ -109,5 +109,5 @@ def refuse_coinciding(poses: Sequence[NDArray[np.float64]], where: str) -> None:
             "poses_coincide",
             "all cameras stand at one point, so there is no parallax to work from.",
             where=where,
-            mend="Give poses with different positions, or the images alone to have them found by COLMAP.",
+            hint="Give poses with different positions, or the images alone to have them found by COLMAP.",
         )

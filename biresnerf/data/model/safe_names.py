@@ -25,5 +25,5 @@ def refuse_outside(paths: Sequence[Path], names: Sequence[str], within: Path, wh
                 "unsafe_path",
                 f"{name[:100]!r} leads out of the image set's folder.",
                 where=where,
-                mend="Name images by their path relative to this file, inside the folder.",
+                hint="Name images by their path relative to this file, inside the folder.",
             )

@@ -13,7 +13,7 @@ def read_text(path: Path, most_bytes: int = MAX_TEXT_BYTES) -> str:
     """The text of ``path``. Raises InputError ``pose_file_invalid`` where it is none, or longer than ``most_bytes``."""
 
     def invalid(what: str) -> InputError:
-        return InputError("pose_file_invalid", what, where=path.name, mend="Export or copy the file again.")
+        return InputError("pose_file_invalid", what, where=path.name, hint="Export or copy the file again.")
 
     try:
         size = path.stat().st_size

@@ -34,7 +34,7 @@ def decode(frame: Frame, camera: Camera) -> NDArray[np.uint8]:
                 "image_changed",
                 f"has {width} x {height} px now, not {camera.width} x {camera.height}.",
                 where=frame.name,
-                mend="Leave the images alone while they are being read.",
+                hint="Leave the images alone while they are being read.",
             )
         try:
             image.load()
@@ -45,7 +45,7 @@ def decode(frame: Frame, camera: Camera) -> NDArray[np.uint8]:
                 "image_truncated",
                 "is cut off or damaged.",
                 where=frame.name,
-                mend="Copy it again, or remove its frame.",
+                hint="Copy it again, or remove its frame.",
             ) from None
 
 
@@ -64,7 +64,7 @@ def _eight_bit(image: Image.Image, name: str) -> NDArray[np.uint8]:
             "image_format_unsupported",
             "holds 32-bit numbers, which are no colours.",
             where=name,
-            mend="Save it with 8 or 16 bits per channel.",
+            hint="Save it with 8 or 16 bits per channel.",
         )
     if image.mode in _ALPHA_MODES or "transparency" in image.info:
         return np.asarray(image.convert("RGBA"))

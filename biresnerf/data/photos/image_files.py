@@ -123,7 +123,7 @@ def open_image(path: Path, name: str) -> Image.Image:
             "not_an_image",
             what,
             where=name,
-            mend="Replace it by a PNG, JPEG, WebP, TIFF or BMP file, or remove its frame.",
+            hint="Replace it by a PNG, JPEG, WebP, TIFF or BMP file, or remove its frame.",
         ) from None
     if image.format == "TIFF":
         # Without a file name it is not mapped into memory: Pillow maps a turned TIFF with its sides exchanged.
@@ -195,5 +195,5 @@ def _too_large(name: str) -> InputError:
         "image_too_large",
         f"has more than {MAX_IMAGE_PIXELS // 10**6} million pixels.",
         where=name,
-        mend="Scale it down, and its intrinsics with it.",
+        hint="Scale it down, and its intrinsics with it.",
     )

@@ -47,7 +47,7 @@ def named_mask(file: Path, name: Any, where: str, within: Path | None = None) ->
             "mask_missing",
             "there is no such mask.",
             where=where,
-            mend="Put the mask there (the path is relative to the file), or remove mask_path.",
+            hint="Put the mask there (the path is relative to the file), or remove mask_path.",
         )
     return path
 

@@ -52,14 +52,14 @@ def load_mask(frame: Frame, camera: Camera) -> NDArray[np.bool_] | None:
             counts = as_stored(_not_black(image) ^ frame.mask_inverted, image, header.orientation)
         except DAMAGED:
             raise InputError(
-                "image_truncated", "is cut off or damaged.", where=_where(frame), mend="Copy the mask again."
+                "image_truncated", "is cut off or damaged.", where=_where(frame), hint="Copy the mask again."
             ) from None
     if counts.mean() < LEAST_SHARE:
         raise InputError(
             "mask_hides_image",
             f"leaves {100 * counts.mean():.2g} % of the photo: {_meaning(frame)}.",
             where=_where(frame),
-            mend="Invert the mask if it means the opposite; else remove the frame, or its mask.",
+            hint="Invert the mask if it means the opposite; else remove the frame, or its mask.",
         )
     return turned(counts, turn)
 
@@ -117,7 +117,7 @@ def _turn_to_fit(frame: Frame, camera: Camera, width: int, height: int, orientat
         "mask_size_mismatch",
         f"has {width} x {height} px, the photo {camera.width} x {camera.height}: not the same shape.",
         where=_where(frame),
-        mend="Give a mask of the photo's size, or of that scaled by one factor.",
+        hint="Give a mask of the photo's size, or of that scaled by one factor.",
     )
 
 

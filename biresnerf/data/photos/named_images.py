@@ -26,7 +26,7 @@ def refuse_too_few(count: int, where: str) -> None:
             "too_few_images",
             f"{count} image{'' if count == 1 else 's'}; at least {MIN_IMAGES} are needed.",
             where=where,
-            mend="Add views that overlap; 20 to 100 are good.",
+            hint="Add views that overlap; 20 to 100 are good.",
         )
 
 
@@ -54,7 +54,7 @@ def find_images(file: Path, names: Sequence[str]) -> list[Path]:
             "image_missing",
             f"{len(missing)} of {len(names)} images not found: {few_names(names[i] for i in missing)}.",
             where=f"{file.name} frames[{missing[0]}].file_path",
-            mend="Put the images there (paths are relative to the file), or remove their frames.",
+            hint="Put the images there (paths are relative to the file), or remove their frames.",
         )
     images = [image for image in found if image is not None]
     places: dict[str, int] = {}
@@ -65,7 +65,7 @@ def find_images(file: Path, names: Sequence[str]) -> list[Path]:
                 "duplicate_image",
                 f"{names[index]!r} is the same file as {names[first]!r} in frames[{first}].",
                 where=f"{file.name} frames[{index}].file_path",
-                mend="Remove one of the two frames.",
+                hint="Remove one of the two frames.",
             )
     return images
 

@@ -103,7 +103,7 @@ def _wait(
                 "seed_timeout",
                 f"COLMAP did not finish within {limit_s:g} s.",
                 where=set_name,
-                mend="Give fewer images, or approximate poses.",
+                hint="Give fewer images, or approximate poses.",
             )
         if running:
             time.sleep(_POLL_S)

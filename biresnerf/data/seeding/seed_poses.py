@@ -152,7 +152,7 @@ def _refuse_missing(dataset: Dataset) -> None:
             "pose_missing",
             f"{len(missing)} of {len(dataset)} images have no pose: {few_names(missing, 5)}.",
             where=dataset.root.name,
-            mend="Give their poses, or have them found: start=auto.",
+            hint="Give their poses, or have them found: start=auto.",
         )
 
 
@@ -170,7 +170,7 @@ def _without_colmap(given: _Given, start: StartPoses, nothing: NDArray[np.int64]
             "colmap_missing",
             "finding poses needs COLMAP, which is not installed.",
             where=given.dataset.root.name,
-            mend="Run `pip install 'biresnerf[colmap]'`, or give poses; photos that all look the same way can do "
+            hint="Run `pip install 'biresnerf[colmap]'`, or give poses; photos that all look the same way can do "
             "without: start=none.",
         )
     warning = "COLMAP is not installed: the given poses were not compared with feature matches."
@@ -234,7 +234,7 @@ def _from_scratch(given: _Given, mapping: Mapping, start: StartPoses) -> Seeding
     if placed < least:
         what = f"COLMAP could place {placed} of {len(dataset)} images; at least {least} are needed"
         if start == "colmap":
-            raise InputError("seed_failed", f"{what}.", where=dataset.root.name, mend=OVERLAP_MEND)
+            raise InputError("seed_failed", f"{what}.", where=dataset.root.name, hint=OVERLAP_MEND)
         return _facing_forward(given, what)
     best = models[0]
     dataset = with_found_lenses(dataset, [best])
@@ -272,7 +272,7 @@ def _facing_forward(given: _Given, what: str) -> Seeding:
             "insufficient_overlap",
             f"{what}, and the photos are too different to have been taken from nearly one place.",
             where=dataset.root.name,
-            mend=OVERLAP_MEND,
+            hint=OVERLAP_MEND,
         )
     warning = f"{what}: all cameras begin at one place, looking the same way, and find their poses without features."
     noted = replace(dataset, warnings=(*dataset.warnings, warning))

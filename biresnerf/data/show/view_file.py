@@ -99,5 +99,5 @@ def read_view_file(folder: Path) -> ViewFile:
         ViewFile,
         folder / VIEW,
         code="view_file_invalid",
-        mend="Leave the files of a result together, as they were written.",
+        hint="Leave the files of a result together, as they were written.",
     )

@@ -223,7 +223,7 @@ def _refuse_the_wrong_mode(device: torch.device) -> None:
             "device_unavailable",
             f"Triton's interpreter is {'on' if interpreted() else 'off'}: the kernels cannot run on {device}.",
             where="device",
-            mend="Unset TRITON_INTERPRET, and use --device cpu where there is no CUDA.",
+            hint="Unset TRITON_INTERPRET, and use --device cpu where there is no CUDA.",
         )
 
 

@@ -117,7 +117,7 @@ def rigid_bodies(dataset: Dataset, options: RefineOptions) -> RigidBodies:
             "invalid_options",
             "so3xr3_camp moves every camera for itself, and this set's cameras belong to a rig.",
             where="pose_parametrisation",
-            mend="Take se3_world or so3xr3, or a model without rigs.bin and frames.bin.",
+            hint="Take se3_world or so3xr3, or a model without rigs.bin and frames.bin.",
         )
     for group in moments:
         of[group] = group[0]
@@ -135,7 +135,7 @@ def _fixed_rows(dataset: Dataset, fixed: Sequence[str]) -> list[int]:
             "fixed_not_found",
             f"there is no image {missing[0]!r}.",
             where="fixed",
-            mend="Name images as the input does, or by their path relative to its folder.",
+            hint="Name images as the input does, or by their path relative to its folder.",
         )
     rows = [row_of[name] for name in fixed]
     for row, name in zip(rows, fixed, strict=True):
@@ -144,7 +144,7 @@ def _fixed_rows(dataset: Dataset, fixed: Sequence[str]) -> list[int]:
                 "fixed_without_pose",
                 f"{name!r} is to be kept where it is, but the input does not say where that is.",
                 where="fixed",
-                mend="Give its pose, or leave it out of fixed.",
+                hint="Give its pose, or leave it out of fixed.",
             )
     return rows
 

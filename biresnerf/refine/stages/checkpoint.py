@@ -56,5 +56,5 @@ def load_checkpoint(folder: Path, name: Path = CHECKPOINT) -> tuple[dict[str, Te
 
 def _invalid(path: Path, what: str) -> InputError:
     return InputError(
-        "checkpoint_invalid", what, where=str(path), mend="Choose another output folder, or remove this one."
+        "checkpoint_invalid", what, where=str(path), hint="Choose another output folder, or remove this one."
     )

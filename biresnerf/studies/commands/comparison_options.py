@@ -108,13 +108,13 @@ def chosen_variants(given: dict[str, Any]) -> tuple[Variant, ...]:
                 "invalid_options",
                 f"{text!r} is not 'NAME: KEY=VALUE ...'.",
                 where="--variant",
-                mend="Give a name, a colon and options.",
+                hint="Give a name, a colon and options.",
             )
         variants.append(Variant(name.strip(), parse_settings(tuple(settings.split()))))
     names = [variant.name for variant in variants]
     if len(set(names)) < len(names):
         raise InputError(
-            "invalid_options", "two variants have one name.", where="--variant", mend="Name them differently."
+            "invalid_options", "two variants have one name.", where="--variant", hint="Name them differently."
         )
     return tuple(variants)
 
@@ -129,7 +129,7 @@ def make_plan(
     scenes = tuple(find_scene(path, given["every"], given["test_views"]) for path in given["scenes"])
     if len({scene.name for scene in scenes}) < len(scenes):
         raise InputError(
-            "invalid_options", "two scenes have one name.", where="SCENES", mend="Rename one's folder."
+            "invalid_options", "two scenes have one name.", where="SCENES", hint="Rename one's folder."
         )
     starts = tuple(_start(given, noise, seed) for noise, seed in product(noises, given["seeds"]))
     chosen = tuple(variants) or (Variant("default", {}),)
@@ -201,5 +201,5 @@ def require(*packages: str) -> None:
             "extra_missing",
             f"needs {' and '.join(missing)}, which is not installed.",
             where="biresnerf compare",
-            mend="Install it with: pip install 'biresnerf[compare]'",
+            hint="Install it with: pip install 'biresnerf[compare]'",
         )

@@ -40,7 +40,7 @@ def study_command(name: str, **given: Any) -> int:
             "invalid_options",
             f"the study {name} has variants of its own.",
             where="--variant",
-            mend="Leave them out, or use `biresnerf compare`.",
+            hint="Leave them out, or use `biresnerf compare`.",
         )
     variants = variants or study.variants
     plan = make_plan(given, variants, study.settings(shared_settings(given)), given["noise"] or study.noises)

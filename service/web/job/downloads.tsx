@@ -171,7 +171,7 @@ async function exported(
     await pause(400);
     made = await call<JobView>("GET", `v1/jobs/${made.id}`);
   }
-  if (made.error) throw new Error(`${made.error.detail} ${made.error.mend}`);
+  if (made.error) throw new Error(`${made.error.detail} ${made.error.hint}`);
   await onNewFiles();
 }
 

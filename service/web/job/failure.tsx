@@ -38,7 +38,7 @@ export function Failure({ job, images }: { job: JobView; images: readonly string
           Its second try used less memory: {shorter.map(([name, value]) => `${name} ${String(value)}`).join(", ")}.
         </p>
       )}
-      {!error.mend && <p>{NEXT[error.code] ?? "The log below says what it did last."}</p>}
+      {!error.hint && <p>{NEXT[error.code] ?? "The log below says what it did last."}</p>}
       {error.log_tail && (
         <details open>
           <summary>The end of its log</summary>

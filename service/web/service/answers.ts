@@ -9,7 +9,7 @@ export interface JobError {
   code: string;
   detail: string;
   where: string;
-  mend: string;
+  hint: string;
   retryable: boolean;
   log_tail: string;
 }

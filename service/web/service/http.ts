@@ -31,7 +31,7 @@ export class Problem extends Error {
     readonly code: string,
     readonly title: string,
     readonly detail: string,
-    readonly mend: string = "",
+    readonly hint: string = "",
     readonly where: string = "",
     readonly errors: readonly FieldProblem[] = [],
     readonly waitS: number = 0,
@@ -46,8 +46,8 @@ export class Problem extends Error {
 
   /** The same of a place, unless it names one. */
   at(place: string): Problem {
-    const { status, code, title, detail, mend, where, errors, waitS } = this;
-    return new Problem(status, code, title, detail, mend, where || place, errors, waitS);
+    const { status, code, title, detail, hint, where, errors, waitS } = this;
+    return new Problem(status, code, title, detail, hint, where || place, errors, waitS);
   }
 
   static unreachable(): Problem {
@@ -66,7 +66,7 @@ export class Problem extends Error {
       const said = JSON.parse(text);
       return new Problem(
         ...([status, String(said.code), String(said.title), String(said.detail)] as const),
-        ...([said.mend ?? "", said.where ?? "", said.errors ?? [], waitS] as const),
+        ...([said.hint ?? "", said.where ?? "", said.errors ?? [], waitS] as const),
       );
     } catch {
       return new Problem(status, "unknown", `The service answered ${status}`, text.slice(0, 300), "", "", [], waitS);

@@ -59,7 +59,7 @@ export async function giveUpRejected(upload: string): Promise<Problem | null> {
   const { state, error } = await call<UploadView>("GET", `v1/uploads/${upload}`);
   if (state !== "rejected" || !error) return null;
   await call("DELETE", `v1/uploads/${upload}`, { headers: TUS });
-  return new Problem(422, error.code, "The archive was not accepted", error.detail, error.mend, error.where);
+  return new Problem(422, error.code, "The archive was not accepted", error.detail, error.hint, error.where);
 }
 
 async function sendPieces(upload: string, file: File, state: Store<Sending>): Promise<void> {

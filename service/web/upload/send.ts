@@ -36,8 +36,8 @@ const NOTHING: Sending = {
 /** What the service would refuse anyway is said before anything is sent, file by file. */
 function refuseTooMuch(chosen: readonly Chosen[], bytes: number, limits: SizeLimits): void {
   const refuse = (detail: string, errors: { pointer: string; detail: string }[] = []) => {
-    const mend = "Send fewer or smaller files, or ask who runs the service for more.";
-    throw new Problem(0, "too_much", "It is more than this service takes", detail, mend, "", errors);
+    const hint = "Send fewer or smaller files, or ask who runs the service for more.";
+    throw new Problem(0, "too_much", "It is more than this service takes", detail, hint, "", errors);
   };
   if (isArchive(chosen)) {
     if (bytes > limits.max_archive_bytes) {

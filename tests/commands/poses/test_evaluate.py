@@ -75,7 +75,7 @@ def test_the_published_alignment_is_added_on_request_only(tmp_path):
     estimate[2, :3, 3] += 0.3
     files = write(tmp_path / "a.json", estimate), write(tmp_path / "b.json", truth)
     error = json.loads(run(*files, "--json", "--paper-compat"))
-    # A rig with depth has no reflection to mend: both alignments are one.
+    # A rig with depth has no reflection to fix: both alignments are one.
     assert error["paper_compat"]["rotation_deg"] == pytest.approx(error["aligned"]["rotation_deg"])
     assert "paper_compat" not in json.loads(run(*files, "--json"))
     assert "paper compat" in run(*files, "--paper-compat")
@@ -167,4 +167,4 @@ def test_a_file_that_cannot_be_compared_is_named(tmp_path, broken, code, where):
     assert isinstance(outcome.exception, InputError)
     assert outcome.exception.code == code
     assert outcome.exception.where.startswith(str(tmp_path / where))
-    assert outcome.exception.mend
+    assert outcome.exception.hint

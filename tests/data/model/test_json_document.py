@@ -1,4 +1,4 @@
-"""Strict JSON: whatever the bytes are, an object comes out or an error that says what to mend."""
+"""Strict JSON: whatever the bytes are, an object comes out or an error that says what to fix."""
 
 from __future__ import annotations
 

@@ -224,7 +224,7 @@ def test_given_poses_are_taken_as_they_are_and_missing_ones_refused_by_name(fold
         seed_poses(without(truth, 3), "given")
     assert_complete(caught.value, "pose_missing", folder.name)
     assert "03.png" in caught.value.what
-    assert "start=auto" in caught.value.mend
+    assert "start=auto" in caught.value.hint
 
 
 def test_without_features_missing_poses_come_from_neighbours_and_all_missing_ones_face_forward(folder):

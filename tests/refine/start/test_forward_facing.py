@@ -75,6 +75,6 @@ def test_cameras_around_a_scene_are_refused(tmp_path, monkeypatch):
     with pytest.raises(InputError) as caught:
         find_forward_facing(images, tiny_options(), CPU, 1, lambda: False)
     assert caught.value.code == "insufficient_overlap"
-    assert caught.value.mend
+    assert caught.value.hint
     with pytest.raises(Interrupted):
         find_forward_facing(images, tiny_options(), CPU, 1, lambda: True)

@@ -20,7 +20,7 @@ def test_everything_that_tests_use_is_found_good() -> None:
     for name in ("versions", "processor", "kernels", "video", "work files", "database", "service disk"):
         assert states[name] == "good", found
     assert found["good"] is ("broken" not in states.values())
-    assert all(check["mend"] for check in found["checks"] if check["state"] != "good")
+    assert all(check["hint"] for check in found["checks"] if check["state"] != "good")
 
 
 def test_a_database_that_does_not_answer_is_broken_and_said_so(monkeypatch: pytest.MonkeyPatch) -> None:

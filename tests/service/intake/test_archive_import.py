@@ -150,7 +150,7 @@ def test_a_bad_archive_is_422_and_stores_nothing(http: httpx.Client, service: Ru
     dataset = new_dataset(http)
     body = problem(upload(http, dataset, content), 422, code)
     assert where is None or body["where"] == where
-    assert body["mend"]
+    assert body["hint"]
     found = http.get(f"/v1/datasets/{dataset}").json()
     assert (found["files"], found["bytes"], found["state"]) == (0, 0, "open")
     stored = service.data_dir / "files" / "datasets" / dataset

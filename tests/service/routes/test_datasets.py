@@ -93,7 +93,7 @@ def test_an_unsafe_name_is_refused(http: httpx.Client, path: str) -> None:
     dataset = new_dataset(http)
     body = problem(put(http, dataset, path, b"x"), 422, "unsafe_path")
     assert body["where"]
-    assert body["mend"]
+    assert body["hint"]
     assert http.get(f"/v1/datasets/{dataset}").json()["files"] == 0
 
 
@@ -197,7 +197,7 @@ def test_a_bad_scene_is_422_with_the_file_and_the_mend(http: httpx.Client, scene
     body = problem(answer, 422 if answer.status_code != 413 else 413, code or answer.json()["code"])
     assert body["code"] not in {"internal_error", "check_crashed", "check_timeout"}
     assert names in f"{body.get('where')} {body['detail']}"
-    assert body["mend"]
+    assert body["hint"]
     assert str(http.base_url.host) not in body["detail"]
     assert "/data/scratch" not in answer.text  # no paths of the server
     found = http.get(f"/v1/datasets/{dataset}").json()

@@ -201,7 +201,7 @@ def test_a_wrong_option_is_named_by_its_path(http: httpx.Client, options: object
     )
     assert body["errors"][0]["pointer"] == pointer
     assert body["errors"][0]["detail"]
-    assert "/v1/options" in body["mend"]
+    assert "/v1/options" in body["hint"]
 
 
 @pytest.mark.parametrize(

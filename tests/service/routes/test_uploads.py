@@ -141,7 +141,7 @@ def test_a_rejected_upload_is_told_at_the_end_and_can_be_given_up(http: httpx.Cl
     found = settled(http, upload)
     assert (found["state"], found["error"]["code"]) == ("rejected", "archive_rejected")
     told = problem(http.post(f"/v1/datasets/{dataset}/finalize"), 422, "archive_rejected")
-    assert f"DELETE {upload}" in told["mend"]
+    assert f"DELETE {upload}" in told["hint"]
     wrong = begin(http, dataset, 1, path="b", sha256="0" * 64)
     send(http, wrong, 0, b"b")
     assert settled(http, wrong)["error"]["code"] == "digest_mismatch"

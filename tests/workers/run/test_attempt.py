@@ -125,7 +125,7 @@ async def test_a_job_without_memory_is_tried_once_more_with_less(
     job = await counting.until_final()
     assert job.error is not None
     assert (job.state, job.attempt, job.error.code) == ("failed", 2, "out_of_memory")
-    assert "max_image_size" in job.error.mend
+    assert "max_image_size" in job.error.hint
 
 
 async def test_a_process_killed_while_the_kernel_counts_a_kill_ran_out_of_memory(

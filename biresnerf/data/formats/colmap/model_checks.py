@@ -46,9 +46,9 @@ _ALL_MODELS = (
 _MEND = "Export the model again with COLMAP, or copy it again: it may be cut off."
 
 
-def broken(where: str, what: str, code: str = "pose_file_invalid", mend: str = _MEND) -> InputError:
+def broken(where: str, what: str, code: str = "pose_file_invalid", hint: str = _MEND) -> InputError:
     """The error for a model that says ``what`` at ``where``."""
-    return InputError(code, f"{what}.", where=where, mend=mend)
+    return InputError(code, f"{what}.", where=where, hint=hint)
 
 
 def refuse_repeated(table: dict[int, Any], number: int, what: str) -> None:
@@ -85,7 +85,7 @@ def _unsupported(name: str, where: str) -> InputError:
         "camera_model_unsupported",
         f"the camera model {name} is not supported.",
         where=where,
-        mend=f"Supported are {', '.join(MODEL_IDS)}; undistort the images with COLMAP's image_undistorter.",
+        hint=f"Supported are {', '.join(MODEL_IDS)}; undistort the images with COLMAP's image_undistorter.",
     )
 
 
@@ -120,9 +120,9 @@ def image_name(raw: bytes | str, where: str) -> str:
     try:
         name = raw.decode() if isinstance(raw, bytes) else raw
     except UnicodeDecodeError:
-        raise broken(where, "the image's name is not UTF-8", mend="Rename the image.") from None
+        raise broken(where, "the image's name is not UTF-8", hint="Rename the image.") from None
     if not name or any(ord(letter) < 32 or ord(letter) == 127 for letter in name):
-        raise broken(where, "the image's name is empty or has control characters", mend="Rename the image.")
+        raise broken(where, "the image's name is empty or has control characters", hint="Rename the image.")
     for spelling in (name, name.replace("\\", "/")):
         drive = spelling[1:3] == ":/"
         if drive or spelling.startswith("/") or ".." in posixpath.normpath(spelling).split("/"):
@@ -130,7 +130,7 @@ def image_name(raw: bytes | str, where: str) -> str:
                 "unsafe_path",
                 f"{name[:100]!r} leads out of the folder of images.",
                 where=where,
-                mend="Name images by their path relative to the folder of images.",
+                hint="Name images by their path relative to the folder of images.",
             )
     return name
 

@@ -68,7 +68,7 @@ def pinhole_camera(camera: Camera) -> Camera:
             "pack_not_possible",
             "a lens of this set sees nothing around its optical axis.",
             where=PINHOLE,
-            mend="Check the principal point.",
+            hint="Check the principal point.",
         )
     return Camera("PINHOLE", new_width, new_height, (focal, focal, new_width / 2, new_height / 2))
 
@@ -154,7 +154,7 @@ def _write_photo(image: RefinedImage, old: Camera, new: Camera, path: Path) -> N
             "image_missing",
             "is not known by its file.",
             where=image.name,
-            mend="Name the folder of the photos (--photos).",
+            hint="Name the folder of the photos (--photos).",
         )
     same = (new.width, new.height, new.full()) == (old.width, old.height, old.full())
     if same and image.orientation == 1 and image.path.suffix == path.suffix:

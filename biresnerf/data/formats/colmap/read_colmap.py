@@ -94,7 +94,7 @@ def refuse_no_images(files: dict[str, Path], root: Path) -> None:
             "no_images",
             "there are poses, but no images.",
             where=str(root),
-            mend="Put the images into images/ beside the poses.",
+            hint="Put the images into images/ beside the poses.",
         )
 
 
@@ -121,7 +121,7 @@ def _for_these_images(model: ColmapModel, dataset: Dataset, table: str) -> Colma
                 "mixed_sizes",
                 f"images of camera {image.camera_id} differ in size.",
                 where=f"{table} image {image.id}",
-                mend="Give images of one size, that of the camera.",
+                hint="Give images of one size, that of the camera.",
             )
         scaled.add(image.camera_id)
         cameras[image.camera_id] = fitted

@@ -128,7 +128,7 @@ class _Tables:
             size = path.stat().st_size
             if size > MAX_TABLE_BYTES:
                 raise broken(
-                    path.name, f"{size / 2**30:.1f} GiB is more than is read", mend="Split the model."
+                    path.name, f"{size / 2**30:.1f} GiB is more than is read", hint="Split the model."
                 )
             content = path.read_bytes()
             return content if self.form == "binary" else content.decode("utf-8-sig")

@@ -141,7 +141,7 @@ def _features(line: str, where: str) -> tuple[NDArray[np.float64], NDArray[np.in
         raise broken(
             where,
             "not a list of x, y, point id; each image has two lines, the second may be empty",
-            mend="Write an empty line after each image that has no features.",
+            hint="Write an empty line after each image that has no features.",
         )
     numbers = floats(words, where, "a feature").reshape(-1, 3)
     if not np.isfinite(numbers).all():

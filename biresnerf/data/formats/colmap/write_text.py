@@ -35,7 +35,7 @@ def write_colmap_text(model: ColmapModel, folder: Path) -> None:
             "pack_not_possible",
             f"COLMAP's text form cannot hold this model: {problem}.",
             where="colmap-text",
-            mend="Use the binary model in colmap/sparse/0, or rename the image.",
+            hint="Use the binary model in colmap/sparse/0, or rename the image.",
         )
     _write(folder / "points3D.txt", _points(model))
     _write(folder / "cameras.txt", _cameras(model))

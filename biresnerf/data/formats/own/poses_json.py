@@ -129,7 +129,7 @@ def read_poses_json(path: Path) -> PosesDocument:
         PosesDocument,
         path,
         code="pose_file_invalid",
-        mend="Give the poses.json of a finished result, as it was written.",
+        hint="Give the poses.json of a finished result, as it was written.",
     )
 
 

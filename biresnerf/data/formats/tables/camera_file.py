@@ -42,7 +42,7 @@ def read_camera_file(root: Path) -> tuple[CameraOf, tuple[Path, ...]]:
                     "intrinsics_missing",
                     "no focal length: neither fl_x nor camera_angle_x.",
                     where=file.name,
-                    mend="Add fl_x (pixels), or remove the file: a focal length is then guessed and refined.",
+                    hint="Add fl_x (pixels), or remove the file: a focal length is then guessed and refined.",
                 )
             return found.camera
 
@@ -73,5 +73,5 @@ def _kitti_projection(file: Path) -> tuple[float, float, float, float]:
             raise broken(f"{file.name} P0", f"has {len(values)} numbers, not 12")
         return float(values[0]), float(values[5]), float(values[2]), float(values[6])
     raise broken(
-        file.name, "has no line P0:", mend="Give KITTI's calib.txt, or a camera.json with fl_x, fl_y, cx, cy."
+        file.name, "has no line P0:", hint="Give KITTI's calib.txt, or a camera.json with fl_x, fl_y, cx, cy."
     )

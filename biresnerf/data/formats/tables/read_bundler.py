@@ -100,7 +100,7 @@ def _numbers(lines: Sequence[Sequence[str]], rows: int, columns: int, where: str
         raise _invalid(where, "holds a word that is no number.") from None
     if not np.isfinite(values).all():
         raise InputError(
-            "pose_not_finite", "NaN or an infinite number.", where=where, mend="Export it again."
+            "pose_not_finite", "NaN or an infinite number.", where=where, hint="Export it again."
         )
     return values
 
@@ -133,13 +133,13 @@ def names_of_cameras(
         ]
         where, notes = table.name, []
         if len(set(names)) != len(names):
-            raise InputError("duplicate_image", "names an image twice.", where=where, mend="Remove one.")
+            raise InputError("duplicate_image", "names an image twice.", where=where, hint="Remove one.")
     if len(names) != count:
         raise InputError(
             "pose_count_mismatch",
             f"{len(names)} images for the {count} cameras of {file.name}.",
             where=where,
-            mend="Give list.txt as it was written with the bundle file: one image a line, in its order.",
+            hint="Give list.txt as it was written with the bundle file: one image a line, in its order.",
         )
     return names, table, notes
 
@@ -160,4 +160,4 @@ def _camera(lens: Lens, path: Path, name: str, where: str) -> Camera:
 
 
 def _invalid(where: str, what: str) -> InputError:
-    return InputError("pose_file_invalid", what, where=where, mend="Export the bundle file (v0.3) again.")
+    return InputError("pose_file_invalid", what, where=where, hint="Export the bundle file (v0.3) again.")

@@ -40,7 +40,7 @@ def read_llff(root: Path, file: Path, within: Path | None = None) -> Dataset:
             "pose_count_mismatch",
             f"has {len(rows)} poses for {len(names)} images, and says not which is whose.",
             where=file.name,
-            mend="Leave in images/ just the images that the poses are for; their order by name decides.",
+            hint="Leave in images/ just the images that the poses are for; their order by name decides.",
         )
     given = []
     for index, (name, row) in enumerate(zip(names, rows, strict=True)):
@@ -74,7 +74,7 @@ def _camera(height: float, width: float, focal: float, where: str) -> Camera:
             "intrinsics_invalid",
             f"{width:g} x {height:g} px with a focal length of {focal:g} px is no camera.",
             where=where,
-            mend="Give height, width and focal length in pixels in the fifth column.",
+            hint="Give height, width and focal length in pixels in the fifth column.",
         )
     return Camera("SIMPLE_PINHOLE", int(width), int(height), (float(focal), width / 2, height / 2))
 
@@ -88,7 +88,7 @@ def _rows(file: Path) -> NDArray[np.float64]:
 
     def invalid(what: str, code: str = "pose_file_invalid") -> InputError:
         return InputError(
-            code, what, where=file.name, mend="Write it again with numpy.save, 17 numbers a row."
+            code, what, where=file.name, hint="Write it again with numpy.save, 17 numbers a row."
         )
 
     try:

@@ -46,7 +46,7 @@ def read_metashape(root: Path, file: Path, within: Path | None = None) -> Datase
             "image_missing",
             f"{len(missing)} of {len(entries)} images not found: {few_names(missing)}.",
             where=file.name,
-            mend="Put the images into images/ under their labels.",
+            hint="Put the images into images/ under their labels.",
         )
     components = Counter(
         entry.get("component_id") for entry in entries.values() if entry.find("transform") is not None
@@ -123,7 +123,7 @@ def _labelled(chunk: ElementTree.Element, file: Path) -> dict[str, ElementTree.E
                 "duplicate_image",
                 "the label stands twice.",
                 where=f"{file.name} camera {label!r}",
-                mend="Remove one.",
+                hint="Remove one.",
             )
         entries[label] = entry
     return entries
@@ -156,7 +156,7 @@ def _floats(element: ElementTree.Element, where: str) -> list[float]:
         raise _invalid(where, f"{element.tag} holds a word that is no number.") from None
     if not np.isfinite(values).all():
         raise InputError(
-            "pose_not_finite", "NaN or an infinite number.", where=where, mend="Export it again."
+            "pose_not_finite", "NaN or an infinite number.", where=where, hint="Export it again."
         )
     return values
 
@@ -176,7 +176,7 @@ def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
             "camera_model_unsupported",
             f"the camera type {kind[:40]} is not supported.",
             where=where,
-            mend="Export undistorted images and cameras of the type frame.",
+            hint="Export undistorted images and cameras of the type frame.",
         )
     values = {}
     for name in ("f", "fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2"):
@@ -189,7 +189,7 @@ def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
             "camera_model_unsupported",
             f"{', '.join(unmodelled)} is not zero, and no supported camera model has it.",
             where=where,
-            mend="Optimise the cameras without it and export again, or export undistorted images.",
+            hint="Optimise the cameras without it and export again, or export undistorted images.",
         )
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
@@ -221,4 +221,4 @@ def _colmap_camera(values: dict[str, float], width: int, height: int, where: str
 
 
 def _invalid(where: str, what: str) -> InputError:
-    return InputError("pose_file_invalid", what, where=where, mend="Export the cameras from Metashape again.")
+    return InputError("pose_file_invalid", what, where=where, hint="Export the cameras from Metashape again.")

@@ -142,7 +142,7 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
         "pose_count_mismatch",
         f"has {count} poses for {len(names)} images, and nothing says which is whose.",
         where=trajectory.file.name,
-        mend="Name images by their time, add rgb.txt (time and name a line), or give one pose an image.",
+        hint="Name images by their time, add rgb.txt (time and name a line), or give one pose an image.",
     )
 
 
@@ -205,5 +205,5 @@ def _kitti_pose(values: NDArray[np.float64], where: str) -> NDArray[np.float64]:
 
 
 def _invalid(where: str, what: str, code: str = "pose_file_invalid") -> InputError:
-    mend = "Give lines of `time x y z qx qy qz qw` (TUM), or of 12 numbers, [R | t] by rows (KITTI)."
-    return InputError(code, what, where=where, mend=mend)
+    hint = "Give lines of `time x y z qx qy qz qw` (TUM), or of 12 numbers, [R | t] by rows (KITTI)."
+    return InputError(code, what, where=where, hint=hint)

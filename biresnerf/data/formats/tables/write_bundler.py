@@ -37,7 +37,7 @@ def bundler_problem(camera: Camera) -> str | None:
 
 
 def refuse_lenses(
-    cameras: Iterable[Camera], problem_of: Callable[[Camera], str | None], form: str, where: str, mend: str
+    cameras: Iterable[Camera], problem_of: Callable[[Camera], str | None], form: str, where: str, hint: str
 ) -> None:
     """Raises InputError ``pack_not_possible`` for the first lens with a problem; ``form`` is whose (Bundler's)."""
     for camera in cameras:
@@ -47,7 +47,7 @@ def refuse_lenses(
                 "pack_not_possible",
                 f"{form} cannot hold a lens of this set: {problem}.",
                 where=where,
-                mend=mend,
+                hint=hint,
             )
 
 
@@ -57,8 +57,8 @@ def write_bundler(refined: RefinedSet, folder: Path) -> None:
     Raises:
         InputError: ``pack_not_possible``: a lens that the format cannot hold.
     """
-    mend = "Ask for the pinhole pack: it holds undistorted images, and a bundle.out for them."
-    refuse_lenses(refined.cameras, bundler_problem, "Bundler's format", "bundler", mend)
+    hint = "Ask for the pinhole pack: it holds undistorted images, and a bundle.out for them."
+    refuse_lenses(refined.cameras, bundler_problem, "Bundler's format", "bundler", hint)
     lines = ["# Bundle file v0.3", f"{len(refined)} {len(refined.model.points)}"]
     for index, cam_from_world in enumerate(refined.cam_from_world):
         full = refined.camera_of(index).full()

@@ -52,8 +52,8 @@ def write_llff(refined: RefinedSet, path: Path, bounds: NDArray[np.float64] | No
     Raises:
         InputError: ``pack_not_possible``: a lens that the form cannot hold; ``bounds_missing``: no points are seen.
     """
-    mend = "Convert to pinhole, which undistorts the photos, then that folder to llff."
-    refuse_lenses(refined.cameras, llff_problem, "LLFF's form", "llff", mend)
+    hint = "Convert to pinhole, which undistorts the photos, then that folder to llff."
+    refuse_lenses(refined.cameras, llff_problem, "LLFF's form", "llff", hint)
     order = rows_by_name(refined)
     if bounds is None:
         bounds = np.array([_bounds_of_points(refined, index) for index in range(len(refined))])
@@ -73,7 +73,7 @@ def _bounds_of_points(refined: RefinedSet, index: int) -> tuple[float, float]:
             "bounds_missing",
             "sees no points that would tell its bounds of depth.",
             where=refined.images[index].name,
-            mend="Give the depth of what is nearest and farthest: --bounds NEAR FAR.",
+            hint="Give the depth of what is nearest and farthest: --bounds NEAR FAR.",
         )
     near, far = np.percentile(depths, (_NEAREST, _FARTHEST)).tolist()
     return near, far

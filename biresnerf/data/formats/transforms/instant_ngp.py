@@ -92,5 +92,5 @@ def _impossible(why: str) -> InputError:
         "pack_not_possible",
         f"instant-ngp cannot read this set: {why}.",
         where=TRANSFORMS_NGP,
-        mend="Ask for the pinhole pack, which holds undistorted images, and use its model.",
+        hint="Ask for the pinhole pack, which holds undistorted images, and use its model.",
     )

@@ -52,7 +52,7 @@ class Fields:
                 "intrinsics_invalid",
                 f"{_short(value)} is not a usable number.",
                 where=self.where(key),
-                mend="Give a number (pixels for lengths).",
+                hint="Give a number (pixels for lengths).",
             )
         return float(value)
 
@@ -87,7 +87,7 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
             "intrinsics_invalid",
             problem,
             where=fields.where("k1"),
-            mend="Check the coefficients k1, k2, ... and p1, p2, or undistort the images.",
+            hint="Check the coefficients k1, k2, ... and p1, p2, or undistort the images.",
         )
     model, params = smallest_model(full, preferred)
     camera = Camera(model, width, height, params).resized(header.width, header.height)
@@ -110,7 +110,7 @@ def _guessed(
             "intrinsics_missing",
             f"{what}, but no focal length: neither fl_x nor camera_angle_x.",
             where=f"{fields.file} frames[{fields.index}]",
-            mend="Add fl_x (pixels) or camera_angle_x (radians), for all frames or in each; or leave out all of it.",
+            hint="Add fl_x (pixels) or camera_angle_x (radians), for all frames or in each; or leave out all of it.",
         )
     camera, source = guess_lens(header)
     if model is not None:
@@ -142,7 +142,7 @@ def _declared_lens(fields: Fields) -> tuple[str | None, bool]:
 
 
 def _unsupported(fields: Fields, key: str, what: str, also: str = "") -> InputError:
-    return InputError(_UNSUPPORTED, what, where=fields.where(key), mend=_MODEL_MEND + also)
+    return InputError(_UNSUPPORTED, what, where=fields.where(key), hint=_MODEL_MEND + also)
 
 
 def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int, int, list[str]]:
@@ -161,14 +161,14 @@ def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int,
     where = fields.where("w")
     if w <= 0 or h <= 0:
         raise InputError(
-            "intrinsics_invalid", f"w = {w}, h = {h}.", where=where, mend="Give the size in pixels."
+            "intrinsics_invalid", f"w = {w}, h = {h}.", where=where, hint="Give the size in pixels."
         )
     if (w, h) == (header.height, header.width):
         raise InputError(
             "image_size_mismatch",
             f"{sizes}, the file says {w} x {h}: turned by 90 degrees.",
             where=where,
-            mend="Rotate the stored pixels (or tag them with EXIF's orientation), or exchange w and h, cx and cy.",
+            hint="Rotate the stored pixels (or tag them with EXIF's orientation), or exchange w and h, cx and cy.",
         )
     # Within one pixel of rounding, the image is a resized copy of the one the intrinsics were made for.
     if min(abs(h * header.width / w - header.height), abs(w * header.height / h - header.width)) > 1.0:
@@ -176,7 +176,7 @@ def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int,
             "image_size_mismatch",
             f"{sizes}, the file says {w} x {h}: not the same shape.",
             where=where,
-            mend="Give the intrinsics of these images; cropped images need their own cx and cy.",
+            hint="Give the intrinsics of these images; cropped images need their own cx and cy.",
         )
     scaled = f"{w} x {h} px in the file, {header.width} x {header.height} in the images"
     return w, h, [f"{scaled}: the intrinsics were scaled to the images"]
@@ -224,7 +224,7 @@ def _parameters(
             "intrinsics_invalid",
             f"the principal point ({cx:g}, {cy:g}) lies far outside the image.",
             where=fields.where("cx"),
-            mend="Give cx and cy in pixels from the top left corner.",
+            hint="Give cx and cy in pixels from the top left corner.",
         )
     return FullParameters(fx, fy, cx, cy, **coefficients, fisheye=fisheye), notes
 
@@ -250,7 +250,7 @@ def _focal(fields: Fields, keys: tuple[str, str, str], size: int) -> tuple[float
                 if key == keys[0]
                 else f"{value:g} is not an angle of view.",
                 where=fields.where(key),
-                mend="Give a positive focal length in pixels, or camera_angle_x in radians below pi.",
+                hint="Give a positive focal length in pixels, or camera_angle_x in radians below pi.",
             )
         return focal, key
     return None, None

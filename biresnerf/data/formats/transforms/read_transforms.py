@@ -41,7 +41,7 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
         within: refuse images outside of this folder; for files of strangers.
 
     Raises:
-        InputError: with the file, the field and the mend; codes as in docs/input.md.
+        InputError: with the file, the field and a hint; codes as in docs/input.md.
     """
     document = read_json_object(path)
     rows = _frame_objects(document, path.name)
@@ -88,7 +88,7 @@ def _frame_objects(document: dict[str, Any], file: str) -> list[dict[str, Any]]:
             "pose_file_invalid",
             "has no list of frames.",
             where=f"{file} frames",
-            mend="Give a transforms.json as nerfstudio, instant-ngp or Blender write it.",
+            hint="Give a transforms.json as nerfstudio, instant-ngp or Blender write it.",
         )
     for index, row in enumerate(rows):
         if not isinstance(row, dict):
@@ -96,7 +96,7 @@ def _frame_objects(document: dict[str, Any], file: str) -> list[dict[str, Any]]:
                 "pose_file_invalid",
                 "is not an object.",
                 where=f"{file} frames[{index}]",
-                mend="Give file_path and transform_matrix in each frame.",
+                hint="Give file_path and transform_matrix in each frame.",
             )
     refuse_too_few(len(rows), f"{file} frames")
     return rows
@@ -112,7 +112,7 @@ def _source_format(document: dict[str, Any], path: Path) -> tuple[SourceFormat, 
             "pose_file_invalid",
             "is not a positive number.",
             where=f"{path.name} applied_scale",
-            mend="Remove the key, or give the factor that was applied to the positions.",
+            hint="Remove the key, or give the factor that was applied to the positions.",
         )
     dialect, notes = _dialect(document), []
     if applied is None and dialect == "nerfstudio":
@@ -149,7 +149,7 @@ def _names(rows: list[dict[str, Any]], file: str) -> list[str]:
                 "frame_without_image",
                 "the frame names no image.",
                 where=f"{file} frames[{index}].file_path",
-                mend="Give the image's path relative to this file, or remove the frame.",
+                hint="Give the image's path relative to this file, or remove the frame.",
             )
         names.append(name)
     return names
@@ -176,7 +176,7 @@ def _cameras(
             f"{names[a]} has {size_a[0]} x {size_a[1]} px, {names[b]} {size_b[0]} x {size_b[1]} px, "
             "but the intrinsics are shared.",
             where=f"{file} frames[{b}]",
-            mend="Give each frame its own fl_x, fl_y, cx, cy, w and h, or images of one size.",
+            hint="Give each frame its own fl_x, fl_y, cx, cy, w and h, or images of one size.",
         )
     sources = tuple(by for _, by in cameras)
     return tuple(camera for camera, _ in cameras), sources, indices, list(notes)

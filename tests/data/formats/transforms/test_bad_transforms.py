@@ -1,4 +1,4 @@
-"""transforms.json that cannot be used: refused by code, file, field and mend, whatever is wrong with it."""
+"""transforms.json that cannot be used: refused by code, file, field and hint, whatever is wrong with it."""
 
 from __future__ import annotations
 
