@@ -10,6 +10,10 @@ from typing import Any
 import click
 from pydantic import BaseModel
 
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print one JSON document, and nothing else."
+)
+
 
 def print_json(answer: BaseModel | dict[str, Any]) -> None:
     """Print one JSON document on standard output; what is no number there is null."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from biresnerf.commands.answers import json_option
 from service.commands.serve import settings_with, setup_problems
 
 if TYPE_CHECKING:
@@ -44,7 +45,6 @@ def keys_command() -> None:
     """
 
 
-as_json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 data_dir_option = click.option(
     "--data-dir", type=click.Path(path_type=Path), help="Where the private database is."
 )
@@ -63,7 +63,7 @@ data_dir_option = click.option(
     help="May be repeated. Default: read, datasets:write and jobs:write. admin may do everything.",
 )
 @click.option("--expires", type=Span(), help="For example 90d. Default: never.")
-@as_json_option
+@json_option
 @data_dir_option
 def create_command(
     name: str,
@@ -89,7 +89,7 @@ def create_command(
 
 @keys_command.command("list")
 @click.option("--tenant", help="Of this tenant only.")
-@as_json_option
+@json_option
 @data_dir_option
 def list_command(tenant: str | None, as_json: bool, data_dir: Path | None) -> None:
     """List the keys, revoked ones too."""
@@ -105,7 +105,7 @@ def list_command(tenant: str | None, as_json: bool, data_dir: Path | None) -> No
 
 @keys_command.command("revoke")
 @click.argument("key_id")
-@as_json_option
+@json_option
 @data_dir_option
 def revoke_command(key_id: str, as_json: bool, data_dir: Path | None) -> None:
     """End the key KEY_ID for good, from its next request on."""

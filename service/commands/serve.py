@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from biresnerf.commands.answers import print_json
-from biresnerf.commands.jobs.service_options import json_option
+from biresnerf.commands.answers import json_option, print_json
 from biresnerf.commands.settings_option import settings_option
 from biresnerf.errors import InputError
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from service.commands.keys import as_json_option, data_dir_option, with_database
+from biresnerf.commands.answers import json_option
+from service.commands.keys import data_dir_option, with_database
 
 if TYPE_CHECKING:
     from biresnerf.wire.service import TenantShare
@@ -25,7 +26,7 @@ def tenants_command() -> None:
 
 
 @tenants_command.command("list")
-@as_json_option
+@json_option
 @data_dir_option
 def list_command(as_json: bool, data_dir: Path | None) -> None:
     """List the tenants with what they use."""
@@ -48,7 +49,7 @@ def list_command(as_json: bool, data_dir: Path | None) -> None:
 @click.option("--max-running", type=_LIMIT, help="Jobs at the same time.")
 @click.option("--max-queued", type=_LIMIT, help="Jobs that wait.")
 @click.option("--max-stored-bytes", type=_LIMIT, help="Bytes of datasets, uploads and results.")
-@as_json_option
+@json_option
 @data_dir_option
 def set_command(name: str, as_json: bool, data_dir: Path | None, **changes: Any) -> None:
     """Change what is given of the tenant NAME; a new name is a new tenant."""

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from biresnerf.commands.answers import print_json
-from biresnerf.commands.jobs.service_options import json_option
+from biresnerf.commands.answers import json_option, print_json
 from service.commands.serve import settings_with, setup_problems
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import click
 
-from biresnerf.commands.answers import print_json
+from biresnerf.commands.answers import json_option, print_json
 from biresnerf.commands.jobs.follow_job import fetch
-from biresnerf.commands.jobs.service_options import JOB, JobName, json_option, service_at, service_options
+from biresnerf.commands.jobs.service_options import JOB, JobName, service_at, service_options
 
 
 @click.command("download")

@@ -8,8 +8,9 @@ from typing import Any, get_args
 import click
 
 from biresnerf.client.job_calls import with_name
+from biresnerf.commands.answers import json_option
 from biresnerf.commands.jobs.follow_job import follow_options, require_empty, see_through
-from biresnerf.commands.jobs.service_options import JOB, JobName, json_option, service_at, service_options
+from biresnerf.commands.jobs.service_options import JOB, JobName, service_at, service_options
 from biresnerf.commands.jobs.submit import label_option
 from biresnerf.commands.settings_option import settings_option
 from biresnerf.wire.jobs import WantedStage

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from biresnerf.commands import exit_codes
-from biresnerf.commands.answers import print_json, table
+from biresnerf.commands.answers import json_option, print_json, table
 from biresnerf.commands.jobs.follow_job import require_success, timeout_option, waited_for
 from biresnerf.commands.jobs.job_progress import left_of, numbers_of, stage_of
-from biresnerf.commands.jobs.service_options import JOB, JobName, json_option, service_at, service_options
+from biresnerf.commands.jobs.service_options import JOB, JobName, service_at, service_options
 from biresnerf.wire.jobs import JobState, JobView
 
 if TYPE_CHECKING:

@@ -54,11 +54,6 @@ def service_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return url(key(command))
 
 
-json_option = click.option(
-    "--json", "as_json", is_flag=True, help="Print one JSON document, and nothing else."
-)
-
-
 @contextmanager
 def service_at(url: str | None, api_key: str | None, job: JobName | None = None) -> Iterator[Client]:
     """The service: of the job's address, of `--url`, or of this machine. Its errors become exit codes."""

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from biresnerf.commands import exit_codes
+from biresnerf.commands.answers import json_option
 from biresnerf.commands.jobs.follow_job import follow_options, require_empty, see_through
 from biresnerf.commands.jobs.job_progress import SendingView
-from biresnerf.commands.jobs.service_options import json_option, service_at, service_options
+from biresnerf.commands.jobs.service_options import service_at, service_options
 from biresnerf.commands.settings_option import settings_option
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ from typing import Any
 
 import click
 
-from biresnerf.commands.answers import print_json, table
-from biresnerf.commands.jobs.service_options import json_option
+from biresnerf.commands.answers import json_option, print_json, table
 from biresnerf.options.refine_options import PRESETS, RefineOptions
 
 
@@ -65,6 +64,7 @@ def measured(options: RefineOptions, folder: Path, steps: int, views: int, size:
     """The figures, as `--json` prints them."""
     import time
 
+    from biresnerf.commands.machine.this_machine import describe_machine
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.photos.images import load_images
     from biresnerf.data.synthetic.scene import write_synthetic_scene
@@ -73,7 +73,6 @@ def measured(options: RefineOptions, folder: Path, steps: int, views: int, size:
     from biresnerf.geometry.perturb import perturb_poses
     from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
     from biresnerf.refine.scene.scene_frame import scene_frame
-    from biresnerf.studies.commands.comparison_options import machine
 
     device = choose_device(options.device)
     resolved = options.model_copy(update={"device": "cuda" if device.type == "cuda" else "cpu"}).resolved()
@@ -94,7 +93,7 @@ def measured(options: RefineOptions, folder: Path, steps: int, views: int, size:
             optimiser.start_reconstruction()
         stages.append({"stage": name, **_timed(optimiser, steps)})
     return {
-        "machine": machine(),
+        "machine": describe_machine(),
         "device": str(device),
         "threads": threads,
         "preset": resolved.preset,

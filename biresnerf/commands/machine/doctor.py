@@ -9,8 +9,7 @@ from importlib.metadata import entry_points
 import click
 
 from biresnerf.commands import exit_codes
-from biresnerf.commands.answers import print_json
-from biresnerf.commands.jobs.service_options import json_option
+from biresnerf.commands.answers import json_option, print_json
 from biresnerf.commands.machine.finding import Check, Found
 from biresnerf.commands.machine.machine_checks import CHECKS
 

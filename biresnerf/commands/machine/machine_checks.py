@@ -33,9 +33,9 @@ def versions() -> Found:
 
 def processor() -> Found:
     """Cores that this process may use."""
-    from biresnerf.studies.commands.comparison_options import machine
+    from biresnerf.commands.machine.this_machine import describe_machine
 
-    return Found("processor", "good", machine())
+    return Found("processor", "good", describe_machine())
 
 
 def kernels() -> Found:

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from biresnerf.commands.answers import print_json
+from biresnerf.commands.answers import json_option, print_json
 from biresnerf.commands.jobs.follow_job import require_empty
-from biresnerf.commands.jobs.service_options import json_option
 
 if TYPE_CHECKING:
     from biresnerf.data.formats.convert import FormName, Photos

@@ -7,8 +7,7 @@ from typing import get_args
 
 import click
 
-from biresnerf.commands.answers import print_json
-from biresnerf.commands.jobs.service_options import json_option
+from biresnerf.commands.answers import json_option, print_json
 from biresnerf.options.refine_options import PackName
 
 

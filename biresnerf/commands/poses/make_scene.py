@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from biresnerf.commands.answers import print_json
-from biresnerf.commands.jobs.service_options import json_option
+from biresnerf.commands.answers import json_option, print_json
 from biresnerf.errors import InputError
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as ProgressBar
 
 from biresnerf.commands import exit_codes
-from biresnerf.commands.answers import print_json
-from biresnerf.commands.jobs.service_options import json_option
+from biresnerf.commands.answers import json_option, print_json
 from biresnerf.commands.settings_option import settings_option
 from biresnerf.errors import Interrupted
 from biresnerf.options.refine_options import PRESETS, parse_options

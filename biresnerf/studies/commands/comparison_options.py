@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import platform
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -15,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from biresnerf.commands.answers import print_json
-from biresnerf.commands.jobs.service_options import json_option
+from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.machine.this_machine import describe_machine
 from biresnerf.commands.settings_option import parse_settings, settings_option
 from biresnerf.errors import InputError
 from biresnerf.options.refine_options import PRESETS
@@ -165,7 +163,7 @@ def run_and_write(plan: Plan, given: dict[str, Any]) -> list[Entry]:
         plan, Runner(output / CELLS, lambda text: click.echo(text, err=True), given["retry_failed"])
     )
     variants = {variant.name: variant.settings for variant in plan.variants}
-    tables = make_tables(entries, variants, plan.settings, machine())
+    tables = make_tables(entries, variants, plan.settings, describe_machine())
     for name, text in (
         (TABLES_JSON, tables.model_dump_json(indent=1)),
         (TABLES_MARKDOWN, as_markdown(tables)),
@@ -181,16 +179,6 @@ def run_and_write(plan: Plan, given: dict[str, Any]) -> list[Entry]:
 
 def _end(number: int, _frame: FrameType | None) -> None:
     sys.exit(128 + number)
-
-
-def machine() -> str:
-    """What the measurements were made on, in words."""
-    from biresnerf import __version__
-
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return (
-        f"{cores} cores ({platform.machine()}), Python {platform.python_version()}, BiResNeRF {__version__}"
-    )
 
 
 def require(*packages: str) -> None:
