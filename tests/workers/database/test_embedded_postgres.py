@@ -17,7 +17,7 @@ import pytest
 
 from tests.workers.conftest import ROOT, short_folder
 from workers.database.embedded_postgres import SOCKET_NAME, SOCKET_PATH_MAX, EmbeddedPostgres
-from workers.database.migrate import migrate
+from workers.database.migrate import migrate, step_names
 from workers.database.postgres_binaries import find_binaries, server_version, unprivileged_user
 from workers.settings.errors import SetupError
 
@@ -217,6 +217,11 @@ def test_migrating_twice_and_from_two_processes_at_once_is_safe(postgres: Embedd
         connection.execute("INSERT INTO schema_steps (name) VALUES ('999_future')")
     with pytest.raises(SetupError, match="999_future"):
         migrate(url)
+
+
+def test_each_step_of_the_schema_has_a_number_of_its_own():
+    numbers = [name.partition("_")[0] for name in step_names()]
+    assert numbers == sorted(set(numbers))
 
 
 def test_a_database_that_does_not_answer_is_a_clear_error(tmp_path: Path):
