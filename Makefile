@@ -13,7 +13,7 @@ export PIP_CONSTRAINT := constraints.txt
 export PIP_BUILD_CONSTRAINT := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup web test lint format demo serve bench openapi docs fuzz audit sbom compose-check
+.PHONY: help setup web test test-fast lint format demo serve bench openapi docs fuzz audit sbom compose-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -26,6 +26,9 @@ web: setup  ## build the page and what report.html is made of, after a change of
 
 test: web  ## all tests; PYTEST="-k name" chooses
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile $(PYTEST)
+
+test-fast: setup  ## within a minute: the tests that need no server and no browser and do not train
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 -m "not server and not browser and not slow" $(PYTEST)
 
 lint: setup  ## format, style, types and the direction of imports
 	$(BIN)/ruff format --check . && $(BIN)/ruff check .

@@ -1,14 +1,70 @@
-"""What holds for all tests."""
+"""What holds for all tests: Ctrl-C, threads, markers by what a test needs, and which skips are expected."""
 
 from __future__ import annotations
 
+import re
 import signal
+from collections import Counter
+
+import pytest
 
 from biresnerf.openmp import let_waiting_threads_sleep
 
-# A shell ignores Ctrl-C on behalf of what it runs in the background, and that is inherited: the processes that tests
-# start and interrupt must be able to hear it wherever the tests themselves run.
+# A shell ignores Ctrl-C on behalf of what it runs in the background, and that is inherited. The processes that tests
+# start and interrupt must hear it wherever the tests run.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 let_waiting_threads_sleep()
+
+# A test that uses one of these fixtures, directly or not, needs what the marker says.
+MARKERS_OF_FIXTURES = {
+    "server": {"service", "closed", "server", "slots"},
+    "browser": {"browser"},
+}
+# Why a test may be skipped on a machine that has all that CI installs: any other skip fails `--unexpected-skips-fail`.
+EXPECTED_SKIPS = (
+    r"torch finds none",
+    r"set BIRESNERF_TEST_DATA to the folder that holds it",
+    r"npm cannot install",
+    r"all was sent before the signal came",
+    r"^got empty parameter set",
+)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--unexpected-skips-fail",
+        action="store_true",
+        help="Fail if a test was skipped for a reason not foreseen.",
+    )
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        fixtures = set(getattr(item, "fixturenames", ()))
+        for marker, names in MARKERS_OF_FIXTURES.items():
+            if fixtures & names:
+                item.add_marker(marker)
+
+
+def _skips(config: pytest.Config) -> tuple[int, Counter[str]]:
+    """How many tests were skipped, and the reasons that `EXPECTED_SKIPS` does not foresee."""
+    reporter = config.pluginmanager.get_plugin("terminalreporter")
+    reports = reporter.stats.get("skipped", ()) if reporter else ()
+    reasons = [str(report.longrepr[2]).removeprefix("Skipped: ") for report in reports]
+    return len(reasons), Counter(r for r in reasons if not any(re.search(e, r) for e in EXPECTED_SKIPS))
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    strict = session.config.getoption("unexpected_skips_fail")
+    if strict and _skips(session.config)[1] and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    skipped, unexpected = _skips(config)
+    if skipped:
+        terminalreporter.write_line(f"{skipped} skipped, {unexpected.total()} of them unexpectedly")
+    for reason, count in unexpected.items():
+        terminalreporter.write_line(f"  {count} x {reason}", red=True)
