@@ -75,6 +75,6 @@ def _fitted(
         rendering = optimiser.render(
             origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=True
         )
-        optimiser.method.loss(rendering.colour, photo[y, x].to(device)).backward()
+        optimiser.method.loss(rendering.colour, photo[y, x].to(device)).mean().backward()
         pose.step(FIT_RATE * 0.1 ** (step / FIT_STEPS))
     return pose.matrices().detach()[0]

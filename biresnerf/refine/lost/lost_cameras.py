@@ -223,7 +223,7 @@ class LostCameraRepair:
             )
             self._spent += rendering.samples
             colour = optimiser.exposure.refitted(rendering, target, None, len(matrices))
-            torch.nn.functional.smooth_l1_loss(colour, target, reduction="sum").backward()
+            optimiser.method.loss(colour, target).sum().backward()
             poses.step(first * (last / first) ** (step / steps))
         return poses.matrices().detach()
 

@@ -222,11 +222,10 @@ class JointOptimiser:
         return StepResult(told_loss, told_error, len(origin), rendering.samples)
 
     def _loss(self, colour: Tensor, batch: PixelBatch) -> Tensor:
-        weights = self.camera_errors.weights
-        if weights is None or not self.method.additions:
-            return self.method.loss(colour, batch.target)
-        loss = torch.nn.functional.smooth_l1_loss(colour, batch.target, reduction="none")
-        return (loss * weights[batch.image][:, None]).mean()
+        loss, weights = self.method.loss(colour, batch.target), self.camera_errors.weights
+        if weights is not None and self.method.additions:
+            loss = loss * weights[batch.image][:, None]
+        return loss.mean()
 
     def pose_rate(self) -> float:
         """Learning rate of the poses at this step."""

@@ -5,13 +5,10 @@ A method is a description; the loop, the sampling of photos, the marching and th
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from torch import Tensor
-from torch.nn.functional import mse_loss, smooth_l1_loss
 
 from biresnerf.field.backends import make_field
 from biresnerf.field.grid_levels import grid_levels
@@ -19,6 +16,7 @@ from biresnerf.field.radiance_field import FieldShape, RadianceField
 from biresnerf.field.reference.mlp_field import MlpField
 from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.options.refine_options import MethodName, RefineOptions
+from biresnerf.refine.optimise.loss import Loss, half_squared_error, squared_error
 from biresnerf.refine.optimise.published_schedules import BarfSchedule, OneStageSchedule, PaperSchedule
 from biresnerf.refine.optimise.schedule import Schedule
 from biresnerf.refine.scene.scene_frame import SceneFrame
@@ -45,7 +43,7 @@ class Method:
 
     field: Literal["two grids", "one grid", "network", "stratified network"]
     schedule: type[Schedule]
-    loss: Callable[[Tensor, Tensor], Tensor]
+    loss: Loss
     two_stages: bool = False
     pose_betas: tuple[float, float] = (0.9, 0.999)
     additions: bool = False
@@ -66,17 +64,17 @@ class Method:
 
 METHODS: dict[MethodName, Method] = {
     "biresnerf": Method(
-        "two grids", Schedule, smooth_l1_loss, two_stages=True, pose_betas=(0.9, 0.99), additions=True,
+        "two grids", Schedule, half_squared_error, two_stages=True, pose_betas=(0.9, 0.99), additions=True,
         robust_frame=True, fine_occupancy=False,
     ),
     # Guo et al. 2023 as far as it is known, its gaps filled from BAA-NGP, which it builds on.
-    "biresnerf-paper": Method("two grids", PaperSchedule, smooth_l1_loss, two_stages=True),
+    "biresnerf-paper": Method("two grids", PaperSchedule, half_squared_error, two_stages=True),
     # Liu et al. 2023.
-    "baa-ngp": Method("one grid", OneStageSchedule, smooth_l1_loss),
+    "baa-ngp": Method("one grid", OneStageSchedule, half_squared_error),
     # BARF on NerfAcc's occupancy grid (Li et al. 2023).
-    "nerfacc-barf": Method("network", BarfSchedule, mse_loss, rays_least=16),
+    "nerfacc-barf": Method("network", BarfSchedule, squared_error, rays_least=16),
     # Lin et al. 2021.
-    "barf": Method("stratified network", BarfSchedule, mse_loss, rays_least=8),
+    "barf": Method("stratified network", BarfSchedule, squared_error, rays_least=8),
 }  # fmt: skip
 
 
