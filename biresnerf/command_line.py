@@ -1,4 +1,4 @@
-"""The command `biresnerf`: finds its commands by their entry points and turns errors into exit codes.
+"""The command `biresnerf`: the table of its commands, and how errors become exit codes.
 
 A command's module is imported only when it is used, so that `biresnerf submit` loads no torch.
 """
@@ -6,8 +6,9 @@ A command's module is imported only when it is used, so that `biresnerf submit` 
 from __future__ import annotations
 
 import difflib
+import pkgutil
 import sys
-from importlib.metadata import EntryPoint, entry_points
+from typing import NamedTuple
 
 import click
 
@@ -17,50 +18,98 @@ from biresnerf.commands.machine.completion import NAME
 from biresnerf.errors import BiresnerfError, InputError
 from biresnerf.openmp import let_waiting_threads_sleep
 
-GROUP = "biresnerf.commands"
-# What brings a package that is not installed; all others come with the service.
-_EXTRAS = {
-    "httpx": "client",
-    "anyio": "client",
-    "scipy": "compare",
-    "matplotlib": "compare",
-    "pycolmap": "colmap",
-}
-# How `biresnerf --help` lists them.
-_SECTIONS = {
-    "On this machine": (
-        *("refine", "inspect", "evaluate", "convert", "export", "report", "make-scene"),
-        *("compare", "study", "bench", "doctor", "completion"),
-    ),
-    "At a service": (
-        *("submit", "list", "status", "wait", "logs", "download", "fork", "cancel", "delete"),
-    ),
-    "Run a service": (
-        *("up", "demo", "api", "worker", "dispatcher", "migrate", "keys", "tenants", "backup", "restore"),
-    ),
-}  # fmt: skip
+
+class Section(NamedTuple):
+    """Commands that `biresnerf --help` lists together.
+
+    Attributes:
+        title: the section's heading.
+        extra: the extra of this package that installs what they need; empty where they need none.
+        commands: ``module:attribute`` of each command by its name.
+    """
+
+    title: str
+    extra: str
+    commands: dict[str, str]
 
 
-class _FoundCommands(click.Group):
-    """Commands by entry point."""
+SECTIONS = (
+    Section(
+        "On this machine",
+        "",
+        {
+            "refine": "biresnerf.commands.poses.refine:refine_command",
+            "inspect": "biresnerf.commands.poses.inspect:inspect_command",
+            "evaluate": "biresnerf.commands.poses.evaluate:evaluate_command",
+            "convert": "biresnerf.commands.poses.convert:convert_command",
+            "export": "biresnerf.commands.poses.export:export_command",
+            "report": "biresnerf.commands.poses.report:report_command",
+            "make-scene": "biresnerf.commands.poses.make_scene:make_scene_command",
+            "bench": "biresnerf.commands.machine.bench:bench_command",
+            "doctor": "biresnerf.commands.machine.doctor:doctor_command",
+            "completion": "biresnerf.commands.machine.completion:completion_command",
+        },
+    ),
+    Section(
+        "Through a service",
+        "client",
+        {
+            "submit": "biresnerf.commands.jobs.submit:submit_command",
+            "list": "biresnerf.commands.jobs.jobs:list_command",
+            "status": "biresnerf.commands.jobs.jobs:status_command",
+            "wait": "biresnerf.commands.jobs.jobs:wait_command",
+            "logs": "biresnerf.commands.jobs.jobs:logs_command",
+            "download": "biresnerf.commands.jobs.download:download_command",
+            "fork": "biresnerf.commands.jobs.fork:fork_command",
+            "cancel": "biresnerf.commands.jobs.jobs:cancel_command",
+            "delete": "biresnerf.commands.jobs.jobs:delete_command",
+        },
+    ),
+    Section(
+        "Run a service",
+        "service",
+        {
+            "up": "service.commands.serve:up_command",
+            "demo": "service.commands.serve:demo_command",
+            "api": "service.commands.serve:api_command",
+            "worker": "service.commands.serve:worker_command",
+            "dispatcher": "service.commands.upkeep:dispatcher_command",
+            "migrate": "service.commands.serve:migrate_command",
+            "keys": "service.commands.keys:keys_command",
+            "tenants": "service.commands.tenants:tenants_command",
+            "backup": "service.commands.upkeep:backup_command",
+            "restore": "service.commands.upkeep:restore_command",
+        },
+    ),
+    Section(
+        "Research",
+        "compare",
+        {
+            "compare": "biresnerf.studies.commands.compare:compare_command",
+            "study": "biresnerf.studies.commands.study:study_command",
+        },
+    ),
+)
+
+
+class _LazyCommands(click.Group):
+    """The commands of `SECTIONS`, each imported when it is asked for."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted(point.name for point in entry_points(group=GROUP))
+        return sorted(name for section in SECTIONS for name in section.commands)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        for point in entry_points(group=GROUP, name=cmd_name):
-            return _loaded(point)
+        for section in SECTIONS:
+            if cmd_name in section.commands:
+                return _load(section, cmd_name)
         return None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        there = self.list_commands(ctx)
-        named = {name for names in _SECTIONS.values() for name in names}
-        sections = {**_SECTIONS, "Others": tuple(name for name in there if name not in named)}
-        for title, names in sections.items():
-            rows = [(name, _first_sentence(self.get_command(ctx, name))) for name in names if name in there]
-            if rows:
-                with formatter.section(title):
-                    formatter.write_dl(rows)
+        for section in SECTIONS:
+            with formatter.section(section.title):
+                formatter.write_dl(
+                    [(name, first_sentence(_load(section, name))) for name in section.commands]
+                )
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -74,53 +123,49 @@ class _FoundCommands(click.Group):
             raise click.UsageError(f"{error.message} Did you mean {near[0]!r}?", ctx) from None
 
 
-def _first_sentence(command: click.Command | None) -> str:
-    """All of it, where click's own short help cuts it off."""
-    paragraph = " ".join((command.help or "").split("\n\n")[0].split()) if command is not None else ""
+def first_sentence(command: click.Command) -> str:
+    """The first sentence of a command's help, uncut (click's own short help is cut at 45 characters)."""
+    paragraph = " ".join((command.help or "").split("\n\n")[0].split())
     return paragraph.split(". ")[0].removesuffix(".")
 
 
-def _loaded(point: EntryPoint) -> click.Command:
+def _load(section: Section, name: str) -> click.Command:
     try:
-        command = point.load()
+        command = pkgutil.resolve_name(section.commands[name])
     except ModuleNotFoundError as error:
-        # The extra that the command belongs to is not installed.
-        missing = error.name
-
-        @click.command(
-            point.name, context_settings={"ignore_unknown_options": True, "allow_extra_args": True}
-        )
-        def unavailable() -> None:
-            raise _missing(missing, point.name)
-
-        unavailable.help = f"(not installed: {missing})"
-        return unavailable
+        return _unavailable(name, error.name, section.extra)
     if not isinstance(command, click.Command):
-        raise TypeError(f"entry point {point.name} is no click command")
+        raise TypeError(f"{section.commands[name]} is not a click command")
     return command
 
 
-def _missing(package: str | None, command: str) -> InputError:
-    extra = _EXTRAS.get(package or "", "service")
-    return InputError(
-        "extra_missing",
-        f"needs the package {package}, which is not installed.",
-        where=f"biresnerf {command}",
-        hint=f"Install it with: pip install 'biresnerf[{extra}]'",
-    )
+def _unavailable(name: str, package: str | None, extra: str) -> click.Command:
+    """Stands in for a command that cannot be imported; raises `InputError` ``extra_missing`` when it runs."""
+
+    @click.command(name, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+    def unavailable() -> None:
+        raise InputError(
+            "extra_missing",
+            f"needs the package {package}, which is not installed.",
+            where=f"biresnerf {name}",
+            hint=f"Install it with: pip install 'biresnerf{f'[{extra}]' if extra else ''}'",
+        )
+
+    unavailable.help = f"(not installed: {package})"
+    return unavailable
 
 
-@click.command(cls=_FoundCommands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(cls=_LazyCommands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="biresnerf")
 def cli() -> None:
-    """Refine the camera poses of an image set, here or through a service.
+    """Refine the camera poses of an image set, on this machine or through a service.
 
-    biresnerf COMMAND --help says what a command does and takes.
+    Run `biresnerf COMMAND --help` for what a command does and its options.
     """
 
 
 def main() -> None:
-    """Entry point; `exit_codes` says what the exit status means."""
+    """Runs a command and exits with a status of `exit_codes`."""
     let_waiting_threads_sleep()
     try:
         status = cli.main(prog_name=NAME, standalone_mode=False)

@@ -1,14 +1,14 @@
-"""docs/commands.md, from the commands themselves as pyproject.toml names them."""
+"""docs/commands.md, from the help of every command."""
 
 from __future__ import annotations
 
-import tomllib
-from importlib import import_module
+import pkgutil
 from inspect import cleandoc
 from pathlib import Path
 
 import click
 
+from biresnerf.command_line import SECTIONS, first_sentence
 from docs.generate.markdown import table
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,13 +22,10 @@ Written by `make docs` from the commands' own help; a test fails when they diffe
 
 def all_commands() -> dict[str, click.Command]:
     """Every command of `biresnerf` by name, those of groups as ``keys create``."""
-    points = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][
-        "biresnerf.commands"
-    ]
+    targets = {name: target for section in SECTIONS for name, target in section.commands.items()}
     found: dict[str, click.Command] = {}
-    for name, place in sorted(points.items()):
-        module, _, attribute = place.partition(":")
-        command = getattr(import_module(module), attribute)
+    for name in sorted(targets):
+        command = pkgutil.resolve_name(targets[name])
         if isinstance(command, click.Group):
             found |= {f"{name} {part}": command.commands[part] for part in sorted(command.commands)}
         else:
@@ -40,16 +37,11 @@ def commands_page() -> str:
     """The page."""
     commands = all_commands()
     rows = [
-        (f"[`{name}`](#{name.replace(' ', '-')})", _first_sentence(command))
+        (f"[`{name}`](#{name.replace(' ', '-')})", first_sentence(command))
         for name, command in commands.items()
     ]
     sections = [_section(name, command) for name, command in commands.items()]
     return "\n".join((_HEAD + table(("command", "does"), rows), *sections))
-
-
-def _first_sentence(command: click.Command) -> str:
-    paragraph = " ".join(cleandoc(command.help or "").split("\n\n")[0].split())
-    return paragraph.split(". ")[0].removesuffix(".")
 
 
 def _section(name: str, command: click.Command) -> str:

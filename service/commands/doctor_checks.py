@@ -1,4 +1,4 @@
-"""What `biresnerf doctor` looks at of the service: its database, its disk, its page."""
+"""The checks of `biresnerf doctor` for the service: its database, its disk, its page."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import psycopg
 from pydantic import ValidationError
 
-from biresnerf.commands.machine.finding import Check, Found
+from biresnerf.commands.machine.machine_checks import Check, Found
 from service.web_page import FOLDER
 from workers.database.embedded_postgres import EmbeddedPostgres
 from workers.process.disk_space import Room

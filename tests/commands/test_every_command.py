@@ -8,7 +8,9 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from biresnerf.command_line import cli
+from biresnerf import command_line
+from biresnerf.command_line import SECTIONS, Section, cli
+from biresnerf.errors import InputError
 from docs.generate.commands_page import ROOT, all_commands
 
 COMMANDS = all_commands()
@@ -23,6 +25,26 @@ def test_the_page_of_commands_and_the_help_have_a_place_for_each() -> None:
     said = CliRunner().invoke(cli, ["--help"]).stdout
     assert "Run a service:" in said
     assert "Others:" not in said
+
+
+def test_a_command_is_named_as_the_table_names_it() -> None:
+    named = [name for section in SECTIONS for name in section.commands]
+    assert len(named) == len(set(named))
+    assert {name.split()[0] for name in COMMANDS} == set(named)
+    assert [COMMANDS[name].name for name in named if name in COMMANDS] == [n for n in named if n in COMMANDS]
+
+
+@pytest.mark.parametrize(("extra", "install"), [("client", "biresnerf[client]"), ("", "biresnerf")])
+def test_a_command_that_lacks_a_package_says_what_installs_it(
+    monkeypatch: pytest.MonkeyPatch, extra: str, install: str
+) -> None:
+    section = Section("Elsewhere", extra, {"away": "package_that_is_nowhere.commands:away_command"})
+    monkeypatch.setattr(command_line, "SECTIONS", (section,))
+    assert "(not installed: package_that_is_nowhere)" in CliRunner().invoke(cli, ["--help"]).stdout
+    failed = CliRunner().invoke(cli, ["away", "--any", "argument"]).exception
+    assert isinstance(failed, InputError)
+    assert (failed.code, failed.where) == ("extra_missing", "biresnerf away")
+    assert f"pip install '{install}'" in str(failed)
 
 
 def test_a_mistyped_command_is_answered_with_the_nearest() -> None:

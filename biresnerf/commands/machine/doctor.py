@@ -2,56 +2,46 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Iterator
 from dataclasses import asdict
-from importlib.metadata import entry_points
 
 import click
 
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option, print_json
-from biresnerf.commands.machine.finding import Check, Found
-from biresnerf.commands.machine.machine_checks import CHECKS
+from biresnerf.commands.machine.machine_checks import CHECKS, Check, Found
 
-# Other parts of the installation name their checks here, as they name their commands.
-GROUP = "biresnerf.checks"
+SERVICE_CHECKS = "service.commands.doctor_checks:CHECKS"
 
 
 @click.command("doctor")
 @json_option
 def doctor_command(as_json: bool) -> int:
-    """Check this installation: versions, kernels, GPU, COLMAP, PostgreSQL, disks, the built pages.
+    """Check this installation: versions, kernels, GPU, COLMAP, PostgreSQL, disks, built pages.
 
-    The first run compiles the kernels, which takes half a minute. Exit status 1 where something is broken; what is
-    merely missing is optional.
+    The first run compiles the kernels, which takes half a minute. The exit status is 1 if something is broken;
+    whatever is only missing is optional.
     """
     found = []
     for check in all_checks():
-        one = check()
-        found.append(one)
+        result = check()
+        found.append(result)
         if not as_json:
-            click.echo(f"{one.state:<8} {one.name:<12} {one.detail}")
-            if one.hint:
-                click.echo(f"{'':<22}{one.hint}")
-    good = all(one.state != "broken" for one in found)
+            click.echo(f"{result.state:<8} {result.name:<12} {result.detail}")
+            if result.hint:
+                click.echo(f"{'':<22}{result.hint}")
+    good = all(result.state != "broken" for result in found)
     if as_json:
-        print_json({"good": good, "checks": [asdict(one) for one in found]})
+        print_json({"good": good, "checks": [asdict(result) for result in found]})
     return exit_codes.DONE if good else exit_codes.FAILED
 
 
 def all_checks() -> Iterator[Check]:
-    """Those of the library, then those of whatever else is installed."""
+    """The library's checks, then the service's where it is installed."""
     yield from CHECKS
-    for point in entry_points(group=GROUP):
-        try:
-            checks = point.load()
-        except ModuleNotFoundError as error:
-            missing = Found(
-                point.name,
-                "missing",
-                f"is not installed ({error.name})",
-                f"pip install 'biresnerf[{point.name}]'",
-            )
-            yield lambda missing=missing: missing  # type: ignore[misc]
-        else:
-            yield from checks
+    try:
+        yield from pkgutil.resolve_name(SERVICE_CHECKS)
+    except ModuleNotFoundError as error:
+        detail = f"is not installed ({error.name})"
+        yield lambda: Found("service", "missing", detail, "pip install 'biresnerf[service]'")

@@ -1,4 +1,4 @@
-"""What this installation can do on this machine, for `biresnerf doctor`: one small function for each thing needed."""
+"""The checks of `biresnerf doctor` that need no service, one function each."""
 
 from __future__ import annotations
 
@@ -9,15 +9,31 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-
-from biresnerf.commands.machine.finding import Check, Found
+from typing import Literal, TypeAlias
 
 _COMPILE_S, _IMPORT_S = 900.0, 120.0
 _WORK_BYTES = 2**30
 _SLOW_S = 6.0  # loading from the cache takes less, compiling far more
+
+# good: works; missing: only something optional is unavailable; broken: should work and does not.
+State = Literal["good", "missing", "broken"]
+
+
+@dataclass(frozen=True)
+class Found:
+    """The result of one check, with a hint on what to do unless it is good."""
+
+    name: str
+    state: State
+    detail: str
+    hint: str = ""
+
+
+Check: TypeAlias = Callable[[], Found]
 
 
 def versions() -> Found:
