@@ -61,6 +61,11 @@ VIOLATIONS = [
         "readers and writers of files",
     ),
     (
+        "biresnerf/data/formats/colmap/read_model.py",
+        "import biresnerf.data.formats.simple.bundler",
+        "inside the formats",
+    ),
+    (
         "biresnerf/refine/scene/scene_frame.py",
         "import biresnerf.refine.optimise.schedule",
         "inside the optimiser",

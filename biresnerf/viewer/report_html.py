@@ -15,7 +15,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from biresnerf.data.formats.own.poses_json import POSES
+from biresnerf.data.formats.simple.poses_json import POSES
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.show.view_file import VIEW, ViewFile, read_view_file
 from biresnerf.errors import InputError

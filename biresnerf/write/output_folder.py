@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from biresnerf.data.formats.input_format import forms_of_input, write_input_form
-from biresnerf.data.formats.own.poses_json import POSES, write_poses_json
+from biresnerf.data.formats.simple.poses_json import POSES, write_poses_json
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes, write_transforms
 from biresnerf.data.formats.write_formats import write_packs
 from biresnerf.data.model.atomic_file import whole_file

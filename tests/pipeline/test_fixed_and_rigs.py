@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
-from biresnerf.data.formats.own.poses_json import read_poses_json
 from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.formats.simple.poses_json import read_poses_json
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
 from biresnerf.data.model.colmap_scene import ColmapFrame, ColmapModel, ColmapRig
 from biresnerf.data.model.refined_set import refined_set

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from biresnerf.data.formats.own.poses_json import matrix_of, read_poses_json
+from biresnerf.data.formats.simple.poses_json import matrix_of, read_poses_json
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import InputError
 from biresnerf.options.refine_options import STAGE_2_OPTIONS, RefineOptions

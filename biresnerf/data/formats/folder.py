@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Literal
 
 from biresnerf.data.formats.colmap.read_model import MODEL_FOLDERS, model_forms
-from biresnerf.data.photos.image_files import is_image_name
+from biresnerf.data.photos.named_images import IMAGE_FOLDER, images_below, images_in, visible
 from biresnerf.errors import InputError
 
 PoseForm = Literal["transforms", "colmap", "llff", "bundler", "metashape", "trajectory"]
 TRANSFORMS_NAMES = ("transforms.json", "transforms_train.json")
-IMAGE_FOLDER = "images"
 LLFF_NAME = "poses_bounds.npy"
 BUNDLER_NAMES = ("bundle.out", "bundle/bundle.out", "bundle.rd.out")
 TRAJECTORY_NAMES = (
@@ -147,34 +146,3 @@ def _root_of_model(folder: Path) -> Path:
     roots = [folder] + [Path(*parts[: -len(tail)]) for tail in tails if tail and parts[-len(tail) :] == tail]
     with_images = (root for root in roots if (root / IMAGE_FOLDER).is_dir() or images_in(root))
     return next(with_images, roots[-1])
-
-
-def visible(folder: Path) -> list[Path]:
-    """What a folder holds but hidden files, sorted. Raises InputError ``input_unreadable``."""
-    try:
-        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    except OSError as error:
-        raise InputError(
-            "input_unreadable",
-            f"cannot be read: {error.strerror}.",
-            where=str(folder),
-            hint="Check the path and its permissions.",
-        ) from None
-
-
-def images_in(folder: Path) -> list[Path]:
-    """The images in ``folder`` itself, sorted; instant-ngp's masks are none."""
-    return [path for path in visible(folder) if _is_image(path.name) and path.is_file()]
-
-
-def images_below(folder: Path) -> list[Path]:
-    """The images in ``folder`` and its folders, sorted; instant-ngp's masks are none."""
-    found = []
-    for parent, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        found += [Path(parent, name) for name in files if _is_image(name)]
-    return sorted(found)
-
-
-def _is_image(name: str) -> bool:
-    return not name.startswith((".", "dynamic_mask_")) and is_image_name(Path(name))

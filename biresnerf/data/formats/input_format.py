@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from biresnerf.data.formats.tables.write_llff import POSES_BOUNDS, given_bounds, write_poses_bounds
+from biresnerf.data.formats.simple.llff import POSES_BOUNDS, given_bounds, write_poses_bounds
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.options.refine_options import PackName

@@ -9,10 +9,10 @@ from pathlib import Path
 from biresnerf.data.formats.colmap.read_colmap import read_colmap_dataset
 from biresnerf.data.formats.folder import FolderContents, PoseForm, look_at, look_into
 from biresnerf.data.formats.image_folder import read_image_folder
-from biresnerf.data.formats.tables.read_bundler import read_bundler
-from biresnerf.data.formats.tables.read_llff import read_llff
-from biresnerf.data.formats.tables.read_metashape import read_metashape
-from biresnerf.data.formats.tables.read_trajectory import read_trajectory
+from biresnerf.data.formats.simple.bundler import read_bundler
+from biresnerf.data.formats.simple.llff import read_llff
+from biresnerf.data.formats.simple.metashape import read_metashape
+from biresnerf.data.formats.simple.trajectory import read_trajectory
 from biresnerf.data.formats.transforms.read_transforms import read_transforms
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.masks import refuse_unfit_mask

@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.colmap.read_colmap import photos_beside
 from biresnerf.data.formats.colmap.read_model import read_colmap_model, world_from_cam_of
 from biresnerf.data.formats.folder import PoseForm
 from biresnerf.data.formats.read_dataset import find_input
-from biresnerf.data.formats.tables.read_bundler import names_of_cameras, read_cameras
-from biresnerf.data.formats.tables.read_llff import read_llff_poses
-from biresnerf.data.formats.tables.read_metashape import read_metashape_poses
-from biresnerf.data.formats.tables.read_trajectory import Trajectory, matched
+from biresnerf.data.formats.simple.bundler import names_of_cameras, read_cameras
+from biresnerf.data.formats.simple.llff import read_llff_poses
+from biresnerf.data.formats.simple.metashape import read_metashape_poses
+from biresnerf.data.formats.simple.trajectory import Trajectory, matched
 from biresnerf.data.model.conventions import world_from_cam_of_file
 from biresnerf.data.model.json_document import read_json_object
 from biresnerf.data.model.pose_validation import rigid_matrix
+from biresnerf.data.photos.named_images import photos_beside
 from biresnerf.errors import InputError
 
 Poses = dict[str, NDArray[np.float64]]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
-from biresnerf.data.formats.own.poses_json import POSES, PoseImage, matrix_of, read_poses_json
+from biresnerf.data.formats.simple.poses_json import POSES, PoseImage, matrix_of, read_poses_json
 from biresnerf.data.formats.write_formats import COLMAP
 from biresnerf.data.model.dataset import Camera
 from biresnerf.data.model.refined_set import RefinedImage, RefinedSet

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from biresnerf.data.formats.colmap.pinhole import PINHOLE, write_pinhole
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.colmap.write_text import write_colmap_text
-from biresnerf.data.formats.own.poses_json import POSES, write_poses_json
-from biresnerf.data.formats.own.scene_glb import SCENE, write_scene
-from biresnerf.data.formats.tables.write_bundler import write_bundler
-from biresnerf.data.formats.tables.write_trajectories import write_kitti, write_tum
+from biresnerf.data.formats.simple.bundler import write_bundler
+from biresnerf.data.formats.simple.pinhole import PINHOLE, write_pinhole
+from biresnerf.data.formats.simple.poses_json import POSES, write_poses_json
+from biresnerf.data.formats.simple.scene_glb import SCENE, write_scene
+from biresnerf.data.formats.simple.trajectory import write_kitti, write_tum
 from biresnerf.data.formats.transforms.instant_ngp import TRANSFORMS_NGP, write_transforms_ngp
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.errors import InputError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -9,6 +10,9 @@ from biresnerf.data.model.safe_names import refuse_outside
 from biresnerf.data.photos.image_files import find_image, is_image_name
 from biresnerf.errors import InputError
 
+IMAGE_FOLDER = "images"
+# Folders beside the poses whose pictures are not the set's photos; `biresnerf convert` writes pinhole/.
+_NO_PHOTOS = frozenset({"masks", "depth", "pinhole"})
 MIN_IMAGES = 3  # two views leave scale and much else open
 
 
@@ -85,3 +89,76 @@ def unused_image_notes(paths: Sequence[Path], others: Iterable[Path] = ()) -> li
     return [
         f"{len(unused)} images beside the used ones have no frame and are left out: {few_names(unused, 3)}"
     ]
+
+
+def image_files(root: Path) -> dict[str, Path]:
+    """As `photos_beside`. Raises InputError ``no_images`` where there are none."""
+    files = photos_beside(root)
+    refuse_no_images(files, root)
+    return files
+
+
+def photos_beside(root: Path) -> dict[str, Path]:
+    """The images beside poses that do not say where theirs are, by path with forward slashes; perhaps none.
+
+    Those of `images_beside`, else those in the one other folder of ``root`` that has images (rgb/ of TUM's sets,
+    train/ of NeRF-synthetic ones), by their path in ``root``.
+    """
+    return images_beside(root) or _images_of_only_folder(root)
+
+
+def _images_of_only_folder(root: Path) -> dict[str, Path]:
+    folders = [path for path in visible(root) if path.is_dir() and path.name not in _NO_PHOTOS]
+    found = [paths for paths in map(images_below, folders) if paths]
+    return {path.relative_to(root).as_posix(): path for path in found[0]} if len(found) == 1 else {}
+
+
+def refuse_no_images(files: dict[str, Path], root: Path) -> None:
+    """Raises InputError ``no_images`` where there are none."""
+    if not files:
+        raise InputError(
+            "no_images",
+            "there are poses, but no images.",
+            where=str(root),
+            hint="Put the images into images/ beside the poses.",
+        )
+
+
+def images_beside(root: Path) -> dict[str, Path]:
+    """The images in ``root``/images, else in ``root``, by their path there; empty where there are none."""
+    folder = root / IMAGE_FOLDER
+    paths = images_below(folder)
+    if not paths:
+        folder, paths = root, images_in(root)
+    return {path.relative_to(folder).as_posix(): path for path in paths}
+
+
+def visible(folder: Path) -> list[Path]:
+    """What a folder holds but hidden files, sorted. Raises InputError ``input_unreadable``."""
+    try:
+        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    except OSError as error:
+        raise InputError(
+            "input_unreadable",
+            f"cannot be read: {error.strerror}.",
+            where=str(folder),
+            hint="Check the path and its permissions.",
+        ) from None
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The images in ``folder`` itself, sorted; instant-ngp's masks are none."""
+    return [path for path in visible(folder) if _is_image(path.name) and path.is_file()]
+
+
+def images_below(folder: Path) -> list[Path]:
+    """The images in ``folder`` and its folders, sorted; instant-ngp's masks are none."""
+    found = []
+    for parent, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        found += [Path(parent, name) for name in files if _is_image(name)]
+    return sorted(found)
+
+
+def _is_image(name: str) -> bool:
+    return not name.startswith((".", "dynamic_mask_")) and is_image_name(Path(name))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from biresnerf.data.formats.own.poses_json import POSES, write_poses_json
+from biresnerf.data.formats.simple.poses_json import POSES, write_poses_json
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.model.refined_set import RefinedSet

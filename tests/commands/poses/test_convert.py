@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from biresnerf.commands.poses.convert import FORMS, convert_command
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.convert import FormName
-from biresnerf.data.formats.own.poses_json import matrix_of, read_poses_json
 from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.formats.simple.poses_json import matrix_of, read_poses_json
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.errors import InputError
 from tests.data.formats.random_sets import random_poses
-from tests.data.formats.tables import trajectories
+from tests.data.formats.simple import trajectories
 from tests.data.scenes import write_image
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from biresnerf.commands.poses.evaluate import evaluate_command, matched_names
 from biresnerf.errors import InputError
-from tests.data.formats.tables import trajectories
+from tests.data.formats.simple import trajectories
 from tests.geometry.rigs import dome, jitter, similar
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -14,8 +14,8 @@ from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.read_result import read_result
 from biresnerf.data.formats.write_formats import write_packs
 from biresnerf.errors import InputError
-from tests.data.formats.colmap.test_pinhole import pack_of
 from tests.data.formats.random_sets import random_result
+from tests.data.formats.simple.test_pinhole import pack_of
 from tests.data.scenes import assert_complete
 
 

@@ -13,7 +13,7 @@ from biresnerf.commands.machine.bench import bench_command
 from biresnerf.commands.poses.inspect import inspect_command
 from biresnerf.data.seeding.match_poses import can_match
 from biresnerf.errors import InputError
-from tests.data.formats.tables import trajectories
+from tests.data.formats.simple import trajectories
 from tests.data.scenes import write_image
 
 

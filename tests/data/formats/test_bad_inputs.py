@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.errors import InputError
-from tests.data.formats.tables import trajectories
-from tests.data.formats.tables.trajectories import NAMES, npy_bytes
+from tests.data.formats.simple import trajectories
+from tests.data.formats.simple.trajectories import NAMES, npy_bytes
 from tests.data.scenes import refused_at_once, write_image
 
 

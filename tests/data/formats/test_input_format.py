@@ -11,7 +11,7 @@ import pytest
 
 from biresnerf.data.formats.input_format import POSES_BOUNDS, forms_of_input, write_input_form
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.formats.tables.read_llff import read_llff, read_llff_poses
+from biresnerf.data.formats.simple.llff import read_llff, read_llff_poses
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes, write_transforms
 from biresnerf.data.formats.write_formats import write_packs
 from biresnerf.data.model.dataset import Camera, Dataset, Frame, SourceFormat

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.colmap.write_text import write_colmap_text
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.formats.tables.write_bundler import bundler_problem, write_bundler
-from biresnerf.data.formats.tables.write_trajectories import write_kitti, write_tum
+from biresnerf.data.formats.simple.bundler import bundler_problem, write_bundler
+from biresnerf.data.formats.simple.trajectory import write_kitti, write_tum
 from biresnerf.data.formats.transforms.instant_ngp import write_transforms_ngp
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
 from biresnerf.data.model.dataset import Camera, Dataset, Frame, SourceFormat

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from biresnerf.data.formats.own.poses_json import matrix_of, read_poses_json, write_poses_json
-from biresnerf.data.formats.own.scene_glb import write_scene
-from biresnerf.data.formats.tables.write_bundler import write_bundler
-from biresnerf.data.formats.tables.write_llff import write_llff
-from biresnerf.data.formats.tables.write_trajectories import write_kitti, write_tum
+from biresnerf.data.formats.simple.bundler import write_bundler
+from biresnerf.data.formats.simple.llff import write_llff
+from biresnerf.data.formats.simple.poses_json import matrix_of, read_poses_json, write_poses_json
+from biresnerf.data.formats.simple.scene_glb import write_scene
+from biresnerf.data.formats.simple.trajectory import write_kitti, write_tum
 from biresnerf.data.formats.transforms.instant_ngp import write_transforms_ngp
 from biresnerf.data.formats.write_formats import ALWAYS, ON_REQUEST, write_packs
 from biresnerf.data.model.refined_set import RefinedSet

@@ -9,7 +9,7 @@ import pytest
 from biresnerf.client.scene import Scene, look_at
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.errors import InputError
-from tests.data.formats.tables import trajectories
+from tests.data.formats.simple import trajectories
 from tests.data.scenes import write_image
 from tests.service.conftest import scene_files
 

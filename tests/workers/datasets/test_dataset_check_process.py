@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from biresnerf.errors import InputError
-from tests.data.formats.tables import trajectories
+from tests.data.formats.simple import trajectories
 from tests.data.scenes import nerfstudio_scene, save, write_image
 from workers.datasets.dataset_check_process import check
 

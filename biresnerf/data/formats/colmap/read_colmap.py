@@ -10,15 +10,11 @@ import numpy as np
 
 from biresnerf.data.formats.bind_images import GivenImage, dataset_of, match_files
 from biresnerf.data.formats.colmap.read_model import ColmapModel, read_colmap_model, world_from_cam_of
-from biresnerf.data.formats.folder import IMAGE_FOLDER, images_below, images_in, visible
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.photos.image_files import read_header
-from biresnerf.data.photos.named_images import few_names
+from biresnerf.data.photos.named_images import IMAGE_FOLDER, few_names, images_beside, refuse_no_images
 from biresnerf.data.photos.orientation import same_shape
 from biresnerf.errors import InputError
-
-# Folders beside the poses whose pictures are not the set's photos; `biresnerf convert` writes pinhole/.
-_NO_PHOTOS = frozenset({"masks", "depth", "pinhole"})
 
 
 def read_colmap_dataset(root: Path, model_folder: Path, within: Path | None = None) -> Dataset:
@@ -63,48 +59,6 @@ def read_colmap_dataset(root: Path, model_folder: Path, within: Path | None = No
     ordered = sorted(given, key=lambda image: image.name)
     dataset = dataset_of(root, ordered, source, [*model.notes, *notes, *_beside_notes(model_folder)], within)
     return replace(dataset, source=replace(source, colmap=_for_these_images(model, dataset, table)))
-
-
-def image_files(root: Path) -> dict[str, Path]:
-    """As `photos_beside`. Raises InputError ``no_images`` where there are none."""
-    files = photos_beside(root)
-    refuse_no_images(files, root)
-    return files
-
-
-def photos_beside(root: Path) -> dict[str, Path]:
-    """The images beside poses that do not say where theirs are, by path with forward slashes; perhaps none.
-
-    Those of `images_beside`, else those in the one other folder of ``root`` that has images (rgb/ of TUM's sets,
-    train/ of NeRF-synthetic ones), by their path in ``root``.
-    """
-    return images_beside(root) or _images_of_only_folder(root)
-
-
-def _images_of_only_folder(root: Path) -> dict[str, Path]:
-    folders = [path for path in visible(root) if path.is_dir() and path.name not in _NO_PHOTOS]
-    found = [paths for paths in map(images_below, folders) if paths]
-    return {path.relative_to(root).as_posix(): path for path in found[0]} if len(found) == 1 else {}
-
-
-def refuse_no_images(files: dict[str, Path], root: Path) -> None:
-    """Raises InputError ``no_images`` where there are none."""
-    if not files:
-        raise InputError(
-            "no_images",
-            "there are poses, but no images.",
-            where=str(root),
-            hint="Put the images into images/ beside the poses.",
-        )
-
-
-def images_beside(root: Path) -> dict[str, Path]:
-    """The images in ``root``/images, else in ``root``, by their path there; empty where there are none."""
-    folder = root / IMAGE_FOLDER
-    paths = images_below(folder)
-    if not paths:
-        folder, paths = root, images_in(root)
-    return {path.relative_to(folder).as_posix(): path for path in paths}
 
 
 def _for_these_images(model: ColmapModel, dataset: Dataset, table: str) -> ColmapModel:

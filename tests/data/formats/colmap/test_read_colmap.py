@@ -14,8 +14,8 @@ from biresnerf.data.formats.transforms.write_transforms import write_transforms
 from biresnerf.data.model.refined_set import refined_set
 from biresnerf.data.photos.masks import load_mask
 from biresnerf.errors import InputError
-from tests.data.formats.tables import trajectories
-from tests.data.formats.tables.trajectories import GIVEN_CAMERA, NAMES, assert_at_truth
+from tests.data.formats.simple import trajectories
+from tests.data.formats.simple.trajectories import GIVEN_CAMERA, NAMES, assert_at_truth
 from tests.data.scenes import HEIGHT, WIDTH, write_image
 from tests.data.test_real_sets import ROOT
 

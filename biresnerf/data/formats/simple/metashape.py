@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import GivenImage, dataset_of
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
-from biresnerf.data.formats.colmap.read_colmap import image_files
 from biresnerf.data.model.dataset import Camera, Dataset, SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.text_file import read_text
-from biresnerf.data.photos.named_images import few_names
+from biresnerf.data.photos.named_images import few_names, image_files
 from biresnerf.errors import InputError
 
 _MAX_DEPTH, _MAX_ELEMENTS = 50, 500_000

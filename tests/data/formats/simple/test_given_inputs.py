@@ -10,8 +10,8 @@ from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Camera
 from biresnerf.data.model.refined_set import refined_set
 from biresnerf.errors import InputError
-from tests.data.formats.tables import trajectories
-from tests.data.formats.tables.trajectories import GIVEN_CAMERA, NAMES, assert_at_truth, truth
+from tests.data.formats.simple import trajectories
+from tests.data.formats.simple.trajectories import GIVEN_CAMERA, NAMES, assert_at_truth, truth
 from tests.data.scenes import HEIGHT, WIDTH, write_image
 from tests.data.test_real_sets import ROOT
 

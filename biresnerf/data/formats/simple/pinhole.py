@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
-from biresnerf.data.formats.tables.write_bundler import write_bundler
+from biresnerf.data.formats.simple.bundler import write_bundler
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.colmap_scene import ColmapImage
 from biresnerf.data.model.dataset import Camera, Frame

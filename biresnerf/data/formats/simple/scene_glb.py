@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.own.glb_file import LINES, POINTS, GlbFile
+from biresnerf.data.formats.simple.glb_file import LINES, POINTS, GlbFile
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.show.renders import ramp_colours

@@ -11,18 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import GivenImage, dataset_of, match_files
-from biresnerf.data.formats.colmap.read_colmap import image_files
-from biresnerf.data.formats.tables.camera_file import read_camera_file
-from biresnerf.data.model.conventions import rotation_from_quat_wxyz
+from biresnerf.data.formats.simple.camera_file import read_camera_file
+from biresnerf.data.formats.simple.llff import rows_by_name
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.conventions import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from biresnerf.data.model.dataset import Dataset, Dialect, SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
+from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.text_file import read_text
+from biresnerf.data.photos.named_images import image_files
 from biresnerf.errors import InputError
 
 TIMES_OF_IMAGES = "rgb.txt"  # of TUM's sets
 MAX_POSES = 100_000
 MAX_TIME_APART_S = 0.02  # between an image and its pose, as in TUM's own tools
 _QUAT_LENGTH_ERROR = 1e-2
+_TUM_HEAD = (
+    "# timestamp tx ty tz qx qy qz qw: camera to world, OpenCV axes (x right, y down, z forward), the input's frame",
+)
 _COLUMNS: dict[int, Dialect] = {8: "tum", 12: "kitti"}
 # What `refine` writes above its poses: which image was taken when.
 _NAMED_TIME = re.compile(r"#\s*([-+0-9.eE]+)\s+(\S.*\S|\S)\s*$")
@@ -207,3 +213,34 @@ def _kitti_pose(values: NDArray[np.float64], where: str) -> NDArray[np.float64]:
 def _invalid(where: str, what: str, code: str = "pose_file_invalid") -> InputError:
     hint = "Give lines of `time x y z qx qy qz qw` (TUM), or of 12 numbers, [R | t] by rows (KITTI)."
     return InputError(code, what, where=where, hint=hint)
+
+
+def write_tum(refined: RefinedSet, path: Path) -> None:
+    """One line an image: time (s), centre, quaternion with the scalar last.
+
+    Times are the input's; where it had none, the images' numbers, counted from 0 in the input's order. Comments
+    at the top say which image each is.
+    """
+    times = refined.timestamps_s or tuple(float(i) for i in range(len(refined)))
+    lines = [*_TUM_HEAD]
+    lines += [f"# {time!r} {image.name}" for time, image in zip(times, refined.images, strict=True)]
+    for time, pose in zip(times, refined.world_from_cam, strict=True):
+        w, x, y, z = quat_wxyz_from_rotation(pose[:3, :3]).tolist()
+        lines.append(" ".join(repr(value) for value in (time, *pose[:3, 3].tolist(), x, y, z, w)))
+    _write_lines(path, lines)
+
+
+def write_kitti(refined: RefinedSet, path: Path) -> None:
+    """One line an image: the 12 numbers of [R | t], row by row.
+
+    The form knows neither names nor comments, so lines are in the order of the files' names, as readers take them.
+    """
+    poses = refined.world_from_cam[rows_by_name(refined)]
+    _write_lines(path, [" ".join(repr(value) for value in pose[:3].ravel().tolist()) for pose in poses])
+
+
+def _write_lines(path: Path, lines: list[str]) -> None:
+    # A name may hold anything but what ends a line.
+    plain = [" ".join(line.splitlines()) for line in lines]
+    with whole_file(path) as temporary:
+        temporary.write_text("\n".join(plain) + "\n", "utf-8")

@@ -1,1 +1,0 @@
-"""The project's own outputs: poses.json and scene.glb. Nothing reads them back."""

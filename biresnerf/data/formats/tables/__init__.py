@@ -1,1 +1,0 @@
-"""Poses in plain tables and XML: TUM, KITTI, LLFF, Bundler, Metashape."""
