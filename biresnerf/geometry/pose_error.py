@@ -89,19 +89,17 @@ def rotation_angle_deg(rotation: Array) -> Array:
     return np.degrees(np.arctan2(twice_sine, twice_cosine))
 
 
-def turned_deg(before: Array, after: Array) -> Array:
-    """By what angle [n] (deg) each camera's ``world_from_cam`` [n, 4, 4] differs from another in the same frame."""
-    return rotation_angle_deg(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+def rotation_between_deg(a: Array, b: Array) -> Array:
+    """Angles [...] (deg, 0 to 180) between the rotations of poses a and b, [..., 3 or 4, 3 or 4], in one frame."""
+    return rotation_angle_deg(np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3])
 
 
 def camera_errors(estimate: Array, truth: Array) -> CameraErrors:
     """Errors of poses ``world_from_cam`` [n, 4, 4] against true ones in the same frame, without alignment."""
     estimate, truth = np.asarray(estimate, dtype=np.float64), np.asarray(truth, dtype=np.float64)
-    rotation_est, rotation_true = estimate[:, :3, :3], truth[:, :3, :3]
-    relative = rotation_est @ rotation_true.transpose(0, 2, 1)
     translation = _cam_from_world_translation(estimate) - _cam_from_world_translation(truth)
     return CameraErrors(
-        rotation_deg=rotation_angle_deg(relative),
+        rotation_deg=rotation_between_deg(truth, estimate),
         translation=np.linalg.norm(translation, axis=1),
         centre=np.linalg.norm(estimate[:, :3, 3] - truth[:, :3, 3], axis=1),
     )

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from biresnerf.geometry.pose_error import rotation_angle_deg
+from biresnerf.geometry.pose_error import rotation_angle_deg, rotation_between_deg
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity, align_by_spread
 
@@ -86,7 +86,7 @@ def relative_errors_deg(estimate: Array, truth: Array) -> Array:
     for first in range(len(truth) - 1):  # a row of pairs at a time: all at once would need much memory
         ours = rigid_inverse(estimate[first]) @ estimate[first + 1 :]
         true = rigid_inverse(truth[first]) @ truth[first + 1 :]
-        turned = rotation_angle_deg(np.swapaxes(true[:, :3, :3], 1, 2) @ ours[:, :3, :3])
+        turned = rotation_between_deg(true, ours)
         apart = np.linalg.norm(true[:, :3, 3], axis=1) > _NO_BASELINE * size
         off = np.where(apart, _angle_deg(ours[:, :3, 3], true[:, :3, 3]), 0.0)
         found.append(np.maximum(turned, off))

@@ -20,7 +20,7 @@ from biresnerf.data.formats.transforms.write_transforms import write_transforms
 from biresnerf.data.synthetic.scene import synthetic_cameras, write_synthetic_scene
 from biresnerf.errors import InputError
 from biresnerf.geometry.perturb import perturb_poses
-from biresnerf.geometry.pose_error import PoseError, pose_error, turned_deg
+from biresnerf.geometry.pose_error import PoseError, pose_error, rotation_between_deg
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
@@ -156,7 +156,7 @@ def test_the_report_is_valid_and_agrees_with_the_poses(run):
     assert set(report.seconds) == {"preparing", "coarse", "fine", "evaluating", "judging"}
     refined = run.refined()
     assert [image.name for image in report.images] == [f"./train/r_{i}" for i in range(VIEWS)]
-    turned = turned_deg(run.start, refined)
+    turned = rotation_between_deg(run.start, refined)
     shifted = np.linalg.norm(run.start[:, :3, 3] - refined[:, :3, 3], axis=1)
     np.testing.assert_allclose([image.moved_deg for image in report.images], turned, atol=1e-3)
     np.testing.assert_allclose([image.moved_units for image in report.images], shifted, atol=1e-4)

@@ -12,7 +12,7 @@ import pytest
 
 import hatch_build
 from biresnerf.data.show.renders import ramp_colours
-from biresnerf.geometry.pose_error import turned_deg
+from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.pose_interpolation import interpolate_pose
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -84,7 +84,7 @@ def test_a_pose_between_two_is_the_librarys(answers, pairs):
 
 def test_turns_are_as_large_as_the_library_says(answers, pairs):
     for found, (first, second, _) in zip(answers["turned"], pairs, strict=True):
-        assert found == pytest.approx(float(turned_deg(first[None], second[None])[0]), abs=1e-6)
+        assert found == pytest.approx(float(rotation_between_deg(first[None], second[None])[0]), abs=1e-6)
 
 
 def test_colours_are_a_part_of_the_ramp_of_pictures_that_neither_ground_hides(answers):

@@ -53,6 +53,8 @@ def drop_contradicting_pairs(database_path: Path, cam_from_world: dict[str, Any]
     import numpy as np
     import pycolmap
 
+    from biresnerf.geometry.pose_error import rotation_between_deg
+
     database = pycolmap.Database.open(database_path)
     names = {image.image_id: image.name for image in database.read_all_images()}
     rotation = {name: np.array(pose)[:3, :3] for name, pose in cam_from_world.items()}
@@ -63,8 +65,7 @@ def drop_contradicting_pairs(database_path: Path, cam_from_world: dict[str, Any]
             continue
         matched = geometry.cam2_from_cam1.rotation.matrix()
         given = rotation[names[b]] @ rotation[names[a]].T
-        cosine = (np.trace(matched.T @ given) - 1) / 2
-        angles[a, b] = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        angles[a, b] = float(rotation_between_deg(matched, given))
     if angles:
         bound = max(PAIR_OUTLIER_DEG, PAIR_OUTLIER * float(np.median(list(angles.values()))))
         for (a, b), angle in angles.items():

@@ -9,7 +9,7 @@ import numpy as np
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding.map_images import MappedModel, known_intrinsics
 from biresnerf.geometry.camera.lens import lens_problem
-from biresnerf.geometry.pose_error import turned_deg
+from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.similarity import align_robust
 
 SAME_DEG = 2.0  # models whose cameras differ by less (median) say the same
@@ -26,7 +26,7 @@ def adds_to(best: MappedModel, other: MappedModel) -> bool:
     carried = align_robust(other.world_from_cam[there], poses, with_rotations=True).apply_to_poses(
         other.world_from_cam[there]
     )
-    turned = turned_deg(poses, carried)
+    turned = rotation_between_deg(poses, carried)
     return float(np.median(turned)) >= SAME_DEG
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.seeding.map_images import MappedModel
 from biresnerf.geometry.focus import focus_point
-from biresnerf.geometry.pose_error import turned_deg
+from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.similarity import align_robust
 
 logger = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ def carry_model(
     trusted = np.ones(len(rows), dtype=np.bool_)
     if judged and common.sum() >= JUDGED_FROM:
         here = found[common]
-        turned = turned_deg(here, there)
+        turned = rotation_between_deg(here, there)
         shifted = np.linalg.norm(here[:, :3, 3] - there[:, :3, 3], axis=1)
         floor = STRAY_SHARE * focus_point(given[posed]).mean_distance
         trusted[common] = (turned <= max(STRAY_DEG, STRAY * float(np.median(turned)))) & (

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
-from biresnerf.geometry.pose_error import rotation_angle_deg
+from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.optimise.pose_hypotheses import pose_hypotheses
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
@@ -269,7 +269,7 @@ def _distinct(matrices: Tensor, scores: Tensor, keep: int) -> Tensor:
     rotations = matrices[:, :, :3].double().cpu().numpy()
     chosen: list[int] = []
     for i in scores.argsort(stable=True).tolist():
-        apart = rotation_angle_deg(rotations[chosen].transpose(0, 2, 1) @ rotations[i])
+        apart = rotation_between_deg(rotations[chosen], rotations[i])
         if bool((apart >= DISTINCT_DEG).all()):
             chosen.append(i)
         if len(chosen) == keep:

@@ -1,19 +1,34 @@
-"""How far away the scene is, by feature matches: for rigs whose axes do not meet."""
+"""What feature matches tell of the scene: the rays of matched points, and how far away they lie."""
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.points.feature_matches import FeatureMatches
-from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.epipolar import epipolar_angles, match_depths
-from biresnerf.refine.scene.match_rays import match_rays
 
-AGREE_DEG = 1.0  # matches off by more say nothing: the poses or they are wrong
+AGREE_DEG = 1.0  # a match whose epipolar error is larger is not used: either it or the poses are wrong
 LEAST_PARALLAX_DEG = 1.0  # between the rays of a match; below, noise makes the depth
 LEAST_MATCHES = 30
+
+
+def match_rays(
+    intrinsics: Intrinsics, matches: FeatureMatches
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Directions in the first and the second camera of each match, float64 [m, 3] each, of length 1.
+
+    Args:
+        intrinsics: of all images of the set, at full size.
+    """
+    first, second = (
+        directions_in_cam(intrinsics, torch.from_numpy(image.copy()), torch.from_numpy(xy.copy())).numpy()
+        for image, xy in zip(matches.images.T, matches.xy.transpose(1, 0, 2), strict=True)
+    )
+    return first, second
 
 
 def matched_depth(
@@ -21,7 +36,7 @@ def matched_depth(
 ) -> float | None:
     """Median depth of matched points in front of the cameras at poses [n, 4, 4], in their unit.
 
-    None where too few matches agree with the poses, or all points lie beyond what the rig's width can tell.
+    None where too few matches agree with the poses, or all points are too far away for the rig's width.
     """
     if matches is None:
         return None

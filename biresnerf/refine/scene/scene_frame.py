@@ -18,7 +18,7 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.similarity import Similarity
-from biresnerf.refine.scene.near_plane import watched_from
+from biresnerf.refine.scene.shared_views import nearest_shared
 
 logger = logging.getLogger(__name__)
 
@@ -135,4 +135,4 @@ def scene_frame(poses: np.ndarray, images: ImageSet, depth: float | None = None)
 def _near(poses: np.ndarray, images: ImageSet, distance: float) -> float:
     intrinsics = Intrinsics.from_cameras(images.cameras)
     rigs = poses.reshape(-1, len(images), 4, 4)
-    return min(watched_from(rig, intrinsics, distance) for rig in rigs)
+    return min(nearest_shared(rig, intrinsics, distance) for rig in rigs)

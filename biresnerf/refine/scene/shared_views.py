@@ -1,17 +1,57 @@
-"""How much of what each camera sees the others see too.
+"""What several cameras see: where to begin sampling in an open scene, and how much of a view others share.
 
-In a scene without background, a camera that looks where no other does finds room there for its photo: the field
-explains it as well as any, wherever it truly belongs. Only that nobody shares the view gives it away.
+Nothing contradicts what a single camera sees right before it. A field that puts colour there explains that camera's
+photo from any pose, and hides the scene from other views. So sampling begins where other cameras look too, and a
+camera whose view no other shares is suspect, however small its error.
 """
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from biresnerf.geometry.camera.camera import Intrinsics, in_view
+from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, in_view
 
 WITNESSES = 2  # other cameras that must have a point in view
+# Sampling begins where this share of what cameras see is seen by witnesses that look less than a right angle
+# elsewhere: cameras across the scene do not help, as the scene lies between.
+WITNESSED = 0.8
+# Distances tried, as shares of the cameras' distance. Noisy poses share less: beyond 0.5 scenes may begin.
+NEAREST, FARTHEST, SPACING = 0.1, 0.5, 0.05
+SEERS, SIDE = 24, 5  # cameras tried, and pixels of each along either side
+
+
+def nearest_shared(unit_from_cam: NDArray[np.float64], intrinsics: Intrinsics, distance: float) -> float:
+    """The share of ``distance`` from which on `WITNESSED` of what cameras see is seen by two others.
+
+    `NEAREST` where no distance reaches that: a set that shares so little needs all it has.
+
+    Args:
+        unit_from_cam: [n, 4, 4]; noisy ones will do.
+        intrinsics: of the n cameras, on the CPU.
+        distance: mean distance of the cameras from the scene's centre.
+    """
+    matrices = torch.from_numpy(unit_from_cam[:, :3])
+    seers = torch.linspace(0, len(matrices) - 1, min(SEERS, len(matrices))).round().long()
+    along = (torch.arange(SIDE, dtype=torch.float64) + 0.5) / SIDE
+    grid = torch.stack(torch.meshgrid(along, along, indexing="xy"), -1).reshape(-1, 2)
+    shares = np.arange(NEAREST, FARTHEST + SPACING / 2, SPACING)
+    witnessed = np.zeros(len(shares))
+    for seer in seers.tolist():
+        size = torch.stack([intrinsics.width[seer], intrinsics.height[seer]]).to(grid)
+        in_cam = directions_in_cam(intrinsics, torch.full((len(grid),), seer), grid * size)
+        rotation, centre = matrices[seer, :, :3], matrices[seer, :, 3]
+        steps = torch.from_numpy(shares)[:, None, None] * distance
+        points = centre + steps * (in_cam.to(matrices) @ rotation.T)
+        facing = matrices[:, :, 2] @ matrices[seer, :, 2] > 0
+        facing[seer] = False
+        others = torch.nonzero(facing)[:, 0]
+        enough = _seen_by(others, points.reshape(-1, 3), matrices, intrinsics).sum(0) >= WITNESSES
+        witnessed += enough.numpy().reshape(len(shares), -1).mean(1)
+    reached = np.flatnonzero(witnessed / len(seers) >= WITNESSED)
+    return float(shares[reached[0]]) if len(reached) else NEAREST
 
 
 def shared_shares(points: Tensor, seer: Tensor, unit_from_cam: Tensor, intrinsics: Intrinsics) -> Tensor:
@@ -22,13 +62,18 @@ def shared_shares(points: Tensor, seer: Tensor, unit_from_cam: Tensor, intrinsic
         unit_from_cam: [n, 3, 4], in the frame of the points.
         intrinsics: of the n cameras.
     """
-    rotation, centre = unit_from_cam[:, :, :3], unit_from_cam[:, :, 3]
-    everyone = torch.arange(len(unit_from_cam), device=points.device)
+    cameras = torch.arange(len(unit_from_cam), device=points.device)
     shares = []
     for own, camera in zip(points, seer.tolist(), strict=True):
-        in_cam = torch.einsum("cji,ckj->cki", rotation, own[None] - centre[:, None])
-        cameras = everyone.repeat_interleave(len(own))
-        seen = in_view(intrinsics, cameras, in_cam.reshape(-1, 3)).reshape(len(everyone), len(own))
+        seen = _seen_by(cameras, own, unit_from_cam, intrinsics)
         seen[camera] = False
         shares.append((seen.sum(0) >= WITNESSES).float().mean())
     return torch.stack(shares)
+
+
+def _seen_by(cameras: Tensor, points: Tensor, unit_from_cam: Tensor, intrinsics: Intrinsics) -> Tensor:
+    """Whether each of the cameras [c], indices into ``unit_from_cam``, has points [m, 3] in view, bool [c, m]."""
+    matrices = unit_from_cam[cameras]
+    in_cam = torch.einsum("cji,ckj->cki", matrices[:, :, :3], points[None] - matrices[:, None, :, 3])
+    seen = in_view(intrinsics, cameras.repeat_interleave(len(points)), in_cam.reshape(-1, 3))
+    return seen.reshape(len(cameras), len(points))

@@ -13,7 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from biresnerf.errors import RefinementError
-from biresnerf.geometry.pose_error import rotation_angle_deg
+from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.progress import OnProgress, Progress, ReusableStage
 from biresnerf.refine.lost.lost_cameras import LostCameraRepair
 from biresnerf.refine.optimise.async_metrics import StepResult
@@ -139,8 +139,8 @@ class TwoStages:
         error = float(np.mean(self._errors))
         self._errors = []
         now = optimiser.poses.poses()
-        turn = self._poses_at_check[:, :3, :3].transpose(1, 2) @ now[:, :3, :3]
-        self._moved_deg = float(np.quantile(rotation_angle_deg(turn.numpy()), 0.9))
+        turned = rotation_between_deg(self._poses_at_check.numpy(), now.numpy())
+        self._moved_deg = float(np.quantile(turned, 0.9))
         self._poses_at_check = now
         optimiser.camera_errors.close_block()
         if optimiser.switch is not None:

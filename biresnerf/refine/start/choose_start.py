@@ -16,7 +16,7 @@ import torch
 from biresnerf.data.model.dataset import GUESSES
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.seeding.seed_poses import PoseCandidate
-from biresnerf.geometry.pose_error import turned_deg
+from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refine.optimise.methods import METHODS
 from biresnerf.refine.start.frozen_trials import FrozenTrials, trial_views
@@ -137,7 +137,7 @@ def choose_start(
     if scores[best] < scores[0] + MARGIN_DB:
         matched = int(np.argmax(scores[1:])) + 1
         disagree = float(
-            np.median(turned_deg(candidates[0].world_from_cam, candidates[matched].world_from_cam))
+            np.median(rotation_between_deg(candidates[0].world_from_cam, candidates[matched].world_from_cam))
         )
         believed = candidates[0].source == "given" and disagree > DISAGREE_DEG
         best = matched if believed and scores[matched] > scores[0] - MARGIN_DB else 0

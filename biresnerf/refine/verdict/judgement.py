@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from biresnerf.data.model.dataset import GUESSES, Dataset
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.geometry.focus import focus_point, rms_spread
-from biresnerf.geometry.pose_error import turned_deg
+from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.refine.lost.pose_certainty import unsure_deg
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.start.input_frame import poses_in_input_frame
@@ -111,7 +111,7 @@ def judge(
 
 def motion(before: Array, after: Array) -> tuple[Array, Array]:
     """Rotation (deg) and distance of the centres [n] between poses [n, 4, 4] of the same cameras."""
-    turned = turned_deg(before, after)
+    turned = rotation_between_deg(before, after)
     return turned, np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
 
 

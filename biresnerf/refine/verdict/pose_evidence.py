@@ -16,7 +16,7 @@ from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, proj
 from biresnerf.geometry.epipolar import epipolar_angles
 from biresnerf.geometry.focus import focus_point
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.refine.scene.match_rays import match_rays
+from biresnerf.refine.scene.scene_depth import match_rays
 from biresnerf.refine.start.frozen_trials import FrozenTrials, TrialScores, joined
 from biresnerf.refine.verdict.verdict import EPIPOLAR_MATTERS, PSNR_MATTERS, SSIM_MATTERS, paired
 from biresnerf.refine.views.held_out_views import unseen_rounds

@@ -19,7 +19,7 @@ from biresnerf.data.seeding.seed_poses import PoseCandidate, Seeding, seed_poses
 from biresnerf.data.synthetic.scene import synthetic_focal
 from biresnerf.errors import Interrupted, RefinementError
 from biresnerf.geometry.perturb import perturb_poses
-from biresnerf.geometry.pose_error import rotation_angle_deg, turned_deg
+from biresnerf.geometry.pose_error import rotation_angle_deg, rotation_between_deg
 from biresnerf.geometry.similarity import Similarity, align_by_spread
 from tests.data.scenes import plain_features, textured_arc
 
@@ -35,7 +35,7 @@ def with_poses(dataset: Dataset, poses: np.ndarray) -> Dataset:
 
 def errors_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     aligned = align_by_spread(found, truth).apply_to_poses(found)
-    return turned_deg(aligned, truth)
+    return rotation_between_deg(aligned, truth)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -10,7 +10,7 @@ from biresnerf.data.model.dataset import Camera, Dataset, Frame, SourceFormat
 from biresnerf.data.model.image_order import natural_order, taken_along_a_path
 from biresnerf.data.photos.image_likeness import likeness
 from biresnerf.data.seeding.missing_poses import guess_missing
-from biresnerf.geometry.pose_error import turned_deg
+from biresnerf.geometry.pose_error import rotation_between_deg
 from tests.data.scenes import arc_poses, textured_arc, write_image
 
 VIEWS = 12
@@ -53,7 +53,7 @@ def test_between_neighbours_by_name_the_pose_is_near_the_truth():
     poses = arc_poses(VIEWS)
     found, sources = guess(poses, [4, 7, 8])  # IMG_99 comes before IMG_100
     assert [sources[i] for i in (4, 7, 8)] == ["neighbours"] * 3
-    assert turned_deg(found, poses).max() < 0.5
+    assert rotation_between_deg(found, poses).max() < 0.5
     assert all(source is None for i, source in enumerate(sources) if i not in (4, 7, 8))
 
 
@@ -84,7 +84,7 @@ def test_without_features_the_photo_that_looks_most_alike_lends_its_pose(tmp_pat
     dataset = Dataset(tmp_path, (camera,), frames, SourceFormat("images", None, {}, np.eye(4)))
     found, sources = guess(poses, [2, 8], alike=lambda: likeness(dataset))
     assert sources[2] == sources[8] == "nearest-view"
-    assert turned_deg(found, poses)[[2, 8]].max() < 17  # neighbours on the arc are 8 degrees apart
+    assert rotation_between_deg(found, poses)[[2, 8]].max() < 17  # neighbours on the arc are 8 degrees apart
 
 
 def test_likeness_is_one_with_itself_and_nothing_for_a_blank_photo(tmp_path):

@@ -20,7 +20,7 @@ from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.data.synthetic.scene import synthetic_focal
 from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.geometry.perturb import perturb_poses
-from biresnerf.geometry.pose_error import pose_error, turned_deg
+from biresnerf.geometry.pose_error import pose_error, rotation_between_deg
 from tests.data.scenes import arc_poses, assert_complete, plain_features, textured_arc, write_image
 
 needs_colmap = pytest.mark.skipif(
@@ -211,7 +211,7 @@ def test_known_intrinsics_are_kept_and_given_poses_only_say_what_the_frame_is(fo
     np.testing.assert_array_equal(found.dataset.world_from_cam, wrong)  # what the result is measured against
     poses = found.candidates[0].world_from_cam
     assert set(found.candidates[0].sources) == {"colmap"}
-    assert turned_deg(poses, arc_poses(VIEWS)).max() < 3  # in the given frame, to within its noise
+    assert rotation_between_deg(poses, arc_poses(VIEWS)).max() < 3  # in the given frame, to within its noise
     assert pose_error(poses, arc_poses(VIEWS)).aligned.rotation_deg.max < 3.0
 
 
@@ -231,7 +231,7 @@ def test_without_features_missing_poses_come_from_neighbours_and_all_missing_one
     truth = with_poses(folder, arc_poses(VIEWS))
     found = seed_poses(without(truth, 3, 7), "none")
     assert [f.pose_source for f in found.dataset.frames].count("neighbours") == 2
-    assert turned_deg(found.dataset.world_from_cam, arc_poses(VIEWS)).max() < 0.5
+    assert rotation_between_deg(found.dataset.world_from_cam, arc_poses(VIEWS)).max() < 0.5
     (candidate,) = seed_poses(without(truth, *range(VIEWS)), "none").candidates
     assert set(candidate.sources) == {"forward-facing"}
     np.testing.assert_array_equal(candidate.world_from_cam, np.tile(np.eye(4), (VIEWS, 1, 1)))

@@ -18,7 +18,7 @@ from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.show.renders import ramp_colours
 from biresnerf.geometry.focus import rms_spread
-from biresnerf.geometry.pose_error import turned_deg
+from biresnerf.geometry.pose_error import rotation_between_deg
 
 SCENE = "scene.glb"
 GREY = (150, 150, 150)
@@ -98,7 +98,7 @@ def _turn_colours(refined: RefinedSet) -> NDArray[np.uint8]:
     turned = [
         TURN_AT_TOP_DEG
         if image.given is None
-        else float(turned_deg(image.given[None], image.world_from_cam[None])[0])
+        else float(rotation_between_deg(image.given[None], image.world_from_cam[None])[0])
         for image in refined.images
     ]
     return ramp_colours(np.array(turned) / TURN_AT_TOP_DEG)

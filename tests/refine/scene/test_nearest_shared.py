@@ -9,8 +9,8 @@ import pytest
 
 from biresnerf.data.model.dataset import Camera
 from biresnerf.geometry.camera.camera import Intrinsics
-from biresnerf.refine.scene.near_plane import FARTHEST, NEAREST, SPACING, watched_from
 from biresnerf.refine.scene.scene_frame import scene_frame
+from biresnerf.refine.scene.shared_views import FARTHEST, NEAREST, SPACING, nearest_shared
 from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set
 
 
@@ -26,7 +26,7 @@ def arc(count: int, apart_deg: float, distance: float = 5.0) -> np.ndarray:
 
 def near_of(poses: np.ndarray, distance: float = 5.0) -> float:
     camera = Camera("SIMPLE_PINHOLE", 20, 20, (20.0, 10.0, 10.0))
-    return watched_from(poses, Intrinsics.from_cameras([camera] * len(poses)), distance)
+    return nearest_shared(poses, Intrinsics.from_cameras([camera] * len(poses)), distance)
 
 
 def test_cameras_closer_together_may_see_nearer_things():
