@@ -57,16 +57,16 @@ def optimiser(
     stage: str, images: int, threads: int, rays: int, size: int = 200, preset: str = "paper"
 ) -> JointOptimiser:
     """An optimiser of the given preset in the middle of a stage, with the shell as its occupancy."""
-    options = RefineOptions(preset=preset, device="cpu", max_image_size=size).resolved()
+    options = RefineOptions(preset=preset, device="cpu", max_image_size=size).resolved("cpu")
     photo_set, poses = photos(images, size), cameras_around(images)
     frame = scene_frame(poses, photo_set)
     start = frame.unit_from_world.apply_to_poses(poses)
     made = JointOptimiser(photo_set, frame, start, options, [], CPU, threads)
     made.occupancy.occupied = shell(made.occupancy.side)
-    made.step_index = int(options.coarse_steps_max) - 1
+    made.step_index = options.coarse_steps_max - 1
     if stage == "fine":
         made.start_reconstruction()
-        made.step_index += 3 * int(options.warmup_steps) + 1
+        made.step_index += 3 * options.warmup_steps + 1
     made.rays = rays
     return made
 

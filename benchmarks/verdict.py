@@ -61,7 +61,7 @@ def main() -> None:
     for seed in range(asked.seeds):
         options = RefineOptions(
             preset="fast", device="cpu", seed=seed, max_image_size=asked.size, trial_steps=asked.steps
-        ).resolved()
+        ).resolved("cpu")
         found = compare_on_unseen_views(
             before, after, images, held_out_views(len(dataset), None), options, torch.device("cpu"),
             use_threads(0), lambda: False,

@@ -20,9 +20,9 @@ from biresnerf.data.photos.images import ImageSet, load_images
 from biresnerf.data.points.feature_matches import FeatureMatches
 from biresnerf.data.seeding.seed_poses import PoseCandidate, seed_poses
 from biresnerf.errors import InputError, Interrupted
-from biresnerf.field.backends import choose_device, use_threads
+from biresnerf.field.backends import resolve_here, use_threads
 from biresnerf.field.cpu.compile_kernels import compile_kernels
-from biresnerf.options.refine_options import STAGE_2_OPTIONS, RefineOptions
+from biresnerf.options.refine_options import RESULT_OPTIONS, STAGE_1_OPTIONS, RefineOptions, ResolvedOptions
 from biresnerf.progress import OnProgress, Progress
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.parameters.intrinsics_parameters import lenses_of
@@ -187,7 +187,9 @@ def _carried(matches: FeatureMatches | None) -> dict[str, Tensor]:
     return {MATCHED_IMAGES: torch.from_numpy(images), MATCHED_XY: torch.from_numpy(xy)}
 
 
-def _optimiser(given: RunInput, options: RefineOptions, device: torch.device, threads: int) -> JointOptimiser:
+def _optimiser(
+    given: RunInput, options: ResolvedOptions, device: torch.device, threads: int
+) -> JointOptimiser:
     """The optimisation at its first step, in the unit frame of the poses it starts from."""
     dataset, images, start = given.dataset, given.images, given.start
     bodies = rigid_bodies(dataset, options)
@@ -204,10 +206,9 @@ def _optimiser(given: RunInput, options: RefineOptions, device: torch.device, th
     return optimiser
 
 
-def _choose_backend(options: RefineOptions, report: OnProgress) -> tuple[RefineOptions, torch.device, int]:
+def _choose_backend(asked: RefineOptions, report: OnProgress) -> tuple[ResolvedOptions, torch.device, int]:
     """The options resolved for the device there is, that device, and the threads taken; kernels compiled."""
-    device = choose_device(options.device)
-    options = options.model_copy(update={"device": "cuda" if device.type == "cuda" else "cpu"}).resolved()
+    options, device = resolve_here(asked)
     threads = use_threads(options.threads)
     if device.type == "cpu":
         message = "loading kernels (the first run compiles them)"
@@ -218,7 +219,7 @@ def _choose_backend(options: RefineOptions, report: OnProgress) -> tuple[RefineO
 
 def _find_start(
     prepared: Prepared,
-    options: RefineOptions,
+    options: ResolvedOptions,
     device: torch.device,
     threads: int,
     report: OnProgress,
@@ -239,7 +240,7 @@ def _find_start(
 
 def _prepare(
     given: Path | Dataset,
-    options: RefineOptions,
+    options: ResolvedOptions,
     folder: OutputFolder,
     report: OnProgress,
     stop: Callable[[], bool],
@@ -250,7 +251,7 @@ def _prepare(
     with ShowSeeding(dataset, folder, report) as show:
         found = seed_poses(
             dataset,
-            options.start or "auto",
+            options.start,
             should_stop=stop,
             seed=options.seed,
             effort=options.seeding_effort,
@@ -263,10 +264,8 @@ def _prepare(
     digest = hashlib.sha256(images.pixels.tobytes())
     if images.counts is not None:
         digest.update(images.counts.tobytes())
-    # What changes neither result nor effort may differ between a run and its continuation.
-    idle = {"threads", "checkpoint_every_s", "orbit_frames", "shown_views", "packs"}
-    asked = options.model_dump(exclude=idle)
-    stage_1 = options.model_dump(exclude=set(STAGE_2_OPTIONS))
+    asked = options.model_dump(include=set(RESULT_OPTIONS))
+    stage_1 = options.model_dump(include=set(STAGE_1_OPTIONS))
     return Prepared(
         dataset,
         images,

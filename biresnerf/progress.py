@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Stage = Literal["preparing", "seeding", "coarse", "fine", "evaluating", "exporting"]
-STAGES: tuple[Stage, ...] = ("preparing", "seeding", "coarse", "fine", "evaluating", "exporting")
-# Stages whose work another run of the same set can take over.
-ReusableStage = Literal["seeding", "coarse"]
+from biresnerf.stages import ReusableStage, Stage
 
 
 class Progress(BaseModel):

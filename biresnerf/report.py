@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import ResolvedOptions
 
 _FROZEN = ConfigDict(frozen=True, extra="forbid")
 
@@ -241,7 +241,7 @@ class Report(BaseModel):
 
     version: str
     state: Literal["complete", "partial"] = Field(description="partial: stopped before the end, on request.")
-    options: RefineOptions
+    options: ResolvedOptions
     verdict: Verdict | None = Field(
         None,
         description="None of a partial result, and where none was asked for; the poses are the refined ones then.",

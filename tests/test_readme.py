@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from biresnerf.options.refine_options import PRESETS
+from biresnerf.options.presets import PRESETS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [

@@ -40,7 +40,7 @@ async def fill(database: Database, dataset: str, count: int) -> None:
         " FROM generate_series(1, %s) AS n RETURNING id, args ->> 'job_id' AS job_id)"
         " INSERT INTO jobs (id, dataset_id, options, fingerprint, queue_id, created_at)"
         " SELECT job_id, %s, %s, '', id, now() - interval '1 day' + make_interval(secs => id) FROM rows",
-        *(count, dataset, Jsonb(RefineOptions(preset="fast").resolved().model_dump(mode="json"))),
+        *(count, dataset, Jsonb(RefineOptions(preset="fast").resolved("cpu").model_dump(mode="json"))),
     )
     async with database.pool.connection() as connection:
         await connection.set_autocommit(True)

@@ -15,7 +15,7 @@ from biresnerf.field.cuda.device_occupancy import DeviceOccupancyGrid
 from biresnerf.field.occupancy import OccupancyGrid
 from biresnerf.field.radiance_field import FieldShape, RadianceField
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
-from biresnerf.options.refine_options import Device
+from biresnerf.options.refine_options import Device, RefineOptions, ResolvedOptions
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +44,15 @@ def choose_device(device: Device) -> torch.device:
     if torch.cuda.is_available():
         logger.warning("computing on the CPU: %s", problem)
     return torch.device("cpu")
+
+
+def resolve_here(options: RefineOptions) -> tuple[ResolvedOptions, torch.device]:
+    """The options with nothing left open, for the device that they ask for on this machine; and that device.
+
+    Raises `InputError` for CUDA that cannot be used, and for options that do not fit together.
+    """
+    device = choose_device(options.device)
+    return options.resolved("cuda" if device.type == "cuda" else "cpu"), device
 
 
 def cuda_problem() -> str | None:

@@ -1,9 +1,10 @@
-"""What options left open come to: by preset, by method, and on a GPU."""
+"""The values of options that were left open: by preset, by method, and on a GPU."""
 
 from __future__ import annotations
 
 from typing import Any, Literal
 
+ComputeDevice = Literal["cpu", "cuda"]
 PresetName = Literal["fast", "balanced", "quality", "paper"]
 MethodName = Literal["biresnerf", "biresnerf-paper", "baa-ngp", "nerfacc-barf", "barf"]
 
@@ -92,6 +93,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
 }
 
 COMMON_VALUES: dict[str, Any] = {
+    "holdout": "auto",
     "exposure": "auto",
     "start": "auto",
     "reconstruction_resolution_min": 128,
@@ -138,3 +140,22 @@ METHOD_PAPER_VALUES: dict[MethodName, dict[str, Any]] = {
     "nerfacc-barf": {"steps": 200_000, "samples_per_step": 2**15},
     "barf": {"steps": 200_000, "samples_per_step": 2**17},
 }
+
+
+def preset_values(
+    preset: PresetName, method: MethodName, device: ComputeDevice, steps: int | None
+) -> dict[str, Any]:
+    """The values of options that were left open; `steps` is None where that was, too."""
+    values = {**COMMON_VALUES, **PRESETS[preset], **METHOD_VALUES[method]}
+    if preset == "paper":
+        values |= METHOD_PAPER_VALUES[method]
+    elif device == "cuda":
+        values |= {key: values[key] * factor for key, factor in CUDA_SCALE.items()}
+    if steps is not None:
+        # A run made shorter by `steps` alone keeps the preset's proportions.
+        ratio = steps / values["steps"]
+        for key in ("coarse_steps_min", "coarse_steps_max", "check_every", "warmup_steps"):
+            values[key] = max(10, round(values[key] * ratio))
+        # In proportion, trials would be too short to tell good poses from better ones.
+        values["trial_steps"] = max(10, min(values["trial_steps"], steps // 4))
+    return values

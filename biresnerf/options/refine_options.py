@@ -1,24 +1,20 @@
-"""What a user may ask for: frozen models that give the CLI flags, the HTTP schema and config.json alike.
+"""What a user can ask for: frozen models that give the CLI flags, the HTTP schema and config.json alike.
 
-A field left at ``None`` takes the preset's value; ``RefineOptions.resolved()`` fills them all in.
+Each option is declared once, in `_Options`. `RefineOptions` is what was asked, where None leaves a value to the
+preset; `ResolvedOptions` is the same with every value filled in.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Generic, Literal, Never, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from biresnerf.errors import InputError
-from biresnerf.options.presets import (
-    COMMON_VALUES,
-    CUDA_SCALE,
-    METHOD_PAPER_VALUES,
-    METHOD_VALUES,
-    PRESETS,
-    MethodName,
-    PresetName,
-)
+from biresnerf.options.option import Option
+from biresnerf.options.presets import ComputeDevice, MethodName, PresetName, preset_values
+from biresnerf.stages import STAGES
 
 Device = Literal["auto", "cpu", "cuda"]
 Background = Literal["auto", "white", "black", "none"]
@@ -30,152 +26,172 @@ PackName = Literal["colmap-text", "instant-ngp", "kitti", "bundler", "pinhole"]
 StartPoses = Literal["auto", "given", "colmap", "none"]
 RefineIntrinsics = Literal["auto", "none", "focal", "all"]
 SeedingEffort = Literal["full", "low"]
+HeldOut = Annotated[int, Field(ge=0, le=200)] | Literal["auto"]
 
-# Options that have no say before stage 2 begins: runs that differ in these alone can share stage 1.
-STAGE_2_OPTIONS = frozenset(
-    {
-        *("reconstruction_levels", "reconstruction_resolution_min", "reconstruction_resolution_max"),
-        *("table_size_log2", "wiring", "warmup_steps", "verdict", "trial_steps"),
-        *("threads", "checkpoint_every_s", "orbit_frames", "shown_views", "packs"),
-    }
-)
+# What else a field may hold: None in what was asked, nothing else once resolved.
+Open = TypeVar("Open")
+DeviceName = TypeVar("DeviceName")
+# Defaults of fields with those types; `ResolvedOptions` refuses them.
+OPEN: Any = None
+AUTO: Any = "auto"
 
 
-class RefineOptions(BaseModel):
-    """Options of one refinement. Unknown keys are refused."""
+class _Options(BaseModel, Generic[Open, DeviceName]):
+    """The declarations of all options. Unknown keys are refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, title="Refinement options")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    preset: PresetName = Field("balanced", description="Fills every option that is left out.")
-    method: MethodName = Field(
+    preset: Annotated[PresetName, Option("coarse")] = Field(
+        "balanced", description="Fills every option that is left out."
+    )
+    method: Annotated[MethodName, Option("coarse", research=True)] = Field(
         "biresnerf",
         description="biresnerf; the two stages as published, biresnerf-paper; or what it is compared with.",
     )
-    device: Device = Field("auto", description="Where to compute; auto takes CUDA where there is one.")
-    seed: int = Field(0, ge=0, lt=2**31, description="Same seed, same machine, same result on the CPU.")
-    threads: int = Field(0, ge=0, le=256, description="CPU threads; 0 takes all cores this process may use.")
-
-    max_image_size: int | None = Field(
-        None,
+    device: Annotated[DeviceName, Option("coarse")] = Field(
+        AUTO, description="Where to compute; auto takes CUDA where there is one."
+    )
+    seed: Annotated[int, Option("seeding")] = Field(
+        0, ge=0, lt=2**31, description="Same seed, same machine, same result on the CPU."
+    )
+    threads: Annotated[int, Option("coarse", changes_result=False)] = Field(
+        0, ge=0, le=256, description="CPU threads; 0 takes all cores this process may use."
+    )
+    max_image_size: Annotated[int | Open, Option("coarse", less_memory=lambda px: max(64, px // 2))] = Field(
+        OPEN,
         ge=16,
         le=4096,
         description="Long side (px) that images are optimised at; results are full size.",
     )
-    holdout: int | None = Field(
-        None,
-        ge=0,
-        le=200,
-        description="Views kept out of the field's training, to measure it. Default: a tenth.",
+    holdout: Annotated[HeldOut | Open, Option("coarse")] = Field(
+        OPEN, description="Views kept out of the field's training, to measure it; auto: a tenth, at most 10."
     )
-    background: Background = Field(
+    background: Annotated[Background, Option("coarse")] = Field(
         "auto", description="What lies behind the scene: a colour, or none where photos show surroundings."
     )
-
-    exposure: ExposureChoice | None = Field(
-        None,
+    exposure: Annotated[ExposureChoice | Open, Option("coarse")] = Field(
+        OPEN,
         description="on: find how bright each photo is against the others, with poses and field; none: all alike; "
         "auto: on where opaque photos differ in brightness.",
     )
-    start: StartPoses | None = Field(
-        None,
+    start: Annotated[StartPoses | Open, Option("seeding")] = Field(
+        OPEN,
         description="auto: feature matches find missing poses, and poses they support are tried against the given "
         "ones; given: the given poses, of all images; colmap: COLMAP's poses, whatever is given; none: no feature "
         "matches, missing poses are guessed from other images.",
     )
-
-    seeding_effort: SeedingEffort = Field(
+    seeding_effort: Annotated[SeedingEffort, Option("seeding", less_memory=lambda _: "low")] = Field(
         "full",
         description="low: COLMAP looks for fewer features in smaller photos, in one thread; it takes less memory and "
         "places fewer photos.",
     )
-
-    fixed: tuple[str, ...] = Field(
+    fixed: Annotated[tuple[str, ...], Option("coarse")] = Field(
         (),
         max_length=10_000,
         description="Names of images whose poses stay as given, to the bit; the result's frame is tied to them.",
     )
-
-    refine_intrinsics: RefineIntrinsics = Field(
+    refine_intrinsics: Annotated[RefineIntrinsics, Option("coarse")] = Field(
         "auto",
         description="What of the lenses is refined too; auto: focal lengths that were guessed or read from EXIF; all: "
         "principal point and distortion as well.",
     )
-
-    steps: int | None = Field(None, ge=20, le=1_000_000, description="Steps of both stages together.")
-    coarse_steps_min: int | None = Field(None, ge=10, description="Stage 1 takes at least this many steps.")
-    coarse_steps_max: int | None = Field(None, ge=10, description="Stage 1 ends here, stable or not.")
-    check_every: int | None = Field(
-        None, ge=5, description="Steps between two looks of the stability detector."
+    steps: Annotated[int | Open, Option("coarse")] = Field(
+        OPEN, ge=20, le=1_000_000, description="Steps of both stages together."
     )
-    detector: DetectorName = Field(
+    coarse_steps_min: Annotated[int | Open, Option("coarse")] = Field(
+        OPEN, ge=10, description="Stage 1 takes at least this many steps."
+    )
+    coarse_steps_max: Annotated[int | Open, Option("coarse")] = Field(
+        OPEN, ge=10, description="Stage 1 ends here, stable or not."
+    )
+    check_every: Annotated[int | Open, Option("coarse")] = Field(
+        OPEN, ge=5, description="Steps between two looks of the stability detector."
+    )
+    detector: Annotated[DetectorName, Option("coarse", research=True)] = Field(
         "trend",
         description="What calls the error stable: a flat line through it, as many rises as falls, or a small variance.",
     )
-    samples_per_step: int | None = Field(
-        None, ge=1024, le=2**22, description="Field samples a step at the end of the coarse-to-fine ramp."
+    samples_per_step: Annotated[
+        int | Open, Option("coarse", less_memory=lambda samples: max(1024, samples // 4))
+    ] = Field(
+        OPEN, ge=1024, le=2**22, description="Field samples a step at the end of the coarse-to-fine ramp."
     )
-
-    pose_rate: float | None = Field(None, gt=0, le=0.1, description="Pose learning rate at the start.")
-    pose_rate_final: float | None = Field(None, gt=0, le=0.1, description="Pose learning rate at the end.")
-    field_rate: float | None = Field(None, gt=0, le=0.5, description="Field learning rate at the start.")
-    field_rate_final: float | None = Field(None, gt=0, le=0.5, description="Field learning rate at the end.")
-    warmup_steps: int | None = Field(
-        None, ge=1, description="Steps over which the reconstruction module's learning rate rises."
+    pose_rate: Annotated[float | Open, Option("coarse")] = Field(
+        OPEN, gt=0, le=0.1, description="Pose learning rate at the start."
     )
-    double_pose_step: bool | None = Field(
-        None,
+    pose_rate_final: Annotated[float | Open, Option("coarse")] = Field(
+        OPEN, gt=0, le=0.1, description="Pose learning rate at the end."
+    )
+    field_rate: Annotated[float | Open, Option("coarse")] = Field(
+        OPEN, gt=0, le=0.5, description="Field learning rate at the start."
+    )
+    field_rate_final: Annotated[float | Open, Option("coarse")] = Field(
+        OPEN, gt=0, le=0.5, description="Field learning rate at the end."
+    )
+    warmup_steps: Annotated[int | Open, Option("fine", research=True)] = Field(
+        OPEN, ge=1, description="Steps over which the reconstruction module's learning rate rises."
+    )
+    double_pose_step: Annotated[bool | Open, Option("coarse", research=True)] = Field(
+        OPEN,
         description="A second Adam, at the field's learning rate, moves the poses too (as BAA-NGP's code).",
     )
-    pose_parametrisation: PoseParametrisation = Field(
+    pose_parametrisation: Annotated[PoseParametrisation, Option("coarse", research=True)] = Field(
         "se3_world",
         description="se3_world turns cameras about the scene, so3xr3 about themselves, so3xr3_camp with CamP's "
         "preconditioner.",
     )
-
-    wiring: Wiring = Field(
+    wiring: Annotated[Wiring, Option("fine", research=True)] = Field(
         "concat",
         description="How the reconstruction module joins: beside the pose-estimation module's features, in their "
         "place with fresh networks, or with networks of its own whose outputs are added.",
     )
-    pose_levels: int = Field(3, ge=1, le=16, description="Levels of the pose-estimation module.")
-    pose_resolution_min: int = Field(16, ge=2, le=128, description="Cells a side of its coarsest level.")
-    pose_resolution_max: int = Field(72, ge=2, le=8192, description="Cells a side of its finest level.")
-    reconstruction_levels: int | None = Field(
-        None, ge=1, le=16, description="Levels of the reconstruction module."
+    pose_levels: Annotated[int, Option("coarse", research=True)] = Field(
+        3, ge=1, le=16, description="Levels of the pose-estimation module."
     )
-    reconstruction_resolution_min: int | None = Field(
-        None, ge=4, le=8192, description="Cells a side of its coarsest level."
+    pose_resolution_min: Annotated[int, Option("coarse", research=True)] = Field(
+        16, ge=2, le=128, description="Cells a side of its coarsest level."
     )
-    reconstruction_resolution_max: int | None = Field(
-        None, ge=4, le=16384, description="Cells a side of its finest level."
+    pose_resolution_max: Annotated[int, Option("coarse", research=True)] = Field(
+        72, ge=2, le=8192, description="Cells a side of its finest level."
     )
-    table_size_log2: int | None = Field(None, ge=10, le=22, description="Entries of a hashed level, log2.")
-
-    verdict: bool = Field(
+    reconstruction_levels: Annotated[int | Open, Option("fine", research=True)] = Field(
+        OPEN, ge=1, le=16, description="Levels of the reconstruction module."
+    )
+    reconstruction_resolution_min: Annotated[int | Open, Option("fine", research=True)] = Field(
+        OPEN, ge=4, le=8192, description="Cells a side of its coarsest level."
+    )
+    reconstruction_resolution_max: Annotated[int | Open, Option("fine", research=True)] = Field(
+        OPEN, ge=4, le=16384, description="Cells a side of its finest level."
+    )
+    table_size_log2: Annotated[int | Open, Option("fine", less_memory=lambda log2: max(10, log2 - 2))] = (
+        Field(OPEN, ge=10, le=22, description="Entries of a hashed level, log2.")
+    )
+    verdict: Annotated[bool, Option("evaluating")] = Field(
         True,
         description="At the end, compare the refined poses with the input's, and return the input's unless the refined "
         "ones are better; without it the refined ones are returned.",
     )
-    trial_steps: int | None = Field(
-        None,
+    trial_steps: Annotated[int | Open, Option("evaluating")] = Field(
+        OPEN,
         ge=0,
         le=100_000,
         description="Steps of each of the verdict's two short trainings (scenes with surroundings take twice as many); "
         "0 leaves them out.",
     )
-
-    checkpoint_every_s: float = Field(20.0, gt=0, description="Seconds between two checkpoints.")
-    orbit_frames: int | None = Field(
-        None, ge=0, le=600, description="Frames of the orbit video; 0 leaves it out."
+    checkpoint_every_s: Annotated[float, Option("coarse", changes_result=False)] = Field(
+        20.0, gt=0, description="Seconds between two checkpoints."
     )
-    shown_views: int | None = Field(
-        None,
+    orbit_frames: Annotated[int | Open, Option("evaluating", changes_result=False)] = Field(
+        OPEN, ge=0, le=600, description="Frames of the orbit video; 0 leaves it out."
+    )
+    shown_views: Annotated[int | Open, Option("evaluating", changes_result=False)] = Field(
+        OPEN,
         ge=0,
         le=200,
         description="Views rendered at the end beside the held-out ones, spread over the set, to be looked at; fewer "
         "where they would take more than a twentieth of the run.",
     )
-    packs: tuple[PackName, ...] = Field(
+    packs: Annotated[tuple[PackName, ...], Option("exporting", changes_result=False)] = Field(
         (),
         description="Forms to write the result in beside those that always are: colmap-text, instant-ngp, kitti, "
         "bundler, pinhole (undistorted photos with a PINHOLE model).",
@@ -187,8 +203,17 @@ class RefineOptions(BaseModel):
         """A list may be written with commas, as on a command line."""
         return tuple(part.strip() for part in value.split(",")) if isinstance(value, str) else value
 
+    @field_validator("holdout", mode="wrap")
+    @classmethod
+    def _counted(cls, value: Any, validate: Callable[[Any], Any]) -> Any:
+        """One error for the whole field, where pydantic has one for each of the types that it may have."""
+        try:
+            return validate(value)
+        except ValidationError:
+            raise ValueError("must be auto or a whole number from 0 to 200") from None
+
     @model_validator(mode="after")
-    def _ordered(self) -> RefineOptions:
+    def _ordered(self) -> Self:
         pairs = (
             ("coarse_steps_min", "coarse_steps_max"),
             ("coarse_steps_max", "steps"),
@@ -203,34 +228,58 @@ class RefineOptions(BaseModel):
                 raise ValueError(f"{low} ({a}) must not exceed {high} ({b})")
         return self
 
-    def resolved(self) -> RefineOptions:
-        """These options with every field left at ``None`` filled in from the preset (``holdout`` stays)."""
-        preset = {**COMMON_VALUES, **PRESETS[self.preset], **METHOD_VALUES[self.method]}
-        if self.preset == "paper":
-            preset.update(METHOD_PAPER_VALUES[self.method])
-        given = self.model_dump()
-        scale = CUDA_SCALE if self.device == "cuda" and self.preset != "paper" else {}
-        filled = {
-            key: preset[key] * scale[key] if key in scale else preset[key]
-            for key in preset
-            if given[key] is None
-        }
-        # A shorter run asked for by `steps` alone keeps the preset's proportions.
-        if self.steps is not None:
-            ratio = self.steps / preset["steps"]
-            for key in ("coarse_steps_min", "coarse_steps_max", "check_every", "warmup_steps"):
-                if given[key] is None:
-                    filled[key] = max(10, round(preset[key] * ratio))
-            if self.trial_steps is None:
-                # In proportion they would be too short to tell good poses from better ones.
-                filled["trial_steps"] = max(10, min(preset["trial_steps"], self.steps // 4))
-        return parse_options({**given, **filled})
+
+def _all_required(schema: dict[str, Any]) -> None:
+    """Resolved options have no defaults."""
+    schema["required"] = list(schema["properties"])
+    for field in schema["properties"].values():
+        field.pop("default", None)
 
 
-def parse_options(values: dict[str, Any]) -> RefineOptions:
+class ResolvedOptions(_Options[Never, ComputeDevice]):
+    """Options of one refinement with every value filled in for the device that runs it."""
+
+    model_config = ConfigDict(
+        title="Resolved options", validate_default=True, json_schema_extra=_all_required
+    )
+
+
+class RefineOptions(_Options[None, Device]):
+    """Options of one refinement. Unknown keys are refused."""
+
+    model_config = ConfigDict(title="Refinement options")
+
+    def resolved(self, device: ComputeDevice) -> ResolvedOptions:
+        """Every value left open filled in: by the method, the preset, and for the device that runs it.
+
+        Raises:
+            InputError: ``invalid_options``: what was asked does not fit what the preset fills in.
+        """
+        values = preset_values(self.preset, self.method, device, self.steps)
+        return _parse(ResolvedOptions, {**values, **self.model_dump(exclude_none=True), "device": device})
+
+
+OPTIONS: Mapping[str, Option] = {
+    name: next(item for item in field.metadata if isinstance(item, Option))
+    for name, field in RefineOptions.model_fields.items()
+}
+# A run goes on from a checkpoint only where these agree, and takes over another's stage 1 where the second do.
+RESULT_OPTIONS = frozenset(name for name, option in OPTIONS.items() if option.changes_result)
+STAGE_1_OPTIONS = frozenset(
+    name for name in RESULT_OPTIONS if STAGES.index(OPTIONS[name].stage) <= STAGES.index("coarse")
+)
+
+Parsed = TypeVar("Parsed", bound=BaseModel)
+
+
+def parse_options(values: Mapping[str, Any]) -> RefineOptions:
     """Options from untrusted values; raises `InputError` naming the path of every key that is wrong."""
+    return _parse(RefineOptions, values)
+
+
+def _parse(model: type[Parsed], values: Mapping[str, Any]) -> Parsed:
     try:
-        return RefineOptions.model_validate(values)
+        return model.model_validate(values)
     except ValidationError as error:
         problems = []
         for item in error.errors():

@@ -9,7 +9,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.geometry.pose_error import PoseError
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.report import SwitchReason
 
 _FROZEN = ConfigDict(frozen=True, extra="forbid")
@@ -78,7 +78,8 @@ class Cell(BaseModel):
         content = [
             self.scene.model_dump_json(exclude={"name", "file", "test_file"}),
             self.start.model_dump_json(),
-            self.options.resolved().model_dump_json(exclude={"checkpoint_every_s"}),
+            self.options.device,
+            self.options.resolved("cpu").model_dump_json(exclude={"device", "checkpoint_every_s"}),
         ]
         return hashlib.sha256("\n".join(content).encode()).hexdigest()[:12]
 
@@ -117,7 +118,7 @@ class Outcome(BaseModel):
     model_config = _FROZEN
 
     version: str
-    options: RefineOptions = Field(description="As used, with everything filled in.")
+    options: ResolvedOptions = Field(description="As used, with everything filled in.")
     before: PoseError
     after: PoseError
     cameras: tuple[CameraResult, ...]

@@ -54,7 +54,7 @@ class Plan:
         if scene.test_file is not None:
             defaults["holdout"] = 0
         options = parse_options({**defaults, **self.settings, **variant.settings})
-        options.resolved()  # refuses what fits no preset, before anything runs
+        options.resolved("cpu")  # refuses what fits no preset, before anything runs
         return options
 
 
@@ -70,9 +70,9 @@ class Entry:
 
 def with_steps(options: RefineOptions, steps: int) -> RefineOptions:
     """The same run in proportion, `steps` long. Raises `InputError` where options do not allow it."""
-    own = options.resolved()
-    ratio = steps / int(own.steps or 1)
-    scaled = {key: max(10, round(int(getattr(own, key) or 0) * ratio)) for key in _SCALED}
+    own = options.resolved("cpu")
+    ratio = steps / own.steps
+    scaled = {key: max(10, round(getattr(own, key) * ratio)) for key in _SCALED}
     scaled["coarse_steps_max"] = min(scaled["coarse_steps_max"], steps)
     scaled["coarse_steps_min"] = min(scaled["coarse_steps_min"], scaled["coarse_steps_max"])
     return parse_options({**options.model_dump(), **scaled, "steps": steps})

@@ -36,19 +36,19 @@ class Study:
 
 def _stage_1_only(given: dict[str, Any]) -> dict[str, Any]:
     """All steps belong to the pose-estimation module."""
-    steps = parse_options(given).resolved().steps
+    steps = parse_options(given).resolved("cpu").steps
     return {**given, "steps": steps, "coarse_steps_min": steps, "coarse_steps_max": steps}
 
 
 def _same_switch(given: dict[str, Any]) -> dict[str, Any]:
     """Stage 2 begins at the cap in all variants, so that their curves part there and not before."""
-    options = parse_options(given).resolved()
+    options = parse_options(given).resolved("cpu")
     return {
         **given,
         "steps": options.steps,
         "coarse_steps_min": options.coarse_steps_max,
         "coarse_steps_max": options.coarse_steps_max,
-        "check_every": max(5, int(options.warmup_steps or 0) // CHECKS_PER_WARMUP),
+        "check_every": max(5, options.warmup_steps // CHECKS_PER_WARMUP),
     }
 
 

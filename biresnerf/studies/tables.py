@@ -48,7 +48,7 @@ METRICS = (
     Metric("fine_s", "stage 2 s", 1, lambda o: o.seconds["fine"]),
     Metric("optimisation_s", "both s", 1, lambda o: o.optimisation_s, tested=True),
     Metric("peak_mb", "memory MB", 0, lambda o: o.peak_memory_bytes / 2**20, _most),
-    Metric("steps", "steps", 0, lambda o: float(o.options.steps or 0)),
+    Metric("steps", "steps", 0, lambda o: float(o.options.steps)),
     # A method of one stage is in its last from the first step: no reason, no switch.
     Metric("switch_step", "switch", 0, lambda o: float(o.switch_step or 0) if o.switch_reason else None),
 )

@@ -9,8 +9,8 @@ from urllib.parse import quote
 from pydantic import ConfigDict, Field
 
 from biresnerf.options.refine_options import PackName, RefineOptions
-from biresnerf.progress import ReusableStage, Stage
 from biresnerf.report import VerdictName
+from biresnerf.stages import ReusableStage, Stage
 from biresnerf.wire.base import Labels, Record
 from biresnerf.wire.datasets import dataset_url
 from biresnerf.wire.problems import JobError

@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from biresnerf.options.refine_options import PresetName, RefineOptions
+from biresnerf.options.presets import PresetName
+from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.wire.base import Record
 from biresnerf.wire.jobs import JobState, PriorityName
 
@@ -29,7 +30,7 @@ class OptionsView(Record):
     """What may be asked for: the JSON Schema of `options`, and every preset with all values filled in."""
 
     json_schema: dict[str, Any]
-    presets: dict[PresetName, RefineOptions]
+    presets: dict[PresetName, ResolvedOptions]
 
 
 class SizeLimits(Record):

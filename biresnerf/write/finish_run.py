@@ -50,7 +50,7 @@ class Run:
         self.report(Progress(stage="evaluating", fraction=LAST_FRACTION))
         fit_held_out_poses(optimiser, self.given.untaught)
         views = held_out or list(range(min(SHOWN_WITHOUT_HELD_OUT, len(self.given.dataset))))
-        frames, more = int(optimiser.options.orbit_frames or 0), int(optimiser.options.shown_views or 0)
+        frames, more = optimiser.options.orbit_frames, optimiser.options.shown_views
         further = spread_views(self.given.dataset.world_from_cam, views, more)
         work = len(views) + len(further) + frames
         rendering_from = time.monotonic()

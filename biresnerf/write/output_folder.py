@@ -27,7 +27,6 @@ from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.options.refine_options import PackName
-from biresnerf.progress import ReusableStage
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.stages.checkpoint import CHECKPOINT, MATCHES, SEEDING
 from biresnerf.refine.stages.history import HISTORY
@@ -39,6 +38,7 @@ from biresnerf.refine.verdict.run_report import run_report
 from biresnerf.refine.views.evaluation import ViewScore, render_view
 from biresnerf.refine.views.shown_views import Points, Shown
 from biresnerf.report import PointsReport, Report
+from biresnerf.stages import ReusableStage
 from biresnerf.viewer.report_html import write_report_html
 
 logger = logging.getLogger(__name__)

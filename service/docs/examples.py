@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from biresnerf.options.refine_options import PRESETS, RefineOptions
+from biresnerf.options.presets import PRESETS
+from biresnerf.options.refine_options import RefineOptions
 from service.docs.webhook_examples import WEBHOOK_EXAMPLES
 
 _AT = "2026-11-21T19:00:00Z"
 _SHA256 = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
 _DATASET_ID, _JOB_ID = "ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB", "job_01JD8Y3V1QKZ5M0C7W2N4T6XAB"
 _DATASET, _JOB = f"/v1/datasets/{_DATASET_ID}", f"/v1/jobs/{_JOB_ID}"
-_OPTIONS = RefineOptions(preset="fast").resolved().model_dump(mode="json")
+_OPTIONS = RefineOptions(preset="fast").resolved("cpu").model_dump(mode="json")
 
 _JOB_VIEW: dict[str, Any] = {
     "id": _JOB_ID,
@@ -208,6 +209,8 @@ EXAMPLES: dict[str, Any] = {
     },
     "OptionsView": {
         "json_schema": {"type": "object", "properties": {"steps": {"type": "integer"}}},
-        "presets": {name: RefineOptions(preset=name).resolved().model_dump(mode="json") for name in PRESETS},
+        "presets": {
+            name: RefineOptions(preset=name).resolved("cpu").model_dump(mode="json") for name in PRESETS
+        },
     },
 }

@@ -8,7 +8,8 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Response
 
 from biresnerf import __version__
-from biresnerf.options.refine_options import PRESETS, RefineOptions
+from biresnerf.options.presets import PRESETS
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.service import Info, OptionsView, SizeLimits
 from service.http.access import CallerHere
 from service.http.http_conditionals import none_match
@@ -31,7 +32,7 @@ async def get_options(
     """JSON Schema of the options, and the presets with every value filled in."""
     view = OptionsView(
         json_schema=RefineOptions.model_json_schema(),
-        presets={name: RefineOptions(preset=name).resolved() for name in PRESETS},
+        presets={name: RefineOptions(preset=name).resolved("cpu") for name in PRESETS},
     )
     etag = f'"{hashlib.sha256(view.model_dump_json().encode()).hexdigest()[:32]}"'
     headers = {"ETag": etag, "Cache-Control": "max-age=300"}

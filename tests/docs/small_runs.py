@@ -39,7 +39,7 @@ SMALL = {
 
 def made_small(options: RefineOptions) -> RefineOptions:
     """The same choices, small. The options must be good as they stand."""
-    options.resolved()
+    options.resolved("cpu")
     chosen = {key: getattr(options, key) for key in KEPT}
     return parse_options({**SMALL, **{key: value for key, value in chosen.items() if value is not None}})
 

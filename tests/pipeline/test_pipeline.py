@@ -22,11 +22,12 @@ from biresnerf.errors import InputError
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import PoseError, pose_error, rotation_between_deg
 from biresnerf.geometry.similarity import Similarity
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.pipeline import refine_poses
-from biresnerf.progress import STAGES, Progress
+from biresnerf.progress import Progress
 from biresnerf.refine.stages.checkpoint import CHECKPOINT
 from biresnerf.report import Report
+from biresnerf.stages import STAGES
 from biresnerf.viewer.report_html import BUNDLE
 
 VIEWS, HELD_OUT = 30, 3
@@ -152,7 +153,7 @@ def test_the_report_is_valid_and_agrees_with_the_poses(run):
     assert report.resumed == 0
     assert report.backend == "cpu"
     assert report.working_size == (56, 56)
-    assert report.options == OPTIONS.resolved()
+    assert report.options == OPTIONS.resolved("cpu")
     assert set(report.seconds) == {"preparing", "coarse", "fine", "evaluating", "judging"}
     refined = run.refined()
     assert [image.name for image in report.images] == [f"./train/r_{i}" for i in range(VIEWS)]
@@ -191,7 +192,9 @@ def test_renders_and_the_orbit_can_be_looked_at(run):
 
 
 def test_options_as_used_lie_beside_the_result(run):
-    assert RefineOptions.model_validate_json((run.output / "config.json").read_text()) == OPTIONS.resolved()
+    assert ResolvedOptions.model_validate_json((run.output / "config.json").read_text()) == OPTIONS.resolved(
+        "cpu"
+    )
 
 
 def test_a_finished_folder_holds_results_only(run):

@@ -12,7 +12,7 @@ import pytest
 from biresnerf.data.formats.simple.poses_json import matrix_of, read_poses_json
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import InputError
-from biresnerf.options.refine_options import STAGE_2_OPTIONS, RefineOptions
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
 
@@ -76,7 +76,3 @@ def test_stage_1_of_other_options_is_refused(
     with pytest.raises(InputError) as caught:
         forked(scene, coarse, tmp_path / "out", OPTIONS.model_copy(update=change))
     assert caught.value.code == "stage_1_not_usable"
-
-
-def test_the_options_of_stage_2_are_options():
-    assert set(RefineOptions.model_fields) > STAGE_2_OPTIONS

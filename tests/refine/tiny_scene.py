@@ -39,7 +39,7 @@ def tiny_options(**changed) -> RefineOptions:
         "holdout": 1,
         "orbit_frames": 0,
     }
-    return RefineOptions(**{**values, **changed}).resolved()
+    return RefineOptions(**{**values, **changed}).resolved("cpu")
 
 
 def tiny_set(folder: Path, views: int = 7, size: int = 24) -> tuple[Dataset, ImageSet]:

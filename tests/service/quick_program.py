@@ -42,7 +42,7 @@ if order.get("task") == "export":
     for form in order["options"]["formats"]:
         (output / f"{form}.txt").write_text("exported")
     sys.exit(0)
-options = parse_options(order["options"]).resolved().model_dump(mode="json")
+options = parse_options(order["options"]).resolved("cpu").model_dump(mode="json")
 steps, step_s = options["steps"], options["seed"] / 1000
 tell("preparing", 0)
 sys.stderr.write("images read\nline 2\n")

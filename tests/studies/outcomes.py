@@ -25,7 +25,7 @@ def outcome(noise: float, seed: int = 1, psnr: float = 30.0, seconds: float = 8.
     error = pose_error(perturb_poses(TRUTH, noise, seed), TRUTH)
     values = {
         "version": "0",
-        "options": RefineOptions(preset="fast").resolved(),
+        "options": RefineOptions(preset="fast").resolved("cpu"),
         "before": pose_error(perturb_poses(TRUTH, 0.15, seed), TRUTH),
         "after": error,
         "cameras": tuple(

@@ -8,7 +8,8 @@ from typing import get_args
 import pytest
 
 from biresnerf.errors import InputError
-from biresnerf.options.refine_options import MethodName, RefineOptions
+from biresnerf.options.presets import MethodName
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.studies.cell import Cell, CellResult, Perturbation
 from biresnerf.studies.plan import Plan, Variant, run_plan, with_steps
 from biresnerf.studies.studies import STUDIES
@@ -78,7 +79,7 @@ def test_at_equal_time_the_others_get_the_steps_that_fit_the_firsts_time(ms, mea
 
     def run(wanted: Cell, title: str) -> CellResult:
         # The first takes 2 ms a step.
-        steps = wanted.options.resolved().steps
+        steps = wanted.options.resolved("cpu").steps
         asked.append(steps)
         each = 2.0 if wanted.options.pose_rate is None else ms
         return CellResult(cell=wanted, outcome=outcome(0.01, seconds=each * steps / 1000))
@@ -120,7 +121,7 @@ def test_a_shorter_run_keeps_its_proportions_even_where_they_were_set():
 def test_every_method_is_a_variant_that_can_be_shortened(method):
     options = plan().options(Variant(method, {"method": method}), scene(), Perturbation())
     assert options.method == method
-    assert with_steps(options, 300).resolved().steps == 300
+    assert with_steps(options, 300).resolved("cpu").steps == 300
 
 
 @pytest.mark.parametrize("name", STUDIES)
@@ -128,7 +129,7 @@ def test_a_study_has_options_that_can_be_run(name):
     study = STUDIES[name]
     made = plan(*study.variants, settings=study.settings({"preset": "fast", "steps": 600}))
     for variant in study.variants:
-        options = made.options(variant, scene(), Perturbation()).resolved()
+        options = made.options(variant, scene(), Perturbation()).resolved("cpu")
         assert options.steps == 600
         if study.swept:
             assert options.coarse_steps_min == options.coarse_steps_max == 600

@@ -96,7 +96,7 @@ for step in range(start + 1, plan["steps"] + 1):
         os.kill(os.getpid(), signal.SIGKILL)
     if step % plan.get("preview_every", 10**9) == 0:
         show(step)
-    size = parse_options(order["options"]).resolved().max_image_size or 0
+    size = parse_options(order["options"]).resolved("cpu").max_image_size or 0
     if plan.get("hungry", 0) and step == 3 and size > plan["hungry"]:
         sys.exit(4)  # as `workers.run.job_process` says that memory ran out
     if stopping and plan.get("slow_to_end"):

@@ -9,7 +9,7 @@ from psycopg import sql
 from psycopg.types.json import Jsonb
 
 from biresnerf.options.refine_options import PackName
-from biresnerf.progress import ReusableStage
+from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import Job, WantedStage
 from workers.database.database import Connection
 from workers.database.ids import new_id
@@ -55,7 +55,7 @@ class DerivedJobs(JobStore):
             if parent["kind"] != "refine":
                 raise Conflict("fork_not_possible", f"{job_id} is an export.")
             options, stage = plan_fork(parent, changes, wanted)
-            resolved = options.resolved().model_dump(mode="json")
+            resolved = options.resolved("cpu").model_dump(mode="json")
             fingerprint = fingerprint_of(f"fork {job_id} {stage}", resolved, labels)
             # Before anything is copied, which no quota counts until the fork is there.
             known = await self._known_or_room(connection, parent, idempotency_key, fingerprint)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from biresnerf.options.refine_options import STAGE_2_OPTIONS, RefineOptions, parse_options
-from biresnerf.progress import ReusableStage
+from biresnerf.options.refine_options import STAGE_1_OPTIONS, RefineOptions, parse_options
+from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import WantedStage
 from workers.settings.errors import Conflict
 
@@ -30,7 +30,7 @@ def plan_fork(
     # What memory did not allow would fail again.
     asked = {**(parent["asked"] or parent["options"]), **parent["smaller"], **changes}
     options = parse_options(asked)
-    new, old = options.resolved().model_dump(mode="json"), {**parent["options"], **parent["smaller"]}
+    new, old = options.resolved("cpu").model_dump(mode="json"), {**parent["options"], **parent["smaller"]}
     changed = {name for name in new if new[name] != old.get(name)}
     reasons = []
     for stage in LATEST_FIRST if wanted == "auto" else (wanted,):
@@ -47,7 +47,7 @@ def _why_not(
     if stage == "coarse":
         if stage not in reusable:
             return "The job has not come to the end of stage 1."
-        earlier = sorted(changed - STAGE_2_OPTIONS)
+        earlier = sorted(changed & STAGE_1_OPTIONS)
         return f"Stage 1 depends on {', '.join(earlier)}." if earlier else None
     if stage not in reusable:
         return "The job has no poses from COLMAP."

@@ -76,7 +76,7 @@ class JobStore:
         ``priority_not_allowed``), `LimitReached` (``queue_full``, ``quota_exhausted``),
         `InputError` (``webhook_url_refused``).
         """
-        resolved = options.resolved().model_dump(mode="json")
+        resolved = options.resolved("cpu").model_dump(mode="json")
         subject = request_with(request_digest or dataset_id, webhook)
         fingerprint = fingerprint_of(subject, resolved, labels, priority)
         async with self._database.transaction() as connection:
@@ -121,7 +121,7 @@ class JobStore:
 
         Raises `Conflict` (``idempotency_key_reused``) where the earlier request was a different one.
         """
-        resolved = options.resolved().model_dump(mode="json")
+        resolved = options.resolved("cpu").model_dump(mode="json")
         async with self._database.transaction() as connection:
             fingerprint = fingerprint_of(request_digest, resolved, labels, priority)
             return await known_job(connection, self._tenant or LOCAL_TENANT, idempotency_key, fingerprint)

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from psycopg.types.json import Jsonb
 
-from biresnerf.progress import ReusableStage
+from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import JobKind
 from biresnerf.wire.problems import JobError
 from workers.database.database import QUIET_S, Database

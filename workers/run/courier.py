@@ -11,7 +11,8 @@ from pathlib import Path
 
 from obstore.exceptions import BaseError as StoreError
 
-from biresnerf.progress import Progress, ReusableStage
+from biresnerf.progress import Progress
+from biresnerf.stages import ReusableStage
 from workers.run.claim import Fenced
 from workers.run.ledger import Ledger
 from workers.run.log_lines import LogLines

@@ -23,7 +23,8 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter
 from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.openmp import let_waiting_threads_sleep
 from biresnerf.options.refine_options import PackName, RefineOptions, parse_options
-from biresnerf.progress import Progress, Stage
+from biresnerf.progress import Progress
+from biresnerf.stages import Stage
 
 EXIT_BUG = 1
 EXIT_INPUT = 2

@@ -11,8 +11,9 @@ from typing import Any, TypeVar
 
 from psycopg.types.json import Jsonb
 
-from biresnerf.progress import Progress, ReusableStage
+from biresnerf.progress import Progress
 from biresnerf.report import VerdictName
+from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import EventType
 from biresnerf.wire.problems import JobError
 from workers.database.database import Connection, Database

@@ -9,7 +9,8 @@ from typing import Any
 import click
 
 from biresnerf.commands.answers import json_option, print_json, table
-from biresnerf.options.refine_options import PRESETS, RefineOptions
+from biresnerf.options.presets import PRESETS
+from biresnerf.options.refine_options import RefineOptions
 
 
 @click.command("bench")
@@ -68,14 +69,13 @@ def measured(options: RefineOptions, folder: Path, steps: int, views: int, size:
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.photos.images import load_images
     from biresnerf.data.synthetic.scene import write_synthetic_scene
-    from biresnerf.field.backends import choose_device, use_threads
+    from biresnerf.field.backends import resolve_here, use_threads
     from biresnerf.field.cpu.compile_kernels import compile_kernels
     from biresnerf.geometry.perturb import perturb_poses
     from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
     from biresnerf.refine.scene.scene_frame import scene_frame
 
-    device = choose_device(options.device)
-    resolved = options.model_copy(update={"device": "cuda" if device.type == "cuda" else "cpu"}).resolved()
+    resolved, device = resolve_here(options)
     threads = use_threads(options.threads)
     began = time.monotonic()
     if device.type == "cpu":

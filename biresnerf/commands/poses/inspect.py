@@ -10,7 +10,8 @@ import click
 
 from biresnerf.commands.answers import json_option, print_json
 from biresnerf.commands.settings_option import settings_option
-from biresnerf.options.refine_options import PRESETS, RefineOptions, parse_options
+from biresnerf.options.presets import PRESETS
+from biresnerf.options.refine_options import ResolvedOptions, parse_options
 
 if TYPE_CHECKING:
     from biresnerf.data.model.dataset import Dataset
@@ -31,10 +32,12 @@ def inspect_command(
 
     Everything is checked that `refine` checks before it starts, except pixels, unless --pixels asks for them.
     """
-    options = parse_options({**settings, **({"preset": preset} if preset else {})}).resolved()
+    asked = parse_options({**settings, **({"preset": preset} if preset else {})})
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.photos.images import load_images
+    from biresnerf.field.backends import resolve_here
 
+    options, _ = resolve_here(asked)
     dataset = read_dataset(input_path)
     missing_names = sorted(set(options.fixed) - {*dataset.names, *dataset.file_names})
     if pixels:
@@ -73,8 +76,8 @@ def contents(dataset: Dataset) -> dict[str, Any]:
     }
 
 
-def plan(dataset: Dataset, options: RefineOptions) -> dict[str, Any]:
-    """What `refine` would do with resolved options."""
+def plan(dataset: Dataset, options: ResolvedOptions) -> dict[str, Any]:
+    """What `refine` would do with these options."""
     from biresnerf.data.photos.images import working_size
 
     sizes = [
@@ -92,11 +95,11 @@ def plan(dataset: Dataset, options: RefineOptions) -> dict[str, Any]:
     }
 
 
-def start_in_words(dataset: Dataset, options: RefineOptions) -> str:
+def start_in_words(dataset: Dataset, options: ResolvedOptions) -> str:
     """Where the poses would come from that the optimisation starts from."""
     from biresnerf.data.seeding.match_poses import can_match
 
-    start, missing = options.start or "auto", int((~dataset.posed).sum())
+    start, missing = options.start, int((~dataset.posed).sum())
     none, all_given = missing == len(dataset), missing == 0
     if start == "given":
         if all_given:

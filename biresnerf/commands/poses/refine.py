@@ -18,7 +18,8 @@ from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option, print_json
 from biresnerf.commands.settings_option import settings_option
 from biresnerf.errors import Interrupted
-from biresnerf.options.refine_options import PRESETS, parse_options
+from biresnerf.options.presets import PRESETS
+from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import Progress
 from biresnerf.report import Report
 

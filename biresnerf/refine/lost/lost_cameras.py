@@ -66,7 +66,7 @@ class LostCameraRepair:
         if not optimiser.method.additions:
             return False
         if optimiser.switch is None:
-            least = float(options.coarse_steps_min or 0)
+            least = float(options.coarse_steps_min)
             points = [least] if optimiser.frame.unbounded else [FIRST_SHARE * least, least]
             return self._times < len(points) and optimiser.step_index >= points[self._times]
         steps = optimiser.schedule.steps

@@ -15,7 +15,7 @@ from biresnerf.field.backends import directions_for, make_occupancy
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
 from biresnerf.geometry.camera.camera import Intrinsics, directions_with_gradient
 from biresnerf.geometry.perturb import RIG_DISTANCE
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.optimise.async_metrics import LateFigures, StepResult
 from biresnerf.refine.optimise.camera_errors import CameraErrors
 from biresnerf.refine.optimise.methods import METHODS, build_field, occupancy_side
@@ -55,7 +55,7 @@ class JointOptimiser:
         images: ImageSet,
         frame: SceneFrame,
         unit_from_cam: np.ndarray,
-        options: RefineOptions,
+        options: ResolvedOptions,
         held_out: list[int],
         device: torch.device,
         threads: int,
@@ -84,7 +84,7 @@ class JointOptimiser:
         behind = frame.background if frame.background is not None else seen.mean(0) / 255
         self.background = torch.as_tensor(behind, dtype=torch.float32, device=device)
         around = self.background if frame.background is not None else None
-        self.exposure = Exposure(images, options.exposure or "auto", held_out, around, device)
+        self.exposure = Exposure(images, options.exposure, held_out, around, device)
         self.step_index = 0
         # The step that stage 2 began at. What has one stage is in its last from the first step on.
         self.switch: int | None = None if self.method.two_stages else 0
@@ -122,7 +122,7 @@ class JointOptimiser:
             length,
             self.device,
             betas=self.method.pose_betas,
-            double_step=bool(options.double_pose_step),
+            double_step=options.double_pose_step,
             preconditioner=preconditioner,
             body=torch.from_numpy(self.bodies.of),
         )

@@ -15,7 +15,8 @@ from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldShape, RadianceField
 from biresnerf.field.reference.mlp_field import MlpField
 from biresnerf.geometry.perturb import RIG_DISTANCE
-from biresnerf.options.refine_options import MethodName, RefineOptions
+from biresnerf.options.presets import MethodName
+from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.optimise.loss import Loss, half_squared_error, squared_error
 from biresnerf.refine.optimise.published_schedules import BarfSchedule, OneStageSchedule, PaperSchedule
 from biresnerf.refine.optimise.schedule import Schedule
@@ -79,7 +80,7 @@ METHODS: dict[MethodName, Method] = {
 
 
 def build_field(
-    method: Method, options: RefineOptions, frame: SceneFrame, device: torch.device, threads: int
+    method: Method, options: ResolvedOptions, frame: SceneFrame, device: torch.device, threads: int
 ) -> RadianceField:
     """The method's radiance field at its start; `options` must be resolved."""
     if method.network or options.wiring == "residual":
@@ -94,10 +95,10 @@ def build_field(
             stratified=BARF_SAMPLES if method.field == "stratified network" else None,
         )
     hashed = grid_levels(
-        int(options.reconstruction_levels or 0),
-        int(options.reconstruction_resolution_min or 0),
-        int(options.reconstruction_resolution_max or 0),
-        int(options.table_size_log2 or 0),
+        options.reconstruction_levels,
+        options.reconstruction_resolution_min,
+        options.reconstruction_resolution_max,
+        options.table_size_log2,
     )
     if method.field == "one grid":
         shape = FieldShape(hashed, grid_levels(0, 1, 1, 0), frame.unbounded, broadcast=True)
@@ -109,9 +110,9 @@ def build_field(
     return make_field(shape, options.seed, device, threads)
 
 
-def occupancy_side(method: Method, options: RefineOptions) -> int:
+def occupancy_side(method: Method, options: ResolvedOptions) -> int:
     """Cells a side of the occupancy grid."""
     if not method.fine_occupancy:
-        return 64 if int(options.samples_per_step or 0) <= 2**16 else 128
-    size = int(options.max_image_size or 0)  # 128 in the publications, for images of 400 px
+        return 64 if options.samples_per_step <= 2**16 else 128
+    size = options.max_image_size  # 128 in the publications, for images of 400 px
     return 128 if size > 200 else 64 if size > 64 else 32

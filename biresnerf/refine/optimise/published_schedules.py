@@ -33,10 +33,10 @@ class PlainSchedule(Schedule):
         return 1.0 if step < self.first_looks * self.steps else EMPTY_LOOKED_AT[0]
 
     def pose_rate(self, step: int, switch: int | None) -> float:
-        return self._decayed("pose", step / self.steps)
+        return self._decayed_pose_rate(step / self.steps)
 
     def field_rates(self, step: int, switch: int | None) -> FieldRates:
-        rate = self._decayed("field", step / self.steps)
+        rate = self._decayed_field_rate(step / self.steps)
         return FieldRates(rate, rate, (), 0.0)
 
     def position_gradient(self, step: int, switch: int | None) -> PositionGradient:
@@ -47,7 +47,7 @@ class PaperSchedule(PlainSchedule):
     """The two stages with what the paper tells of: coarse-to-fine ray sampling, and a smooth warm-up at the switch."""
 
     def _warmed(self, step: int, switch: int) -> float:
-        return smooth_ramp((step - switch + 1) / self._option("warmup_steps"))
+        return smooth_ramp((step - switch + 1) / self.options.warmup_steps)
 
     def pose_rate(self, step: int, switch: int | None) -> float:
         rate = super().pose_rate(step, switch)
@@ -57,9 +57,9 @@ class PaperSchedule(PlainSchedule):
         rates = super().field_rates(step, switch)
         if switch is None:
             return rates
-        high = self._decayed("field", (step - switch) / max(1, self.steps - switch))
+        high = self._decayed_field_rate((step - switch) / max(1, self.steps - switch))
         high *= self._warmed(step, switch)
-        levels = int(self._option("reconstruction_levels"))
+        levels = self.options.reconstruction_levels
         return FieldRates(rates.pose, rates.networks, (high,) * levels, high)
 
 
@@ -70,7 +70,7 @@ class OneStageSchedule(PlainSchedule):
         return self.fine_interval
 
     def samples(self, step: int, switch: int | None) -> int:
-        return int(self._option("samples_per_step"))
+        return int(self.options.samples_per_step)
 
 
 class BarfSchedule(OneStageSchedule):

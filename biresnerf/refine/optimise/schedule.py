@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from biresnerf.field.radiance_field import FieldRates, PositionGradient
 from biresnerf.geometry.perturb import RIG_DISTANCE
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import ResolvedOptions
 
 COARSE_INTERVAL = 2.5e-2  # ray marching interval at the start, unit lengths: half a cell of the pose module
 FINE_INTERVAL = 3.3e-3  # BAA-NGP's 5e-3 in a box of side 3
@@ -55,7 +55,7 @@ class Schedule:
         distance: mean distance of the cameras from the scene, unit lengths.
     """
 
-    options: RefineOptions
+    options: ResolvedOptions
     pixel: float
     unbounded: bool = False
     distance: float = RIG_DISTANCE
@@ -68,27 +68,28 @@ class Schedule:
 
     @property
     def steps(self) -> int:
-        return int(self.options.steps or 0)
+        return self.options.steps
 
-    def _option(self, name: str) -> float:
-        return float(getattr(self.options, name))
+    def _decayed_pose_rate(self, share: float) -> float:
+        start, end = self.options.pose_rate, self.options.pose_rate_final
+        return start * (end / start) ** min(share, 1.0)
 
-    def _decayed(self, name: str, share: float) -> float:
-        start, end = self._option(f"{name}_rate"), self._option(f"{name}_rate_final")
+    def _decayed_field_rate(self, share: float) -> float:
+        start, end = self.options.field_rate, self.options.field_rate_final
         return start * (end / start) ** min(share, 1.0)
 
     def interval(self, step: int, switch: int | None) -> float:
         """Ray marching interval, unit lengths."""
         if switch is not None:
             return self.fine_interval
-        share = min(1.0, step / (RAMP_SHARE * self._option("coarse_steps_max")))
+        share = min(1.0, step / (RAMP_SHARE * self.options.coarse_steps_max))
         start = OPEN_COARSE_INTERVAL if self.unbounded else COARSE_INTERVAL
         return max(self.fine_interval, start * (self.fine_interval / start) ** share)
 
     def near(self, step: int, switch: int | None) -> float:
         """Distance that sampling starts at, as a share of the cameras' distance."""
         start, end = NEAR_SHARES
-        share = 1.0 if switch is not None else min(1.0, step / self._option("coarse_steps_max"))
+        share = 1.0 if switch is not None else min(1.0, step / self.options.coarse_steps_max)
         return start * (end / start) ** share
 
     def far(self, far: float) -> float:
@@ -97,15 +98,13 @@ class Schedule:
 
     def samples(self, step: int, switch: int | None) -> int:
         """Samples a step: half of the budget at the start of stage 1, all of it from its end."""
-        share = (
-            1.0 if switch is not None else min(1.0, step / (RAMP_SHARE * self._option("coarse_steps_max")))
-        )
-        budget = self._option("samples_per_step") * (OPEN_SAMPLES if self.unbounded else 1)
+        share = 1.0 if switch is not None else min(1.0, step / (RAMP_SHARE * self.options.coarse_steps_max))
+        budget = self.options.samples_per_step * (OPEN_SAMPLES if self.unbounded else 1)
         return int(budget * 2 ** (share - 1))
 
     def pruned(self, step: int) -> bool:
         """Whether empty space may be skipped."""
-        return step >= UNPRUNED_SHARE * self._option("coarse_steps_min")
+        return step >= UNPRUNED_SHARE * self.options.coarse_steps_min
 
     def dilated(self, switch: int | None) -> bool:
         """Whether neighbours of occupied cells are looked into."""
@@ -120,7 +119,7 @@ class Schedule:
 
     def blur(self, step: int, switch: int | None, long_side: float) -> float:
         """Standard deviation (px) that photos are blurred with, before its random factor."""
-        end = BLUR_END_SHARE * self._option("coarse_steps_max")
+        end = BLUR_END_SHARE * self.options.coarse_steps_max
         if switch is not None or step >= end:
             return 0.0
         start = BLUR_PIXELS * long_side
@@ -132,10 +131,10 @@ class Schedule:
             return 0.0
         rise = POSE_START / 40_000 * self.steps
         if self.unbounded:
-            rise = max(rise, OPEN_POSE_START * self._option("coarse_steps_min"))
-        rate = smooth_ramp(step / rise) * self._decayed("pose", step / self.steps)
+            rise = max(rise, OPEN_POSE_START * self.options.coarse_steps_min)
+        rate = smooth_ramp(step / rise) * self._decayed_pose_rate(step / self.steps)
         if switch is not None:
-            warmup = 2 * self._option("warmup_steps")
+            warmup = 2 * self.options.warmup_steps
             share = POSE_DIP + (1 - POSE_DIP) * smooth_ramp((step - switch) / warmup)
             rate = min(rate, POSE_STAGE2_CAP) * share
         return rate
@@ -149,21 +148,21 @@ class Schedule:
 
     def lens_rate(self, step: int, switch: int | None) -> float:
         """Learning rate of the intrinsics: a share of the poses', later: what these can explain is theirs."""
-        start = LENS_START * self._option("coarse_steps_min")
+        start = LENS_START * self.options.coarse_steps_min
         return LENS_SHARE * self.pose_rate(step, switch) * smooth_ramp((step - start) / start)
 
     def field_rates(self, step: int, switch: int | None) -> FieldRates:
         """Learning rates of the field: smooth warm-up of the reconstruction module after the switch."""
-        rate = smooth_ramp(step / (FIELD_START / 40_000 * self.steps)) * self._decayed(
-            "field", step / self.steps
+        rate = smooth_ramp(step / (FIELD_START / 40_000 * self.steps)) * self._decayed_field_rate(
+            step / self.steps
         )
         if switch is None:
             return FieldRates(rate, rate, (), 0.0)
-        warmup = self._option("warmup_steps")
+        warmup = self.options.warmup_steps
         q = (step - switch + 1) / warmup
         rate *= FIELD_DIP + (1 - FIELD_DIP) * smooth_ramp(q)
-        high = smooth_ramp(q) * self._decayed("field", (step - switch) / max(1, self.steps - switch))
-        levels = int(self._option("reconstruction_levels"))
+        high = smooth_ramp(q) * self._decayed_field_rate((step - switch) / max(1, self.steps - switch))
+        levels = self.options.reconstruction_levels
         # Level by level, about three at a time; the last opens as the warm-up ends.
         opened = [smooth_ramp(6 * q - 5 * level / max(1, levels - 1)) for level in range(levels)]
         return FieldRates(rate, rate, tuple(high * r for r in opened), high)
@@ -172,7 +171,7 @@ class Schedule:
         """Straight-through smoothing, and how much of the reconstruction module's gradient reaches the poses."""
         if switch is None:
             return PositionGradient(1.0, 0.0, 0.0)
-        share = smooth_ramp((step - switch) / self._option("warmup_steps") - 1)
+        share = smooth_ramp((step - switch) / self.options.warmup_steps - 1)
         half = (switch + self.steps) / 2
         smoothing = 1.0 - smooth_ramp((step - half) / max(1.0, self.steps - half))
         return PositionGradient(1.0, smoothing, share)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.errors import InputError
 from biresnerf.geometry.similarity import Similarity, align_robust
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import ResolvedOptions
 
 # Fixed centres nearer to each other than this share of the rig's spread leave its scale open.
 _APART = 1e-6
@@ -100,7 +100,7 @@ def _scale_about(centre: NDArray[np.float64], a: NDArray[np.float64], b: NDArray
     return float(np.median(far_b[some] / far_a[some])) if some.any() else 1.0
 
 
-def rigid_bodies(dataset: Dataset, options: RefineOptions) -> RigidBodies:
+def rigid_bodies(dataset: Dataset, options: ResolvedOptions) -> RigidBodies:
     """The bodies of a set: one for each moment of a COLMAP rig with several cameras, one for every other image.
 
     ``options.fixed`` names images as the input writes them or by their path relative to its folder.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from biresnerf.errors import RefinementError
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.progress import OnProgress, Progress, ReusableStage
+from biresnerf.progress import OnProgress, Progress
 from biresnerf.refine.lost.lost_cameras import LostCameraRepair
 from biresnerf.refine.optimise.async_metrics import StepResult
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
@@ -23,6 +23,7 @@ from biresnerf.refine.stages.history import History, Observer
 from biresnerf.refine.stages.previews import Previews
 from biresnerf.refine.stages.run_record import RunRecord
 from biresnerf.refine.stages.stability import StabilityDetector
+from biresnerf.stages import ReusableStage
 
 logger = logging.getLogger(__name__)
 
@@ -69,8 +70,8 @@ class TwoStages:
         self.repair = LostCameraRepair(optimiser)
         options = optimiser.options
         self.detector = StabilityDetector(
-            int(options.coarse_steps_min or 0),
-            int(options.coarse_steps_max or 0),
+            options.coarse_steps_min,
+            options.coarse_steps_max,
             options.detector,
             guarded=optimiser.method.additions,
         )
@@ -114,7 +115,7 @@ class TwoStages:
             stage = self.stage
             # Also where the period does not divide the cap: stage 2 must not wait, or never come.
             due = optimiser.step_index == self.detector.cap and optimiser.switch is None
-            if due or optimiser.step_index % int(options.check_every or 1) == 0:
+            if due or optimiser.step_index % options.check_every == 0:
                 self._check(result)
             now = time.monotonic()
             self.record.seconds[stage] += now - started
@@ -147,7 +148,7 @@ class TwoStages:
             self._write_history(error, last)
             self._repair_if_due()
             return
-        still_deg = self.detector.still_deg(optimiser.pose_rate(), int(optimiser.options.check_every or 1))
+        still_deg = self.detector.still_deg(optimiser.pose_rate(), optimiser.options.check_every)
         verdict = self.detector.check(optimiser.step_index, error, self._moved_deg, still_deg)
         self._signal = {"still_deg": still_deg, **self.detector.signal()}
         self._write_history(error, last)
@@ -215,7 +216,7 @@ class TwoStages:
         done, total = optimiser.step_index, optimiser.schedule.steps
         coarse = self._step_seconds["coarse"] or self._step_seconds["fine"] / FINE_COST
         fine = self._step_seconds["fine"] or coarse * FINE_COST
-        switch = int(options.coarse_steps_max or 0) if optimiser.switch is None else optimiser.switch
+        switch = options.coarse_steps_max if optimiser.switch is None else optimiser.switch
         left = max(0, switch - done) * coarse + (total - max(done, switch)) * fine
         spent = sum(self.record.seconds.values())
         share = spent / max(spent + left, 1e-9)

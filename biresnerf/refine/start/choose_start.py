@@ -17,7 +17,7 @@ from biresnerf.data.model.dataset import GUESSES
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.seeding.seed_poses import PoseCandidate
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.refine.optimise.methods import METHODS
 from biresnerf.refine.start.frozen_trials import FrozenTrials, trial_views
 from biresnerf.report import PoseSource, TrialReport
@@ -90,7 +90,7 @@ class Start:
         """Each camera's factor of the pose rate [2, n] in stage 1 and stage 2."""
         return np.where(self.placed[None], np.array(MATCHED_MOBILITY)[:, None], 1.0)
 
-    def stage_lengths(self, asked: RefineOptions, resolved: RefineOptions) -> RefineOptions:
+    def stage_lengths(self, asked: RefineOptions, resolved: ResolvedOptions) -> ResolvedOptions:
         """`resolved` with a shorter stage 1 where matches have placed most cameras, unless one was `asked` for."""
         if self.placed.mean() < MOSTLY_PLACED or not METHODS[resolved.method].additions:
             return resolved
@@ -116,7 +116,7 @@ class Start:
 def choose_start(
     candidates: list[Start],
     images: ImageSet,
-    options: RefineOptions,
+    options: ResolvedOptions,
     device: torch.device,
     threads: int,
     should_stop: Callable[[], bool],

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import InputError, Interrupted
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene_frame import SceneFrame, scene_frame
 from biresnerf.refine.start.frozen_trials import trial_views
@@ -44,7 +44,7 @@ class Found:
 
 def find_forward_facing(
     images: ImageSet,
-    options: RefineOptions,
+    options: ResolvedOptions,
     device: torch.device,
     threads: int,
     should_stop: Callable[[], bool],
@@ -121,7 +121,7 @@ def _short_run(
     images: ImageSet,
     frame: SceneFrame,
     world_from_cam: NDArray[np.float64],
-    options: RefineOptions,
+    options: ResolvedOptions,
     steps: int,
     device: torch.device,
     threads: int,
@@ -134,7 +134,7 @@ def _short_run(
             "steps": steps,
             "coarse_steps_min": steps // 4,
             "coarse_steps_max": steps,
-            "samples_per_step": min(SAMPLES, int(options.samples_per_step or SAMPLES)),
+            "samples_per_step": min(SAMPLES, options.samples_per_step),
         }
     )
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)

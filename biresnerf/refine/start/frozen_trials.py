@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from biresnerf.data.model.dataset import Camera
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import Interrupted
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.optimise.photo_sampler import PhotoSampler
 from biresnerf.refine.scene.scene_frame import scene_frame
@@ -69,7 +69,7 @@ class FrozenTrials:
         images: ImageSet,
         unseen: Sequence[int],
         rigs: Sequence[NDArray[np.float64]],
-        options: RefineOptions,
+        options: ResolvedOptions,
         steps: int,
         device: torch.device,
         threads: int,
@@ -86,7 +86,7 @@ class FrozenTrials:
                 "steps": self.steps,
                 "coarse_steps_min": self.steps,
                 "coarse_steps_max": self.steps,
-                "samples_per_step": min(SAMPLES, int(options.samples_per_step or SAMPLES)),
+                "samples_per_step": min(SAMPLES, options.samples_per_step),
             }
         )
         self._device, self._threads, self._should_stop = device, threads, should_stop

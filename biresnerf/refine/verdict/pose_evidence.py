@@ -15,7 +15,7 @@ from biresnerf.data.points.feature_matches import FeatureMatches
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project
 from biresnerf.geometry.epipolar import epipolar_angles
 from biresnerf.geometry.focus import focus_point
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.scene.scene_depth import match_rays
 from biresnerf.refine.start.frozen_trials import FrozenTrials, TrialScores, joined
 from biresnerf.refine.verdict.verdict import EPIPOLAR_MATTERS, PSNR_MATTERS, SSIM_MATTERS, paired
@@ -69,7 +69,7 @@ def compare_on_unseen_views(
     after: Rig,
     images: ImageSet,
     held_out: Sequence[int],
-    options: RefineOptions,
+    options: ResolvedOptions,
     device: torch.device,
     threads: int,
     should_stop: Callable[[], bool],
@@ -82,7 +82,7 @@ def compare_on_unseen_views(
     Raises:
         Interrupted: ``should_stop`` said so.
     """
-    steps = int(options.trial_steps or 0)
+    steps = options.trial_steps
     rounds = unseen_rounds(len(images), held_out, most=16)
     if steps == 0 or not rounds[0]:
         return None

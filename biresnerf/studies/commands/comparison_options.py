@@ -17,7 +17,7 @@ from biresnerf.commands.answers import json_option, print_json
 from biresnerf.commands.machine.this_machine import describe_machine
 from biresnerf.commands.settings_option import parse_settings, settings_option
 from biresnerf.errors import InputError
-from biresnerf.options.refine_options import PRESETS
+from biresnerf.options.presets import PRESETS
 
 if TYPE_CHECKING:
     from biresnerf.studies.cell import Perturbation

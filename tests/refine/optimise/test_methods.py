@@ -13,7 +13,8 @@ from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_robust
-from biresnerf.options.refine_options import METHOD_VALUES, PRESETS, RefineOptions
+from biresnerf.options.presets import METHOD_VALUES, PRESETS
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
 from biresnerf.refine.optimise import methods
@@ -161,18 +162,20 @@ def test_a_camera_that_strays_from_a_formed_field_comes_back(tmp_path, method):
 def test_a_method_keeps_its_published_rates_and_grid_in_every_preset_and_yields_to_what_is_asked():
     for preset in PRESETS:
         for method, values in METHOD_VALUES.items():
-            options = RefineOptions(preset=preset, method=method).resolved()
+            options = RefineOptions(preset=preset, method=method).resolved("cpu")
             assert {key: getattr(options, key) for key in values} == values
-    asked = RefineOptions(preset="paper", method="baa-ngp", pose_rate=2e-3, double_pose_step=False).resolved()
+    asked = RefineOptions(preset="paper", method="baa-ngp", pose_rate=2e-3, double_pose_step=False).resolved(
+        "cpu"
+    )
     assert (asked.pose_rate, asked.double_pose_step, asked.pose_rate_final) == (2e-3, False, 1e-5)
 
 
 def test_the_paper_preset_has_each_method_at_its_published_length_and_batch():
     def of(method):
-        options = RefineOptions(preset="paper", method=method).resolved()
+        options = RefineOptions(preset="paper", method=method).resolved("cpu")
         return options.steps, options.samples_per_step, options.table_size_log2
 
     assert of("baa-ngp") == of("biresnerf-paper") == of("biresnerf") == (40_000, 2**18, 19)
     assert of("barf")[:2] == (200_000, 1024 * 128)
     assert of("nerfacc-barf")[0] == 200_000
-    assert RefineOptions(preset="fast", method="barf").resolved().steps == PRESETS["fast"]["steps"]
+    assert RefineOptions(preset="fast", method="barf").resolved("cpu").steps == PRESETS["fast"]["steps"]

@@ -15,7 +15,7 @@ ONE_STAGE = ("baa-ngp", "nerfacc-barf", "barf")
 
 
 def schedule(method: str, *, unbounded: bool = False, steps: int | None = None) -> Schedule:
-    options = RefineOptions(preset="paper", method=method, steps=steps).resolved()
+    options = RefineOptions(preset="paper", method=method, steps=steps).resolved("cpu")
     return METHODS[method].schedule(options, 0.005, unbounded, DISTANCE)
 
 

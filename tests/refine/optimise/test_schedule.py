@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from biresnerf.options.refine_options import PRESETS, RefineOptions
+from biresnerf.options.presets import PRESETS
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refine.optimise.schedule import FREEZE_SHARE, Schedule, smooth_ramp
 
 SMALL_JUMP = 0.15  # of the largest value; the shortest ramp takes 15 steps
@@ -13,7 +14,7 @@ SMALL_JUMP = 0.15  # of the largest value; the shortest ramp takes 15 steps
 
 @pytest.fixture(scope="module", params=list(PRESETS))
 def schedule(request):
-    return Schedule(RefineOptions(preset=request.param).resolved(), pixel=0.0125)
+    return Schedule(RefineOptions(preset=request.param).resolved("cpu"), pixel=0.0125)
 
 
 def switch_of(schedule: Schedule) -> int:
@@ -27,7 +28,7 @@ def largest_jump(values) -> float:
 
 def test_a_shorter_run_shortens_its_stages_but_not_what_it_is_judged_by():
     def of(steps):
-        options = RefineOptions(preset="fast", steps=steps).resolved()
+        options = RefineOptions(preset="fast", steps=steps).resolved("cpu")
         return options.coarse_steps_max, options.trial_steps
 
     full = PRESETS["fast"]

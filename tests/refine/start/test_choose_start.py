@@ -76,12 +76,12 @@ def test_stage_1_is_shorter_where_matches_placed_the_cameras_and_its_length_was_
     dataset, _ = scene
     given, matched = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
     open_options = RefineOptions(preset="fast")
-    resolved = open_options.resolved()
+    resolved = open_options.resolved("cpu")
     assert given.stage_lengths(open_options, resolved) == resolved
     shorter = matched.stage_lengths(open_options, resolved)
     assert (shorter.coarse_steps_min, shorter.coarse_steps_max) == (400, 800)
     fixed = RefineOptions(preset="fast", coarse_steps_min=500, coarse_steps_max=900)
-    assert matched.stage_lengths(fixed, fixed.resolved()) == fixed.resolved()
+    assert matched.stage_lengths(fixed, fixed.resolved("cpu")) == fixed.resolved("cpu")
 
 
 def test_cameras_that_matches_left_out_where_they_placed_most_are_not_sound(scene):

@@ -135,7 +135,7 @@ def test_unseen_views_hold_those_never_trained_on_and_spare_enough():
 
 @pytest.mark.parametrize("count", range(1, 40))
 def test_small_sets_are_looked_at_in_rounds_until_enough_views_were_unseen_or_all(count):
-    held_out = held_out_views(count, None)
+    held_out = held_out_views(count, "auto")
     rounds = unseen_rounds(count, held_out, 16)
     assert rounds[0] == unseen_views(count, held_out, 16)
     seen = [view for views in rounds for view in views]

@@ -13,7 +13,8 @@ import httpx
 import psutil
 import pytest
 
-from biresnerf.options.refine_options import PRESETS, RefineOptions
+from biresnerf.options.presets import PRESETS
+from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from service.app import create_app
 from service.commands.serve import free_port
 from tests.service.conftest import LIMITS, Running, problem, short_folder
@@ -30,7 +31,7 @@ def test_the_options_are_a_schema_and_resolved_presets(http: httpx.Client) -> No
     assert body["json_schema"] == RefineOptions.model_json_schema()
     assert set(body["presets"]) == set(PRESETS)
     for values in body["presets"].values():
-        assert RefineOptions.model_validate(values).resolved() == RefineOptions.model_validate(values)
+        assert RefineOptions.model_validate(values).resolved("cpu") == ResolvedOptions.model_validate(values)
         assert values["steps"] is not None
     assert http.get("/v1/options", headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
 

@@ -103,7 +103,7 @@ async def test_a_real_job_is_forked_and_exported(database_url: str, tmp_path: Pa
 
 
 PARENT = {
-    "options": SMALL.resolved().model_dump(mode="json"),
+    "options": SMALL.resolved("cpu").model_dump(mode="json"),
     "asked": SMALL.model_dump(mode="json", exclude_unset=True),
     "smaller": {},
     "reusable": {"seeding": {}, "coarse": {}},
