@@ -1,33 +1,50 @@
-"""The errors the library raises on purpose. Everything else is a bug."""
+"""The errors raised on purpose, and the fault they carry. Everything else is a bug."""
 
 from __future__ import annotations
+
+from typing import Any, Self
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Fault(BaseModel):
+    """What is wrong and how to fix it, the same in an exception, in a job's error and in an HTTP answer."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    code: str = Field(description="Stable machine-readable name in snake_case, such as `pose_file_invalid`.")
+    detail: str = Field(description="What is wrong, in one sentence.")
+    where: str = Field("", description="The file or entry at fault, and the field in it where there is one.")
+    hint: str = Field("", description="What to do about it.")
+
+    def __str__(self) -> str:
+        return " ".join(part for part in (self.where and f"{self.where}:", self.detail, self.hint) if part)
 
 
 class BiresnerfError(Exception):
     """Base of all errors raised on purpose."""
 
 
-class InputError(BiresnerfError):
-    """Something the user can fix.
+class FaultError(BiresnerfError):
+    """Base of the errors that carry a `Fault`; its fields can be read from the error, too."""
 
-    Args:
-        code: stable machine-readable name, snake_case (for example ``pose_file_invalid``).
-        what: what is wrong, in one sentence.
-        where: the file, and the field inside it where there is one.
-        hint: what to do about it.
-    """
+    def __init__(self, code: str, detail: str, *, where: str = "", hint: str = "") -> None:
+        self.fault = Fault(code=code, detail=detail, where=where, hint=hint)
+        self.code, self.detail, self.where, self.hint = code, detail, where, hint
+        super().__init__(str(self.fault))
 
-    def __init__(self, code: str, what: str, *, where: str = "", hint: str = "") -> None:
-        self.code, self.what, self.where, self.hint = code, what, where, hint
-        super().__init__(" ".join(part for part in (f"{where}:" if where else "", what, hint) if part))
+    @classmethod
+    def of(cls, fault: Fault, **others: Any) -> Self:
+        """An error of this class that carries ``fault``; ``others`` are the class's further arguments."""
+        return cls(fault.code, fault.detail, **{"where": fault.where, "hint": fault.hint} | others)
 
 
-class RefinementError(BiresnerfError):
-    """The optimisation could not go on (diverged, nothing to render). Carries a stable ``code``."""
+class InputError(FaultError):
+    """Something that the user can fix."""
 
-    def __init__(self, code: str, what: str) -> None:
-        self.code, self.what = code, what
-        super().__init__(what)
+
+class RefinementError(FaultError):
+    """The optimisation could not go on: it diverged, or there is nothing to render."""
 
 
 class Interrupted(BiresnerfError):

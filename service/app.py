@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Route
 
 from biresnerf import __version__
-from biresnerf.errors import InputError
+from biresnerf.errors import FaultError
 from service import web_page
 from service.docs import docs_page
 from service.docs.openapi import describe
@@ -23,7 +23,7 @@ from service.http.access import Access, say_who_is_let_in
 from service.http.dependencies import Service
 from service.http.metrics import WebMetrics
 from service.http.observe import Observed, is_probe
-from service.http.problems import CATALOGUE, ProblemError
+from service.http.problems import ProblemError, problem_of
 from service.http.request_context import RequestContext, render
 from service.intake.archive_import import take_upload
 from service.intake.json_body import validation_problem
@@ -43,7 +43,7 @@ from service.routes import (
 from service.routes import derived_jobs as job_life
 from workers.engine import open_stores
 from workers.process.watchdog import watched
-from workers.settings.errors import EngineError, NotFound, Unavailable
+from workers.settings.errors import NotFound, Unavailable
 from workers.settings.settings import Settings
 from workers.settings.traces import flush_traces
 
@@ -122,7 +122,7 @@ async def _check_unfinished(service: Service) -> None:
                 with contextlib.suppress(NotFound):  # deleted meanwhile
                     await service.stores.datasets.check(dataset_id)
         except Unavailable as error:
-            logger.warning("unfinished checks wait: %s", error.what)
+            logger.warning("unfinished checks wait: %s", error.detail)
         except Exception:
             logger.exception("a check failed on our side; it is tried again")
         await asyncio.sleep(_UNFINISHED_EVERY_S)
@@ -136,7 +136,7 @@ async def _tend_uploads(service: Service) -> None:
                 await take_upload(service, upload_id)
             await service.stores.uploads.expire()
         except Unavailable as error:
-            logger.warning("received uploads wait: %s", error.what)
+            logger.warning("received uploads wait: %s", error.detail)
         except Exception:
             logger.exception("an upload was not brought in on our side; it is tried again")
         await asyncio.sleep(_UNFINISHED_EVERY_S)
@@ -150,7 +150,7 @@ def _answer_with_problems(app: FastAPI) -> None:
             told.headers["Allow"] = ", ".join(_methods_at(request))
         return render(told, request)
 
-    for kind in (ProblemError, InputError, EngineError, RequestValidationError, HTTPException):
+    for kind in (FaultError, RequestValidationError, HTTPException):
         app.add_exception_handler(kind, problem)
 
 
@@ -166,17 +166,8 @@ def _methods_at(request: Request) -> list[str]:
 
 
 def _as_problem(error: Exception) -> ProblemError:
-    if isinstance(error, ProblemError):
-        return error
-    if isinstance(error, InputError):
-        return ProblemError.from_input_error(error)
-    if isinstance(error, NotFound):
-        return ProblemError("not_found", error.what)
-    if isinstance(error, EngineError):
-        code = error.code if error.code in CATALOGUE else "internal_error"
-        if code == "internal_error":
-            logger.error("engine error without a place in the catalogue: %s", error.code)
-        return ProblemError(code, error.what)
+    if isinstance(error, FaultError):
+        return problem_of(error)
     if isinstance(error, RequestValidationError):
         return validation_problem([{**item, "type": item["type"]} for item in error.errors()], below="")
     if isinstance(error, HTTPException):

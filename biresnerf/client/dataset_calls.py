@@ -65,7 +65,7 @@ def finalize(session: Session, dataset_id: str) -> Flow[DatasetView]:
     if found.state == "rejected":
         if found.error is None:
             raise ServiceError("dataset_invalid", "The service rejected the dataset.", status=422)
-        raise ServiceError.of_failure(found.error)
+        raise ServiceError.of(found.error, status=422)
     return found
 
 

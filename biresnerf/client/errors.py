@@ -8,9 +8,9 @@ from collections.abc import Mapping
 
 from pydantic import ValidationError
 
-from biresnerf.errors import BiresnerfError
+from biresnerf.errors import BiresnerfError, FaultError
 from biresnerf.wire.jobs import JobView
-from biresnerf.wire.problems import FieldProblem, JobError, Problem
+from biresnerf.wire.problems import FieldProblem, Problem
 
 # Answers that say: not now.
 _LATER = frozenset({408, 429, 502, 503, 504, 507})
@@ -18,7 +18,7 @@ _LATER = frozenset({408, 429, 502, 503, 504, 507})
 _REFUSED = frozenset({408, 429, 503, 507})
 
 
-class ServiceError(BiresnerfError):
+class ServiceError(FaultError):
     """The service refused, failed, or could not be reached.
 
     Attributes:
@@ -45,10 +45,9 @@ class ServiceError(BiresnerfError):
         retry_after_s: float | None = None,
         untouched: bool = False,
     ) -> None:
-        self.code, self.detail, self.status, self.where, self.hint = code, detail, status, where, hint
-        self.errors, self.request_id, self.retry_after_s = errors, request_id, retry_after_s
-        self._untouched = untouched
-        super().__init__(" ".join(part for part in (f"{where}:" if where else "", detail, hint) if part))
+        super().__init__(code, detail, where=where, hint=hint)
+        self.status, self.errors, self.request_id = status, errors, request_id
+        self.retry_after_s, self._untouched = retry_after_s, untouched
 
     @property
     def retryable(self) -> bool:
@@ -73,12 +72,9 @@ class ServiceError(BiresnerfError):
             problem = Problem.model_validate_json(content, extra="ignore")
         except ValidationError:
             return cls.of_stranger(status, request_id=headers.get("x-request-id"), retry_after_s=wait_s)
-        return cls(
-            problem.code,
-            problem.detail,
+        return cls.of(
+            problem,
             status=status,
-            where=problem.where or "",
-            hint=problem.hint or "",
             errors=tuple(problem.errors),
             request_id=problem.request_id,
             retry_after_s=wait_s,
@@ -98,11 +94,6 @@ class ServiceError(BiresnerfError):
             retry_after_s=retry_after_s,
         )
 
-    @classmethod
-    def of_failure(cls, error: JobError) -> ServiceError:
-        """What the check of a dataset or upload found wrong, as if it had been answered at once."""
-        return cls(error.code, error.detail, status=422, where=error.where, hint=error.hint)
-
 
 class JobFailed(BiresnerfError):
     """The job ended without the result that was waited for; ``job`` is how it ended."""
@@ -113,8 +104,7 @@ class JobFailed(BiresnerfError):
         if error is None:
             super().__init__(f"The job {job.id} is {job.state}.")
             return
-        parts = (f"The job {job.id} failed ({error.code}):", f"{error.where}:" if error.where else "")
-        super().__init__(" ".join(part for part in (*parts, error.detail, error.hint) if part))
+        super().__init__(f"The job {job.id} failed ({error.code}): {error}")
 
 
 class JobNotOver(BiresnerfError, TimeoutError):

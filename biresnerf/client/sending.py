@@ -145,6 +145,6 @@ def _until_stored(session: Session, address: str) -> Flow[None]:
         if upload.state == "stored":
             return
         if upload.error is not None:
-            raise ServiceError.of_failure(upload.error)
+            raise ServiceError.of(upload.error, status=422)
         yield Pause(pause_s)
         pause_s = min(1.5 * pause_s, _LONGEST_POLL_S)  # unpacking a large set takes a while

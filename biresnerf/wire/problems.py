@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from biresnerf.wire.base import Record
+from biresnerf.errors import Fault
 
 
 class FieldProblem(BaseModel):
@@ -18,11 +18,10 @@ class FieldProblem(BaseModel):
     detail: str
 
 
-class Problem(BaseModel):
+class Problem(Fault):
     """An error as RFC 9457 has it, with a stable `code`."""
 
     model_config = ConfigDict(
-        frozen=True,
         json_schema_extra={
             "examples": [
                 {
@@ -45,28 +44,18 @@ class Problem(BaseModel):
     type: str
     title: str
     status: int
-    detail: str
     instance: str | None = None
-    code: str
     request_id: str | None = None
     retryable: bool = False
-    where: str | None = Field(
-        None, description="The file or entry at fault, and the field in it where there is one."
-    )
-    hint: str | None = Field(None, description="What to do about it.")
     errors: list[FieldProblem] = Field(default_factory=list)
 
 
-class JobError(Record):
-    """Why a job failed.
+class JobError(Fault):
+    """Why a job, an upload or the check of a dataset failed.
 
-    ``code`` is the pipeline's own (InputError, RefinementError) or one of the engine's: ``timeout``,
-    ``out_of_memory``, ``too_many_crashes``, ``engine_error``. ``log_tail`` is the end of what the job wrote to stderr.
+    ``code`` is one of the library's (InputError, RefinementError) or of the engine's: ``timeout``,
+    ``out_of_memory``, ``too_many_crashes``, ``engine_error``.
     """
 
-    code: str
-    detail: str
-    where: str = ""
-    hint: str = ""
     retryable: bool = False
-    log_tail: str = ""
+    log_tail: str = Field("", description="The end of what the job's process wrote to standard error.")

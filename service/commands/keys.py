@@ -116,7 +116,7 @@ def revoke_command(key_id: str, as_json: bool, data_dir: Path | None) -> None:
     try:
         key = with_database(data_dir, lambda database: KeyStore(database).revoke(key_id))
     except NotFound as error:
-        raise InputError(error.code, error.what, hint="`biresnerf keys list` shows the ids.") from None
+        raise InputError.of(error.fault, hint="`biresnerf keys list` shows the ids.") from None
     click.echo(json.dumps(key.model_dump(mode="json")) if as_json else _line(key))
 
 

@@ -44,7 +44,7 @@ def setup_problems() -> Iterator[None]:
     try:
         yield
     except SetupError as error:
-        raise InputError(error.code, error.what) from None
+        raise InputError.of(error.fault) from None
     except ValidationError as error:
         lines = [
             f"BIRESNERF_{'_'.join(map(str, item['loc'])).upper()}: {item['msg']}." for item in error.errors()

@@ -23,7 +23,7 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.dependencies import Service, service_of
-from service.http.problems import ProblemError
+from service.http.problems import ProblemError, problem_of
 from service.http.rate_limits import Allowance, Buckets
 from workers.datasets.datasets import DatasetStore
 from workers.datasets.uploads import UploadStore
@@ -147,7 +147,7 @@ class Access:
         try:
             return await identify(service_of(request), request)
         except Unavailable as error:  # here, above the routes, nobody else makes a 503 of it
-            raise ProblemError(error.code, error.what) from None
+            raise problem_of(error) from None
         except ProblemError as refusal:
             # Who shows a key that holds is never stopped for what others send from the same address.
             if refusal.status == 401:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from http import HTTPStatus
 from typing import Any
 
-from biresnerf.errors import InputError
+from biresnerf.errors import FaultError
 from biresnerf.wire.problems import FieldProblem, Problem
+from workers.settings.errors import EngineError
+
+logger = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = "5"
@@ -78,7 +82,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
 }
 
 
-class ProblemError(Exception):
+class ProblemError(FaultError):
     """Raised anywhere in the service to answer with a problem; the catalogue gives status and title."""
 
     def __init__(
@@ -86,22 +90,16 @@ class ProblemError(Exception):
         code: str,
         detail: str,
         *,
-        where: str | None = None,
-        hint: str | None = None,
+        where: str = "",
+        hint: str = "",
         errors: list[FieldProblem] | None = None,
         headers: dict[str, str] | None = None,
     ) -> None:
-        super().__init__(f"{code}: {detail}")
-        # Validation has codes of its own, which are all mistakes in the content.
+        super().__init__(code, detail, where=where, hint=hint)
+        # Codes of the library that are not in the catalogue are all mistakes in the content.
         self.status, self.title = CATALOGUE.get(code, (422, "The content cannot be used"))
-        self.code, self.detail, self.where, self.hint = code, detail, where, hint
         self.errors = errors or []
         self.headers = headers or {}
-
-    @classmethod
-    def from_input_error(cls, error: InputError) -> ProblemError:
-        """The same mistake as HTTP tells it."""
-        return cls(error.code, error.what, where=error.where or None, hint=error.hint or None)
 
     @property
     def retryable(self) -> bool:
@@ -119,18 +117,25 @@ class ProblemError(Exception):
     def problem(self, instance: str | None = None, request_id: str | None = None) -> Problem:
         """The body of the answer."""
         return Problem(
+            **dict(self.fault),
             type=f"urn:biresnerf:problem:{self.code}",
             title=self.title,
             status=self.status,
-            detail=self.detail,
             instance=instance,
-            code=self.code,
             request_id=request_id,
             retryable=self.retryable,
-            where=self.where,
-            hint=self.hint,
             errors=self.errors,
         )
+
+
+def problem_of(error: FaultError) -> ProblemError:
+    """The answer to an error of the library or of the engine."""
+    if isinstance(error, ProblemError):
+        return error
+    if isinstance(error, EngineError) and error.code not in CATALOGUE:
+        logger.error("engine error that is missing from the catalogue: %s", error.code)
+        return ProblemError("internal_error", error.detail)
+    return ProblemError.of(error.fault)
 
 
 def declared(*codes: str) -> dict[int | str, dict[str, Any]]:
@@ -152,4 +157,4 @@ def _example(code: str) -> dict[str, Any]:
     """The problem as it looks where there is nothing special to say."""
     title = CATALOGUE[code][1]
     problem = ProblemError(code, f"{title}.").problem("/v1/…", "5f1c0d9e6a0b4a3c")
-    return {"summary": title, "value": problem.model_dump(mode="json", exclude_none=True)}
+    return {"summary": title, "value": problem.model_dump(mode="json", exclude_defaults=True)}

@@ -10,17 +10,17 @@ import uuid
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-from biresnerf.errors import InputError
+from biresnerf.errors import FaultError
 from biresnerf.wire.datasets import DatasetRecord
 from biresnerf.wire.problems import JobError
 from service.http.dependencies import Service
-from service.http.problems import ProblemError
+from service.http.problems import ProblemError, problem_of
 from service.intake.sandboxed_child import Limits, run_confined
 from service.intake.unpack import UnpackRequest
 from service.intake.uploads import staging_folder, write_stream
 from workers.records import Upload
 from workers.run.claim import insist
-from workers.settings.errors import Conflict, EngineError, LimitReached, NotFound, Unavailable
+from workers.settings.errors import EngineError, NotFound, Unavailable
 
 logger = logging.getLogger(__name__)
 
@@ -118,7 +118,7 @@ async def take_upload(service: Service, upload_id: str) -> None:
         await _bring_in(service, await uploads.get(upload_id))
     except NotFound:
         return  # deleted meanwhile
-    except (ProblemError, InputError, EngineError) as error:
+    except FaultError as error:
         wrong = _clients_mistake(error)
         if wrong is None:
             raise
@@ -134,16 +134,11 @@ async def _renew(service: Service, upload_id: str, token: uuid.UUID) -> None:
             await service.stores.uploads.take(upload_id, token)
 
 
-def _clients_mistake(error: ProblemError | InputError | EngineError) -> JobError | None:
-    """The error where sending the same again would end the same; None where it is ours."""
-    if isinstance(error, ProblemError):
-        told = JobError(code=error.code, detail=error.detail, where=error.where or "", hint=error.hint or "")
-        return None if error.retryable or error.status >= 500 else told
-    if isinstance(error, InputError):
-        return JobError(code=error.code, detail=error.what, where=error.where, hint=error.hint)
-    if isinstance(error, Conflict | LimitReached) and error.code != "storage_full":
-        return JobError(code=error.code, detail=error.what)
-    return None
+def _clients_mistake(error: FaultError) -> JobError | None:
+    """The upload's error where sending the same again would fail again; None where the service is at fault."""
+    problem = problem_of(error)
+    service_at_fault = problem.status >= 500 or (problem.retryable and problem.code != "quota_exhausted")
+    return None if service_at_fault else JobError(**dict(problem.fault))
 
 
 async def _bring_in(service: Service, upload: Upload) -> None:
@@ -186,9 +181,7 @@ async def settle_uploads(service: Service, dataset_id: str) -> None:
     for upload in pending:
         give_up = f"or give it up: DELETE /v1/uploads/{upload.id}"
         if upload.error is not None:
-            error = upload.error
-            hint = f"{error.hint} Send it again, {give_up}.".strip()
-            raise ProblemError(error.code, error.detail, where=error.where or None, hint=hint)
+            raise ProblemError.of(upload.error, hint=f"{upload.error.hint} Send it again, {give_up}.".strip())
         raise ProblemError(
             "dataset_not_complete",
             f"Of the upload {upload.id}, {upload.received} of {upload.size} bytes have arrived.",

@@ -8,7 +8,7 @@ from biresnerf.errors import InputError
 from biresnerf.wire.datasets import DatasetRecord
 from biresnerf.wire.safe_paths import NameSet
 from service.http.access import Caller
-from service.http.problems import ProblemError
+from service.http.problems import ProblemError, problem_of
 from service.intake.archive_import import settle_uploads
 
 
@@ -28,7 +28,7 @@ async def begin_check(caller: Caller, dataset_id: str) -> DatasetRecord:
             try:
                 names.add(file.path)
             except InputError as error:
-                raise ProblemError.from_input_error(error) from None
+                raise problem_of(error) from None
         if (cursor := page.next_cursor) is None:
             break
     dataset = await store.finalize(dataset_id)
@@ -47,5 +47,5 @@ async def finish_check(caller: Caller, dataset_id: str) -> DatasetRecord:
         error = dataset.error
         if error is None:
             raise ProblemError("dataset_invalid", "The check rejected the dataset.")
-        raise ProblemError(error.code, error.detail, where=error.where or None, hint=error.hint or None)
+        raise ProblemError.of(error)
     return dataset

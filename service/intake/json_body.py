@@ -76,7 +76,7 @@ def validation_problem(found: Iterable[Any], below: str = "#") -> ProblemError:
     return ProblemError(
         "invalid_options" if in_options else "invalid_request",
         "; ".join(f"{field.pointer}: {field.detail}" for field in fields[:10]),
-        hint="GET /v1/options lists the options and their ranges." if in_options else None,
+        hint="GET /v1/options lists the options and their ranges." if in_options else "",
         errors=fields[:100],
     )
 

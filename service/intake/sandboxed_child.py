@@ -1,7 +1,7 @@
 """Child programs that read what strangers sent: the parent waits with limits, the child confines itself.
 
 The web process never parses an archive or an image. A child takes one JSON request as its argument and
-answers with one JSON line: ``{"result": ...}`` or ``{"error": {"code", "what", "where", "hint"}}``.
+answers with one JSON line: ``{"result": ...}`` or ``{"error": a fault}``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from biresnerf.errors import InputError
+from biresnerf.errors import Fault, InputError
 from service.http.problems import ProblemError
 from workers.process.die_with_parent import tethered
 
@@ -83,7 +83,7 @@ def _read_answer(module: str, answer: bytes, log: bytes, status: int | None) -> 
         result: dict[str, Any] = content["result"]
         return result
     if "error" in content:
-        raise ProblemError.from_input_error(InputError(**content["error"]))
+        raise ProblemError.of(Fault.model_validate(content["error"]))
     logger.error("%s ended with status %s: %s", module, status, log[-2000:].decode(errors="replace"))
     raise ProblemError(
         "validation_resources",
@@ -103,7 +103,7 @@ def run_child(work: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
     try:
         answer: dict[str, Any] = {"result": work(request)}
     except InputError as error:
-        answer = {"error": {"code": error.code, "what": error.what, "where": error.where, "hint": error.hint}}
+        answer = {"error": error.fault.model_dump()}
     with os.fdopen(answer_to, "wb") as out:
         out.write(json.dumps(answer).encode() + b"\n")
 

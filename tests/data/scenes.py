@@ -76,7 +76,7 @@ def assert_complete(error: InputError, code: str, *where: str) -> None:
     assert error.code == code, f"{error.code}: {error}"
     for part in where:
         assert part in error.where, f"{part!r} is not in {error.where!r}"
-    assert error.what.endswith("."), error.what
+    assert error.detail.endswith("."), error.detail
     assert error.hint.endswith("."), error.hint
 
 
@@ -89,7 +89,7 @@ def refused_at_once(read: Callable[[], object]) -> InputError:
     assert time.perf_counter() - started < 1.0
     assert tracemalloc.get_traced_memory()[1] < 200 * 2**20
     tracemalloc.stop()
-    assert caught.value.what.endswith(".")
+    assert caught.value.detail.endswith(".")
     assert caught.value.hint.endswith(".")
     return caught.value
 

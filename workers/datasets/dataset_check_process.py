@@ -1,7 +1,7 @@
 """The program that validates a dataset: `python -m workers.datasets.dataset_check_process FOLDER`.
 
-Writes one line of JSON to standard output: ``{"report": {...}}`` (exit status 0), or ``{"error":
-{"code", "detail", "where", "hint"}}`` (exit status 2). It reads what strangers sent, so it confines itself
+Writes one line of JSON to standard output: ``{"report": {...}}`` (exit status 0), or ``{"error": a fault}``
+(exit status 2). It reads what strangers sent, so it confines itself
 first: memory, CPU time, no files written. Loads neither torch nor pycolmap; poses that are missing are
 found by the job, not here.
 """
@@ -34,7 +34,7 @@ def main(folder: Path) -> int:
         status = 0
     except InputError as error:
         where = error.where.replace(f"{folder}/", "").replace(str(folder), "the dataset")
-        answer = {"error": {"code": error.code, "detail": error.what, "where": where, "hint": error.hint}}
+        answer = {"error": error.fault.model_copy(update={"where": where}).model_dump()}
         status = EXIT_INPUT_ERROR
     with os.fdopen(answer_to, "w") as out:
         out.write(json.dumps(answer) + "\n")

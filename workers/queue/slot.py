@@ -186,7 +186,7 @@ class Slot:
         try:
             room_for_jobs(self._settings).require(rows[0]["bytes"] or 0)
         except LimitReached as full:
-            log.warning("the job waits: %s", full.what)
+            log.warning("the job waits: %s", full.detail)
             return False
         return True
 
@@ -256,7 +256,7 @@ def main() -> int:
         set_up_traces(arguments.slot, settings)
         asyncio.run(Slot(settings, arguments.slot).run())
     except SetupError as error:
-        sys.stderr.write(f"{error.what}\n")
+        sys.stderr.write(f"{error.detail}\n")
         return 2
     except ConnectorException as error:
         # Only while idle; the supervisor starts us again, and until the database is back there is no work.

@@ -8,7 +8,6 @@ memory; 143 stopped by SIGTERM after writing a checkpoint, if there was anything
 from __future__ import annotations
 
 import errno
-import json
 import logging
 import os
 import signal
@@ -62,12 +61,10 @@ def main(folder: Path) -> int:
             _refine(order, parse_options(order.options), protocol, stop)
     except Interrupted:
         return EXIT_STOPPED
-    except InputError as error:
-        _report(error.code, error.what, error.where, error.hint)
-        return EXIT_INPUT
-    except RefinementError as error:
-        _report(error.code, error.what, "", "")
-        return EXIT_REFINEMENT
+    except (InputError, RefinementError) as error:
+        Path("error.json").write_text(error.fault.model_dump_json())
+        sys.stderr.write(f"{error}\n")
+        return EXIT_INPUT if isinstance(error, InputError) else EXIT_REFINEMENT
     except Exception as error:  # noqa: BLE001 - the last line of defence: a bug ends in the log and in the status
         traceback.print_exc()
         return EXIT_MEMORY if is_want_of_memory(error) else EXIT_BUG
@@ -135,12 +132,6 @@ def _protocol_only() -> TextIO:
     protocol = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     return protocol
-
-
-def _report(code: str, detail: str, where: str, hint: str) -> None:
-    said = json.dumps({"code": code, "detail": detail, "where": where, "hint": hint})
-    Path("error.json").write_text(said)
-    sys.stderr.write(f"{detail} {hint}\n")
 
 
 if __name__ == "__main__":

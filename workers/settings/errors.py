@@ -1,34 +1,30 @@
-"""Errors of the job engine that callers tell apart. Each carries a stable ``code``."""
+"""The errors of the job engine, by what a caller does about them."""
 
 from __future__ import annotations
 
-from biresnerf.errors import BiresnerfError
+from biresnerf.errors import FaultError
 
 
-class EngineError(BiresnerfError):
-    """Base: ``code`` is snake_case and stable, ``what`` one sentence for people."""
-
-    def __init__(self, code: str, what: str) -> None:
-        self.code, self.what = code, what
-        super().__init__(what)
+class EngineError(FaultError):
+    """Base of the engine's errors."""
 
 
 class NotFound(EngineError):
     """No such job, dataset or file."""
 
-    def __init__(self, what: str) -> None:
-        super().__init__("not_found", what)
+    def __init__(self, detail: str) -> None:
+        super().__init__("not_found", detail)
 
 
 class Expired(EngineError):
-    """It was kept for its time, and its files are gone."""
+    """Its retention time is over and its files were deleted."""
 
-    def __init__(self, what: str) -> None:
-        super().__init__("expired", what)
+    def __init__(self, detail: str) -> None:
+        super().__init__("expired", detail)
 
 
 class Conflict(EngineError):
-    """The thing exists, but its state does not allow this.
+    """The job, dataset or upload exists, but its state does not allow this.
 
     Codes: ``state_conflict``, ``dataset_not_open``, ``dataset_not_ready``, ``dataset_not_complete``,
     ``dataset_in_use``, ``idempotency_key_reused``, ``offset_mismatch``, ``priority_not_allowed``.
@@ -42,11 +38,11 @@ class LimitReached(EngineError):
 
 
 class Unavailable(EngineError):
-    """The database or the storage does not answer just now; trying again later may work.
+    """The database or the storage does not answer; a later try may succeed.
 
     Codes: ``database_unavailable``, ``storage_unavailable``.
     """
 
 
 class SetupError(EngineError):
-    """The operator has to change something before the engine can start; ``what`` says what and how."""
+    """The operator has to change something before the engine can start; the detail says what and how."""

@@ -34,7 +34,7 @@ async def require_same_store(database: Database, files: FileStore) -> None:
                 await connection.execute("INSERT INTO file_store (id) VALUES (%s)", (found,))
                 known = found
     except Unavailable as error:
-        raise SetupError("storage_unusable", f"The start needs database and files. {error.what}") from error
+        raise SetupError("storage_unusable", f"The start needs database and files. {error.detail}") from error
     if found != known:
         raise SetupError(
             "storage_of_another",

@@ -62,7 +62,7 @@ def main() -> int:
     try:
         asyncio.run(_until_told(settings))
     except SetupError as error:
-        sys.stderr.write(f"{error.what}\n")
+        sys.stderr.write(f"{error.detail}\n")
         return 2
     return 0
 

@@ -57,4 +57,4 @@ async def _in_time(check: Awaitable[str]) -> str:
     except TimeoutError:
         return f"No answer within {CHECK_S:g} s."
     except Unavailable as error:
-        return error.what
+        return error.detail

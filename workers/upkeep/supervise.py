@@ -193,7 +193,7 @@ class _Supervisor:
                 pause_s = FIRST_PAUSE_S
             except SetupError as error:
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
-                log.error("%s", error.what)
+                log.error("%s", error.detail)
                 await asyncio.sleep(pause_s)
 
 

@@ -58,7 +58,7 @@ def _at(path: Path, error: InputError, name: str) -> InputError:
     # Two files are compared, often of one name: only the whole path says which.
     own = error.where.startswith((name, str(path)))
     where = str(path) + (error.where.removeprefix(str(path)).removeprefix(name) if own else f"/{error.where}")
-    return InputError(error.code, error.what, where=where, hint=error.hint)
+    return InputError.of(error.fault, where=where)
 
 
 def _colmap(_root: Path, folder: Path) -> Poses:

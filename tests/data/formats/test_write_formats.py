@@ -175,7 +175,7 @@ def test_instant_ngp_refuses_what_it_would_misread(tmp_path):
     with pytest.raises(InputError) as caught:
         write_transforms_ngp(with_(refined, images=images), tmp_path / "t.json")
     assert_complete(caught.value, "pack_not_possible")
-    assert ".webp" in caught.value.what
+    assert ".webp" in caught.value.detail
     assert not (tmp_path / "t.json").exists()
 
 

@@ -72,7 +72,7 @@ def test_broken_json_is_refused_with_the_place(file, text, code, words):
     with pytest.raises(InputError) as caught:
         read_json_object(file)
     assert_complete(caught.value, code, "transforms.json")
-    assert words in caught.value.what
+    assert words in caught.value.detail
 
 
 def test_other_encodings_are_refused(file):

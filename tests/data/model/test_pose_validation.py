@@ -54,7 +54,7 @@ def test_a_scaled_rotation_is_refused_and_its_factor_named(seed, factor, inverse
     with pytest.raises(InputError) as caught:
         rigid_matrix(pose.tolist(), "file frames[1].transform_matrix")
     assert caught.value.code == "pose_not_rotation"
-    named = float(caught.value.what.removeprefix("the rotation is scaled by ").removesuffix("."))
+    named = float(caught.value.detail.removeprefix("the rotation is scaled by ").removesuffix("."))
     assert named == pytest.approx(factor, rel=1e-5)
 
 

@@ -166,8 +166,8 @@ def test_a_mask_of_another_shape_is_refused_with_both_sizes(tmp_path):
         with pytest.raises(InputError) as caught:
             check()
         assert_complete(caught.value, "mask_size_mismatch", "images/002.jpg", "mask2.png")
-        assert "24 x 16" in caught.value.what
-        assert "20 x 16" in caught.value.what
+        assert "24 x 16" in caught.value.detail
+        assert "20 x 16" in caught.value.detail
 
 
 def test_a_mask_that_hides_the_whole_photo_is_refused(tmp_path):

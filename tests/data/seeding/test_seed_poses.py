@@ -116,7 +116,7 @@ def test_images_that_show_nothing_in_common_are_refused_with_counts(tmp_path):
     with pytest.raises(InputError) as caught:
         seeded(tmp_path)
     assert_complete(caught.value, "insufficient_overlap", tmp_path.name)
-    assert "0 of 4" in caught.value.what
+    assert "0 of 4" in caught.value.detail
     with pytest.raises(InputError) as caught:
         seeded(tmp_path, start="colmap")
     assert_complete(caught.value, "seed_failed", tmp_path.name)
@@ -223,7 +223,7 @@ def test_given_poses_are_taken_as_they_are_and_missing_ones_refused_by_name(fold
     with pytest.raises(InputError) as caught:
         seed_poses(without(truth, 3), "given")
     assert_complete(caught.value, "pose_missing", folder.name)
-    assert "03.png" in caught.value.what
+    assert "03.png" in caught.value.detail
     assert "start=auto" in caught.value.hint
 
 

@@ -95,7 +95,7 @@ async def test_a_real_job_is_forked_and_exported(database_url: str, tmp_path: Pa
         with pytest.raises(Conflict) as caught:
             await derived.fork(first.id, {"steps": 80})
         assert caught.value.code == "fork_not_possible"
-        assert "Stage 1 depends on" in caught.value.what
+        assert "Stage 1 depends on" in caught.value.detail
         await stores.jobs.delete(first.id)
         with pytest.raises(NotFound):
             await stores.jobs.get(export.id)
@@ -149,7 +149,7 @@ def test_a_fork_that_could_take_nothing_over_is_refused_with_the_reason(
 ):
     with pytest.raises(Conflict) as caught:
         plan_fork(parent, changes, wanted)
-    assert caught.value.what == reason
+    assert caught.value.detail == reason
 
 
 def test_a_fork_of_a_job_that_ran_out_of_memory_asks_for_as_little_as_its_second_try():

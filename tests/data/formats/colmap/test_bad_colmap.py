@@ -37,7 +37,7 @@ def test_a_file_cut_off_at_any_byte_is_refused(tmp_path, table):
         error = refused(tmp_path, tiny_tables() | {table: whole[:length]})
         assert_complete(error, "pose_file_invalid", table)
     error = refused(tmp_path, tiny_tables() | {table: whole + b"\0"})
-    assert "1 bytes follow the last record" in error.what
+    assert "1 bytes follow the last record" in error.detail
 
 
 HUGE = [

@@ -170,7 +170,7 @@ def test_the_text_form_refuses_names_with_spaces_and_says_so(tmp_path):
     with pytest.raises(InputError) as caught:
         write_colmap_text(random_result(0).model, tmp_path / "0")
     assert_complete(caught.value, "pack_not_possible", "colmap-text")
-    assert "ö 00.jpg" in caught.value.what
+    assert "ö 00.jpg" in caught.value.detail
     assert not (tmp_path / "0").exists()
 
 
