@@ -28,7 +28,7 @@ async function buildPage() {
   const dist = fresh(`${PAGE}/dist`);
   const result = await build({
     ...shared,
-    entryPoints: { app: `${PAGE}/app.tsx`, style: `${PAGE}/style.css` },
+    entryPoints: { app: `${PAGE}/app.tsx`, style: `${PAGE}/styles/style.css` },
     outdir: dist,
     entryNames: "[name]-[hash]",
     chunkNames: "[name]-[hash]",

@@ -1,9 +1,14 @@
 // report.html: reads the data that the library wrote into the page, and shows it. Nothing is fetched.
 import { render } from "preact";
-import { JobView } from "./JobView";
-import { historyOf, pointsOf } from "./job_data";
-import { count, duration, fixed } from "./numbers";
-import type { PosesFile, ReportFile, ViewFile } from "./types";
+import { useCallback, useMemo, useState } from "preact/hooks";
+import type { PointLayer, PosesFile, ReportFile, ViewFile } from "./result/types";
+import { historyOf, pointsOf, useWidgetData } from "./result/widget_data";
+import { SceneView } from "./scene/scene_view";
+import { Curves } from "./widgets/curves";
+import { ImageCompare } from "./widgets/image_compare";
+import { ImageTable } from "./widgets/image_table";
+import { count, duration, fixed } from "./widgets/numbers";
+import { VerdictSentence } from "./widgets/verdict";
 
 /** What report_html.py embeds. */
 interface Embedded {
@@ -40,14 +45,7 @@ function Report({ data, licences }: { data: Embedded; licences: string }) {
         <p class="soft">{factsOf(report).join(" · ")}</p>
       </header>
       <main>
-        <JobView
-          poses={data.poses}
-          report={report}
-          view={view}
-          history={historyOf(data.history)}
-          points={points}
-          urlOf={(file) => files[file] ?? null}
-        />
+        <Widgets data={data} points={points} />
         {orbit && (
           <div class="panel">
             <h2>Orbit</h2>
@@ -76,6 +74,39 @@ function Report({ data, licences }: { data: Embedded; licences: string }) {
         </details>
       </footer>
     </>
+  );
+}
+
+/** Everything there is to see, with one image chosen in all of it. */
+function Widgets({ data, points }: { data: Embedded; points: readonly PointLayer[] }) {
+  const { poses, report, view } = data;
+  const urlOf = useCallback((file: string) => data.files[file] ?? null, [data]);
+  const { names, cameras, centres, rows, cellOf } = useWidgetData(poses, report, view, urlOf);
+  const [selected, setSelected] = useState<number | null>(view?.views[0]?.image ?? (names.length > 0 ? 0 : null));
+  const lines = useMemo(() => historyOf(data.history), [data]);
+  const choice = { selected, onSelect: setSelected };
+  return (
+    <div class="job-view">
+      <VerdictSentence verdict={report.verdict} state={report.state} asked={report.options.verdict !== false} />
+      <div class="job-pictures">
+        <div class="panel panel-scene">
+          <h2>Cameras</h2>
+          <SceneView cameras={cameras} points={points} {...choice} />
+        </div>
+        <div class="panel panel-compare">
+          <h2>Photo and render</h2>
+          <ImageCompare names={names} views={view?.views ?? []} centres={centres} urlOf={urlOf} {...choice} />
+        </div>
+      </div>
+      <div class="panel">
+        <h2>Images</h2>
+        <ImageTable rows={rows} cellOf={cellOf} {...choice} />
+      </div>
+      <div class="panel">
+        <h2>The run</h2>
+        <Curves {...{ lines }} switchStep={report.switch_step} switchReason={report.switch_reason} steps={report.steps_done} />
+      </div>
+    </div>
   );
 }
 

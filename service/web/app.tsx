@@ -3,9 +3,9 @@ import { render } from "preact";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { JobPage } from "./job/page";
 import { JobsPage } from "./jobs/list";
-import { KeyForm } from "./key_form";
-import { apiKey, forgetKey, keyWanted } from "./service/http";
-import { useStore } from "./service/store";
+import { KeyForm } from "./parts/key_form";
+import { apiKey, forgetKey, keyWanted } from "./api/http";
+import { useStore } from "./api/store";
 import { DatasetPage } from "./upload/dataset_page";
 
 interface Route {

@@ -1,8 +1,8 @@
 // Answers what test_poses_and_colours.py asks: reads questions as JSON from standard input, writes the answers.
 import { readFileSync } from "node:fs";
-import { rampColour } from "../../biresnerf/viewer/colours";
-import { historyOf, pointsOf } from "../../biresnerf/viewer/job_data";
-import { between, bordersOf, turnDeg } from "../../biresnerf/viewer/poses";
+import { rampColour } from "../../biresnerf/viewer/scene/colours";
+import { historyOf, pointsOf } from "../../biresnerf/viewer/result/widget_data";
+import { between, bordersOf, turnDeg } from "../../biresnerf/viewer/result/poses";
 
 const asked = JSON.parse(readFileSync(0, "utf-8"));
 const bytes = Uint8Array.from(Buffer.from(asked.points.base64, "base64")).buffer;

@@ -4,11 +4,11 @@ import type { ComponentChildren } from "preact";
 import { isOver } from "../jobs/state";
 import { OptionsForm } from "../options/form";
 import type { Values } from "../options/schema";
-import { ProblemBox } from "../problem_box";
-import type { JobView } from "../service/answers";
-import { asProblem, call, type Problem } from "../service/http";
-import { Store, useStore } from "../service/store";
-import { CopyButton } from "./copy_button";
+import { ProblemBox } from "../parts/problem_box";
+import type { JobView } from "../api/answers";
+import { asProblem, call, type Problem } from "../api/http";
+import { Store, useStore } from "../api/store";
+import { CopyButton } from "../parts/copy_button";
 
 /** Options to run a job again with, where another part of the page asks for that. */
 export const wishedAgain = new Store<{ job: string; values: Values } | null>(null);

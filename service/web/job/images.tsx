@@ -1,11 +1,11 @@
 // One row an image; of those that are ticked the job can be run again with their poses held.
 import { useState } from "preact/hooks";
-import type { ImageTableProps } from "../../../biresnerf/viewer/types";
-import { count } from "../format";
+import type { ImageTableProps } from "../../../biresnerf/viewer/result/types";
+import { count } from "../parts/format";
 import { isOver } from "../jobs/state";
-import type { JobView } from "../service/answers";
+import type { JobView } from "../api/answers";
 import { wishedAgain } from "./actions";
-import { CopyButton } from "./copy_button";
+import { CopyButton } from "../parts/copy_button";
 
 type Widgets = typeof import("./widgets");
 

@@ -1,18 +1,18 @@
 // One job: how far it is, what came out, what can be done with it.
 import { useEffect, useMemo, useState } from "preact/hooks";
-import { duration, moment } from "../format";
+import { duration, moment } from "../parts/format";
 import { Chip, isOver, STAGE_WORDS, StageBar, titleOf } from "../jobs/state";
-import { ProblemBox } from "../problem_box";
-import type { JobView, Stage } from "../service/answers";
-import { pictureUrl } from "../service/pictures";
-import { useStore } from "../service/store";
-import { useTitle } from "../title";
+import { ProblemBox } from "../parts/problem_box";
+import type { JobView, Stage } from "../api/answers";
+import { pictureUrl } from "../api/picture_urls";
+import { useStore } from "../api/store";
+import { useTitle } from "../parts/title";
 import { Actions } from "./actions";
-import { Downloads } from "./downloads";
+import { Downloads } from "../downloads/downloads";
 import { Failure } from "./failure";
-import { LiveJob, type Seen } from "./live";
+import { LiveJob, type Seen } from "./live_job";
 import { LogView } from "./log";
-import { Pictures } from "./pictures";
+import { JobViews } from "./views";
 
 export function JobPage({ id }: { id: string }) {
   const live = useMemo(() => new LiveJob(id), [id]);
@@ -96,7 +96,7 @@ function Shown({ seen }: { seen: Seen }) {
       return found ? pictureUrl(found.href, found.sha256, () => redraw((n) => n + 1)) : null;
     };
   }, [artifacts, drawn]);
-  return <Pictures seen={seen} urlOf={urlOf} />;
+  return <JobViews seen={seen} urlOf={urlOf} />;
 }
 
 function Files({ live, seen }: { live: LiveJob; seen: Seen }) {

@@ -1,6 +1,6 @@
 // What feature matches say of the photos while COLMAP works, before there is anything to render.
-import type { UrlOf } from "../../../biresnerf/viewer/types";
-import { count } from "../format";
+import type { UrlOf } from "../../../biresnerf/viewer/result/types";
+import { count } from "../parts/format";
 
 /** preview/seeding.json. */
 export interface SeedingFile {

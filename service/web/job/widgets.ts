@@ -1,6 +1,6 @@
 // What draws with WebGL and canvases: in a file of its own, so that lists and uploads do not wait for it.
-export { Curves } from "../../../biresnerf/viewer/Curves";
-export { ImageCompare } from "../../../biresnerf/viewer/ImageCompare";
-export { ImageTable } from "../../../biresnerf/viewer/ImageTable";
-export { SceneView } from "../../../biresnerf/viewer/SceneView";
-export { VerdictSentence } from "../../../biresnerf/viewer/VerdictSentence";
+export { Curves } from "../../../biresnerf/viewer/widgets/curves";
+export { ImageCompare } from "../../../biresnerf/viewer/widgets/image_compare";
+export { ImageTable } from "../../../biresnerf/viewer/widgets/image_table";
+export { SceneView } from "../../../biresnerf/viewer/scene/scene_view";
+export { VerdictSentence } from "../../../biresnerf/viewer/widgets/verdict";

@@ -1,12 +1,12 @@
 // All jobs, newest first, as they are now.
 import { useEffect, useState } from "preact/hooks";
-import { Pick } from "../../../biresnerf/viewer/Controls";
-import type { JobList, JobState, JobView } from "../service/answers";
-import { asProblem, call, type Problem } from "../service/http";
-import { usePicture } from "../service/pictures";
-import { count, moment } from "../format";
-import { ProblemBox } from "../problem_box";
-import { useTitle } from "../title";
+import { Pick } from "../../../biresnerf/viewer/widgets/controls";
+import type { JobList, JobState, JobView } from "../api/answers";
+import { asProblem, call, type Problem } from "../api/http";
+import { usePicture } from "../api/picture_urls";
+import { count, moment } from "../parts/format";
+import { ProblemBox } from "../parts/problem_box";
+import { useTitle } from "../parts/title";
 import { DropZone } from "../upload/drop";
 import { Chip, isOver, StageBar, STATE_WORDS, titleOf } from "./state";
 

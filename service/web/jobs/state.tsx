@@ -1,6 +1,6 @@
 // A job's state in words, as a chip, and as a bar of its stages.
-import { STAGES, type JobView, type Stage } from "../service/answers";
-import { duration, percent } from "../format";
+import { STAGES, type JobView, type Stage } from "../api/answers";
+import { duration, percent } from "../parts/format";
 
 export const STAGE_WORDS: Record<Stage, string> = {
   preparing: "Preparing",

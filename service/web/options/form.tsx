@@ -1,8 +1,8 @@
 // Preset and options, made from what the service says of them.
 import { useEffect, useMemo, useState } from "preact/hooks";
-import type { OptionsView } from "../service/answers";
-import { asProblem, call, type FieldProblem, type Problem } from "../service/http";
-import { ProblemBox } from "../problem_box";
+import type { OptionsView } from "../api/answers";
+import { asProblem, call, type FieldProblem, type Problem } from "../api/http";
+import { ProblemBox } from "../parts/problem_box";
 import { fieldsOf, parsed, presetValue, words, type Field, type Values } from "./schema";
 
 const PRESET_WORDS: Record<string, string> = {

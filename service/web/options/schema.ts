@@ -1,5 +1,5 @@
 // The options' JSON Schema as fields of a form.
-import type { OptionsView, Schema } from "../service/answers";
+import type { OptionsView, Schema } from "../api/answers";
 
 export type Values = Record<string, unknown>;
 

@@ -1,14 +1,14 @@
 // A set of images: on its way, checked, and what to do with it.
 import { useCallback, useEffect, useState } from "preact/hooks";
-import type { DatasetView, JobView } from "../service/answers";
-import { asProblem, call, pause, type Problem } from "../service/http";
-import { Store, useStore } from "../service/store";
+import type { DatasetView, JobView } from "../api/answers";
+import { asProblem, call, pause, type Problem } from "../api/http";
+import { Store, useStore } from "../api/store";
 import { nameLabel } from "../jobs/state";
-import { bytes, count, duration, percent } from "../format";
+import { bytes, count, duration, percent } from "../parts/format";
 import { OptionsForm } from "../options/form";
 import type { Values } from "../options/schema";
-import { ProblemBox } from "../problem_box";
-import { useTitle } from "../title";
+import { ProblemBox } from "../parts/problem_box";
+import { useTitle } from "../parts/title";
 import { CheckTable } from "./check_table";
 import { DropZone } from "./drop";
 import { sendings, type Sending } from "./send";

@@ -1,8 +1,8 @@
 // Where sets are dropped or chosen.
 import { useEffect, useRef, useState } from "preact/hooks";
-import { asProblem, type Problem } from "../service/http";
-import { percent } from "../format";
-import { ProblemBox } from "../problem_box";
+import { asProblem, type Problem } from "../api/http";
+import { percent } from "../parts/format";
+import { ProblemBox } from "../parts/problem_box";
 import { fromDrop, fromInput, type Chosen, type Gathered } from "./gather";
 import { begin } from "./send";
 

@@ -1,7 +1,7 @@
 // Archives go by tus 1.0: in pieces, on from the last byte that arrived, also after the page was loaded anew.
-import type { DatasetView, UploadView } from "../service/answers";
-import { ask, asProblem, call, Problem } from "../service/http";
-import type { Store } from "../service/store";
+import type { DatasetView, UploadView } from "../api/answers";
+import { ask, asProblem, call, Problem } from "../api/http";
+import type { Store } from "../api/store";
 import { persistently, put, type Sending } from "./send";
 
 const PIECE_BYTES = 16 * 2 ** 20;

@@ -1,8 +1,8 @@
 // Brings files to the service: only those it has not, several at a time, each again where the connection breaks.
-import type { DatasetView, Info, SizeLimits } from "../service/answers";
-import { address, asProblem, call, noteRefusal, pause, Problem, withKey } from "../service/http";
-import { Store } from "../service/store";
-import { bytes as inBytes, count } from "../format";
+import type { DatasetView, Info, SizeLimits } from "../api/answers";
+import { address, asProblem, call, noteRefusal, pause, Problem, withKey } from "../api/http";
+import { Store } from "../api/store";
+import { bytes as inBytes, count } from "../parts/format";
 import { isArchive, type Chosen, type Gathered } from "./gather";
 import { giveUpRejected, sendArchive } from "./resumable";
 

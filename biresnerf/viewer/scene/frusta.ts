@@ -10,8 +10,8 @@ import {
   MeshBasicMaterial,
 } from "three";
 import type { Colour } from "./colours";
-import { inWorld } from "./poses";
-import type { Matrix, SceneCamera, Triple } from "./types";
+import { inWorld } from "../result/poses";
+import type { Matrix, SceneCamera, Triple } from "../result/types";
 
 // Vertices: the centre 0, the picture's corners 1 to 4 from its top left, and a tip 5 above its top edge.
 const SIDES = [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 1, 1, 2, 3, 1, 3, 4];

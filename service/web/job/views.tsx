@@ -1,14 +1,14 @@
 // What there is to see of a job, with one image chosen in all of it; while it runs, its previews.
 import type { ComponentChildren } from "preact";
-import { useEffect, useMemo, useState } from "preact/hooks";
-import { camerasOf, cellsOf, centresOf, rowsOf } from "../../../biresnerf/viewer/job_data";
-import type { PosesFile, UrlOf, ViewFile } from "../../../biresnerf/viewer/types";
+import { useEffect, useState } from "preact/hooks";
+import { useWidgetData } from "../../../biresnerf/viewer/result/widget_data";
+import type { PosesFile, UrlOf, ViewFile } from "../../../biresnerf/viewer/result/types";
 import { isOver } from "../jobs/state";
-import { asProblem, type Problem } from "../service/http";
-import { ProblemBox } from "../problem_box";
-import type { ArtifactView, JobView } from "../service/answers";
+import { asProblem, type Problem } from "../api/http";
+import { ProblemBox } from "../parts/problem_box";
+import type { ArtifactView, JobView } from "../api/answers";
 import { Images } from "./images";
-import type { Seen } from "./live";
+import type { Seen } from "./live_job";
 import { Seeding } from "./seeding";
 
 type Widgets = typeof import("./widgets");
@@ -22,7 +22,7 @@ function useWidgets(): { widgets: Widgets | null; problem: Problem | null } {
   return { widgets, problem };
 }
 
-export function Pictures({ seen, urlOf }: { seen: Seen; urlOf: UrlOf }) {
+export function JobViews({ seen, urlOf }: { seen: Seen; urlOf: UrlOf }) {
   const { widgets, problem } = useWidgets();
   const job = seen.job!;
   if (problem) return <ProblemBox problem={problem} />;
@@ -49,11 +49,7 @@ function Views({ seen, urlOf, widgets }: { seen: Seen; urlOf: UrlOf; widgets: Wi
   const first = view?.views[0]?.image ?? (poses?.images.length ? 0 : null);
   const selected = chosen === undefined ? first : chosen;
   const choice = { selected, onSelect: setChosen };
-  const names = useMemo(() => poses?.images.map(({ name }) => name) ?? [], [poses]);
-  const cameras = useMemo(() => (poses ? camerasOf(poses, report) : []), [poses, report]);
-  const centres = useMemo(() => (poses ? centresOf(poses) : []), [poses]);
-  const rows = useMemo(() => (report ? rowsOf(report) : []), [report]);
-  const cellOf = useMemo(() => cellsOf(view, names.length, urlOf), [view, names, urlOf]);
+  const { names, cameras, centres, rows, cellOf } = useWidgetData(poses, report, view, urlOf);
   return (
     <>
       <div class="job-pictures">

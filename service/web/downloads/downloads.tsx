@@ -1,13 +1,13 @@
 // The result, by who it is for.
 import { useState } from "preact/hooks";
-import { bytes, count, percent } from "../format";
-import { ProblemBox } from "../problem_box";
-import type { ArtifactView, JobView, ShareView } from "../service/answers";
-import { address, apiKey, ask, asProblem, call, pause, Problem } from "../service/http";
-import { direct } from "../service/pictures";
-import { useStore } from "../service/store";
+import { bytes, count, percent } from "../parts/format";
+import { ProblemBox } from "../parts/problem_box";
+import type { ArtifactView, JobView, ShareView } from "../api/answers";
+import { address, apiKey, ask, asProblem, call, pause, Problem } from "../api/http";
+import { direct } from "../api/picture_urls";
+import { useStore } from "../api/store";
 import { isOver } from "../jobs/state";
-import { CopyButton } from "./copy_button";
+import { CopyButton } from "../parts/copy_button";
 import { CONSUMERS, curlLines, filesFor, pythonLines, type Consumer } from "./consumers";
 import { fitsOneZip, Zip } from "./zip";
 

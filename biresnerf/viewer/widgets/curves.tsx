@@ -3,7 +3,7 @@ import { useEffect, useMemo, useRef } from "preact/hooks";
 import uPlot from "uplot";
 import { fixed, short } from "./numbers";
 import { themeColour, useDark } from "./theme";
-import type { CurvesProps, HistoryLine } from "./types";
+import type { CurvesProps, HistoryLine } from "../result/types";
 
 const HIGH_PX = 170;
 

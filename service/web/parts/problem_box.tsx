@@ -1,6 +1,6 @@
 // What went wrong, where, and what to do about it.
-import type { JobError } from "./service/answers";
-import type { Problem } from "./service/http";
+import type { JobError } from "../api/answers";
+import type { Problem } from "../api/http";
 
 export function ProblemBox({ problem, heading }: { problem: Problem | JobError; heading?: string }) {
   const title = heading ?? ("title" in problem ? problem.title : "It failed");

@@ -1,5 +1,5 @@
 // Colours of values, on absolute scales: the same value has the same colour in every job and on every page.
-import type { ColourBy, SceneCamera } from "./types";
+import type { ColourBy, SceneCamera } from "../result/types";
 
 export type Colour = readonly [number, number, number]; // 0 to 255
 

@@ -1,5 +1,5 @@
 // Who the files of a result are for.
-import type { ArtifactView } from "../service/answers";
+import type { ArtifactView } from "../api/answers";
 
 export interface Consumer {
   name: string;

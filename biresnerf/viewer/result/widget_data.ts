@@ -1,4 +1,5 @@
 // From the files of a result to what widgets take.
+import { useMemo } from "preact/hooks";
 import { bordersOf, centreOf, length, minus, turnDeg } from "./poses";
 import type {
   HistoryLine,
@@ -9,7 +10,6 @@ import type {
   ReportFile,
   SceneCamera,
   SheetCell,
-  Triple,
   UrlOf,
   ViewFile,
 } from "./types";
@@ -34,10 +34,6 @@ export function camerasOf(poses: PosesFile, report: ReportFile | null): SceneCam
       flags: image.flags,
     };
   });
-}
-
-export function centresOf(poses: PosesFile): Triple[] {
-  return poses.images.map((image) => centreOf(image.world_from_cam));
 }
 
 export function rowsOf(report: ReportFile): ImageRow[] {
@@ -95,4 +91,14 @@ export function cellsOf(view: ViewFile | null, images: number, urlOf: UrlOf): (i
     sheet_width: sheet.columns * sheet.cell_width,
     sheet_height: rows * sheet.cell_height,
   });
+}
+
+/** What the widgets of one result share; worked out again where its files change. */
+export function useWidgetData(poses: PosesFile | null, report: ReportFile | null, view: ViewFile | null, urlOf: UrlOf) {
+  const names = useMemo(() => poses?.images.map(({ name }) => name) ?? [], [poses]);
+  const cameras = useMemo(() => (poses ? camerasOf(poses, report) : []), [poses, report]);
+  const centres = useMemo(() => cameras.map(({ after }) => centreOf(after)), [cameras]);
+  const rows = useMemo(() => (report ? rowsOf(report) : []), [report]);
+  const cellOf = useMemo(() => cellsOf(view, names.length, urlOf), [view, names, urlOf]);
+  return { names, cameras, centres, rows, cellOf };
 }

@@ -1,14 +1,14 @@
 // (1) Cameras before and after, in three dimensions.
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
-import { CameraTable } from "./CameraTable";
+import { CameraTable } from "./camera_table";
 import { colourOf } from "./colours";
-import { Button, ImageStepper } from "./Controls";
-import { fixed, short, sourceWords } from "./numbers";
-import { between, centreOf, medianOf, spreadOf, turnDeg } from "./poses";
-import { capOf, FIRST_CHOICE, layerOf, Legend, SceneControls } from "./SceneControls";
-import type { Look } from "./scene_parts";
-import { hexColour, themeColour, useDark, useStill } from "./theme";
-import type { PointLayer, SceneCamera, SceneViewProps } from "./types";
+import { Button, ImageStepper } from "../widgets/controls";
+import { fixed, short, sourceWords } from "../widgets/numbers";
+import { between, centreOf, medianOf, spreadOf, turnDeg } from "../result/poses";
+import { capOf, FIRST_CHOICE, layerOf, Legend, SceneControls } from "./scene_controls";
+import type { Look } from "./geometry";
+import { hexColour, themeColour, useDark, useStill } from "../widgets/theme";
+import type { PointLayer, SceneCamera, SceneViewProps } from "../result/types";
 import { useScene } from "./use_scene";
 
 const NO_POINTS: readonly PointLayer[] = [];

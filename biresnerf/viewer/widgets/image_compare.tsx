@@ -1,9 +1,9 @@
 // (2) What the field shows at a camera, against the photo that was taken there.
 import { useMemo, useState } from "preact/hooks";
-import { Choice, ImageStepper } from "./Controls";
+import { Choice, ImageStepper } from "./controls";
 import { fixed } from "./numbers";
-import { length, minus } from "./poses";
-import type { ImageCompareProps, PictureKind, RenderedView, Triple } from "./types";
+import { length, minus } from "../result/poses";
+import type { ImageCompareProps, PictureKind, RenderedView, Triple } from "../result/types";
 
 type Mode = "swipe" | "difference" | "depth";
 const NEAR = 3;

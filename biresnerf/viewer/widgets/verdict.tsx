@@ -1,6 +1,6 @@
 // (5) Whether refinement helped, in one sentence, and what proves it.
 import { count, fixed, short, signed } from "./numbers";
-import type { PairedDifference, Verdict, VerdictName, VerdictSentenceProps } from "./types";
+import type { PairedDifference, Verdict, VerdictName, VerdictSentenceProps } from "../result/types";
 
 const WORDS: Readonly<Record<VerdictName, { chip: string; tone: "good" | "plain" | "unsure" | "bad" }>> = {
   improved: { chip: "Improved", tone: "good" },

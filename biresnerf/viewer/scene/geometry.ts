@@ -2,8 +2,8 @@
 import { BufferAttribute, BufferGeometry, Points, PointsMaterial, Vector3 } from "three";
 import type { Colour } from "./colours";
 import { srgb } from "./frusta";
-import { axisOf, centreOf, length, minus } from "./poses";
-import type { PointLayer, SceneCamera, Triple } from "./types";
+import { axisOf, centreOf, length, minus } from "../result/poses";
+import type { PointLayer, SceneCamera, Triple } from "../result/types";
 
 /** What is to be shown, and how. */
 export interface Look {

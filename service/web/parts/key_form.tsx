@@ -1,6 +1,6 @@
 // Asks for an API key where the service wants one.
 import { useState } from "preact/hooks";
-import { useKey } from "./service/http";
+import { useKey } from "../api/http";
 import { useTitle } from "./title";
 
 export function KeyForm({ said }: { said: string }) {

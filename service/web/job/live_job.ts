@@ -1,11 +1,11 @@
 // All that is known of one job, kept up to date for as long as somebody looks.
-import { historyOf, pointsOf } from "../../../biresnerf/viewer/job_data";
-import type { HistoryLine, PointLayer, PosesFile, ReportFile, ViewFile } from "../../../biresnerf/viewer/types";
+import { historyOf, pointsOf } from "../../../biresnerf/viewer/result/widget_data";
+import type { HistoryLine, PointLayer, PosesFile, ReportFile, ViewFile } from "../../../biresnerf/viewer/result/types";
 import { isOver } from "../jobs/state";
-import type { ArtifactList, ArtifactView, JobView } from "../service/answers";
-import { follow, type JobEvent } from "../service/events";
-import { ask, asProblem, call, pause, type Problem } from "../service/http";
-import { Store } from "../service/store";
+import type { ArtifactList, ArtifactView, JobView } from "../api/answers";
+import { follow, type JobEvent } from "../api/events";
+import { ask, asProblem, call, pause, type Problem } from "../api/http";
+import { Store } from "../api/store";
 import type { SeedingFile } from "./seeding";
 
 export interface Seen {

@@ -1,8 +1,8 @@
 // What of the three-dimensional picture can be chosen, and what its colours mean.
 import { css, kindColour, rampColour, scaleOf, signedColour, UNKNOWN } from "./colours";
-import { Choice, Pick, Switch } from "./Controls";
-import { sourceWords } from "./numbers";
-import type { ColourBy, PointLayer } from "./types";
+import { Choice, Pick, Switch } from "../widgets/controls";
+import { sourceWords } from "../widgets/numbers";
+import type { ColourBy, PointLayer } from "../result/types";
 
 /** What the reader has chosen. */
 export interface SceneChoice {

@@ -258,14 +258,3 @@ export interface VerdictSentenceProps {
   /** Whether a verdict was asked for. */
   readonly asked?: boolean;
 }
-
-/** Everything together, as report.html shows it and a job's page may. */
-export interface JobViewProps {
-  readonly poses: PosesFile;
-  readonly report: ReportFile;
-  /** Null while the job runs, and in results of older versions. */
-  readonly view: ViewFile | null;
-  readonly history: readonly HistoryLine[];
-  readonly points?: readonly PointLayer[];
-  readonly urlOf: UrlOf;
-}

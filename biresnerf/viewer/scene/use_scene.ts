@@ -1,8 +1,8 @@
 // The three-dimensional picture's life within a page: made, resized, shown anew, taken down.
 import { useEffect, useRef, useState } from "preact/hooks";
-import { SceneDrawing } from "./scene_drawing";
-import type { Look, Viewpoint } from "./scene_parts";
-import type { SceneCamera } from "./types";
+import { SceneDrawing } from "./drawing";
+import type { Look, Viewpoint } from "./geometry";
+import type { SceneCamera } from "../result/types";
 
 /**
  * The drawing in `host`, made anew for other cameras and seen from where the last one was; and why there is none.

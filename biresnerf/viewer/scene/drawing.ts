@@ -15,9 +15,9 @@ import {
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { Frusta, VERTICES } from "./frusta";
-import { cloudOf, type Look, overviewOf, pathsOf, upwardsOf, type Viewpoint } from "./scene_parts";
-import { axisOf, between, centreOf, medianOf, minus, plus, spreadOf } from "./poses";
-import type { Matrix, PointLayer, SceneCamera, Triple } from "./types";
+import { cloudOf, type Look, overviewOf, pathsOf, upwardsOf, type Viewpoint } from "./geometry";
+import { axisOf, between, centreOf, medianOf, minus, plus, spreadOf } from "../result/poses";
+import type { Matrix, PointLayer, SceneCamera, Triple } from "../result/types";
 
 const VIEW_DEG = 45;
 const PICK_PX = 14;

@@ -1,8 +1,8 @@
 // (4) One row an image.
 import { useMemo, useState } from "preact/hooks";
-import { Pick } from "./Controls";
+import { Pick } from "./controls";
 import { ALARMING, count, fixed, flagWords, short, signed, sourceWords } from "./numbers";
-import type { ImageRow, ImageTableProps, SheetCell } from "./types";
+import type { ImageRow, ImageTableProps, SheetCell } from "../result/types";
 
 const SHOWN_AT_FIRST = 200;
 const THUMB_PX = 30;

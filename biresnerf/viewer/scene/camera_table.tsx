@@ -1,7 +1,7 @@
 // What takes the place of the three-dimensional picture where the browser cannot draw it.
-import { short } from "./numbers";
-import { centreOf } from "./poses";
-import type { SceneCamera, Triple } from "./types";
+import { short } from "../widgets/numbers";
+import { centreOf } from "../result/poses";
+import type { SceneCamera, Triple } from "../result/types";
 
 const words = (centre: Triple): string => centre.map((value) => short(value, 4)).join(", ");
 
