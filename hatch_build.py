@@ -51,8 +51,9 @@ def build(root: Path) -> None:
 
 
 def check_types(root: Path) -> int:
-    """TypeScript's exit code for all sources."""
+    """TypeScript's exit code for all sources; types of answers and result files come from their schemas."""
     install_packages(root)
+    subprocess.run([*node(), "web_types.mjs"], cwd=root, check=True)
     return subprocess.run([*node(), "node_modules/typescript/bin/tsc", "--noEmit"], cwd=root).returncode
 
 

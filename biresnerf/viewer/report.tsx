@@ -1,8 +1,8 @@
 // report.html: reads the data that the library wrote into the page, and shows it. Nothing is fetched.
 import { render } from "preact";
 import { useCallback, useMemo, useState } from "preact/hooks";
-import type { PointLayer, PosesFile, ReportFile, ViewFile } from "./result/types";
-import { historyOf, pointsOf, useWidgetData } from "./result/widget_data";
+import type { PosesDocument, Report, ViewFile } from "schemas";
+import { historyOf, type PointLayer, pointsOf, useWidgetData } from "./result/widget_data";
 import { SceneView } from "./scene/scene_view";
 import { Curves } from "./widgets/curves";
 import { ImageCompare } from "./widgets/image_compare";
@@ -14,8 +14,8 @@ import { VerdictSentence } from "./widgets/verdict";
 interface Embedded {
   readonly title: string;
   readonly written: string;
-  readonly poses: PosesFile;
-  readonly report: ReportFile;
+  readonly poses: PosesDocument;
+  readonly report: Report;
   readonly view: ViewFile | null;
   readonly history: string;
   /** Files of the result as data: URLs. */
@@ -29,7 +29,7 @@ function bytesOf(url: string): ArrayBuffer {
   return Uint8Array.from(text, (character) => character.charCodeAt(0)).buffer;
 }
 
-function Report({ data, licences }: { data: Embedded; licences: string }) {
+function ReportPage({ data, licences }: { data: Embedded; licences: string }) {
   const { report, view, files } = data;
   const points = (view?.points ?? []).flatMap((entry) => {
     const url = files[entry.file];
@@ -110,7 +110,7 @@ function Widgets({ data, points }: { data: Embedded; points: readonly PointLayer
   );
 }
 
-function factsOf(report: ReportFile): string[] {
+function factsOf(report: Report): string[] {
   const seconds = Object.values(report.seconds).reduce((a, b) => a + b, 0);
   return [
     count(report.images.length, "image"),
@@ -139,4 +139,4 @@ function Notes({ title, lines }: { title: string; lines: readonly string[] }) {
 const embedded = (id: string): unknown => JSON.parse(document.getElementById(id)?.textContent ?? "null");
 
 const root = document.getElementById("report");
-if (root) render(<Report data={embedded("data") as Embedded} licences={String(embedded("licences"))} />, root);
+if (root) render(<ReportPage data={embedded("data") as Embedded} licences={String(embedded("licences"))} />, root);

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 from urllib.parse import quote
 
 from pydantic import ConfigDict, Field, StringConstraints
 
+from biresnerf.report import IntrinsicsSource
 from biresnerf.wire.base import Record
 from biresnerf.wire.problems import JobError
 
@@ -24,8 +25,24 @@ class ManifestEntry(Record):
     sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
 
 
+class CheckReport(Record):
+    """What the check of a dataset found."""
+
+    images: int
+    with_pose: int
+    without_pose: int
+    poses: Literal["missing", "partial", "given"]
+    cameras: int
+    camera_models: tuple[str, ...] = Field(description="COLMAP's names.")
+    intrinsics: tuple[IntrinsicsSource, ...] = Field(description="Where those of the cameras come from.")
+    format: str
+    masks: int
+    transparency: bool = Field(description="Whether images have an alpha channel.")
+    warnings: tuple[str, ...]
+
+
 class DatasetRecord(Record):
-    """A set of uploaded files. ``report`` is what the validation found (or why it was rejected)."""
+    """A set of uploaded files."""
 
     id: str
     tenant: str = Field("local", description="Whose it is.")
@@ -34,7 +51,7 @@ class DatasetRecord(Record):
     files: int = 0
     bytes: int = 0
     missing: tuple[str, ...] = Field((), description="Manifest paths not received yet.")
-    report: dict[str, Any] | None = None
+    report: CheckReport | None = Field(None, description="What its check found; none unless it is ready.")
     error: JobError | None = None
     created_at: datetime
     expires_at: datetime | None = Field(

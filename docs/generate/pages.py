@@ -7,6 +7,7 @@ from pathlib import Path
 from docs.generate.commands_page import commands_page
 from docs.generate.notebooks import notebook
 from docs.generate.options_page import options_page
+from docs.generate.result_schema import result_schema
 from docs.generate.settings_page import settings_page
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -18,6 +19,7 @@ def generated() -> dict[Path, str]:
         ROOT / "docs/options.md": options_page(),
         ROOT / "docs/settings.md": settings_page(),
         ROOT / "docs/commands.md": commands_page(),
+        ROOT / "docs/result.schema.json": result_schema(),
     }
     walks = [path for path in sorted((ROOT / "examples").glob("*.py")) if "# %%" in path.read_text("utf-8")]
     return pages | {walk.with_suffix(".ipynb"): notebook(walk) for walk in walks}

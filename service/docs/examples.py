@@ -53,7 +53,11 @@ _DATASET_VIEW: dict[str, Any] = {
     "files": 61,
     "bytes": 48_211_034,
     "missing": [],
-    "report": {"images": 60, "with_pose": 60, "without_pose": 0, "poses": "given", "cameras": 1},
+    "report": {
+        **{"images": 60, "with_pose": 60, "without_pose": 0, "poses": "given"},
+        **{"cameras": 1, "camera_models": ["OPENCV"], "intrinsics": ["given"], "format": "nerfstudio"},
+        **{"masks": 0, "transparency": False, "warnings": []},
+    },
     "error": None,
     "created_at": _AT,
     "revision": 63,

@@ -1,11 +1,11 @@
 // The page that the service shows at `/`: what is after the `#` of its address says what of it.
 import { render } from "preact";
 import { useEffect, useRef, useState } from "preact/hooks";
+import { apiKey, forgetKey, keyWanted } from "./api/http";
+import { useStore } from "./api/store";
 import { JobPage } from "./job/page";
 import { JobsPage } from "./jobs/list";
 import { KeyForm } from "./parts/key_form";
-import { apiKey, forgetKey, keyWanted } from "./api/http";
-import { useStore } from "./api/store";
 import { DatasetPage } from "./upload/dataset_page";
 
 interface Route {

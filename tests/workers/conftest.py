@@ -31,6 +31,13 @@ from workers.settings.settings import Settings
 ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("counting_program.py")
 PATIENCE_S = 90.0
+# The end of a check program that accepts the files.
+_FOUND = {
+    **{"images": 1, "with_pose": 1, "without_pose": 0, "poses": "given", "cameras": 1},
+    **{"camera_models": ["PINHOLE"], "intrinsics": ["given"], "format": "colmap"},
+    **{"masks": 0, "transparency": False, "warnings": []},
+}
+ACCEPTED = f"print({json.dumps({'report': _FOUND})!r})"
 
 
 @pytest.fixture
@@ -91,7 +98,7 @@ def quick_settings(data_dir: Path, **changes: object) -> Settings:
         "janitor_s": 0.3,
         "stop_grace_s": 5.0,
         "job_command": (sys.executable, str(PROGRAM)),
-        "check_command": (sys.executable, "-c", 'print(\'{"report": {"images": 1}}\')'),
+        "check_command": (sys.executable, "-c", ACCEPTED),
     }
     return Settings(**{**values, **changes})
 

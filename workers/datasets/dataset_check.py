@@ -12,12 +12,11 @@ import tempfile
 import time
 import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from psycopg.types.json import Jsonb
 
+from biresnerf.wire.datasets import CheckReport
 from biresnerf.wire.problems import JobError
 from workers.database.database import Database
 from workers.process.turns import Turns
@@ -34,14 +33,6 @@ CHECKS = "checks"
 IN_USE = "in-use"
 SETTLED_S = 1.0
 LOOK_S = 0.5  # between two looks at a check that another process makes
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """``error`` is none for a good dataset; ``report`` is what the check found out."""
-
-    report: dict[str, Any]
-    error: JobError | None
 
 
 class Checker:
@@ -101,16 +92,17 @@ class Checker:
         renewing = asyncio.create_task(self._renew(dataset_id, token))
         try:
             files = [(row["key"], row["path"]) for row in rows]
-            verdict = await check_files(self._files, files, self._settings)
+            outcome = await check_files(self._files, files, self._settings)
         finally:
             renewing.cancel()
+        found = Jsonb(outcome.model_dump(mode="json"))
         await insist(
             lambda: self._database.fetch(
                 "UPDATE datasets SET state = %s, report = %s, error = %s, revision = revision + 1,"
                 " check_token = NULL, check_until = NULL"
                 " WHERE id = %s AND state = 'finalizing' AND check_token = %s",
-                *("rejected" if verdict.error else "ready", Jsonb(verdict.report)),
-                *(Jsonb(verdict.error.model_dump()) if verdict.error else None, dataset_id, token),
+                *(("rejected", None, found) if isinstance(outcome, JobError) else ("ready", found, None)),
+                *(dataset_id, token),
             )
         )
 
@@ -121,8 +113,10 @@ class Checker:
                 await self._take(dataset_id, token)
 
 
-async def check_files(files: FileStore, members: Sequence[tuple[str, str]], settings: Settings) -> Verdict:
-    """Run the check program on the files, given as (key, path). Its crash or timeout is a rejection too.
+async def check_files(
+    files: FileStore, members: Sequence[tuple[str, str]], settings: Settings
+) -> CheckReport | JobError:
+    """Run the check program on the files, given as (key, path). Its crash or timeout rejects them too.
 
     Where it is killed (by the kernel, say, for another process's hunger) it is tried once more.
     """
@@ -134,11 +128,11 @@ async def check_files(files: FileStore, members: Sequence[tuple[str, str]], sett
         fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel frees it, however we die
         dataset = folder / "input"
         await files.stage(members, dataset)
-        verdict, killed = await _run(dataset, folder / "log.txt", settings)
+        outcome, killed = await _run(dataset, folder / "log.txt", settings)
         if killed:
             log.warning("the check of %d files was killed; trying once more", len(members))
-            verdict, _ = await _run(dataset, folder / "log.txt", settings)
-        return verdict
+            outcome, _ = await _run(dataset, folder / "log.txt", settings)
+        return outcome
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         lock.close()
@@ -156,7 +150,7 @@ def _sweep(parent: Path) -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[Verdict, bool]:
+async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[CheckReport | JobError, bool]:
     """The outcome, and whether a signal ended the program."""
     child = await Child.start(settings.check_command, dataset, errors, {"OMP_NUM_THREADS": "1"})
     try:
@@ -166,17 +160,17 @@ async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[Verdict
     except TimeoutError:
         detail = f"The check took longer than {settings.check_timeout_s:g} s."
         error = JobError(code="check_timeout", detail=detail, hint="Send fewer or smaller images.")
-        return Verdict({}, error), False
+        return error, False
     finally:
         child.kill()
         await child.wait()
     try:
         answer = json.loads(said)
         if status == 0:
-            return Verdict(dict(answer["report"]), None), False
+            return CheckReport.model_validate(answer["report"]), False
         if status == EXIT_INPUT_ERROR:
-            return Verdict({}, JobError(**answer["error"])), False
+            return JobError(**answer["error"]), False
     except (ValueError, TypeError, KeyError) as error:
         log.error("the check program's answer is unreadable: %s", error)
     detail = f"The check of the files ended unexpectedly (status {status})."
-    return Verdict({}, JobError(code="check_crashed", detail=detail, log_tail=log_tail(errors))), status < 0
+    return JobError(code="check_crashed", detail=detail, log_tail=log_tail(errors)), status < 0

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.data.formats.simple.poses_json import POSES, write_poses_json
 from biresnerf.data.model.atomic_file import whole_file
@@ -24,7 +24,28 @@ SEEDING_JSON, PHOTOS = "seeding.json", "photos.jpg"
 SHEET_COLUMNS, SHEET_MOST = 6, 36
 TILE, _GAP = 128, 4  # px
 _GROUND = (238, 238, 238)
+_FROZEN = ConfigDict(frozen=True, extra="forbid")
 UNREADABLE: tuple[type[Exception], ...] = (InputError, *DAMAGED)
+
+
+class SeedingImage(BaseModel):
+    """What is known of one photo."""
+
+    model_config = _FROZEN
+
+    name: str
+    posed: bool
+    features: int | None = Field(description="How many were found; None before it was searched.")
+    partners: int = Field(description="Photos that it has matches with.")
+
+
+class SeedingPreview(BaseModel):
+    """``seeding.json``: how far the search for matching features is."""
+
+    model_config = _FROZEN
+
+    matched_pairs: int
+    images: tuple[SeedingImage, ...]
 
 
 def write_seeding_preview(
@@ -41,22 +62,21 @@ def write_seeding_preview(
     if not sheet.is_file():
         write_contact_sheet(dataset.frames, sheet)
     with whole_file(told) as temporary:
-        temporary.write_text(json.dumps(_described(dataset, found), indent=1), "utf-8")
+        temporary.write_text(_described(dataset, found).model_dump_json(indent=1), "utf-8")
     if poses is None:
         return [sheet, told]
     write_poses_json(poses, folder / POSES)
     return [sheet, told, folder / POSES]
 
 
-def _described(dataset: Dataset, found: SeedingProgress) -> dict[str, object]:
+def _described(dataset: Dataset, found: SeedingProgress) -> SeedingPreview:
     partners = Counter(index for pair in found.matches for index in pair)
-    return {
-        "matched_pairs": len(found.matches),
-        "images": [
-            {"name": f.name, "posed": posed, "features": found.features.get(i), "partners": partners[i]}
-            for i, (f, posed) in enumerate(zip(dataset.frames, dataset.posed.tolist(), strict=True))
-        ],
-    }
+    posed = dataset.posed.tolist()
+    images = tuple(
+        SeedingImage(name=f.name, posed=posed[i], features=found.features.get(i), partners=partners[i])
+        for i, f in enumerate(dataset.frames)
+    )
+    return SeedingPreview(matched_pairs=len(found.matches), images=images)
 
 
 def write_contact_sheet(frames: Sequence[Frame], path: Path) -> None:

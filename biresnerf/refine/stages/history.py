@@ -6,7 +6,9 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.data.model.atomic_file import whole_file
 
@@ -14,7 +16,35 @@ if TYPE_CHECKING:
     from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 
 HISTORY = "history.jsonl"
-Line = Mapping[str, float | str]
+
+
+class HistoryLine(BaseModel):
+    """One check of the detector. Studies add figures of their own."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
+
+    step: int
+    stage: Literal["coarse", "fine"]
+    psnr: float = Field(description="Of the mean error since the last check, dB.")
+    loss: float = Field(description="Of the last step.")
+    moved_deg: float = Field(
+        description="90 % quantile of the cameras' rotation since the last check, degrees."
+    )
+    lost: int = Field(description="Cameras that do not agree with the field.")
+    rays: int = Field(description="In the last step.")
+    samples: int = Field(description="In the last step.")
+    pose_rate: float = Field(description="Learning rate of the poses from here on.")
+    field_rate: float
+    reconstruction_rate: float
+    seconds: float
+    still_deg: float | None = Field(
+        None, description="Stage 1: cameras that rotated by less count as settled, degrees."
+    )
+    trend_db: float | None = Field(
+        None, description="Stage 1: change of the error over the detector's window; from its 10th check on."
+    )
+    level_db: float | None = Field(None, description="How large a trend still counts as none.")
+    confirmed: int | None = Field(None, description="Checks in a row that found the error stable.")
 
 
 @dataclass(frozen=True)
@@ -44,7 +74,7 @@ class History:
         with whole_file(self.path) as temporary:
             temporary.write_text("".join(json.dumps(line) + "\n" for line in kept), "utf-8")
 
-    def append(self, line: Line) -> None:
+    def append(self, line: Mapping[str, object]) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, allow_nan=False) + "\n")

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from torch import Tensor
@@ -19,7 +19,7 @@ from biresnerf.refine.lost.lost_cameras import LostCameraRepair
 from biresnerf.refine.optimise.async_metrics import StepResult
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.stages.checkpoint import CHECKPOINT, COARSE, save_checkpoint
-from biresnerf.refine.stages.history import History, Observer
+from biresnerf.refine.stages.history import History, HistoryLine, Observer
 from biresnerf.refine.stages.previews import Previews
 from biresnerf.refine.stages.run_record import RunRecord
 from biresnerf.refine.stages.stability import StabilityDetector
@@ -86,7 +86,7 @@ class TwoStages:
         self._fraction = FIRST_FRACTION
 
     @property
-    def stage(self) -> str:
+    def stage(self) -> Literal["coarse", "fine"]:
         return "coarse" if self.optimiser.switch is None else "fine"
 
     def run(self) -> bool:
@@ -182,22 +182,21 @@ class TwoStages:
         # The error is the mean since the last check; loss, rays and samples are the last step's, rates the next's.
         rates = optimiser.schedule.field_rates(optimiser.step_index, optimiser.switch)
         self.history.append(
-            {
-                "step": optimiser.step_index,
-                "stage": self.stage,
-                "psnr": -10 * math.log10(max(mean_squared_error, 1e-12)),
-                "loss": last.loss,
-                "moved_deg": self._moved_deg,
-                "lost": int(optimiser.camera_errors.lost.sum()),
-                "rays": last.rays,
-                "samples": last.samples,
-                "pose_rate": optimiser.pose_rate(),
-                "field_rate": rates.pose,
-                "reconstruction_rate": max(rates.reconstruction, default=0.0),
-                "seconds": round(sum(self.record.seconds[stage] for stage in ("coarse", "fine")), 3),
-                **self._signal,
-                **self.observer.at_check(optimiser),
-            }
+            HistoryLine(
+                step=optimiser.step_index,
+                stage=self.stage,
+                psnr=-10 * math.log10(max(mean_squared_error, 1e-12)),
+                loss=last.loss,
+                moved_deg=self._moved_deg,
+                lost=int(optimiser.camera_errors.lost.sum()),
+                rays=last.rays,
+                samples=last.samples,
+                pose_rate=optimiser.pose_rate(),
+                field_rate=rates.pose,
+                reconstruction_rate=max(rates.reconstruction, default=0.0),
+                seconds=round(sum(self.record.seconds[stage] for stage in ("coarse", "fine")), 3),
+                **{**self._signal, **self.observer.at_check(optimiser)},
+            ).model_dump(exclude_none=True)
         )
 
     def _roll_back(self) -> None:

@@ -1,5 +1,10 @@
 // Poses in numbers: between two of them, how far apart they are, what a lens sees. No drawing, no page.
-import type { Matrix, Row, Triple } from "./types";
+import type { PoseCamera, PoseImage } from "schemas";
+
+export type Triple = readonly [number, number, number];
+/** Upper three rows of a 4 x 4 matrix; OpenCV axes (x right, y down, z forward), in the input's world. */
+export type Matrix = PoseImage["world_from_cam"];
+export type Row = Matrix[number];
 
 /** Unit quaternion w, x, y, z. */
 export type Quaternion = readonly [number, number, number, number];
@@ -91,12 +96,7 @@ export function turnDeg(first: Matrix, second: Matrix): number {
 }
 
 /** Borders of the picture at distance 1 before the lens: left, top, right, bottom; a drawing, so without distortion. */
-export function bordersOf(camera: {
-  model: string;
-  width: number;
-  height: number;
-  params: readonly number[];
-}): [number, number, number, number] {
+export function bordersOf(camera: PoseCamera): [number, number, number, number] {
   const { width, height, params } = camera;
   // COLMAP's models with one focal length say f, cx, cy; the others fx, fy, cx, cy.
   const single = /^(SIMPLE_|RADIAL)/.test(camera.model);

@@ -1,21 +1,71 @@
 // From the files of a result to what widgets take.
 import { useMemo } from "preact/hooks";
-import { bordersOf, centreOf, length, minus, turnDeg } from "./poses";
-import type {
+import type { HistoryLine, PosesDocument, Report, ShownPoints, ViewFile } from "schemas";
+import { type Flag, FLAGS } from "../widgets/words";
+import { bordersOf, centreOf, length, type Matrix, minus, type Triple, turnDeg } from "./poses";
+
+/** URL of a file of the result (`renders/…`, `view/…`), or null where there is none (left out, not there yet). */
+export type UrlOf = (file: string) => string | null;
+
+/** What the curves show of a check. */
+export type CurvePoint = Pick<
   HistoryLine,
-  ImageRow,
-  PointLayer,
-  PointsEntry,
-  PosesFile,
-  ReportFile,
-  SceneCamera,
-  SheetCell,
-  UrlOf,
-  ViewFile,
-} from "./types";
+  "step" | "stage" | "psnr" | "loss" | "moved_deg" | "still_deg" | "trend_db" | "level_db"
+>;
+
+export interface SceneCamera {
+  readonly name: string;
+  readonly before: Matrix | null;
+  readonly after: Matrix;
+  /** The picture's borders at distance 1 before the lens: left, top, right, bottom. */
+  readonly borders: readonly [number, number, number, number];
+  /** Whose pose it started from: `given`, `colmap`, `neighbours`, … */
+  readonly source: string;
+  readonly moved_deg: number;
+  readonly moved_units: number;
+  /** Refined minus input in the verdict's trainings, dB, where measured. */
+  readonly delta_psnr: number | null;
+  readonly flags: readonly string[];
+}
+
+export interface PointLayer {
+  readonly source: ShownPoints["source"];
+  /** Positions in the world minus `origin`, [3 n]. */
+  readonly positions: Float32Array;
+  /** [3 n]. */
+  readonly colours: Uint8Array;
+  readonly origin: Triple;
+}
+
+export interface ImageRow {
+  readonly image: number;
+  readonly name: string;
+  readonly source: string;
+  readonly moved_deg: number;
+  readonly moved_units: number;
+  readonly psnr_before: number | null;
+  readonly psnr_after: number | null;
+  readonly epipolar_px_before: number | null;
+  readonly epipolar_px_after: number | null;
+  /** Held-out views: render against photo at the end. */
+  readonly psnr: number | null;
+  readonly flags: readonly Flag[];
+}
+
+/** Where an image's picture lies in the contact sheet. */
+export interface SheetCell {
+  readonly url: string;
+  readonly x: number;
+  readonly y: number;
+  readonly width: number;
+  readonly height: number;
+  /** Size of the whole sheet, for those who show it smaller. */
+  readonly sheet_width: number;
+  readonly sheet_height: number;
+}
 
 /** Cameras before and after; what the report measured of them joins by index, as both files keep the input's order. */
-export function camerasOf(poses: PosesFile, report: ReportFile | null): SceneCamera[] {
+export function camerasOf(poses: PosesDocument, report: Report | null): SceneCamera[] {
   const borders = poses.cameras.map(bordersOf);
   return poses.images.map((image, index) => {
     const before = image.world_from_cam_before;
@@ -36,8 +86,8 @@ export function camerasOf(poses: PosesFile, report: ReportFile | null): SceneCam
   });
 }
 
-export function rowsOf(report: ReportFile): ImageRow[] {
-  const flags = ["held_out", "fixed", "lost", "repaired", "moved_far", "blurred", "exposure_off", "unsure_deg"] as const;
+export function rowsOf(report: Report): ImageRow[] {
+  const flags = Object.keys(FLAGS) as Flag[];
   return report.images.map((image, index) => ({
     image: index,
     name: image.name,
@@ -54,8 +104,8 @@ export function rowsOf(report: ReportFile): ImageRow[] {
 }
 
 /** Lines of history.jsonl; one that is torn off, or none at all, is left out. */
-export function historyOf(text: string): HistoryLine[] {
-  const lines: HistoryLine[] = [];
+export function historyOf(text: string): CurvePoint[] {
+  const lines: CurvePoint[] = [];
   for (const line of text.split("\n")) {
     try {
       const read: unknown = JSON.parse(line);
@@ -68,7 +118,7 @@ export function historyOf(text: string): HistoryLine[] {
 }
 
 /** Points from the bytes of a file that view.json lists. */
-export function pointsOf(entry: PointsEntry, bytes: ArrayBuffer): PointLayer {
+export function pointsOf(entry: ShownPoints, bytes: ArrayBuffer): PointLayer {
   const positions = new Float32Array(entry.count * 3);
   const view = new DataView(bytes);
   for (let i = 0; i < positions.length; i++) positions[i] = view.getFloat32(4 * i, true);
@@ -94,7 +144,7 @@ export function cellsOf(view: ViewFile | null, images: number, urlOf: UrlOf): (i
 }
 
 /** What the widgets of one result share; worked out again where its files change. */
-export function useWidgetData(poses: PosesFile | null, report: ReportFile | null, view: ViewFile | null, urlOf: UrlOf) {
+export function useWidgetData(poses: PosesDocument | null, report: Report | null, view: ViewFile | null, urlOf: UrlOf) {
   const names = useMemo(() => poses?.images.map(({ name }) => name) ?? [], [poses]);
   const cameras = useMemo(() => (poses ? camerasOf(poses, report) : []), [poses, report]);
   const centres = useMemo(() => cameras.map(({ after }) => centreOf(after)), [cameras]);

@@ -1,7 +1,7 @@
 // What takes the place of the three-dimensional picture where the browser cannot draw it.
+import { centreOf, type Triple } from "../result/poses";
+import type { SceneCamera } from "../result/widget_data";
 import { short } from "../widgets/numbers";
-import { centreOf } from "../result/poses";
-import type { SceneCamera, Triple } from "../result/types";
 
 const words = (centre: Triple): string => centre.map((value) => short(value, 4)).join(", ");
 

@@ -1,6 +1,7 @@
 // Colours of values, on absolute scales: the same value has the same colour in every job and on every page.
-import type { ColourBy, SceneCamera } from "../result/types";
+import type { SceneCamera } from "../result/widget_data";
 
+export type ColourBy = "moved_deg" | "moved_units" | "delta_psnr" | "source";
 export type Colour = readonly [number, number, number]; // 0 to 255
 
 // Viridis, as in the pictures of differences and depths: even steps look even, also without colour vision.

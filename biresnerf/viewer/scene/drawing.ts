@@ -14,10 +14,10 @@ import {
   WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { axisOf, between, centreOf, type Matrix, medianOf, minus, plus, spreadOf, type Triple } from "../result/poses";
+import type { PointLayer, SceneCamera } from "../result/widget_data";
 import { Frusta, VERTICES } from "./frusta";
 import { cloudOf, type Look, overviewOf, pathsOf, upwardsOf, type Viewpoint } from "./geometry";
-import { axisOf, between, centreOf, medianOf, minus, plus, spreadOf } from "../result/poses";
-import type { Matrix, PointLayer, SceneCamera, Triple } from "../result/types";
 
 const VIEW_DEG = 45;
 const PICK_PX = 14;

@@ -9,9 +9,9 @@ import {
   Mesh,
   MeshBasicMaterial,
 } from "three";
+import { inWorld, type Matrix, type Triple } from "../result/poses";
+import type { SceneCamera } from "../result/widget_data";
 import type { Colour } from "./colours";
-import { inWorld } from "../result/poses";
-import type { Matrix, SceneCamera, Triple } from "../result/types";
 
 // Vertices: the centre 0, the picture's corners 1 to 4 from its top left, and a tip 5 above its top edge.
 const SIDES = [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 1, 1, 2, 3, 1, 3, 4];

@@ -1,9 +1,9 @@
 // What the three-dimensional picture is put together from: where it is seen from at first, and clouds of points.
 import { BufferAttribute, BufferGeometry, Points, PointsMaterial, Vector3 } from "three";
+import { axisOf, centreOf, length, minus, type Triple } from "../result/poses";
+import type { PointLayer, SceneCamera } from "../result/widget_data";
 import type { Colour } from "./colours";
 import { srgb } from "./frusta";
-import { axisOf, centreOf, length, minus } from "../result/poses";
-import type { PointLayer, SceneCamera, Triple } from "../result/types";
 
 /** What is to be shown, and how. */
 export interface Look {

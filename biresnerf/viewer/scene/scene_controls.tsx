@@ -1,8 +1,8 @@
 // What of the three-dimensional picture can be chosen, and what its colours mean.
-import { css, kindColour, rampColour, scaleOf, signedColour, UNKNOWN } from "./colours";
+import type { PointLayer } from "../result/widget_data";
 import { Choice, Pick, Switch } from "../widgets/controls";
-import { sourceWords } from "../widgets/numbers";
-import type { ColourBy, PointLayer } from "../result/types";
+import { sourceWords } from "../widgets/words";
+import { type ColourBy, css, kindColour, rampColour, scaleOf, signedColour, UNKNOWN } from "./colours";
 
 /** What the reader has chosen. */
 export interface SceneChoice {

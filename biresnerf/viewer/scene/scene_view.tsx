@@ -1,15 +1,24 @@
 // (1) Cameras before and after, in three dimensions.
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import { between, centreOf, medianOf, spreadOf, turnDeg } from "../result/poses";
+import type { PointLayer, SceneCamera } from "../result/widget_data";
+import { Button, ImageStepper } from "../widgets/controls";
+import { fixed, short } from "../widgets/numbers";
+import { hexColour, themeColour, useDark, useStill } from "../widgets/theme";
+import { sourceWords } from "../widgets/words";
 import { CameraTable } from "./camera_table";
 import { colourOf } from "./colours";
-import { Button, ImageStepper } from "../widgets/controls";
-import { fixed, short, sourceWords } from "../widgets/numbers";
-import { between, centreOf, medianOf, spreadOf, turnDeg } from "../result/poses";
-import { capOf, FIRST_CHOICE, layerOf, Legend, SceneControls } from "./scene_controls";
 import type { Look } from "./geometry";
-import { hexColour, themeColour, useDark, useStill } from "../widgets/theme";
-import type { PointLayer, SceneCamera, SceneViewProps } from "../result/types";
+import { capOf, FIRST_CHOICE, layerOf, Legend, SceneControls } from "./scene_controls";
 import { useScene } from "./use_scene";
+
+export interface SceneViewProps {
+  readonly cameras: readonly SceneCamera[];
+  readonly points?: readonly PointLayer[];
+  /** Index of the chosen image; null: none. */
+  readonly selected: number | null;
+  readonly onSelect: (image: number | null) => void;
+}
 
 const NO_POINTS: readonly PointLayer[] = [];
 

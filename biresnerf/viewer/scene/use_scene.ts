@@ -1,8 +1,8 @@
 // The three-dimensional picture's life within a page: made, resized, shown anew, taken down.
 import { useEffect, useRef, useState } from "preact/hooks";
+import type { SceneCamera } from "../result/widget_data";
 import { SceneDrawing } from "./drawing";
 import type { Look, Viewpoint } from "./geometry";
-import type { SceneCamera } from "../result/types";
 
 /**
  * The drawing in `host`, made anew for other cameras and seen from where the last one was; and why there is none.

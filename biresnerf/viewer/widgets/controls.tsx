@@ -1,6 +1,8 @@
-// Small controls that several widgets use.
+// Small controls and labels that several widgets use.
 import type { ComponentChildren } from "preact";
 import { useId } from "preact/hooks";
+import type { Verdict } from "schemas";
+import { VERDICTS } from "./words";
 
 /** One of a few: radio buttons that look like one bar. */
 export function Choice<T extends string | number>(props: {
@@ -117,4 +119,10 @@ export function ImageStepper(props: {
       </Button>
     </div>
   );
+}
+
+/** The verdict as a small label. */
+export function VerdictChip({ verdict }: { verdict: Verdict["verdict"] }) {
+  const { word, tone } = VERDICTS[verdict];
+  return <span class={`chip chip-${tone}`}>{word}</span>;
 }

@@ -1,16 +1,25 @@
 // (3) Curves of the run: how well the field fits, how much the cameras still move, when the detector calls it stable.
 import { useEffect, useMemo, useRef } from "preact/hooks";
 import uPlot from "uplot";
+import type { CurvePoint } from "../result/widget_data";
 import { fixed, short } from "./numbers";
 import { themeColour, useDark } from "./theme";
-import type { CurvesProps, HistoryLine } from "../result/types";
+
+export interface CurvesProps {
+  readonly lines: readonly CurvePoint[];
+  /** First step of stage 2, once known. */
+  readonly switchStep?: number | null;
+  readonly switchReason?: "stable" | "cap" | null;
+  /** All steps of the run, where known: the axis then shows what is still to come. */
+  readonly steps?: number | null;
+}
 
 const HIGH_PX = 170;
 
 interface Curve {
   readonly label: string;
   readonly colour: string;
-  readonly value: (line: HistoryLine) => number | undefined;
+  readonly value: (line: CurvePoint) => number | null | undefined;
   readonly scale?: string;
   readonly dashed?: boolean;
 }
@@ -21,9 +30,9 @@ interface Chart {
   readonly logarithmic?: boolean;
   readonly second?: string;
   readonly curves: readonly Curve[];
-  readonly summary: (lines: readonly HistoryLine[]) => string;
+  readonly summary: (lines: readonly CurvePoint[]) => string;
   /** Whether there is, or will be, something to show of it; and what is said until then. */
-  readonly of?: (line: HistoryLine) => boolean;
+  readonly of?: (line: CurvePoint) => boolean;
   readonly later?: string;
 }
 
@@ -51,7 +60,7 @@ const CHARTS: readonly Chart[] = [
   {
     title: "Stability signal",
     axis: "dB over the window",
-    of: (line) => line.still_deg !== undefined,
+    of: (line) => line.still_deg != null,
     later: "begins with the detector's 10th look",
     curves: [
       { label: "trend of the error, dB", colour: "--curve-1", value: (line) => line.trend_db },
@@ -60,7 +69,7 @@ const CHARTS: readonly Chart[] = [
     ],
     summary: (lines) =>
       ends(
-        lines.filter((line) => line.trend_db !== undefined),
+        lines.filter((line) => line.trend_db != null),
         "Trend of the error over the detector's window, in stage 1",
         (line) => `${fixed(line.trend_db, 2)} dB`,
       ),
@@ -68,9 +77,9 @@ const CHARTS: readonly Chart[] = [
 ];
 
 const positive = (value: number): number | undefined => (value > 0 ? value : undefined); // a logarithm has no zero
-const negative = (value: number | undefined): number | undefined => (value === undefined ? undefined : -value);
+const negative = (value: number | null | undefined) => (value == null ? value : -value);
 
-function ends(lines: readonly HistoryLine[], what: string, say: (line: HistoryLine) => string): string {
+function ends(lines: readonly CurvePoint[], what: string, say: (line: CurvePoint) => string): string {
   const [first, last] = [lines[0], lines[lines.length - 1]];
   if (!first || !last) return `${what}: nothing yet`;
   return `${what}: ${say(first)} at step ${first.step}, ${say(last)} at step ${last.step}`;
@@ -110,12 +119,12 @@ export function Curves({ lines, switchStep = null, switchReason = null, steps = 
 }
 
 /** The last step of stage 1, where lines of stage 2 are there. */
-function switchOf(lines: readonly HistoryLine[]): number | null {
+function switchOf(lines: readonly CurvePoint[]): number | null {
   const first = lines.findIndex((line) => line.stage === "fine");
   return first < 0 ? null : first === 0 ? 0 : (lines[first - 1]?.step ?? null);
 }
 
-function Plot(props: { chart: Chart; lines: readonly HistoryLine[]; switchStep: number | null; steps: number | null }) {
+function Plot(props: { chart: Chart; lines: readonly CurvePoint[]; switchStep: number | null; steps: number | null }) {
   const { chart, lines, switchStep, steps } = props;
   const dark = useDark();
   const host = useRef<HTMLDivElement>(null);
@@ -154,7 +163,7 @@ function Plot(props: { chart: Chart; lines: readonly HistoryLine[]; switchStep: 
               <i class={curve.dashed ? "dash dash-dashed" : "dash"} style={{ color: `var(${curve.colour})` }} /> {curve.label}
             </span>
           ))}
-        {chart.later && !lines.some((line) => line.trend_db !== undefined) && <span class="soft">({chart.later})</span>}
+        {chart.later && !lines.some((line) => line.trend_db != null) && <span class="soft">({chart.later})</span>}
       </figcaption>
       <div ref={host} role="img" aria-label={`${chart.title}. ${chart.summary(lines)}.`} />
     </figure>

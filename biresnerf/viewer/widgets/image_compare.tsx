@@ -1,10 +1,22 @@
 // (2) What the field shows at a camera, against the photo that was taken there.
 import { useMemo, useState } from "preact/hooks";
+import type { ShownPictures, ShownView } from "schemas";
+import { length, minus, type Triple } from "../result/poses";
+import type { UrlOf } from "../result/widget_data";
 import { Choice, ImageStepper } from "./controls";
 import { fixed } from "./numbers";
-import { length, minus } from "../result/poses";
-import type { ImageCompareProps, PictureKind, RenderedView, Triple } from "../result/types";
 
+export interface ImageCompareProps {
+  readonly names: readonly string[];
+  readonly views: readonly ShownView[];
+  /** Centres of the cameras, to say which views are near one that has none. */
+  readonly centres: readonly Triple[];
+  readonly urlOf: UrlOf;
+  readonly selected: number | null;
+  readonly onSelect: (image: number | null) => void;
+}
+
+type PictureKind = keyof ShownPictures;
 type Mode = "swipe" | "difference" | "depth";
 const NEAR = 3;
 
@@ -50,7 +62,7 @@ export function ImageCompare({ names, views, centres, urlOf, selected, onSelect 
   );
 }
 
-function Picture(props: { view: RenderedView; name: string; mode: Mode; urlOf: ImageCompareProps["urlOf"] }) {
+function Picture(props: { view: ShownView; name: string; mode: Mode; urlOf: ImageCompareProps["urlOf"] }) {
   const { view, name, mode, urlOf } = props;
   const [at, setAt] = useState(0.5);
   const [missing, setMissing] = useState<string | null>(null);

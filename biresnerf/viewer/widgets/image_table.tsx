@@ -1,8 +1,20 @@
 // (4) One row an image.
 import { useMemo, useState } from "preact/hooks";
+import type { ImageRow, SheetCell } from "../result/widget_data";
 import { Pick } from "./controls";
-import { ALARMING, count, fixed, flagWords, short, signed, sourceWords } from "./numbers";
-import type { ImageRow, ImageTableProps, SheetCell } from "../result/types";
+import { count, fixed, short, signed } from "./numbers";
+import { ALARMING, FLAGS, sourceWords } from "./words";
+
+export interface ImageTableProps {
+  readonly rows: readonly ImageRow[];
+  readonly selected: number | null;
+  readonly onSelect: (image: number | null) => void;
+  /** The image's place in the contact sheet. */
+  readonly cellOf?: (image: number) => SheetCell | null;
+  /** Images that are ticked, where they can be. */
+  readonly ticked?: ReadonlySet<number>;
+  readonly onTick?: (image: number, on: boolean) => void;
+}
 
 const SHOWN_AT_FIRST = 200;
 const THUMB_PX = 30;
@@ -56,7 +68,7 @@ export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }:
     const kept = rows.filter(
       (row) =>
         row.name.toLocaleLowerCase().includes(wanted) &&
-        (kind === "" || row.flags.includes(kind) || kind === `from ${row.source}`),
+        (kind === "" || row.flags.some((flag) => flag === kind) || kind === `from ${row.source}`),
     );
     const by = [NAME, SOURCE, ...COLUMNS].find((column) => column.key === order?.key);
     return by && order ? sorted(kept, by, order.down) : kept;
@@ -88,7 +100,7 @@ export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }:
           onChange={setKind}
           options={[
             { value: "", text: "all" },
-            ...kinds.map((flag) => ({ value: flag, text: flagWords(flag) })),
+            ...kinds.map((flag) => ({ value: flag, text: FLAGS[flag] })),
             ...(sources.length > 1
               ? sources.map((source) => ({ value: `from ${source}`, text: `pose from ${sourceWords(source)}` }))
               : []),
@@ -151,7 +163,7 @@ export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }:
                 <td>
                   {row.flags.map((flag) => (
                     <span key={flag} class={ALARMING.has(flag) ? "flag flag-bad" : "flag"}>
-                      {flagWords(flag)}
+                      {FLAGS[flag]}
                     </span>
                   ))}
                 </td>

@@ -30,22 +30,3 @@ export function duration(seconds: number): string {
     ? `${minutes} min ${String(whole % 60).padStart(2, "0")} s`
     : `${Math.floor(minutes / 60)} h ${String(minutes % 60).padStart(2, "0")} min`;
 }
-
-const FLAGS: Readonly<Record<string, string>> = {
-  held_out: "held out",
-  fixed: "fixed",
-  lost: "lost",
-  repaired: "repaired",
-  moved_far: "moved far",
-  blurred: "blurred",
-  exposure_off: "exposure off",
-  unsure_deg: "place unsure",
-};
-
-export const flagWords = (flag: string): string => FLAGS[flag] ?? flag.replaceAll("_", " ");
-
-/** Flags that ask for a look. */
-export const ALARMING: ReadonlySet<string> = new Set(["lost", "moved_far", "blurred", "exposure_off", "unsure_deg"]);
-
-export const sourceWords = (source: string): string =>
-  source === "given" ? "given" : source.replaceAll("-", " ");

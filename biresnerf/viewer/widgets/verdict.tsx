@@ -1,19 +1,13 @@
 // (5) Whether refinement helped, in one sentence, and what proves it.
+import type { PairedDifference, Verdict } from "schemas";
+import { VerdictChip } from "./controls";
 import { count, fixed, short, signed } from "./numbers";
-import type { PairedDifference, Verdict, VerdictName, VerdictSentenceProps } from "../result/types";
 
-const WORDS: Readonly<Record<VerdictName, { chip: string; tone: "good" | "plain" | "unsure" | "bad" }>> = {
-  improved: { chip: "Improved", tone: "good" },
-  unchanged: { chip: "Unchanged", tone: "plain" },
-  kept_input: { chip: "Input kept", tone: "plain" },
-  inconclusive: { chip: "Inconclusive", tone: "unsure" },
-  failed_check: { chip: "Check failed", tone: "bad" },
-};
-
-/** The verdict as a small label, for lists of jobs. */
-export function VerdictChip({ verdict }: { verdict: VerdictName }) {
-  const { chip, tone } = WORDS[verdict];
-  return <span class={`chip chip-${tone}`}>{chip}</span>;
+export interface VerdictSentenceProps {
+  readonly verdict: Verdict | null;
+  readonly state: "complete" | "partial";
+  /** Whether a verdict was asked for. */
+  readonly asked?: boolean;
 }
 
 export function VerdictSentence({ verdict, state, asked = true }: VerdictSentenceProps) {
@@ -21,7 +15,7 @@ export function VerdictSentence({ verdict, state, asked = true }: VerdictSentenc
     return (
       <section class="verdict" aria-label="Verdict">
         <p class="verdict-sentence">
-          <span class="chip chip-plain">{state === "partial" ? "Partial" : "No verdict"}</span>
+          <span class="chip chip-plain">{state === "partial" ? "partial" : "no verdict"}</span>
           {state === "partial"
             ? "The run was stopped before its end: these are the best poses until then, and nobody has compared them with the input's."
             : asked

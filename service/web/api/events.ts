@@ -1,5 +1,5 @@
 // A job's server-sent events. Read by fetch: EventSource sends no API key.
-import type { JobView } from "./answers";
+import type { JobView } from "schemas";
 import { address, asProblem, noteRefusal, pause, Problem, withKey } from "./http";
 
 export interface JobEvent {

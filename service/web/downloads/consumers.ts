@@ -1,5 +1,5 @@
 // Who the files of a result are for.
-import type { ArtifactView } from "../api/answers";
+import type { ArtifactView } from "schemas";
 
 export interface Consumer {
   name: string;

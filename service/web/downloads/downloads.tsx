@@ -1,14 +1,15 @@
 // The result, by who it is for.
 import { useState } from "preact/hooks";
-import { bytes, count, percent } from "../parts/format";
-import { ProblemBox } from "../parts/problem_box";
-import type { ArtifactView, JobView, ShareView } from "../api/answers";
+import type { ArtifactView, JobView, ShareView } from "schemas";
+import { count } from "../../../biresnerf/viewer/widgets/numbers";
 import { address, apiKey, ask, asProblem, call, pause, Problem } from "../api/http";
 import { direct } from "../api/picture_urls";
 import { useStore } from "../api/store";
 import { isOver } from "../jobs/state";
 import { CopyButton } from "../parts/copy_button";
-import { CONSUMERS, curlLines, filesFor, pythonLines, type Consumer } from "./consumers";
+import { bytes, percent } from "../parts/format";
+import { ProblemBox } from "../parts/problem_box";
+import { type Consumer, CONSUMERS, curlLines, filesFor, pythonLines } from "./consumers";
 import { fitsOneZip, Zip } from "./zip";
 
 const SHARED_S = 7 * 86_400;

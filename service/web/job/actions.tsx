@@ -1,14 +1,14 @@
 // What can be done with a job: end it, run it again with other options, delete it, pass it on.
-import { useEffect, useRef, useState } from "preact/hooks";
 import type { ComponentChildren } from "preact";
+import { useEffect, useRef, useState } from "preact/hooks";
+import type { JobView } from "schemas";
+import { asProblem, call, type Problem } from "../api/http";
+import { Store, useStore } from "../api/store";
 import { isOver } from "../jobs/state";
 import { OptionsForm } from "../options/form";
 import type { Values } from "../options/schema";
-import { ProblemBox } from "../parts/problem_box";
-import type { JobView } from "../api/answers";
-import { asProblem, call, type Problem } from "../api/http";
-import { Store, useStore } from "../api/store";
 import { CopyButton } from "../parts/copy_button";
+import { ProblemBox } from "../parts/problem_box";
 
 /** Options to run a job again with, where another part of the page asks for that. */
 export const wishedAgain = new Store<{ job: string; values: Values } | null>(null);

@@ -1,6 +1,6 @@
 // A job that did not succeed: what failed, on which images, and what to do next.
+import type { JobView } from "schemas";
 import { ProblemBox } from "../parts/problem_box";
-import type { JobView } from "../api/answers";
 
 export function Failure({ job, images }: { job: JobView; images: readonly string[] }) {
   const { error } = job;

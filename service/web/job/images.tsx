@@ -1,11 +1,11 @@
 // One row an image; of those that are ticked the job can be run again with their poses held.
 import { useState } from "preact/hooks";
-import type { ImageTableProps } from "../../../biresnerf/viewer/result/types";
-import { count } from "../parts/format";
+import type { JobView } from "schemas";
+import type { ImageTableProps } from "../../../biresnerf/viewer/widgets/image_table";
+import { count } from "../../../biresnerf/viewer/widgets/numbers";
 import { isOver } from "../jobs/state";
-import type { JobView } from "../api/answers";
-import { wishedAgain } from "./actions";
 import { CopyButton } from "../parts/copy_button";
+import { wishedAgain } from "./actions";
 
 type Widgets = typeof import("./widgets");
 

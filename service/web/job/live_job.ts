@@ -1,25 +1,23 @@
 // All that is known of one job, kept up to date for as long as somebody looks.
-import { historyOf, pointsOf } from "../../../biresnerf/viewer/result/widget_data";
-import type { HistoryLine, PointLayer, PosesFile, ReportFile, ViewFile } from "../../../biresnerf/viewer/result/types";
-import { isOver } from "../jobs/state";
-import type { ArtifactList, ArtifactView, JobView } from "../api/answers";
+import type { ArtifactList, ArtifactView, JobView, PosesDocument, Report, SeedingPreview, ViewFile } from "schemas";
+import { type CurvePoint, historyOf, type PointLayer, pointsOf } from "../../../biresnerf/viewer/result/widget_data";
 import { follow, type JobEvent } from "../api/events";
 import { ask, asProblem, call, pause, type Problem } from "../api/http";
 import { Store } from "../api/store";
-import type { SeedingFile } from "./seeding";
+import { isOver } from "../jobs/state";
 
 export interface Seen {
   job: JobView | null;
   events: JobEvent[];
-  artifacts: ArtifactView[];
+  artifacts: readonly ArtifactView[];
   /** The run's curve so far. */
-  history: HistoryLine[];
-  poses: PosesFile | null;
-  report: ReportFile | null;
+  history: CurvePoint[];
+  poses: PosesDocument | null;
+  report: Report | null;
   view: ViewFile | null;
   points: PointLayer[];
   /** What COLMAP has found, while it works. */
-  seeding: SeedingFile | null;
+  seeding: SeedingPreview | null;
   /** Whether progress comes as it happens. */
   linked: boolean;
   problem: Problem | null;
@@ -34,9 +32,9 @@ export class LiveJob extends Store<Seen> {
   private readonly stop = new AbortController();
   /** What was read of each file, by its digest: a preview of another digest is read anew. */
   private readonly read = new Map<string, string>();
-  private recorded: HistoryLine[] = [];
+  private recorded: CurvePoint[] = [];
   /** Between two previews the progress events tell how it goes. */
-  private told: HistoryLine[] = [];
+  private told: CurvePoint[] = [];
   private looking: Promise<void> | null = null;
   private lookAgain = false;
 
@@ -130,9 +128,9 @@ export class LiveJob extends Store<Seen> {
     const view = (await this.json<ViewFile>("view.json")) ?? this.value.view;
     const [history, report, poses, seeding] = await Promise.all([
       this.text("history.jsonl"),
-      this.json<ReportFile>("report.json"),
-      this.json<PosesFile>(view?.poses ?? "poses.json"),
-      this.json<SeedingFile>("seeding.json"),
+      this.json<Report>("report.json"),
+      this.json<PosesDocument>(view?.poses ?? "poses.json"),
+      this.json<SeedingPreview>("seeding.json"),
     ]);
     if (history !== null) {
       this.recorded = historyOf(history);
@@ -181,18 +179,17 @@ export class LiveJob extends Store<Seen> {
   }
 }
 
-const SIGNAL = ["still_deg", "trend_db", "level_db", "confirmed"] as const;
+const SIGNAL = ["still_deg", "trend_db", "level_db"] as const;
 
 const stepping = ({ stage }: JobView) => (stage === "coarse" || stage === "fine" ? stage : null);
 
 /** A line of the curve from a progress event, where it is of a later step than the last one. */
-function lineOf(job: JobView, last: HistoryLine | undefined): HistoryLine | null {
+function lineOf(job: JobView, last: CurvePoint | undefined): CurvePoint | null {
   const { loss, psnr, moved_deg } = job.metrics;
   const { step } = job.progress;
   const stage = stepping(job);
   if (!stage || loss === undefined || psnr === undefined || !last || step <= last.step) return null;
-  const seconds = job.started_at ? (Date.now() - Date.parse(job.started_at)) / 1000 : last.seconds;
-  const line = { step, stage, loss, psnr, seconds, moved_deg: moved_deg ?? 0, pose_rate: last.pose_rate };
+  const line = { step, stage, loss, psnr, moved_deg: moved_deg ?? 0 };
   // The detector looks at stage 1 alone; what it saw last stays in the job.
   const signal = stage === "coarse" ? SIGNAL.filter((name) => job.metrics[name] !== undefined) : [];
   return { ...line, ...Object.fromEntries(signal.map((name) => [name, job.metrics[name]])) };

@@ -1,8 +1,8 @@
 // What the job's process has written, while it runs too.
 import { useEffect, useRef, useState } from "preact/hooks";
-import { isOver } from "../jobs/state";
-import type { JobView } from "../api/answers";
+import type { JobView } from "schemas";
 import { ask, pause } from "../api/http";
+import { isOver } from "../jobs/state";
 
 const EVERY_MS = 1500;
 const LINES_MAX = 2000;

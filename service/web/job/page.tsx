@@ -1,14 +1,15 @@
 // One job: how far it is, what came out, what can be done with it.
 import { useEffect, useMemo, useState } from "preact/hooks";
-import { duration, moment } from "../parts/format";
-import { Chip, isOver, STAGE_WORDS, StageBar, titleOf } from "../jobs/state";
-import { ProblemBox } from "../parts/problem_box";
-import type { JobView, Stage } from "../api/answers";
+import type { JobView } from "schemas";
+import { duration } from "../../../biresnerf/viewer/widgets/numbers";
 import { pictureUrl } from "../api/picture_urls";
 import { useStore } from "../api/store";
+import { Downloads } from "../downloads/downloads";
+import { Chip, isOver, type Stage, STAGE_WORDS, StageBar, titleOf } from "../jobs/state";
+import { moment } from "../parts/format";
+import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 import { Actions } from "./actions";
-import { Downloads } from "../downloads/downloads";
 import { Failure } from "./failure";
 import { LiveJob, type Seen } from "./live_job";
 import { LogView } from "./log";

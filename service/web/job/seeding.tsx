@@ -1,18 +1,13 @@
 // What feature matches say of the photos while COLMAP works, before there is anything to render.
-import type { UrlOf } from "../../../biresnerf/viewer/result/types";
-import { count } from "../parts/format";
-
-/** preview/seeding.json. */
-export interface SeedingFile {
-  matched_pairs: number;
-  images: { name: string; posed: boolean; features: number | null; partners: number }[];
-}
+import type { SeedingPreview } from "schemas";
+import type { UrlOf } from "../../../biresnerf/viewer/result/widget_data";
+import { count } from "../../../biresnerf/viewer/widgets/numbers";
 
 const PHOTOS = "preview/photos.jpg";
 const NAMED_MOST = 12;
 const HIGH = 48;
 
-export function Seeding({ seeding, urlOf }: { seeding: SeedingFile; urlOf: UrlOf }) {
+export function Seeding({ seeding, urlOf }: { seeding: SeedingPreview; urlOf: UrlOf }) {
   const { images, matched_pairs } = seeding;
   const looked = images.filter(({ features }) => features !== null);
   const lone = looked.filter(({ partners }) => partners === 0);
@@ -40,7 +35,7 @@ export function Seeding({ seeding, urlOf }: { seeding: SeedingFile; urlOf: UrlOf
 }
 
 /** A bar an image, in the set's order: gaps are where nothing ties the photos to the others. */
-function Overlap({ images }: Pick<SeedingFile, "images">) {
+function Overlap({ images }: Pick<SeedingPreview, "images">) {
   const most = Math.max(...images.map(({ partners }) => partners));
   const least = Math.min(...images.map(({ partners }) => partners));
   return (

@@ -1,12 +1,11 @@
 // What there is to see of a job, with one image chosen in all of it; while it runs, its previews.
 import type { ComponentChildren } from "preact";
 import { useEffect, useState } from "preact/hooks";
-import { useWidgetData } from "../../../biresnerf/viewer/result/widget_data";
-import type { PosesFile, UrlOf, ViewFile } from "../../../biresnerf/viewer/result/types";
-import { isOver } from "../jobs/state";
+import type { ArtifactView, JobView, PosesDocument, ViewFile } from "schemas";
+import { type UrlOf, useWidgetData } from "../../../biresnerf/viewer/result/widget_data";
 import { asProblem, type Problem } from "../api/http";
+import { isOver } from "../jobs/state";
 import { ProblemBox } from "../parts/problem_box";
-import type { ArtifactView, JobView } from "../api/answers";
 import { Images } from "./images";
 import type { Seen } from "./live_job";
 import { Seeding } from "./seeding";
@@ -134,7 +133,7 @@ function Waiting({ job, for: what }: { job: JobView; for: string }) {
 const KINDS = ["render", "photo", "difference", "depth"] as const;
 
 /** One view as the field has it now. */
-function Preview({ seen, poses, urlOf }: { seen: Seen; poses: PosesFile | null; urlOf: UrlOf }) {
+function Preview({ seen, poses, urlOf }: { seen: Seen; poses: PosesDocument | null; urlOf: UrlOf }) {
   const pictures = previewPictures(seen.artifacts);
   if (!pictures.size && seen.seeding && !isOver(seen.job!)) return <Seeding seeding={seen.seeding} urlOf={urlOf} />;
   if (!pictures.size) return <Waiting job={seen.job!} for="pictures" />;

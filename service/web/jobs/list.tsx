@@ -1,14 +1,15 @@
 // All jobs, newest first, as they are now.
 import { useEffect, useState } from "preact/hooks";
+import type { JobList, JobView } from "schemas";
 import { Pick } from "../../../biresnerf/viewer/widgets/controls";
-import type { JobList, JobState, JobView } from "../api/answers";
+import { count } from "../../../biresnerf/viewer/widgets/numbers";
 import { asProblem, call, type Problem } from "../api/http";
 import { usePicture } from "../api/picture_urls";
-import { count, moment } from "../parts/format";
+import { moment } from "../parts/format";
 import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 import { DropZone } from "../upload/drop";
-import { Chip, isOver, StageBar, STATE_WORDS, titleOf } from "./state";
+import { Chip, isOver, type JobState, StageBar, STATE_WORDS, titleOf } from "./state";
 
 /** How many more are shown at a time, and how many the service gives at once. */
 const PAGE = 24;

@@ -1,6 +1,11 @@
 // A job's state in words, as a chip, and as a bar of its stages.
-import { STAGES, type JobView, type Stage } from "../api/answers";
-import { duration, percent } from "../parts/format";
+import type { JobView } from "schemas";
+import { VerdictChip } from "../../../biresnerf/viewer/widgets/controls";
+import { duration } from "../../../biresnerf/viewer/widgets/numbers";
+import { percent } from "../parts/format";
+
+export type JobState = JobView["state"];
+export type Stage = NonNullable<JobView["stage"]>;
 
 export const STAGE_WORDS: Record<Stage, string> = {
   preparing: "Preparing",
@@ -10,6 +15,7 @@ export const STAGE_WORDS: Record<Stage, string> = {
   evaluating: "Evaluating",
   exporting: "Writing",
 };
+const STAGES = Object.keys(STAGE_WORDS) as Stage[];
 export const STATE_WORDS = {
   queued: "waiting",
   running: "running",
@@ -17,20 +23,6 @@ export const STATE_WORDS = {
   failed: "failed",
   cancelled: "cancelled",
   expired: "expired",
-} as const;
-const VERDICT_WORDS = {
-  improved: "improved",
-  unchanged: "unchanged",
-  kept_input: "input kept",
-  inconclusive: "inconclusive",
-  failed_check: "check failed",
-} as const;
-const VERDICT_TONES = {
-  improved: "good",
-  unchanged: "plain",
-  kept_input: "plain",
-  inconclusive: "unsure",
-  failed_check: "bad",
 } as const;
 
 export const isOver = (job: JobView) => !["queued", "running"].includes(job.state);
@@ -45,9 +37,7 @@ export function titleOf(job: JobView): string {
 }
 
 export function Chip({ job }: { job: JobView }) {
-  if (job.state === "succeeded" && job.verdict) {
-    return <span class={`chip chip-${VERDICT_TONES[job.verdict]}`}>{VERDICT_WORDS[job.verdict]}</span>;
-  }
+  if (job.state === "succeeded" && job.verdict) return <VerdictChip verdict={job.verdict} />;
   const tone = job.state === "failed" ? "bad" : job.state === "running" ? "accent" : "plain";
   const ending = job.cancel_requested && !isOver(job);
   const words = ending ? "ending" : STATE_WORDS[job.state];

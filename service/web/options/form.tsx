@@ -1,9 +1,9 @@
 // Preset and options, made from what the service says of them.
 import { useEffect, useMemo, useState } from "preact/hooks";
-import type { OptionsView } from "../api/answers";
+import type { OptionsView } from "schemas";
 import { asProblem, call, type FieldProblem, type Problem } from "../api/http";
 import { ProblemBox } from "../parts/problem_box";
-import { fieldsOf, parsed, presetValue, words, type Field, type Values } from "./schema";
+import { type Field, fieldsOf, parsed, presetValue, type Values, words } from "./schema";
 
 const PRESET_WORDS: Record<string, string> = {
   fast: "A look within minutes",

@@ -1,5 +1,20 @@
 // The options' JSON Schema as fields of a form.
-import type { OptionsView, Schema } from "../api/answers";
+import type { OptionsView } from "schemas";
+
+/** The part of JSON Schema that pydantic uses for the options. */
+interface Schema {
+  readonly type?: string;
+  readonly description?: string;
+  readonly default?: unknown;
+  readonly enum?: readonly (string | number)[];
+  readonly anyOf?: readonly Schema[];
+  readonly items?: Schema;
+  readonly properties?: Readonly<Record<string, Schema>>;
+  readonly minimum?: number;
+  readonly maximum?: number;
+  readonly exclusiveMinimum?: number;
+  readonly exclusiveMaximum?: number;
+}
 
 export type Values = Record<string, unknown>;
 
@@ -48,7 +63,8 @@ function fieldOf(name: string, said: Schema): Field {
 
 /** What holds where a field is left empty. */
 export function presetValue(view: OptionsView, preset: string, name: string): string {
-  return words(view.presets[preset]?.[name] ?? view.json_schema.properties?.[name]?.default);
+  const filled: Values = { ...view.presets[preset as keyof OptionsView["presets"]] };
+  return words(filled[name] ?? (view.json_schema as Schema).properties?.[name]?.default);
 }
 
 export function words(value: unknown): string {

@@ -1,5 +1,5 @@
 // What went wrong, where, and what to do about it.
-import type { JobError } from "../api/answers";
+import type { JobError } from "schemas";
 import type { Problem } from "../api/http";
 
 export function ProblemBox({ problem, heading }: { problem: Problem | JobError; heading?: string }) {

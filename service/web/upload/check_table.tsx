@@ -1,7 +1,8 @@
 // What the service's check of a set says, line by line, as it comes to know it.
 import type { ComponentChildren } from "preact";
-import type { DatasetView } from "../api/answers";
-import { bytes, count } from "../parts/format";
+import type { DatasetView } from "schemas";
+import { count } from "../../../biresnerf/viewer/widgets/numbers";
+import { bytes } from "../parts/format";
 
 type Mark = "good" | "note" | "bad" | "wait";
 const MARKS: Record<Mark, [string, string]> = {

@@ -1,17 +1,18 @@
 // A set of images: on its way, checked, and what to do with it.
 import { useCallback, useEffect, useState } from "preact/hooks";
-import type { DatasetView, JobView } from "../api/answers";
+import type { DatasetView, JobView } from "schemas";
+import { count, duration } from "../../../biresnerf/viewer/widgets/numbers";
 import { asProblem, call, pause, type Problem } from "../api/http";
 import { Store, useStore } from "../api/store";
 import { nameLabel } from "../jobs/state";
-import { bytes, count, duration, percent } from "../parts/format";
 import { OptionsForm } from "../options/form";
 import type { Values } from "../options/schema";
+import { bytes, percent } from "../parts/format";
 import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 import { CheckTable } from "./check_table";
 import { DropZone } from "./drop";
-import { sendings, type Sending } from "./send";
+import { type Sending, sendings } from "./send";
 import { StillToCome } from "./still_to_come";
 
 const LOOK_EVERY_MS = 700;

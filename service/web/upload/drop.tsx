@@ -3,7 +3,7 @@ import { useEffect, useRef, useState } from "preact/hooks";
 import { asProblem, type Problem } from "../api/http";
 import { percent } from "../parts/format";
 import { ProblemBox } from "../parts/problem_box";
-import { fromDrop, fromInput, type Chosen, type Gathered } from "./gather";
+import { type Chosen, fromDrop, fromInput, type Gathered } from "./gather";
 import { begin } from "./send";
 
 interface Props {

@@ -1,5 +1,5 @@
 // Archives go by tus 1.0: in pieces, on from the last byte that arrived, also after the page was loaded anew.
-import type { DatasetView, UploadView } from "../api/answers";
+import type { DatasetView, UploadView } from "schemas";
 import { ask, asProblem, call, Problem } from "../api/http";
 import type { Store } from "../api/store";
 import { persistently, put, type Sending } from "./send";

@@ -1,9 +1,10 @@
 // Brings files to the service: only those it has not, several at a time, each again where the connection breaks.
-import type { DatasetView, Info, SizeLimits } from "../api/answers";
+import type { DatasetView, Info, SizeLimits } from "schemas";
+import { count } from "../../../biresnerf/viewer/widgets/numbers";
 import { address, asProblem, call, noteRefusal, pause, Problem, withKey } from "../api/http";
 import { Store } from "../api/store";
-import { bytes as inBytes, count } from "../parts/format";
-import { isArchive, type Chosen, type Gathered } from "./gather";
+import { bytes as inBytes } from "../parts/format";
+import { type Chosen, type Gathered, isArchive } from "./gather";
 import { giveUpRejected, sendArchive } from "./resumable";
 
 const AT_ONCE = 4;

@@ -1,6 +1,6 @@
 // What to do about a set of which not all arrived: the page was loaded anew, or the sending was given up.
-import type { DatasetView } from "../api/answers";
-import { count } from "../parts/format";
+import type { DatasetView } from "schemas";
+import { count } from "../../../biresnerf/viewer/widgets/numbers";
 import { DropZone } from "./drop";
 import { checkArrived, goOn } from "./send";
 

@@ -13,7 +13,7 @@ import pytest
 from biresnerf.errors import InputError
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.datasets import DatasetRecord, ManifestEntry
-from tests.workers.conftest import quick_settings, ready_dataset
+from tests.workers.conftest import ACCEPTED, quick_settings, ready_dataset
 from workers.engine import Stores, open_stores
 from workers.settings.errors import Conflict, LimitReached, NotFound
 from workers.settings.settings import Settings
@@ -153,9 +153,7 @@ async def test_a_check_that_does_not_pass_rejects_the_dataset(database_url: str,
 
 async def test_two_checks_at_once_run_the_program_once(database_url: str, tmp_path):
     marks = tmp_path / "marks"
-    program = (
-        f"open({str(marks)!r}, 'a').write('x'); import time; time.sleep(0.3); print('{{\"report\": {{}}}}')"
-    )
+    program = f"open({str(marks)!r}, 'a').write('x'); import time; time.sleep(0.3); {ACCEPTED}"
     settings = checked_by(program, database_url, tmp_path)
     async with open_stores(settings) as one, open_stores(settings) as other:
         dataset = await one.datasets.create("fox")
@@ -169,7 +167,7 @@ async def test_two_checks_at_once_run_the_program_once(database_url: str, tmp_pa
 async def test_many_checks_of_one_tenant_do_not_hold_up_anothers(database_url: str, tmp_path):
     marks = tmp_path / "marks"
     mark = f"open({str(marks)!r}, 'a').write(open(sys.argv[1] + '/a').read())"
-    program = f"import sys; {mark}; print('{{\"report\": {{}}}}')"
+    program = f"import sys; {mark}; {ACCEPTED}"
     async with open_stores(checked_by(program, database_url, tmp_path)) as stores:
         finalized = []
         for tenant in "aaaaaab":
@@ -209,13 +207,13 @@ async def checking(database_url: str, folder: Path, program: str) -> DatasetReco
 async def test_a_check_longer_than_the_stall_time_comes_to_its_end_and_runs_once(database_url: str, tmp_path):
     marks = tmp_path / "marks"
     mark = f"open({str(marks)!r}, 'a').write('x')"
-    program = f"{mark}; import time; time.sleep(2.5); print('{{\"report\": {{}}}}')"
+    program = f"{mark}; import time; time.sleep(2.5); {ACCEPTED}"
     assert (await checking(database_url, tmp_path, program)).state == "ready"
     assert marks.read_text() == "x"
 
 
 async def test_a_check_whose_lease_went_to_another_process_decides_nothing(database_url: str, tmp_path):
-    program = "import time; time.sleep(0.5); print('{\"report\": {}}')"
+    program = f"import time; time.sleep(0.5); {ACCEPTED}"
     settings = checked_by(program, database_url, tmp_path)
     async with open_stores(settings) as stores:
         dataset = await finalized_dataset(stores)
@@ -240,7 +238,7 @@ import os
 open({str(marks)!r}, 'a').write('x')
 if os.path.getsize({str(marks)!r}) == 1:
     os.kill(os.getpid(), 9)
-print('{{"report": {{}}}}')
+{ACCEPTED}
 """
     assert (await checking(database_url, tmp_path, program)).state == "ready"
     assert marks.read_text() == "xx"
@@ -249,7 +247,7 @@ print('{{"report": {{}}}}')
 async def test_what_a_killed_check_left_is_cleared_away_and_what_is_in_use_stays(
     database_url: str, tmp_path: Path
 ):
-    program = "import time; time.sleep(2.0); print('{\"report\": {}}')"
+    program = f"import time; time.sleep(2.0); {ACCEPTED}"
     checking_it = asyncio.create_task(checking(database_url, tmp_path, program))
     checks = quick_settings(tmp_path / "data").scratch_dir / "checks"
     while not list(checks.glob("*/log.txt")):

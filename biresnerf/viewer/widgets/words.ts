@@ -1,0 +1,27 @@
+// Words for what the result's files name.
+import type { ImageReport, Verdict } from "schemas";
+
+export const FLAGS = {
+  held_out: "held out",
+  fixed: "fixed",
+  lost: "lost",
+  repaired: "repaired",
+  moved_far: "moved far",
+  blurred: "blurred",
+  exposure_off: "exposure off",
+  unsure_deg: "place unsure",
+} as const satisfies Partial<Record<keyof ImageReport, string>>;
+export type Flag = keyof typeof FLAGS;
+
+/** Flags that ask for a look. */
+export const ALARMING: ReadonlySet<Flag> = new Set(["lost", "moved_far", "blurred", "exposure_off", "unsure_deg"]);
+
+export const VERDICTS = {
+  improved: { word: "improved", tone: "good" },
+  unchanged: { word: "unchanged", tone: "plain" },
+  kept_input: { word: "input kept", tone: "plain" },
+  inconclusive: { word: "inconclusive", tone: "unsure" },
+  failed_check: { word: "check failed", tone: "bad" },
+} as const satisfies Record<Verdict["verdict"], { word: string; tone: string }>;
+
+export const sourceWords = (source: string): string => source.replaceAll("-", " ");
