@@ -28,7 +28,7 @@ from workers.settings.settings import Settings
 STAGES = ("loading", "preparing", "seeding", "coarse", "fine", "evaluating", "exporting")
 OPTIONS = RefineOptions(
     preset="fast", steps=600, max_image_size=64, samples_per_step=8192, reconstruction_levels=4,
-    table_size_log2=14, start="given", orbit_frames=24, trial_steps=200, packs=("pinhole",),
+    table_size_log2=14, start="given", orbit_frames=24, trial_steps=200, exports=("pinhole",),
 )  # fmt: skip
 
 

@@ -11,7 +11,8 @@ from typing import Any, TypeAlias
 
 from biresnerf.client.calls import Call, Flow, Session, ask
 from biresnerf.client.pages import collect
-from biresnerf.options.refine_options import PackName, RefineOptions, parse_options
+from biresnerf.options.formats import ExportName
+from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.report import Report
 from biresnerf.wire.base import LABEL_LENGTH, LABELS_MOST
 from biresnerf.wire.jobs import (
@@ -136,7 +137,7 @@ def delete_job(session: Session, job_id: str) -> Flow[None]:
     yield from ask(session, Call("DELETE", job_url(job_id)))
 
 
-def export(session: Session, job_id: str, formats: Sequence[PackName]) -> Flow[JobView]:
+def export(session: Session, job_id: str, formats: Sequence[ExportName]) -> Flow[JobView]:
     """Has the result written in further forms; gives the job that does it, or has done it before."""
     body = NewExport(formats=list(formats)).model_dump()
     answer = yield from ask(session, Call("POST", f"{job_url(job_id)}/exports", json=body))

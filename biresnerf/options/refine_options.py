@@ -12,6 +12,7 @@ from typing import Annotated, Any, Generic, Literal, Never, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from biresnerf.errors import InputError
+from biresnerf.options.formats import ExportName
 from biresnerf.options.option import Option
 from biresnerf.options.presets import ComputeDevice, MethodName, PresetName, preset_values
 from biresnerf.stages import STAGES
@@ -22,7 +23,6 @@ ExposureChoice = Literal["auto", "none", "on"]
 Wiring = Literal["concat", "replace", "residual"]
 DetectorName = Literal["trend", "counter", "variance"]
 PoseParametrisation = Literal["se3_world", "so3xr3", "so3xr3_camp"]
-PackName = Literal["colmap-text", "instant-ngp", "kitti", "bundler", "pinhole"]
 StartPoses = Literal["auto", "given", "colmap", "none"]
 RefineIntrinsics = Literal["auto", "none", "focal", "all"]
 SeedingEffort = Literal["full", "low"]
@@ -191,13 +191,13 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         description="Views rendered at the end beside the held-out ones, spread over the set, to be looked at; fewer "
         "where they would take more than a twentieth of the run.",
     )
-    packs: Annotated[tuple[PackName, ...], Option("exporting", changes_result=False)] = Field(
+    exports: Annotated[tuple[ExportName, ...], Option("exporting", changes_result=False)] = Field(
         (),
-        description="Forms to write the result in beside those that always are: colmap-text, instant-ngp, kitti, "
-        "bundler, pinhole (undistorted photos with a PINHOLE model).",
+        description="Formats to write the result in, beside those that every result has; pinhole: undistorted photos "
+        "with a PINHOLE model.",
     )
 
-    @field_validator("fixed", "packs", mode="before")
+    @field_validator("fixed", "exports", mode="before")
     @classmethod
     def _listed(cls, value: Any) -> Any:
         """A list may be written with commas, as on a command line."""

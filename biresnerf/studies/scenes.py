@@ -39,14 +39,14 @@ def find_scene(path: Path, every: int, test_views: int) -> Scene:
     file = path
     if path.is_dir():
         contents = look_into(path)
-        if contents.transforms is None:
+        if contents.poses is None or contents.format != "transforms":
             raise InputError(
                 "poses_missing",
                 "has no true poses to compare with.",
                 where=str(path),
                 hint="Give a folder with a transforms.json.",
             )
-        file = contents.transforms
+        file = contents.poses
     elif not path.is_file():
         raise InputError("input_missing", "does not exist.", where=str(path), hint="Name a scene's folder.")
     beside = file.with_name(TEST_NAME)

@@ -8,7 +8,8 @@ from urllib.parse import quote
 
 from pydantic import ConfigDict, Field
 
-from biresnerf.options.refine_options import PackName, RefineOptions
+from biresnerf.options.formats import ExportName
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.report import VerdictName
 from biresnerf.stages import ReusableStage, Stage
 from biresnerf.wire.base import Labels, Record
@@ -220,11 +221,11 @@ class ForkJob(Record):
 
 
 class NewExport(Record):
-    """Forms to write a result in, beside those it has."""
+    """Formats to write a result in, beside those it has."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"formats": ["kitti", "pinhole"]}]})
 
-    formats: list[PackName] = Field(min_length=1, max_length=20)
+    formats: list[ExportName] = Field(min_length=1, max_length=20)
 
 
 def job_url(job_id: str) -> str:

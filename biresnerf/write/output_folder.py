@@ -11,10 +11,10 @@ from typing import Literal
 
 import numpy as np
 
-from biresnerf.data.formats.input_format import forms_of_input, write_input_form
+from biresnerf.data.formats.codec import WriteContext
+from biresnerf.data.formats.result_formats import write_result_formats
 from biresnerf.data.formats.simple.poses_json import POSES, write_poses_json
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes, write_transforms
-from biresnerf.data.formats.write_formats import write_packs
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet, refined_set
@@ -26,7 +26,6 @@ from biresnerf.data.show.view_pictures import write_contact_sheet, write_points,
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.similarity import Similarity
-from biresnerf.options.refine_options import PackName
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.stages.checkpoint import CHECKPOINT, MATCHES, SEEDING
 from biresnerf.refine.stages.history import HISTORY
@@ -206,7 +205,7 @@ class OutputFolder:
         Where the verdict keeps the input's poses, those are written, and the refined ones beside them in refined/.
 
         Raises:
-            Interrupted: ``should_stop`` said so while packs were written.
+            Interrupted: ``should_stop`` said so while exports were written.
         """
         dataset, optimiser = given.dataset, stages.optimiser
         shown = shown or Shown()
@@ -222,10 +221,10 @@ class OutputFolder:
             if np.isfinite(refined).all():
                 _, moved = self._write_poses(self.path / REFINED, given, refined_dataset, refined, report, ())
                 poses = f"{REFINED}/{POSES}"
-        # On the way to the end nobody waits for large packs.
-        packs = optimiser.options.packs if state == "complete" else ()
+        # On the way to the end nobody waits for large exports.
+        exports = optimiser.options.exports if state == "complete" else ()
         report, result = self._write_poses(
-            self.path, given, returned_dataset, returned, report, packs, should_stop
+            self.path, given, returned_dataset, returned, report, exports, should_stop
         )
         surface = shown.surface(optimiser.frame.unit_from_world, similarity)
         self._write_view_file(given, shown, moved or result, surface, poses)
@@ -261,19 +260,20 @@ class OutputFolder:
         dataset: Dataset,
         world_from_cam: np.ndarray,
         report: Report,
-        packs: Sequence[PackName],
+        exports: Sequence[str],
         should_stop: Callable[[], bool] = lambda: False,
     ) -> tuple[Report, RefinedSet]:
-        """Poses [n, 4, 4] of ``dataset``, the input with other lenses or none, in the input's form, and the packs.
+        """Writes poses [n, 4, 4] in the formats of every result, in the input's own and in the exports.
+
+        ``dataset`` is the input, with the refined lenses where those are returned.
 
         Returns the report with notes on them, and the set as written.
         """
-        write_transforms(dataset, world_from_cam, folder / TRANSFORMS)
         refined = _described(dataset, world_from_cam, report)
         refined = with_points_of(refined, dataset.source.colmap, given.matches, given.images)
-        asked = dict.fromkeys((*forms_of_input(dataset), *packs))
-        notes = write_packs(refined, folder, asked, should_stop) + transforms_notes(dataset, world_from_cam)
-        write_input_form(dataset, refined, folder)
+        context = WriteContext(dataset, should_stop=should_stop)
+        notes = write_result_formats(refined, folder, exports, context)
+        notes += transforms_notes(dataset, world_from_cam)
         points = PointsReport(source=refined.points_source, count=len(refined.model.points))
         return report.model_copy(update={"points": points, "warnings": report.warnings + notes}), refined
 

@@ -16,7 +16,7 @@ VIEWS, SIZE = 8, 24
 # Choices are kept, sizes are not.
 KEPT = (
     *("method", "seed", "background", "exposure", "start", "fixed", "refine_intrinsics", "detector"),
-    *("pose_parametrisation", "wiring", "double_pose_step", "packs"),
+    *("pose_parametrisation", "wiring", "double_pose_step", "exports"),
 )
 SMALL = {
     "preset": "fast",

@@ -82,12 +82,12 @@ def test_a_wrong_count_of_held_out_views_is_one_error_at_its_own_place(value):
 
 def test_what_changes_no_result_may_change_on_resuming_and_what_comes_later_keeps_stage_1():
     assert set(OPTIONS) - RESULT_OPTIONS == {
-        *("threads", "checkpoint_every_s", "orbit_frames", "shown_views", "packs")
+        *("threads", "checkpoint_every_s", "orbit_frames", "shown_views", "exports")
     }
     assert set(OPTIONS) - STAGE_1_OPTIONS == {
         *("reconstruction_levels", "reconstruction_resolution_min", "reconstruction_resolution_max"),
         *("table_size_log2", "wiring", "warmup_steps", "verdict", "trial_steps"),
-        *("threads", "checkpoint_every_s", "orbit_frames", "shown_views", "packs"),
+        *("threads", "checkpoint_every_s", "orbit_frames", "shown_views", "exports"),
     }
 
 

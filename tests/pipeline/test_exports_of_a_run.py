@@ -42,7 +42,7 @@ def test_a_text_model_comes_back_in_both_forms_with_its_ids_and_points_of_the_re
     points = replace(exact.points, track_image_ids=10 * exact.points.track_image_ids, xyz=xyz)
     write_colmap_text(replace(exact, images=images, points=points), scene / "sparse/0")
 
-    options = tiny_options(start="given", verdict=False, packs=("kitti", "pinhole"))
+    options = tiny_options(start="given", verdict=False, exports=("kitti", "pinhole"))
     report = refine_poses(scene, tmp_path / "out", options)
     model = read_colmap_model(tmp_path / "out/colmap/sparse/0")
     text = read_colmap_model(tmp_path / "out/colmap/sparse_txt/0")

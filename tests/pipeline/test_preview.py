@@ -54,7 +54,7 @@ def test_a_running_refinement_shows_poses_and_a_view_and_a_finished_one_cleans_u
 def test_a_run_stopped_after_its_last_step_leaves_a_partial_result_and_goes_on(tmp_path, stage):
     scene = write_synthetic_scene(tmp_path / "scene", 6, 24, seed=3)
     output = tmp_path / "out"
-    options = OPTIONS.model_copy(update={"steps": 20, "verdict": False, "packs": ("pinhole",)})
+    options = OPTIONS.model_copy(update={"steps": 20, "verdict": False, "exports": ("pinhole",)})
     told: list[Progress] = []
     with pytest.raises(Interrupted):
         refine_poses(scene, output, options, told.append, lambda: told[-1].stage == stage)

@@ -8,7 +8,7 @@ from typing import Any
 from psycopg import sql
 from psycopg.types.json import Jsonb
 
-from biresnerf.options.refine_options import PackName
+from biresnerf.options.formats import ExportName
 from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import Job, WantedStage
 from workers.database.database import Connection
@@ -116,7 +116,7 @@ class DerivedJobs(JobStore):
             taken[name] = {"prefix": target, "files": reusable[name]["files"]}
         return taken
 
-    async def export(self, job_id: str, formats: Sequence[PackName]) -> tuple[Job, bool]:
+    async def export(self, job_id: str, formats: Sequence[ExportName]) -> tuple[Job, bool]:
         """Queue an export of the job's result in further forms; the same request finds the same export.
 
         Raises `Conflict` (``result_not_ready``; ``state_conflict``: there are no poses to export),

@@ -21,7 +21,8 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.openmp import let_waiting_threads_sleep
-from biresnerf.options.refine_options import PackName, RefineOptions, parse_options
+from biresnerf.options.formats import ExportName
+from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.progress import Progress
 from biresnerf.stages import Stage
 
@@ -114,17 +115,16 @@ def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop)
 
 
 def _export(order: Order, stop: _Stop) -> None:
-    """The result in further forms; the photos lie in the input where a form needs them."""
-    from biresnerf.data.formats.read_result import read_result
-    from biresnerf.data.formats.write_formats import ON_REQUEST
+    """Write the result in further formats; the photos are in the input where a format needs them."""
+    from biresnerf.data.formats.codec import WriteContext
+    from biresnerf.data.formats.result_formats import read_result, write_format
 
     assert order.result is not None, "said with every export"
-    forms = TypeAdapter(tuple[PackName, ...]).validate_python(order.options["formats"])
+    names = TypeAdapter(tuple[ExportName, ...]).validate_python(order.options["formats"])
     photos = order.input if any(order.input.iterdir()) else None
     refined = read_result(order.result, photos)
-    for form in forms:
-        # Nothing of it is kept when it is stopped, so it need not be asked.
-        ON_REQUEST[form](refined, order.output, stop.asked.is_set)
+    for name in names:
+        write_format(refined, order.output, name, WriteContext(should_stop=stop.asked.is_set))
 
 
 def _protocol_only() -> TextIO:

@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from biresnerf.options.formats import formats
 from workers.database.database import Database
 from workers.run.claim import Claim
 from workers.settings.errors import NotFound
 from workers.store.files import FileStore
 
-NEEDS_PHOTOS = frozenset({"pinhole"})
-EXPORTED_FROM = ("poses.json", "colmap/sparse/0/")  # of a result; all other forms can be made from these
+EXPORTED_FROM = ("poses.json", "colmap/sparse/0/")  # of a result; all other formats can be made from these
 
 
 async def stage_job(database: Database, files: FileStore, claim: Claim, folder: Path) -> None:
@@ -30,13 +30,17 @@ async def stage_job(database: Database, files: FileStore, claim: Claim, folder: 
     if claim.kind == "export":
         order |= {"task": "export", "result": "result"}
         await _stage_result(database, files, claim, folder / "result")
-    if claim.kind == "refine" or NEEDS_PHOTOS & set(claim.asked["formats"]):
+    if claim.kind == "refine" or _needs_photos(claim.asked["formats"]):
         rows = await database.fetch(
             "SELECT key, path FROM dataset_files WHERE dataset_id = %s", claim.dataset_id
         )
         await files.stage(((row["key"], row["path"]) for row in rows), folder / "input")
     await files.stage(_gone_on_from(claim), folder / "output")
     (folder / "job.json").write_text(json.dumps(order, indent=1))
+
+
+def _needs_photos(names: list[str]) -> bool:
+    return any("photos" in formats()[name].needs for name in names)
 
 
 def _gone_on_from(claim: Claim) -> Iterator[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""`biresnerf convert INPUT OUTPUT --to FORM`: poses from one form into others, nothing optimised."""
+"""`biresnerf convert INPUT OUTPUT --to FORMAT`: poses from one format into others, nothing optimised."""
 
 from __future__ import annotations
 
@@ -10,31 +10,19 @@ import click
 
 from biresnerf.commands.answers import json_option, print_json
 from biresnerf.commands.jobs.follow_job import require_empty
+from biresnerf.options.formats import formats
 
 if TYPE_CHECKING:
-    from biresnerf.data.formats.convert import FormName, Photos
-
-FORMS = (
-    "transforms",
-    "colmap",
-    "colmap-text",
-    "instant-ngp",
-    "tum",
-    "kitti",
-    "bundler",
-    "llff",
-    "pinhole",
-    "poses",
-    "scene",
-)
+    from biresnerf.data.formats.convert import Photos
 
 
 @click.command("convert")
 @click.argument("input_path", metavar="INPUT", type=click.Path(path_type=Path))
 @click.argument("output", type=click.Path(path_type=Path))
 @click.option(
-    "--to", "forms", required=True, multiple=True, type=click.Choice(FORMS), help="A form; may be repeated."
-)
+    "--to", "names", required=True, multiple=True,
+    type=click.Choice([name for name, one in formats().items() if one.in_set]), help="A format; may be repeated.",
+)  # fmt: skip
 @click.option(
     "--photos", type=click.Choice(["link", "copy", "none"]), default="link", show_default=True,
     help="How images and masks come into OUTPUT.",
@@ -47,15 +35,15 @@ FORMS = (
 def convert_command(
     input_path: Path,
     output: Path,
-    forms: tuple[FormName, ...],
+    names: tuple[str, ...],
     photos: Photos,
     bounds: tuple[float, float] | None,
     as_json: bool,
 ) -> None:
-    """Write the poses of INPUT, in any form that `refine` reads, into the new folder OUTPUT in other forms.
+    """Write the poses of INPUT, in any format that `refine` reads, into the new folder OUTPUT in other formats.
 
-    World, scale and names stay as they are. Images without a pose are left out, and named. docs/formats.md says what
-    each form holds. For the result of `refine` there is `export`.
+    World, scale and names stay as they are. Images without a pose are left out and listed. docs/formats.md says what
+    each format holds. For the result of `refine` there is `export`.
     """
     require_empty(output)
     if bounds is not None and bounds[0] >= bounds[1]:
@@ -64,13 +52,13 @@ def convert_command(
     from biresnerf.data.formats.read_dataset import read_dataset
 
     dataset = read_dataset(input_path)
-    done = convert(dataset, tuple(dict.fromkeys(forms)), output, photos, bounds)
+    done = convert(dataset, tuple(dict.fromkeys(names)), output, photos, bounds)
     warnings = [*dataset.warnings, *done.notes]
     if as_json:
         print_json(_document(done.places, len(dataset) - len(done.left_out), done.left_out, warnings))
         return
-    for form, place in done.places.items():
-        click.echo(f"{form} in {os.path.relpath(place)}")
+    for name, place in done.places.items():
+        click.echo(f"{name} in {os.path.relpath(place)}")
     if done.left_out:
         click.echo(f"left out, without a pose: {', '.join(done.left_out)}", err=True)
     for warning in warnings:
@@ -78,10 +66,10 @@ def convert_command(
 
 
 def _document(
-    places: dict[FormName, Path], images: int, left_out: tuple[str, ...], warnings: list[str]
+    places: dict[str, Path], images: int, left_out: tuple[str, ...], warnings: list[str]
 ) -> dict[str, Any]:
     return {
-        "forms": {form: str(place) for form, place in places.items()},
+        "forms": {name: str(place) for name, place in places.items()},
         "images": images,
         "left_out": left_out,
         "warnings": warnings,

@@ -1,23 +1,25 @@
-"""`biresnerf export RESULT FORM...`: a finished result in further forms."""
+"""`biresnerf export RESULT FORMAT...`: a finished result in further formats."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args
 
 import click
 
 from biresnerf.commands.answers import json_option, print_json
-from biresnerf.options.refine_options import PackName
+from biresnerf.options.formats import formats
 
 
 @click.command("export")
 @click.argument("result", type=click.Path(path_type=Path))
-@click.argument("forms", metavar="FORM...", nargs=-1, required=True, type=click.Choice(get_args(PackName)))
+@click.argument(
+    "names", metavar="FORMAT...", nargs=-1, required=True,
+    type=click.Choice([name for name, one in formats().items() if one.on_request]),
+)  # fmt: skip
 @click.option(
     "--photos",
     type=click.Path(path_type=Path),
-    help="The input's folder, for forms that hold photos (pinhole).",
+    help="The input's folder, for formats that hold photos (pinhole).",
 )
 @click.option(
     "--output",
@@ -27,20 +29,20 @@ from biresnerf.options.refine_options import PackName
 )
 @json_option
 def export_command(
-    result: Path, forms: tuple[PackName, ...], photos: Path | None, output: Path | None, as_json: bool
+    result: Path, names: tuple[str, ...], photos: Path | None, output: Path | None, as_json: bool
 ) -> None:
-    """Write a finished RESULT in the given forms beside those it has.
+    """Write a finished RESULT in the given formats, beside those it has.
 
-    docs/formats.md says what each form holds, and for which program it is.
+    docs/formats.md says what each format holds, and which program reads it.
     """
-    from biresnerf.data.formats.read_result import read_result
-    from biresnerf.data.formats.write_formats import ON_REQUEST
+    from biresnerf.data.formats.codec import WriteContext
+    from biresnerf.data.formats.result_formats import read_result, write_format
 
     refined = read_result(result, photos)
     folder = output or result
-    for form in forms:
-        ON_REQUEST[form](refined, folder, lambda: False)
+    for name in names:
+        write_format(refined, folder, name, WriteContext())
         if not as_json:
-            click.echo(f"{form} written to {folder}")
+            click.echo(f"{name} written to {folder}")
     if as_json:
-        print_json({"folder": str(folder), "forms": list(forms)})
+        print_json({"folder": str(folder), "forms": list(names)})

@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from biresnerf.data.formats.colmap.read_colmap import read_colmap_dataset
-from biresnerf.data.formats.folder import FolderContents, PoseForm, look_at, look_into
+from biresnerf.data.formats.folder import FolderContents, look_at, look_into
 from biresnerf.data.formats.image_folder import read_image_folder
-from biresnerf.data.formats.simple.bundler import read_bundler
-from biresnerf.data.formats.simple.llff import read_llff
-from biresnerf.data.formats.simple.metashape import read_metashape
-from biresnerf.data.formats.simple.trajectory import read_trajectory
-from biresnerf.data.formats.transforms.read_transforms import read_transforms
+from biresnerf.data.formats.registry import codecs
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.masks import refuse_unfit_mask
 from biresnerf.errors import InputError
-
-# (root, the file or the model's folder, within) -> Dataset
-_READERS: dict[PoseForm, Callable[[Path, Path, Path | None], Dataset]] = {
-    "transforms": lambda _root, file, within: read_transforms(file, within),
-    "colmap": read_colmap_dataset,
-    "llff": read_llff,
-    "bundler": read_bundler,
-    "metashape": read_metashape,
-    "trajectory": read_trajectory,
-}
 
 
 def read_dataset(path: Path, within: Path | None = None) -> Dataset:
@@ -43,10 +27,12 @@ def read_dataset(path: Path, within: Path | None = None) -> Dataset:
         InputError: the input cannot be used; says the file, the field and a hint.
     """
     contents = find_input(Path(path))
-    if contents.form is None or contents.poses is None:
+    if contents.format is None or contents.poses is None:
         dataset = read_image_folder(contents.root, contents.images, within)
     else:
-        dataset = _READERS[contents.form](contents.root, contents.poses, within)
+        read = codecs()[contents.format].read
+        assert read is not None, "only formats that are read are found"
+        dataset = read(contents.root, contents.poses, within)
     for index, frame in enumerate(dataset.frames):
         refuse_unfit_mask(frame, dataset.camera_of(index))
     return replace(dataset, warnings=contents.notes + dataset.warnings)

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.colmap.read_model import read_colmap_model, world_from_cam_of
-from biresnerf.data.formats.folder import PoseForm
 from biresnerf.data.formats.read_dataset import find_input
 from biresnerf.data.formats.simple.bundler import names_of_cameras, read_cameras
 from biresnerf.data.formats.simple.llff import read_llff_poses
@@ -41,7 +40,7 @@ def read_poses(path: Path) -> Poses:
     """
     try:
         contents = find_input(path)
-        file, form = contents.poses, contents.form
+        file, form = contents.poses, contents.format
     except InputError as error:
         if error.code in ("input_missing", "input_unreadable"):
             raise _at(path, error, path.name) from None
@@ -128,7 +127,7 @@ def _transforms(_root: Path, file: Path) -> Poses:
     return poses
 
 
-_READERS: dict[PoseForm, Callable[[Path, Path], Poses]] = {
+_READERS: dict[str, Callable[[Path, Path], Poses]] = {
     "transforms": _transforms,
     "colmap": _colmap,
     "llff": _llff,

@@ -32,7 +32,7 @@ export interface Field {
 /** Those that people change; all others are in a second group, in the schema's order. */
 const FIRST = [
   ...["max_image_size", "steps", "start", "background", "exposure", "refine_intrinsics", "holdout"],
-  ...["fixed", "packs", "device", "seed"],
+  ...["fixed", "exports", "device", "seed"],
 ];
 
 export function fieldsOf(schema: Schema): { first: Field[]; rest: Field[] } {

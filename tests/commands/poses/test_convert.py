@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -12,13 +11,13 @@ from click.testing import CliRunner, Result
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from biresnerf.commands.poses.convert import FORMS, convert_command
+from biresnerf.commands.poses.convert import convert_command
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
-from biresnerf.data.formats.convert import FormName
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.simple.poses_json import matrix_of, read_poses_json
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.errors import InputError
+from biresnerf.options.formats import formats
 from tests.data.formats.random_sets import random_poses
 from tests.data.formats.simple import trajectories
 from tests.data.scenes import write_image
@@ -35,6 +34,7 @@ PLACES = {
     "bundler": "bundle.out",
     "llff": "poses_bounds.npy",
 }
+FORMS = tuple(name for name, one in formats().items() if one.in_set)
 BOUNDS = ("--bounds", 0.5, 9)  # for sets without points
 
 
@@ -114,14 +114,15 @@ def test_every_form_that_is_read_becomes_every_form_that_is_written(tmp_path: Pa
 
 
 def test_the_command_offers_every_form_there_is() -> None:
-    assert get_args(FormName) == FORMS
+    [option] = [one for one in convert_command.params if one.name == "names"]
+    assert set(option.type.choices) == {*PLACES, "pinhole", "poses", "scene"} == set(FORMS)
 
 
 def test_a_form_that_cannot_hold_the_set_leaves_nothing_behind(tmp_path: Path) -> None:
     trajectories.tum_set(tmp_path / "scene", ["0", "1", "2", "3"])
     refused = run(tmp_path / "scene", tmp_path / "out", "--to", "tum", "--to", "bundler")
     assert isinstance(refused.exception, InputError)
-    assert refused.exception.code == "pack_not_possible"
+    assert refused.exception.code == "export_not_possible"
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
 
 

@@ -11,8 +11,7 @@ from click.testing import CliRunner
 
 from biresnerf.commands.poses.export import export_command
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
-from biresnerf.data.formats.read_result import read_result
-from biresnerf.data.formats.write_formats import write_packs
+from biresnerf.data.formats.result_formats import read_result, write_result_formats
 from biresnerf.errors import InputError
 from tests.data.formats.random_sets import random_result
 from tests.data.formats.simple.test_pinhole import pack_of
@@ -28,7 +27,7 @@ def result(tmp_path):
         for (number, image), name in zip(refined.model.images.items(), names, strict=True)
     }
     refined = replace(refined, model=replace(refined.model, images=images))
-    write_packs(refined, tmp_path / "out")
+    write_result_formats(refined, tmp_path / "out")
     return refined, tmp_path
 
 

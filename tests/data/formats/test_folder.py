@@ -40,7 +40,7 @@ def test_images_are_found_in_the_folder_or_below_images(tmp_path, below):
         write_image(tmp_path / below / f"{index}.png")
     (tmp_path / "notes.txt").touch()
     contents = look_into(tmp_path)
-    assert contents.transforms is None
+    assert contents.poses is None
     assert [path.name for path in contents.images] == ["0.png", "1.png", "2.png"]
     assert contents.root == tmp_path
 
@@ -76,14 +76,14 @@ def test_the_first_form_in_the_order_is_read_and_the_others_are_said(tmp_path):
     write_image(tmp_path / "images/0.png")
     while present:
         contents = look_into(tmp_path)
-        assert contents.form == FORMS[present[0]]
+        assert contents.format == FORMS[present[0]]
         assert contents.root == tmp_path
         if len(present) > 1:
             were = "were not" if len(present) > 2 else "was not"
             assert contents.notes == (f"{present[0]} was read and {', '.join(present[1:])} {were}",)
         path = tmp_path / present.pop(0)
         shutil.rmtree(path) if path.is_dir() else path.unlink()
-    assert look_into(tmp_path).form is None
+    assert look_into(tmp_path).format is None
 
 
 @pytest.mark.parametrize("name", ["poses.bin", "video.mp4", "scene.ply"])

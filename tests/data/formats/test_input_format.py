@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from biresnerf.data.formats.input_format import POSES_BOUNDS, forms_of_input, write_input_form
+from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.formats.simple.llff import read_llff, read_llff_poses
+from biresnerf.data.formats.result_formats import formats_given_back, write_result_formats
+from biresnerf.data.formats.simple.llff import LLFF, read_llff, read_llff_poses
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes, write_transforms
-from biresnerf.data.formats.write_formats import write_packs
 from biresnerf.data.model.dataset import Camera, Dataset, Frame, SourceFormat
 from biresnerf.data.model.refined_set import refined_set
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
@@ -93,12 +93,12 @@ def test_llff_comes_back_as_its_own_file(tmp_path):
     rows = llff_folder(tmp_path / "in")
     dataset = read_llff(tmp_path / "in", tmp_path / "in/poses_bounds.npy")
     same = refined_set(dataset, dataset.world_from_cam)
-    write_input_form(dataset, same, tmp_path / "same")
-    np.testing.assert_allclose(np.load(tmp_path / "same" / POSES_BOUNDS), rows, atol=1e-12)
+    write_result_formats(same, tmp_path / "same", context=WriteContext(dataset))
+    np.testing.assert_allclose(np.load(tmp_path / "same" / LLFF.in_result), rows, atol=1e-12)
     moved = perturb_poses(dataset.world_from_cam, 0.1, 2)
-    write_input_form(dataset, refined_set(dataset, moved), tmp_path / "moved")
-    np.testing.assert_allclose(read_llff_poses(tmp_path / "moved" / POSES_BOUNDS), moved, atol=1e-12)
-    np.testing.assert_array_equal(np.load(tmp_path / "moved" / POSES_BOUNDS)[:, 14:], rows[:, 14:])
+    write_result_formats(refined_set(dataset, moved), tmp_path / "moved", context=WriteContext(dataset))
+    np.testing.assert_allclose(read_llff_poses(tmp_path / "moved" / LLFF.in_result), moved, atol=1e-12)
+    np.testing.assert_array_equal(np.load(tmp_path / "moved" / LLFF.in_result)[:, 14:], rows[:, 14:])
 
 
 @pytest.mark.parametrize("form", ["tum", "kitti", "bundler"])
@@ -113,7 +113,7 @@ def test_trajectories_and_bundles_read_back_from_what_is_written(tmp_path, form)
         for i, f in enumerate(dataset.frames[:5])
     )
     dataset = replace(dataset, root=folder / "images", cameras=(camera,), frames=frames)
-    write_packs(refined_set(dataset, dataset.world_from_cam), tmp_path / "out", ["kitti", "bundler"])
+    write_result_formats(refined_set(dataset, dataset.world_from_cam), tmp_path / "out", ["kitti", "bundler"])
     for name in {
         "tum": ["tum.txt"],
         "kitti": ["kitti.txt"],
@@ -127,11 +127,11 @@ def test_trajectories_and_bundles_read_back_from_what_is_written(tmp_path, form)
     np.testing.assert_allclose(again.world_from_cam, dataset.world_from_cam, atol=1e-9)
     if form == "tum":
         assert [frame.timestamp_s for frame in again.frames] == [frame.timestamp_s for frame in frames]
-    assert forms_of_input(again) == {"tum": (), "kitti": ("kitti",), "bundler": ("bundler",)}[form]
+    assert formats_given_back(again) == {"tum": (), "kitti": ("kitti",), "bundler": ("bundler",)}[form]
 
 
 def test_a_text_model_comes_back_as_text():
     dataset = posed_dataset("PINHOLE")
     for form, packs in (("text", ("colmap-text",)), ("binary", ())):
         model = replace(random_model(0, rigs=False), form=form)
-        assert forms_of_input(replace(dataset, source=replace(dataset.source, colmap=model))) == packs
+        assert formats_given_back(replace(dataset, source=replace(dataset.source, colmap=model))) == packs

@@ -110,7 +110,7 @@ def test_lenses_poses_and_names_come_back_where_the_form_can_hold_them(
     if too_much or (form == "bundle.out" and bundler_problem(cameras[0])):
         with pytest.raises(InputError) as caught:
             write_as(form, dataset, poses, folder)
-        assert caught.value.code == "pack_not_possible"
+        assert caught.value.code == "export_not_possible"
         return
     again = read_dataset(write_as(form, dataset, poses, folder))
     assert_comes_back(dataset, again)

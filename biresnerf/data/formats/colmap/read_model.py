@@ -31,8 +31,6 @@ from biresnerf.data.model.conventions import rotation_from_quat_wxyz
 from biresnerf.data.model.dataset import Camera
 
 MAX_TABLE_BYTES = 2 * 2**30
-# Where a dataset's model lies, in the order they are looked at; also `sparse_txt`, as `refine` writes it.
-MODEL_FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse", "colmap/sparse", ".", "sparse_txt/0", "sparse_txt")
 _SUFFIXES: dict[ModelForm, str] = {"binary": ".bin", "text": ".txt"}
 # An image's pose by images.bin and by frames.bin are the same motion, up to this much: radians, and the share of
 # the distance.

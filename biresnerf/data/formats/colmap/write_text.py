@@ -27,12 +27,12 @@ def write_colmap_text(model: ColmapModel, folder: Path) -> None:
     """Writes cameras.txt, images.txt, points3D.txt and, where the model has them, rigs.txt and frames.txt.
 
     Raises:
-        InputError: ``pack_not_possible``: a name that the form cannot hold.
+        InputError: ``export_not_possible``: a name that the form cannot hold.
     """
     problem = colmap_text_problem(model)
     if problem is not None:
         raise InputError(
-            "pack_not_possible",
+            "export_not_possible",
             f"COLMAP's text form cannot hold this model: {problem}.",
             where="colmap-text",
             hint="Use the binary model in colmap/sparse/0, or rename the image.",

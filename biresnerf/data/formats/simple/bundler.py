@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import GivenImage, dataset_of, match_files
+from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.colmap_scene import ColmapModel
@@ -23,6 +24,24 @@ from biresnerf.data.model.text_file import read_text
 from biresnerf.data.photos.image_files import read_header
 from biresnerf.data.photos.named_images import image_files
 from biresnerf.errors import InputError
+from biresnerf.options.formats import Format
+
+BUNDLER = Format(
+    name="bundler",
+    title="Bundler",
+    rank=60,
+    found_as=("bundle.out", "bundle/bundle.out", "bundle.rd.out"),
+    suffixes=(".out",),
+    gives="poses, focal length, two radial coefficients; v0.3",
+    checked_against="files written from its manual",
+    in_set="bundle.out",
+    in_result="bundler/bundle.out",
+    loses=("some lenses", "rigs", "mask paths"),
+    heading="For Metashape",
+    hint="Bundler's form: File › Import › Import Cameras",
+    downloads="bundler/",
+)
+
 
 LIST_NAMES = ("list.txt", "bundle/list.txt")
 MAX_CAMERAS = 100_000
@@ -185,12 +204,12 @@ def bundler_problem(camera: Camera) -> str | None:
 def refuse_lenses(
     cameras: Iterable[Camera], problem_of: Callable[[Camera], str | None], form: str, where: str, hint: str
 ) -> None:
-    """Raises InputError ``pack_not_possible`` for the first lens with a problem; ``form`` is whose (Bundler's)."""
+    """Raises InputError ``export_not_possible`` for the first lens with a problem; ``form`` is whose (Bundler's)."""
     for camera in cameras:
         problem = problem_of(camera)
         if problem is not None:
             raise InputError(
-                "pack_not_possible",
+                "export_not_possible",
                 f"{form} cannot hold a lens of this set: {problem}.",
                 where=where,
                 hint=hint,
@@ -201,7 +220,7 @@ def write_bundler(refined: RefinedSet, folder: Path) -> None:
     """Writes ``bundle.out`` and ``list.txt`` (image names in the cameras' order) into ``folder``.
 
     Raises:
-        InputError: ``pack_not_possible``: a lens that the format cannot hold.
+        InputError: ``export_not_possible``: a lens that the format cannot hold.
     """
     hint = "Ask for the pinhole pack: it holds undistorted images, and a bundle.out for them."
     refuse_lenses(refined.cameras, bundler_problem, "Bundler's format", "bundler", hint)
@@ -243,3 +262,14 @@ def _point_lines(refined: RefinedSet) -> list[str]:
         lines.append(" ".join(str(value) for value in points.rgb[k].tolist()))
         lines.append(" ".join([str(len(views)), *views]))
     return lines
+
+
+CODECS = (
+    Codec(
+        BUNDLER,
+        read=read_bundler,
+        image_root=lambda file: file.parent.parent if file.parent.name == "bundle" else file.parent,
+        write=lambda refined, path, _: write_bundler(refined, path.parent),
+        given_back=lambda dataset: dataset.source.dialect == "bundler",
+    ),
+)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import GivenImage, dataset_of
+from biresnerf.data.formats.codec import Codec, WriteContext
 from biresnerf.data.formats.simple.bundler import bundler_problem, refuse_lenses
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.dataset import Camera, Dataset, SourceFormat
@@ -17,8 +18,25 @@ from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.photos.named_images import image_files
 from biresnerf.errors import InputError
+from biresnerf.options.formats import Format
 
-POSES_BOUNDS = "poses_bounds.npy"
+LLFF = Format(
+    name="llff",
+    title="LLFF",
+    rank=50,
+    found_as=("poses_bounds.npy",),
+    suffixes=(".npy",),
+    gives="poses, one focal length an image",
+    checked_against="two real sets, against their transforms.json",
+    in_set="poses_bounds.npy",
+    in_result="poses_bounds.npy",
+    needs=("bounds",),
+    loses=("names", "some lenses", "distortion", "rigs", "points", "mask paths"),
+    heading="For LLFF",
+    hint="In the form of the input",
+)
+
+
 # LLFF's own shares of the points in front of a camera that may lie before and behind its bounds, percent.
 _NEAREST, _FARTHEST = 0.1, 99.9
 MAX_IMAGES = 100_000
@@ -152,14 +170,13 @@ def write_llff(refined: RefinedSet, path: Path, bounds: NDArray[np.float64] | No
         bounds: nearest and farthest depth [n, 2] of the images; where left out, of the points that each sees.
 
     Raises:
-        InputError: ``pack_not_possible``: a lens that the form cannot hold; ``bounds_missing``: no points are seen.
+        InputError: ``export_not_possible``: a lens that the form cannot hold; ``bounds_missing``: no points are seen.
     """
     hint = "Convert to pinhole, which undistorts the photos, then that folder to llff."
     refuse_lenses(refined.cameras, llff_problem, "LLFF's form", "llff", hint)
-    order = rows_by_name(refined)
     if bounds is None:
         bounds = np.array([_bounds_of_points(refined, index) for index in range(len(refined))])
-    write_poses_bounds(refined, order, bounds, path)
+    write_poses_bounds(refined, bounds, path)
 
 
 def _bounds_of_points(refined: RefinedSet, index: int) -> tuple[float, float]:
@@ -181,13 +198,12 @@ def _bounds_of_points(refined: RefinedSet, index: int) -> tuple[float, float]:
     return near, far
 
 
-def write_poses_bounds(
-    refined: RefinedSet, order: list[int], bounds: NDArray[np.float64], path: Path
-) -> None:
-    """A row for each image, in this ``order``; ``bounds`` [n, 2] are in the set's.
+def write_poses_bounds(refined: RefinedSet, bounds: NDArray[np.float64], path: Path) -> None:
+    """A row for each image, in the order of the files' names; ``bounds`` [n, 2] are in the set's order.
 
     The fifth column is height, width and focal length (px) of the images as they are.
     """
+    order = rows_by_name(refined)
     rows = np.empty((len(order), 17))
     rows[:, 15:] = bounds[order]
     for row, index in zip(rows, order, strict=True):
@@ -197,3 +213,18 @@ def write_poses_bounds(
         row[:15] = np.stack([down, right, -ahead, centre, lens], axis=1).ravel()
     with whole_file(path) as temporary, temporary.open("wb") as file:
         np.save(file, rows)
+
+
+def _write(refined: RefinedSet, path: Path, context: WriteContext) -> None:
+    source = None if context.dataset is None else context.dataset.source
+    if context.bounds is not None:
+        write_llff(refined, path, np.tile(context.bounds, (len(refined), 1)))
+    elif source is not None and source.dialect == "llff":
+        write_poses_bounds(refined, given_bounds(source.files[0], len(refined)), path)
+    else:
+        write_llff(refined, path)
+
+
+CODECS = (
+    Codec(LLFF, read=read_llff, write=_write, given_back=lambda dataset: dataset.source.dialect == "llff"),
+)

@@ -14,12 +14,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import GivenImage, dataset_of
+from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
 from biresnerf.data.model.dataset import Camera, Dataset, SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.text_file import read_text
 from biresnerf.data.photos.named_images import few_names, image_files
 from biresnerf.errors import InputError
+from biresnerf.options.formats import Format
+
+METASHAPE = Format(
+    name="metashape",
+    title="Metashape",
+    rank=70,
+    found_as=("*.xml",),
+    suffixes=(".xml",),
+    gives="poses, cameras of type frame, from a camera export (XML)",
+    checked_against="files written from its manual; no export of the program itself was at hand",
+)
+_HEAD_BYTES = 4096
+
 
 _MAX_DEPTH, _MAX_ELEMENTS = 50, 500_000
 
@@ -221,3 +235,13 @@ def _colmap_camera(values: dict[str, float], width: int, height: int, where: str
 
 def _invalid(where: str, what: str) -> InputError:
     return InputError("pose_file_invalid", what, where=where, hint="Export the cameras from Metashape again.")
+
+
+def _is_metashape(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return b"<chunk" in file.read(_HEAD_BYTES)
+
+
+CODECS = (Codec(METASHAPE, read=read_metashape, recognises=_is_metashape),)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.simple.bundler import write_bundler
 from biresnerf.data.model.atomic_file import whole_file
@@ -30,8 +31,22 @@ from biresnerf.data.photos.image_files import quiet_pillow
 from biresnerf.data.show.renders import picture_stems
 from biresnerf.errors import InputError, Interrupted
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points, rays_of_pixels
+from biresnerf.options.formats import Format
 
-PINHOLE = "pinhole"
+PINHOLE = Format(
+    name="pinhole",
+    title="undistorted photos with a PINHOLE model",
+    rank=15,
+    in_set="pinhole",
+    in_result="pinhole",
+    needs=("photos",),
+    loses=("rigs", "masks"),
+    heading="For 3D Gaussian splatting, gsplat, OpenMVS",
+    hint="Photos without distortion, with PINHOLE cameras and points",
+    downloads="pinhole/",
+)
+
+
 WIDEST_TANGENT = 1.75  # 60 degrees from the axis: beyond it a flat picture is all stretch
 _JPEG = {"quality": 95, "subsampling": 0}
 _ROWS_AT_ONCE = 256
@@ -44,7 +59,7 @@ def pinhole_camera(camera: Camera) -> Camera:
     A camera that is one already comes back as it is.
 
     Raises:
-        InputError: ``pack_not_possible``: nothing is seen around the optical axis.
+        InputError: ``export_not_possible``: nothing is seen around the optical axis.
     """
     lens = camera.full()
     centred = lens.cx == camera.width / 2 and lens.cy == camera.height / 2
@@ -65,9 +80,9 @@ def pinhole_camera(camera: Camera) -> Camera:
     new_width, new_height = (int(2 * focal * min(tangent, WIDEST_TANGENT)) for tangent in seen)
     if new_width < 2 or new_height < 2:
         raise InputError(
-            "pack_not_possible",
+            "export_not_possible",
             "a lens of this set sees nothing around its optical axis.",
-            where=PINHOLE,
+            where=PINHOLE.name,
             hint="Check the principal point.",
         )
     return Camera("PINHOLE", new_width, new_height, (focal, focal, new_width / 2, new_height / 2))
@@ -86,7 +101,7 @@ def write_pinhole(refined: RefinedSet, folder: Path, should_stop: Callable[[], b
     not carried over.
 
     Raises:
-        InputError: ``pack_not_possible``, or a code of `decode` for a photo that cannot be read.
+        InputError: ``export_not_possible``, or a code of `decode` for a photo that cannot be read.
         Interrupted: ``should_stop``, asked before each photo, said so; a folder that was new is gone again.
     """
     new = not folder.exists()
@@ -206,3 +221,8 @@ def _bilinear(values: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[n
     upper = values[top, left] * (1 - a) + values[top, right] * a
     lower = values[below, left] * (1 - a) + values[below, right] * a
     return upper * (1 - b) + lower * b
+
+
+CODECS = (
+    Codec(PINHOLE, write=lambda refined, path, context: write_pinhole(refined, path, context.should_stop)),
+)

@@ -1,6 +1,6 @@
 """``poses.json``: every image's pose before and after, its lens and flags, in one self-describing file of ours.
 
-It is the only form that loses nothing, so the other packs can be made from it later.
+With the COLMAP model it loses nothing, so the other formats of a result can be made from the two later.
 """
 
 from __future__ import annotations
@@ -13,12 +13,27 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from biresnerf.data.formats.codec import Codec
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.json_document import read_model
 from biresnerf.data.model.refined_set import PointsSource, RefinedSet
+from biresnerf.options.formats import Format
 
+POSES_JSON = Format(
+    name="poses",
+    title="poses.json",
+    rank=90,
+    in_set="poses.json",
+    in_result="poses.json",
+    always=True,
+    loses=("rigs", "points"),
+    heading="For your own programs",
+    hint="Each pose before and after, with all digits",
+)
+
+
+POSES = POSES_JSON.in_result
 _FROZEN = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-POSES = "poses.json"
 AXES = (
     "world_from_cam and cam_from_world are [R | t] with OpenCV axes (x right, y down, z forward), in the input's "
     "world; the centre of the first pixel is (0.5, 0.5)"
@@ -141,3 +156,6 @@ def matrix_of(rows: Matrix) -> NDArray[np.float64]:
 def _rows(matrix: NDArray[np.float64]) -> Matrix:
     a, b, c = (tuple(float(value) for value in row) for row in matrix[:3])
     return a, b, c  # type: ignore[return-value]
+
+
+CODECS = (Codec(POSES_JSON, write=lambda refined, path, _: write_poses_json(refined, path)),)

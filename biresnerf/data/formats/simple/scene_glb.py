@@ -13,14 +13,28 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.simple.glb_file import LINES, POINTS, GlbFile
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.show.renders import ramp_colours
 from biresnerf.geometry.focus import rms_spread
 from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.options.formats import Format
 
-SCENE = "scene.glb"
+SCENE = Format(
+    name="scene",
+    title="scene.glb",
+    rank=40,
+    in_set="scene.glb",
+    in_result="scene.glb",
+    always=True,
+    loses=("lenses", "rigs"),
+    heading="For Blender",
+    hint="Cameras before and after, and points: File › Import › glTF",
+)
+
+
 GREY = (150, 150, 150)
 TURN_AT_TOP_DEG = 10.0  # that the brightest colour stands for, in every file
 MOST_POINTS = 200_000  # a viewer's file, not an archive
@@ -102,3 +116,6 @@ def _turn_colours(refined: RefinedSet) -> NDArray[np.uint8]:
         for image in refined.images
     ]
     return ramp_colours(np.array(turned) / TURN_AT_TOP_DEG)
+
+
+CODECS = (Codec(SCENE, write=lambda refined, path, _: write_scene(refined, path)),)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import GivenImage, dataset_of, match_files
+from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.simple.camera_file import read_camera_file
 from biresnerf.data.formats.simple.llff import rows_by_name
 from biresnerf.data.model.atomic_file import whole_file
@@ -21,6 +22,49 @@ from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.text_file import read_text
 from biresnerf.data.photos.named_images import image_files
 from biresnerf.errors import InputError
+from biresnerf.options.formats import Format
+
+TRAJECTORY = Format(
+    name="trajectory",
+    title="TUM, KITTI",
+    rank=80,
+    found_as=(
+        "trajectory.txt",
+        "tum.txt",
+        "kitti.txt",
+        "poses.txt",
+        "groundtruth.txt",
+        "CameraTrajectory.txt",
+        "KeyFrameTrajectory.txt",
+    ),
+    suffixes=(".txt",),
+    gives="poses, TUM's times; a camera from the file beside it, KITTI's in `calib.txt`",
+    checked_against="files written with SciPy's quaternions (TUM) and from its description (KITTI)",
+)
+TUM = Format(
+    name="tum",
+    title="TUM trajectory",
+    rank=81,
+    in_set="tum.txt",
+    in_result="tum.txt",
+    always=True,
+    needs=("lens file",),
+    loses=("lenses", "rigs", "points", "mask paths"),
+    heading="For evo and SLAM tools",
+    hint="A trajectory in TUM's form",
+)
+KITTI = Format(
+    name="kitti",
+    title="KITTI trajectory",
+    rank=82,
+    in_set="kitti.txt",
+    in_result="kitti.txt",
+    needs=("lens file",),
+    loses=("names", "lenses", "rigs", "points", "mask paths"),
+    heading="For odometry tools",
+    hint="A trajectory in KITTI's form",
+)
+
 
 TIMES_OF_IMAGES = "rgb.txt"  # of TUM's sets
 MAX_POSES = 100_000
@@ -244,3 +288,14 @@ def _write_lines(path: Path, lines: list[str]) -> None:
     plain = [" ".join(line.splitlines()) for line in lines]
     with whole_file(path) as temporary:
         temporary.write_text("\n".join(plain) + "\n", "utf-8")
+
+
+CODECS = (
+    Codec(TRAJECTORY, read=read_trajectory),
+    Codec(TUM, write=lambda refined, path, _: write_tum(refined, path)),
+    Codec(
+        KITTI,
+        write=lambda refined, path, _: write_kitti(refined, path),
+        given_back=lambda dataset: dataset.source.dialect == "kitti",
+    ),
+)

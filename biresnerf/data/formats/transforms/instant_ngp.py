@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from biresnerf.data.formats.codec import Codec
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.model.dataset import Camera
@@ -19,8 +20,21 @@ from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import COEFFICIENTS
 from biresnerf.geometry.focus import focus_point
+from biresnerf.options.formats import Format
 
-TRANSFORMS_NGP = "transforms_ngp.json"
+INSTANT_NGP = Format(
+    name="instant-ngp",
+    title="transforms_ngp.json (instant-ngp)",
+    rank=30,
+    in_set="transforms_ngp.json",
+    in_result="transforms_ngp.json",
+    loses=("rigs", "points", "mask paths"),
+    lacks="FULL_OPENCV; WebP and TIFF images",
+    heading="For instant-ngp",
+    hint="Put it into the photos' folder, then open it in instant-ngp",
+)
+
+
 LARGEST_AABB = 128  # the loader's bound; powers of two only
 INNER_SHARE = 0.9  # of the unit cube, for what the cameras look at
 POINTS_INSIDE = 0.98  # of the points that the box must hold
@@ -35,7 +49,7 @@ def write_transforms_ngp(refined: RefinedSet, path: Path) -> None:
     """Writes the file, whole or not at all.
 
     Raises:
-        InputError: ``pack_not_possible``: a lens that instant-ngp does not have, or images it cannot decode.
+        InputError: ``export_not_possible``: a lens that instant-ngp does not have, or images it cannot decode.
     """
     for image in refined.images:
         if PurePosixPath(image.file_name).suffix.lower() not in _SUFFIXES:
@@ -89,8 +103,11 @@ def _placement(refined: RefinedSet) -> tuple[float, list[float], int]:
 
 def _impossible(why: str) -> InputError:
     return InputError(
-        "pack_not_possible",
+        "export_not_possible",
         f"instant-ngp cannot read this set: {why}.",
-        where=TRANSFORMS_NGP,
+        where=INSTANT_NGP.in_result,
         hint="Ask for the pinhole pack, which holds undistorted images, and use its model.",
     )
+
+
+CODECS = (Codec(INSTANT_NGP, write=lambda refined, path, _: write_transforms_ngp(refined, path)),)

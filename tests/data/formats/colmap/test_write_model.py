@@ -169,7 +169,7 @@ def test_colmap_reads_ids_names_lenses_poses_points_and_rigs_of_both_forms(tmp_p
 def test_the_text_form_refuses_names_with_spaces_and_says_so(tmp_path):
     with pytest.raises(InputError) as caught:
         write_colmap_text(random_result(0).model, tmp_path / "0")
-    assert_complete(caught.value, "pack_not_possible", "colmap-text")
+    assert_complete(caught.value, "export_not_possible", "colmap-text")
     assert "ö 00.jpg" in caught.value.detail
     assert not (tmp_path / "0").exists()
 

@@ -95,7 +95,7 @@ def test_a_camera_that_is_centred_and_pinhole_stays_and_a_blind_one_is_refused()
     assert pinhole_camera(plain) == Camera("PINHOLE", 160, 120, (150.0, 150.0, 80.0, 60.0))
     with pytest.raises(InputError) as caught:
         pinhole_camera(Camera("PINHOLE", 160, 120, (150.0, 150.0, 160.0, 60.0)))
-    assert_complete(caught.value, "pack_not_possible", "pinhole")
+    assert_complete(caught.value, "export_not_possible", "pinhole")
 
 
 def pack_of(folder, refined, names):

@@ -1,4 +1,4 @@
-"""Every pack, read by its format's own rules, puts points where we do; and says why where it cannot."""
+"""Every format, read by its format's own rules, puts points where we do; and says why where it cannot."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from biresnerf.data.formats.registry import codecs
+from biresnerf.data.formats.result_formats import write_result_formats
 from biresnerf.data.formats.simple.bundler import write_bundler
 from biresnerf.data.formats.simple.llff import write_llff
 from biresnerf.data.formats.simple.poses_json import matrix_of, read_poses_json, write_poses_json
 from biresnerf.data.formats.simple.scene_glb import write_scene
 from biresnerf.data.formats.simple.trajectory import write_kitti, write_tum
 from biresnerf.data.formats.transforms.instant_ngp import write_transforms_ngp
-from biresnerf.data.formats.write_formats import ALWAYS, ON_REQUEST, write_packs
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.options.formats import formats
 from biresnerf.options.refine_options import RefineOptions
 from tests.data.formats.random_sets import random_result
 from tests.data.formats.readers import (
@@ -174,7 +176,7 @@ def test_instant_ngp_refuses_what_it_would_misread(tmp_path):
     images = tuple(replace(i, file_name=i.file_name.replace(".jpg", ".webp")) for i in refined.images)
     with pytest.raises(InputError) as caught:
         write_transforms_ngp(with_(refined, images=images), tmp_path / "t.json")
-    assert_complete(caught.value, "pack_not_possible")
+    assert_complete(caught.value, "export_not_possible")
     assert ".webp" in caught.value.detail
     assert not (tmp_path / "t.json").exists()
 
@@ -208,7 +210,7 @@ def test_bundler_refuses_lenses_that_it_cannot_hold(tmp_path, model):
     refined = random_result(6, model=model)
     with pytest.raises(InputError) as caught:
         write_bundler(centred(refined) if model != "SIMPLE_RADIAL" else refined, tmp_path)
-    assert_complete(caught.value, "pack_not_possible")
+    assert_complete(caught.value, "export_not_possible")
 
 
 def test_the_scene_is_a_valid_gltf_and_blender_would_show_the_callers_coordinates(tmp_path):
@@ -266,9 +268,9 @@ def test_coordinates_of_a_map_keep_their_digits_in_the_scene(tmp_path):
     assert np.abs(glb_accessor(document, binary, after)).max() < 100
 
 
-def test_all_packs_are_written_and_those_that_cannot_be_say_why(tmp_path):
+def test_all_exports_are_written_and_those_that_cannot_be_say_why(tmp_path):
     refined = centred(random_result(9, model="SIMPLE_RADIAL"))
-    notes = write_packs(refined, tmp_path, ["colmap-text", "instant-ngp", "kitti", "bundler"])
+    notes = write_result_formats(refined, tmp_path, ["colmap-text", "instant-ngp", "kitti", "bundler"])
     [note] = notes
     assert note.startswith("colmap-text was not written")
     assert "space" in note
@@ -278,9 +280,11 @@ def test_all_packs_are_written_and_those_that_cannot_be_say_why(tmp_path):
         *("tum.txt", "scene.glb", "poses.json", "kitti.txt", "transforms_ngp.json"),
         *("bundler/bundle.out", "bundler/list.txt"),
     }
-    assert len(ALWAYS) == 4
+    always = {name for name, one in formats().items() if one.always}
+    assert always == {"transforms", "colmap", "tum", "scene", "poses"}
 
 
-def test_every_pack_that_may_be_asked_for_is_known():
-    [allowed] = RefineOptions.model_fields["packs"].annotation.__args__[:1]
-    assert set(allowed.__args__) == set(ON_REQUEST)
+def test_every_export_that_may_be_asked_for_has_a_writer():
+    [allowed] = RefineOptions.model_fields["exports"].annotation.__args__[:1]
+    assert set(allowed.__args__) == {"colmap-text", "instant-ngp", "kitti", "bundler", "pinhole"}
+    assert all(codecs()[name].write is not None for name in allowed.__args__)

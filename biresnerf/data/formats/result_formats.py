@@ -1,19 +1,65 @@
-"""A finished result read back from its folder, so that it can be written in further forms."""
+"""The formats of a result: written with it, or later from what a finished result holds."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
+from biresnerf.data.formats.codec import WriteContext
+from biresnerf.data.formats.colmap.format import COLMAP
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
+from biresnerf.data.formats.registry import codecs
 from biresnerf.data.formats.simple.poses_json import POSES, PoseImage, matrix_of, read_poses_json
-from biresnerf.data.formats.write_formats import COLMAP
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.dataset import Camera, Dataset
 from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
 from biresnerf.geometry.similarity import Similarity
+from biresnerf.options.formats import formats
+
+
+def write_result_formats(
+    refined: RefinedSet,
+    folder: Path,
+    exports: Iterable[str] = (),
+    context: WriteContext | None = None,
+) -> tuple[str, ...]:
+    """Writes the formats of every result into ``folder``, the input's own format, and ``exports``.
+
+    Without the input in ``context``, the formats that need it are left out.
+
+    Returns:
+        a sentence for each export, or own format, that cannot hold this set.
+
+    Raises:
+        Interrupted: `WriteContext.should_stop` returned true.
+    """
+    context = context or WriteContext()
+    for one in formats().values():
+        if one.always and (context.dataset is not None or "input" not in one.needs):
+            write_format(refined, folder, one.name, context)
+    notes = []
+    own = () if context.dataset is None else formats_given_back(context.dataset)
+    for name in dict.fromkeys((*own, *exports)):
+        try:
+            write_format(refined, folder, name, context)
+        except InputError as error:
+            notes.append(f"{name} was not written: {error}")
+    return tuple(notes)
+
+
+def write_format(refined: RefinedSet, folder: Path, name: str, context: WriteContext) -> None:
+    """Writes one format where a result in ``folder`` has it. Raises InputError ``export_not_possible``."""
+    codec = codecs()[name]
+    assert codec.write is not None, f"{name} has a place in results"
+    codec.write(refined, folder / codec.format.in_result, context)
+
+
+def formats_given_back(dataset: Dataset) -> tuple[str, ...]:
+    """The formats that a result has because its input was in them, beside those that every result has."""
+    return tuple(name for name, codec in codecs().items() if codec.given_back(dataset))
 
 
 def read_result(folder: Path, photos: Path | None = None) -> RefinedSet:
@@ -21,7 +67,7 @@ def read_result(folder: Path, photos: Path | None = None) -> RefinedSet:
 
     Args:
         folder: what `refine` wrote.
-        photos: the input's folder, which file names are relative to; only the pinhole pack needs it.
+        photos: the input's folder, which file names are relative to; only formats that hold photos need it.
 
     Raises:
         InputError: ``result_missing``, ``result_inconsistent``, ``image_missing``, or a code of the readers.
@@ -35,7 +81,7 @@ def read_result(folder: Path, photos: Path | None = None) -> RefinedSet:
             hint="Name the output folder of a finished `biresnerf refine`.",
         )
     document = read_poses_json(path)
-    model = read_colmap_model(folder / COLMAP)
+    model = read_colmap_model(folder / COLMAP.in_result)
     id_of_name = {image.name: image.id for image in model.images.values()}
     image_ids = []
     for image in document.images:
@@ -86,7 +132,7 @@ def _image(image: PoseImage, photos: Path | None) -> RefinedImage:
 def _inconsistent(folder: Path, what: str) -> InputError:
     return InputError(
         "result_inconsistent",
-        f"{POSES} and the model in {COLMAP} do not fit each other: {what!r}.",
+        f"{POSES} and the model in {COLMAP.in_result} do not fit each other: {what!r}.",
         where=str(folder),
         hint="Leave the files of a result together, as they were written.",
     )

@@ -1,0 +1,65 @@
+"""What a module that reads or writes a format provides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.options.formats import Format
+
+
+@dataclass(frozen=True)
+class WriteContext:
+    """What a writer may need beside the poses.
+
+    Attributes:
+        dataset: the input; None where a finished result is read back and written again.
+        bounds: depths of the nearest and farthest point, where the user gave them.
+        should_stop: long writers ask it, and raise `Interrupted`.
+    """
+
+    dataset: Dataset | None = None
+    bounds: tuple[float, float] | None = None
+    should_stop: Callable[[], bool] = lambda: False
+
+
+# The folder that images lie in or below, the pose file (or the folder of a COLMAP model), and the folder that no file
+# may lie outside of.
+Reader: TypeAlias = Callable[[Path, Path, Path | None], Dataset]
+# The set, the file or folder to write, which the format's declaration names, and the context. Raises InputError
+# ``export_not_possible`` where the format cannot hold the set.
+Writer: TypeAlias = Callable[[RefinedSet, Path, WriteContext], None]
+
+
+@dataclass(frozen=True)
+class Codec:
+    """A declared format with the functions that read and write it. A module lists its own in ``CODECS``.
+
+    Attributes:
+        format: the declaration.
+        read: None for formats that are only written.
+        recognises: whether what lies under one of the declared names is of this format.
+        pose_place: for a file that the user names, the file or folder to be read; None where it is not of this format
+            by its name.
+        image_root: the folder that the images of such a place lie in or below.
+        write: None for formats that are only read.
+        given_back: whether this set came in this format, so that its result is written in it too.
+    """
+
+    format: Format
+    read: Reader | None = None
+    recognises: Callable[[Path], bool] = Path.is_file
+    pose_place: Callable[[Path], Path | None] | None = None
+    image_root: Callable[[Path], Path] = lambda place: place.parent
+    write: Writer | None = None
+    given_back: Callable[[Dataset], bool] = lambda dataset: False
+
+    def place_of(self, file: Path) -> Path | None:
+        """What is read when the user names ``file``; None where it is not of this format by its name."""
+        if self.pose_place is not None:
+            return self.pose_place(file)
+        return file if file.suffix.lower() in self.format.suffixes else None

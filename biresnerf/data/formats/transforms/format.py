@@ -1,0 +1,36 @@
+"""transforms.json as a format: found by name, read, and written in the input's own dialect."""
+
+from __future__ import annotations
+
+from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.transforms.read_transforms import read_transforms
+from biresnerf.data.formats.transforms.write_transforms import write_transforms
+from biresnerf.options.formats import Format
+
+TRANSFORMS = Format(
+    name="transforms",
+    title="transforms.json (nerfstudio, instant-ngp, Blender)",
+    rank=10,
+    found_as=("transforms.json", "transforms_train.json"),
+    suffixes=(".json",),
+    gives="poses (also for some images only), shared or per-frame intrinsics, masks",
+    checked_against="hand-made files of each dialect; published sets",
+    in_set="transforms.json",
+    in_result="transforms.json",
+    always=True,
+    needs=("input",),
+    loses=("rigs", "points"),
+    heading="For nerfstudio",
+    hint="Put it in the place of the photos' transforms.json, then: ns-train nerfacto --data FOLDER",
+)
+CODECS = (
+    Codec(
+        TRANSFORMS,
+        read=lambda _, file, within: read_transforms(file, within),
+        write=lambda refined, path, context: (
+            None
+            if context.dataset is None
+            else write_transforms(context.dataset, refined.world_from_cam, path)
+        ),
+    ),
+)

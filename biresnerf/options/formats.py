@@ -1,0 +1,97 @@
+"""The file formats that poses are read from and written to, as each format's own module declares them.
+
+Options, the client and the web process need a format's name and properties, but must not load its reader, which needs
+NumPy. A declaration therefore has literal values only, and is taken from the module's source without importing it.
+`biresnerf.data.formats.registry` adds the functions that read and write.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+Need = Literal["photos", "lens file", "bounds", "input"]
+Loss = Literal["names", "lenses", "some lenses", "distortion", "rigs", "points", "mask paths", "masks"]
+
+_PACKAGE = Path(__file__).resolve().parents[2]
+_FOLDER = _PACKAGE / "biresnerf" / "data" / "formats"
+_DECLARATION = re.compile(r"^\w+ = Format\(\n.*?^\)$", re.MULTILINE | re.DOTALL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format:
+    """One format.
+
+    Attributes:
+        name: what options, commands and the API call it.
+        title: what people call it.
+        rank: its place in lists, and in the order in which a folder is searched for poses; unique.
+        found_as: names (or a pattern with ``*``) under which a folder holds it, the preferred one first; empty for
+            formats that are not read.
+        suffixes: of files that are taken for this format when they are named as the input.
+        gives: what reading it gives, for the docs.
+        checked_against: what its reader was tested with, for the docs.
+        in_set: where `convert` writes it in its folder; empty for formats that it does not write.
+        in_result: where it lies in the folder of a result; empty for formats that results do not have.
+        always: every result has it.
+        needs: ``photos``: the input's photos; ``lens file``: a camera.json beside it, as it has no lenses;
+            ``bounds``: depths of the nearest and farthest point; ``input``: the input's own file.
+        loses: what of a set it cannot hold.
+        lacks: more that it cannot hold, in words, for the docs.
+        heading, hint: whom its download is for, and how it is used.
+        downloads: the files that belong to it in a result: one file, or a folder with a slash at its end; `in_result`
+            where left out.
+        module: where it is declared.
+    """
+
+    name: str
+    title: str
+    rank: int
+    found_as: tuple[str, ...] = ()
+    suffixes: tuple[str, ...] = ()
+    gives: str = ""
+    checked_against: str = ""
+    in_set: str = ""
+    in_result: str = ""
+    always: bool = False
+    needs: tuple[Need, ...] = ()
+    loses: tuple[Loss, ...] = ()
+    lacks: str = ""
+    heading: str = ""
+    hint: str = ""
+    downloads: str = ""
+    module: str = ""
+
+    @property
+    def on_request(self) -> bool:
+        """Whether a result is written in it when that is asked for: all that it needs can be had at any time."""
+        return bool(self.in_result) and not self.always and not {"input", "bounds"} & set(self.needs)
+
+
+@cache
+def formats() -> dict[str, Format]:
+    """All formats by name, in the order of their ranks."""
+    found = [declared for path in sorted(_FOLDER.rglob("*.py")) for declared in _declared_in(path)]
+    return {declared.name: declared for declared in sorted(found, key=lambda declared: declared.rank)}
+
+
+def _declared_in(path: Path) -> Iterator[Format]:
+    """The declarations ``NAME = Format(...)`` of a module, the closing bracket on a line of its own."""
+    for match in _DECLARATION.finditer(path.read_text("utf-8")):
+        call = ast.parse(match[0].split(" = ", 1)[1], mode="eval").body
+        assert isinstance(call, ast.Call)
+        values = {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
+        module = ".".join(path.relative_to(_PACKAGE).with_suffix("").parts).removesuffix(".__init__")
+        yield Format(**values, module=module)
+
+
+# The formats that a result is written in on request, as a type that options and the API's schema list.
+if TYPE_CHECKING:
+    ExportName: TypeAlias = str
+else:
+    ExportName = Literal[tuple(name for name, one in formats().items() if one.on_request)]
