@@ -222,7 +222,7 @@ def write_bundler(refined: RefinedSet, folder: Path) -> None:
     Raises:
         InputError: ``export_not_possible``: a lens that the format cannot hold.
     """
-    hint = "Ask for the pinhole pack: it holds undistorted images, and a bundle.out for them."
+    hint = "Export `pinhole`: it holds undistorted images, and a bundle.out for them."
     refuse_lenses(refined.cameras, bundler_problem, "Bundler's format", "bundler", hint)
     lines = ["# Bundle file v0.3", f"{len(refined)} {len(refined.model.points)}"]
     for index, cam_from_world in enumerate(refined.cam_from_world):

@@ -1,4 +1,4 @@
-"""The pinhole pack: undistorted photos with a PINHOLE model, for programs that know no other lens (3DGS, OpenMVS).
+"""Undistorted photos with a PINHOLE model, for programs that know no other lens (3DGS, OpenMVS).
 
 Every camera of it has square pixels and its principal point in the picture's middle, as 3DGS takes for granted (it
 reads two angles of view and no more). Undistortion is our own: COLMAP's keeps the principal point where it was, so
@@ -95,7 +95,7 @@ def _tangents(rays: NDArray[np.float64], axis: int, sign: int) -> NDArray[np.flo
 
 
 def write_pinhole(refined: RefinedSet, folder: Path, should_stop: Callable[[], bool] = lambda: False) -> None:
-    """Writes images/, sparse/0/, bundle.out, list.txt and names.json (pack's name: caller's name) into ``folder``.
+    """Writes images/, sparse/0/, bundle.out, list.txt and names.json (new name: input's name) into ``folder``.
 
     Photos keep their names without folders, where those differ; JPEG stays JPEG, all else becomes PNG. EXIF data are
     not carried over.
@@ -143,7 +143,7 @@ def _names(refined: RefinedSet) -> list[str]:
 
 
 def _as_pinhole(refined: RefinedSet, cameras: tuple[Camera, ...], names: list[str]) -> RefinedSet:
-    """The same set as the pack's cameras see it: features go where their rays meet the new picture."""
+    """The same set as the new cameras see it: features go where their rays meet the new picture."""
     model = refined.model
     index_of = {number: row for row, number in enumerate(refined.image_ids)}
     lenses = dict(model.cameras)

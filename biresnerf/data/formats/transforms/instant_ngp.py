@@ -106,7 +106,7 @@ def _impossible(why: str) -> InputError:
         "export_not_possible",
         f"instant-ngp cannot read this set: {why}.",
         where=INSTANT_NGP.in_result,
-        hint="Ask for the pinhole pack, which holds undistorted images, and use its model.",
+        hint="Export `pinhole`, which holds undistorted images, and use its model.",
     )
 
 

@@ -61,7 +61,7 @@ def transforms_notes(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> t
     if not document and len({family(camera) for camera in dataset.cameras}) > 1:
         notes.append(
             "transforms.json holds lenses of several kinds, which nerfstudio takes for one: "
-            "give it the COLMAP model or the pinhole pack."
+            "give it the COLMAP model or the export pinhole."
         )
     return tuple(notes)
 
