@@ -1,56 +1,47 @@
-"""`Client`: does what flows ask for, one thing after another, or on several threads where they say so."""
+"""`Client`: the methods of `AsyncClient`, blocking. They run on an event loop in a thread of the client's own."""
 
 from __future__ import annotations
 
 import functools
-import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from contextlib import contextmanager
-from threading import Event
+import weakref
+from collections.abc import Awaitable, Callable, Iterator
+from concurrent.futures import Future
+from contextlib import ExitStack
+from queue import SimpleQueue
 from types import TracebackType
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeAlias, TypeVar
 
-import httpx
+import anyio
+from anyio.from_thread import start_blocking_portal
 
-from biresnerf.client import dataset_calls, downloads, job_calls, sending, service_calls, submitting
-from biresnerf.client.calls import (
-    Answer,
-    Call,
-    Effect,
-    FilePart,
-    Flow,
-    Pause,
-    Session,
-    Stream,
-    Together,
-    Work,
-)
+from biresnerf.client.client import AsyncClient
 from biresnerf.client.errors import ServiceError
-from biresnerf.client.events import Following, Happening
-from biresnerf.client.http import CHUNK_BYTES, answer_of, broken, redirected, request_of, settings, stopped
-from biresnerf.errors import BiresnerfError
-from biresnerf.wire.jobs import JobView
+from biresnerf.client.events import StreamEvent
 
 P = ParamSpec("P")
 T = TypeVar("T")
+# From the event loop's thread to the calling thread; None is the last one.
+_Messages: TypeAlias = SimpleQueue[Any]
 
 
-def _method(flow: Callable[Concatenate[Session, P], Flow[T]]) -> Callable[Concatenate[Client, P], T]:
-    """The flow as a method that waits for its outcome."""
+def _blocking(
+    method: Callable[Concatenate[AsyncClient, P], Awaitable[T]],
+) -> Callable[Concatenate[Client, P], T]:
+    """The same method of `Client`: same arguments, same documentation, same answer."""
 
-    @functools.wraps(flow)
-    def method(client: Client, /, *arguments: P.args, **options: P.kwargs) -> T:
-        return client.run(flow(client.session, *arguments, **options))
+    @functools.wraps(method)
+    def blocking(client: Client, /, *arguments: P.args, **named: P.kwargs) -> T:
+        return client._call(method, arguments, named)
 
-    return method
+    return blocking
 
 
 class Client:
-    """Talks to one service. Use as a context manager.
+    """Talks to one service. Use as a context manager; may be used from several threads.
 
-    Every method raises `ServiceError`. What fails for a moment is tried again, with growing pauses or as the service
-    asks, for ``patience_s``; what creates something is asked for so that it is created once.
+    Every method raises `ServiceError`. What fails for a moment is retried for ``patience_s``, with growing pauses or
+    when the service asks for it; a request that creates something creates it once. Callbacks run in the calling
+    thread, and may use the client. Ctrl-C, or an error in a callback, cancels the request under way.
     """
 
     def __init__(
@@ -59,12 +50,16 @@ class Client:
         *,
         api_key: str | None = None,
         patience_s: float = 60.0,
-        on_pause: Callable[[ServiceError, float], None] | None = None,
+        on_pause: Callable[[ServiceError, float], object] | None = None,
     ) -> None:
-        """``on_pause`` hears why, and how many seconds, is waited before something is tried again."""
-        self.url = url.rstrip("/")
-        self.session = Session(self.url, patience_s, on_pause)
-        self._http = httpx.Client(**settings(self.url, api_key))
+        """See `AsyncClient`; ``on_pause`` is called in the client's own thread."""
+        self._client = AsyncClient(url, api_key=api_key, patience_s=patience_s, on_pause=on_pause)
+        self.url = self._client.url
+        stack = ExitStack()
+        self._portal = stack.enter_context(start_blocking_portal())
+        stack.callback(self._portal.call, self._client.close)
+        # Also when the client is dropped or the process exits: the loop's thread must not outlive them.
+        self._close = weakref.finalize(self, stack.close)
 
     def __enter__(self) -> Client:
         return self
@@ -75,176 +70,110 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Ends all connections."""
-        self._http.close()
+        """Closes all connections."""
+        self._close()
 
-    ready = _method(service_calls.ready)
-    info = _method(service_calls.info)
-    options = _method(service_calls.options)
+    ready = _blocking(AsyncClient.ready)
+    info = _blocking(AsyncClient.info)
+    options = _blocking(AsyncClient.options)
 
-    create_dataset = _method(dataset_calls.create_dataset)
-    dataset = _method(dataset_calls.dataset)
-    datasets = _method(dataset_calls.datasets)
-    dataset_files = _method(dataset_calls.dataset_files)
-    send_missing = _method(sending.send_missing)
-    send_archive = _method(sending.send_archive)
-    finalize = _method(dataset_calls.finalize)
-    delete_dataset = _method(dataset_calls.delete_dataset)
+    create_dataset = _blocking(AsyncClient.create_dataset)
+    dataset = _blocking(AsyncClient.dataset)
+    datasets = _blocking(AsyncClient.datasets)
+    dataset_files = _blocking(AsyncClient.dataset_files)
+    send_missing = _blocking(AsyncClient.send_missing)
+    send_archive = _blocking(AsyncClient.send_archive)
+    finalize = _blocking(AsyncClient.finalize)
+    delete_dataset = _blocking(AsyncClient.delete_dataset)
 
-    submit = _method(submitting.submit)
-    create_job = _method(job_calls.create_job)
-    job = _method(job_calls.job)
-    jobs = _method(job_calls.jobs)
-    cancel = _method(job_calls.cancel)
-    fork = _method(job_calls.fork)
-    delete_job = _method(job_calls.delete_job)
-    log = _method(job_calls.log)
+    submit = _blocking(AsyncClient.submit)
+    create_job = _blocking(AsyncClient.create_job)
+    job = _blocking(AsyncClient.job)
+    jobs = _blocking(AsyncClient.jobs)
+    wait = _blocking(AsyncClient.wait)
+    cancel = _blocking(AsyncClient.cancel)
+    fork = _blocking(AsyncClient.fork)
+    delete_job = _blocking(AsyncClient.delete_job)
+    log = _blocking(AsyncClient.log)
 
-    artifacts = _method(job_calls.artifacts)
-    download = _method(downloads.download)
-    download_all = _method(downloads.download_all)
-    report = _method(job_calls.report)
-    images = _method(job_calls.images)
-    share = _method(job_calls.share)
-    export = _method(job_calls.export)
-    exports = _method(job_calls.exports)
+    artifacts = _blocking(AsyncClient.artifacts)
+    download = _blocking(AsyncClient.download)
+    download_all = _blocking(AsyncClient.download_all)
+    report = _blocking(AsyncClient.report)
+    images = _blocking(AsyncClient.images)
+    share = _blocking(AsyncClient.share)
+    export = _blocking(AsyncClient.export)
+    exports = _blocking(AsyncClient.exports)
 
-    create_webhook = _method(service_calls.create_webhook)
-    webhook = _method(service_calls.webhook)
-    webhooks = _method(service_calls.webhooks)
-    change_webhook = _method(service_calls.change_webhook)
-    delete_webhook = _method(service_calls.delete_webhook)
-    rotate_webhook_secret = _method(service_calls.rotate_webhook_secret)
-    test_webhook = _method(service_calls.test_webhook)
-    deliveries = _method(service_calls.deliveries)
-    delivery = _method(service_calls.delivery)
-    redeliver = _method(service_calls.redeliver)
+    create_webhook = _blocking(AsyncClient.create_webhook)
+    webhook = _blocking(AsyncClient.webhook)
+    webhooks = _blocking(AsyncClient.webhooks)
+    change_webhook = _blocking(AsyncClient.change_webhook)
+    delete_webhook = _blocking(AsyncClient.delete_webhook)
+    rotate_webhook_secret = _blocking(AsyncClient.rotate_webhook_secret)
+    test_webhook = _blocking(AsyncClient.test_webhook)
+    deliveries = _blocking(AsyncClient.deliveries)
+    delivery = _blocking(AsyncClient.delivery)
+    redeliver = _blocking(AsyncClient.redeliver)
 
-    def events(self, job_id: str, *, after: int = 0, timeout_s: float | None = None) -> Iterator[Happening]:
-        """What happens to the job until it is over: each event after that number once, and how far it is.
+    def events(self, job_id: str, *, after: int = 0, timeout_s: float | None = None) -> Iterator[StreamEvent]:
+        messages: _Messages = SimpleQueue()
 
-        Lost connections are taken up again where they broke off, and a service that is away is waited for.
+        async def forward() -> None:
+            async for event in self._client.events(job_id, after=after, timeout_s=timeout_s):
+                messages.put(event)
 
-        Raises:
-            JobNotOver: it is not over after ``timeout_s``.
-        """
-        following = Following(self.session, job_id, after, timeout_s)
-        while not following.over:
-            call = following.connect()
-            try:
-                with self._opened(call) as response:
-                    for chunk in response.iter_raw():
-                        yield from following.take(chunk)
-                        if following.connect_again:
-                            break
-                pause_s = following.ended()
-            except httpx.TransportError as error:
-                pause_s = following.broken(broken(self.url, call, error))
-            except ServiceError as error:
-                pause_s = following.broken(error)
-            time.sleep(pause_s)
-
-    def wait(
-        self,
-        job_id: str,
-        on_progress: Callable[[JobView], None] | None = None,
-        *,
-        timeout_s: float | None = None,
-    ) -> JobView:
-        """The job once it is over, however it ended; ``on_progress`` hears how far it is.
-
-        Raises:
-            JobNotOver: it is not over after ``timeout_s``.
-        """
-        for happening in self.events(job_id, timeout_s=timeout_s):
-            if on_progress is not None and (job := happening.job) is not None:
-                on_progress(job)
-        return self.job(job_id)
-
-    def run(self, flow: Flow[T], stop: Event | None = None) -> T:
-        """Does what the flow asks for, to its end; ``stop`` ends it early."""
-        result: Any = None
-        error: Exception | None = None
+        future = self._start(forward, messages)
         try:
-            while True:
-                effect = flow.send(result) if error is None else flow.throw(error)
-                result, error = None, None
-                try:
-                    result = self._do(effect, stop)
-                except (BiresnerfError, OSError) as failure:
-                    error = failure
-        except StopIteration as end:
-            answer: T = end.value
-            return answer
+            while (event := messages.get()) is not None:
+                yield event
+            future.result()
         finally:
-            flow.close()
+            future.cancel()
 
-    def _do(self, effect: Effect, stop: Event | None) -> Any:
-        if stop is not None and stop.is_set():
-            raise stopped()
-        match effect:
-            case Call():
-                return self._call(effect)
-            case Stream():
-                return self._pour(effect, stop)
-            case Pause():
-                return stop.wait(effect.seconds) if stop is not None else time.sleep(effect.seconds)
-            case Work():
-                return effect.do()
-            case Together():
-                return self._together(effect)
+    events.__doc__ = AsyncClient.events.__doc__
 
-    def _call(self, call: Call) -> Answer:
-        content = _chunks(call.content) if call.content is not None else None
+    def _call(
+        self, method: Callable[..., Awaitable[T]], arguments: tuple[Any, ...], named: dict[str, Any]
+    ) -> T:
+        messages: _Messages = SimpleQueue()
+
+        def relayed(value: Any) -> Any:
+            return functools.partial(_relay, messages, value) if callable(value) else value
+
+        work = functools.partial(
+            method,
+            self._client,
+            *(relayed(value) for value in arguments),
+            **{name: relayed(value) for name, value in named.items()},
+        )
+        future = self._start(work, messages)
         try:
-            response = self._http.request(**request_of(call, content))
-        except httpx.TransportError as error:
-            raise broken(self.url, call, error) from None
-        self.session.met = True
-        return answer_of(response)
+            while (message := messages.get()) is not None:
+                callback, returned = message
+                callback()
+                self._portal.start_task_soon(returned.set)
+        except BaseException:
+            if future.cancel():
+                while messages.get() is not None:  # until its files and connections are closed
+                    pass
+            raise
+        return future.result()
 
-    def _pour(self, stream: Stream, stop: Event | None) -> None:
-        call: Call | None = stream.call
-        try:
-            while call is not None:
-                with self._opened(call) as response:
-                    call = redirected(call, response)
-                    if call is None:
-                        stream.sink.begin(response.status_code)
-                        for chunk in response.iter_raw():
-                            stream.sink.take(chunk)
-                            if stop is not None and stop.is_set():
-                                raise stopped()
-        except httpx.TransportError as error:
-            raise broken(self.url, stream.call, error) from None
+    def _start(self, work: Callable[[], Awaitable[T]], messages: _Messages) -> Future[T]:
+        """Runs ``work`` on the event loop; puts None in the queue at its end."""
 
-    @contextmanager
-    def _opened(self, call: Call) -> Iterator[httpx.Response]:
-        with self._http.stream(**request_of(call, None)) as response:
-            self.session.met = True
-            if response.status_code >= 400:
-                response.read()
-                answer_of(response)
-            yield response
-
-    def _together(self, several: Together) -> None:
-        with ThreadPoolExecutor(several.lanes) as lanes:
-            running = [lanes.submit(self.run, flow, several.stop) for flow in several.flows]
+        async def run() -> T:
             try:
-                done, _ = wait(running, return_when=FIRST_EXCEPTION)
-                for one in done:
-                    one.result()
+                return await work()
             finally:
-                several.stop.set()  # where one failed, or Ctrl-C came, the others end at their next piece
-                for one in running:
-                    one.cancel()
+                messages.put(None)
+
+        return self._portal.start_task_soon(run)
 
 
-def _chunks(part: FilePart) -> Iterator[bytes]:
-    with part.path.open("rb") as source:
-        source.seek(part.start)
-        while chunk := source.read(CHUNK_BYTES):
-            if part.stop.is_set():
-                raise stopped()
-            yield chunk
-            part.on_bytes(len(chunk))
+async def _relay(messages: _Messages, callback: Callable[..., object], *facts: object) -> None:
+    """Has the calling thread run the callback, and waits until it returns."""
+    returned = anyio.Event()
+    messages.put((functools.partial(callback, *facts), returned))
+    await returned.wait()

@@ -1,4 +1,4 @@
-"""What can be asked about jobs and their results."""
+"""Requests about jobs and their results."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any, TypeAlias
 
-from biresnerf.client.calls import Call, Flow, Session, ask
-from biresnerf.client.pages import collect
+from biresnerf.client.transport import Call, Transport, parse
 from biresnerf.options.formats import ExportName
 from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.report import Report
@@ -32,155 +31,130 @@ from biresnerf.wire.results import ArtifactList, ArtifactView, ImageList, NewSha
 from biresnerf.wire.webhooks import JobWebhook
 
 OptionsLike: TypeAlias = RefineOptions | Mapping[str, Any] | None
-LOG_LINES = 1000
+_LOG_LINES = 1000
 
 
-def chosen(options: OptionsLike) -> RefineOptions:
-    """Options from what a caller may give; raises `InputError` ``invalid_options``."""
+class JobCalls(Transport):
+    """Requests about jobs and their results."""
+
+    async def create_job(
+        self,
+        dataset_id: str,
+        options: OptionsLike = None,
+        *,
+        labels: Mapping[str, str] | None = None,
+        priority: PriorityName = "normal",
+        webhook: JobWebhook | None = None,
+        idempotency_key: str | None = None,
+    ) -> JobView:
+        """Queues a refinement of a dataset. Requests with the same key queue it once and return the same job."""
+        body = NewJob(
+            dataset_id=dataset_id,
+            options=as_options(options),
+            labels=dict(labels or {}),
+            webhook=webhook,
+            priority=priority,
+        )
+        return await self._queue("/v1/jobs", body, idempotency_key)
+
+    async def _queue(self, path: str, body: NewJob | ForkJob, key: str | None) -> JobView:
+        headers = {"Idempotency-Key": key or uuid.uuid4().hex}
+        asked = body.model_dump(mode="json", exclude_unset=True)
+        return parse(await self._ask(Call("POST", path, json=asked, headers=headers)), JobView)
+
+    async def job(self, job_id: str) -> JobView:
+        """The job as it is now."""
+        return parse(await self._ask(Call("GET", job_url(job_id))), JobView)
+
+    async def jobs(
+        self,
+        *,
+        state: JobState | None = None,
+        label: tuple[str, str] | None = None,
+        created_after: datetime | None = None,
+        limit: int | None = None,
+    ) -> list[JobView]:
+        """Refinements, newest first."""
+        params = {
+            **({"state": state} if state else {}),
+            **({"label": ":".join(label)} if label else {}),
+            **({"created_after": created_after.astimezone().isoformat()} if created_after else {}),
+        }
+        return await self._collect(Call("GET", "/v1/jobs", params), JobList, limit)
+
+    async def cancel(self, job_id: str, *, keep_partial: bool = False) -> JobView:
+        """Asks for the job to end; with ``keep_partial`` its best poses so far become its result."""
+        body = CancelJob(keep_partial=keep_partial).model_dump()
+        return parse(await self._ask(Call("POST", f"{job_url(job_id)}/cancel", json=body)), JobView)
+
+    async def fork(
+        self,
+        job_id: str,
+        options: OptionsLike = None,
+        *,
+        from_stage: WantedStage = "auto",
+        labels: Mapping[str, str] | None = None,
+        idempotency_key: str | None = None,
+    ) -> JobView:
+        """Queues a job with some options changed, which reuses the work of a stage of this one."""
+        body = ForkJob(options=as_options(options), from_stage=from_stage, labels=dict(labels or {}))
+        return await self._queue(f"{job_url(job_id)}/fork", body, idempotency_key)
+
+    async def delete_job(self, job_id: str) -> None:
+        """Deletes a job that is over, with its results and exports."""
+        await self._ask(Call("DELETE", job_url(job_id)))
+
+    async def export(self, job_id: str, formats: Sequence[ExportName]) -> JobView:
+        """Has the result written in further formats; returns the job that does so, or did so before."""
+        body = NewExport(formats=list(formats)).model_dump()
+        return parse(await self._ask(Call("POST", f"{job_url(job_id)}/exports", json=body)), JobView)
+
+    async def exports(self, job_id: str) -> list[JobView]:
+        """All exports of the job, oldest first."""
+        return parse(await self._ask(Call("GET", f"{job_url(job_id)}/exports")), JobList).items
+
+    async def log(self, job_id: str, *, after: int = 0, limit: int = _LOG_LINES) -> list[LogLine]:
+        """What the job's process has written, from the line after number ``after``."""
+        params: dict[str, str | int] = {"after": after, "limit": limit, "format": "ndjson"}
+        answer = await self._ask(Call("GET", f"{job_url(job_id)}/logs", params))
+        # Not splitlines(): the text of a line may hold other characters that it splits at.
+        lines = answer.content.decode().split("\n")
+        return [LogLine.model_validate_json(line, extra="ignore") for line in lines if line]
+
+    async def report(self, job_id: str) -> Report:
+        """The report of a finished job: verdict, evidence, images, cameras."""
+        return parse(await self._ask(Call("GET", f"{job_url(job_id)}/report")), Report)
+
+    async def images(self, job_id: str, *, sort: str = "", limit: int | None = None) -> ImageList:
+        """The report's figures of each image, sorted by a column (largest first with ``-`` before its name)."""
+        params: dict[str, str | int] = {
+            **({"sort": sort} if sort else {}),
+            **({"limit": limit} if limit else {}),
+        }
+        return parse(await self._ask(Call("GET", f"{job_url(job_id)}/images", params)), ImageList)
+
+    async def artifacts(self, job_id: str) -> list[ArtifactView]:
+        """The files of the job's result and its exports; previews while it runs."""
+        return parse(await self._ask(Call("GET", f"{job_url(job_id)}/artifacts")), ArtifactList).items
+
+    async def share(self, job_id: str, name: str, *, valid_s: int = 3600) -> ShareView:
+        """A link to one file that needs no key; ``href`` is a complete address."""
+        body = NewShare(name=name, valid_s=valid_s).model_dump()
+        made = parse(await self._ask(Call("POST", f"{job_url(job_id)}/shares", json=body)), ShareView)
+        return made.model_copy(update={"href": self.url + made.href})
+
+
+def as_options(options: OptionsLike) -> RefineOptions:
+    """The options, checked; raises `InputError` ``invalid_options``."""
     return options if isinstance(options, RefineOptions) else parse_options(dict(options or {}))
 
 
 def with_name(labels: Mapping[str, str], name: str) -> dict[str, str]:
-    """The labels with what people know the job by in lists, where that is not said and there is room for it."""
+    """The labels with ``name``, by which lists show the job, unless they have one or are too many already."""
     return dict(labels) if len(labels) >= LABELS_MOST else {"name": name[:LABEL_LENGTH], **labels}
 
 
-def create_job(
-    session: Session,
-    dataset_id: str,
-    options: OptionsLike = None,
-    *,
-    labels: Mapping[str, str] | None = None,
-    priority: PriorityName = "normal",
-    webhook: JobWebhook | None = None,
-    idempotency_key: str | None = None,
-) -> Flow[JobView]:
-    """Queues a refinement of a dataset; with the same key it is queued once, however often it is asked for."""
-    body = NewJob(
-        dataset_id=dataset_id,
-        options=chosen(options),
-        labels=dict(labels or {}),
-        webhook=webhook,
-        priority=priority,
-    )
-    return (yield from queued(session, body, idempotency_key))
-
-
-def key_of(body: NewJob) -> str:
-    """An idempotency key that is the same wherever the same is asked for."""
+def idempotency_key_of(body: NewJob) -> str:
+    """A key that is the same for the same request, from any process."""
     asked = json.dumps(body.model_dump(mode="json", exclude_unset=True), sort_keys=True)
     return hashlib.sha256(asked.encode()).hexdigest()[:32]
-
-
-def queued(session: Session, body: NewJob, key: str | None) -> Flow[JobView]:
-    """The job that the key stands for, queued now or before."""
-    return (yield from _create(session, "/v1/jobs", body, key))
-
-
-def _create(session: Session, path: str, body: NewJob | ForkJob, key: str | None) -> Flow[JobView]:
-    headers = {"Idempotency-Key": key or uuid.uuid4().hex}
-    call = Call("POST", path, json=body.model_dump(mode="json", exclude_unset=True), headers=headers)
-    answer = yield from ask(session, call)
-    return answer.model(JobView)
-
-
-def job(session: Session, job_id: str) -> Flow[JobView]:
-    """The job now."""
-    answer = yield from ask(session, Call("GET", job_url(job_id)))
-    return answer.model(JobView)
-
-
-def jobs(
-    session: Session,
-    *,
-    state: JobState | None = None,
-    label: tuple[str, str] | None = None,
-    created_after: datetime | None = None,
-    limit: int | None = None,
-) -> Flow[list[JobView]]:
-    """Refinements, the newest first."""
-    params = {
-        **({"state": state} if state else {}),
-        **({"label": ":".join(label)} if label else {}),
-        **({"created_after": created_after.astimezone().isoformat()} if created_after else {}),
-    }
-    return (
-        yield from collect(
-            session, Call("GET", "/v1/jobs", params), lambda answer: answer.model(JobList), limit
-        )
-    )
-
-
-def cancel(session: Session, job_id: str, *, keep_partial: bool = False) -> Flow[JobView]:
-    """Asks for the job's end, with the best poses so far as its result where they are to be kept."""
-    body = CancelJob(keep_partial=keep_partial).model_dump()
-    answer = yield from ask(session, Call("POST", f"{job_url(job_id)}/cancel", json=body))
-    return answer.model(JobView)
-
-
-def fork(
-    session: Session,
-    job_id: str,
-    options: OptionsLike = None,
-    *,
-    from_stage: WantedStage = "auto",
-    labels: Mapping[str, str] | None = None,
-    idempotency_key: str | None = None,
-) -> Flow[JobView]:
-    """Queues a job with some other options, that takes over the work of a stage of this one."""
-    body = ForkJob(options=chosen(options), from_stage=from_stage, labels=dict(labels or {}))
-    return (yield from _create(session, f"{job_url(job_id)}/fork", body, idempotency_key))
-
-
-def delete_job(session: Session, job_id: str) -> Flow[None]:
-    """Deletes a job that is over, with its results and its exports."""
-    yield from ask(session, Call("DELETE", job_url(job_id)))
-
-
-def export(session: Session, job_id: str, formats: Sequence[ExportName]) -> Flow[JobView]:
-    """Has the result written in further forms; gives the job that does it, or has done it before."""
-    body = NewExport(formats=list(formats)).model_dump()
-    answer = yield from ask(session, Call("POST", f"{job_url(job_id)}/exports", json=body))
-    return answer.model(JobView)
-
-
-def exports(session: Session, job_id: str) -> Flow[list[JobView]]:
-    """All exports of the job, the oldest first."""
-    answer = yield from ask(session, Call("GET", f"{job_url(job_id)}/exports"))
-    return answer.model(JobList).items
-
-
-def log(session: Session, job_id: str, *, after: int = 0, limit: int = LOG_LINES) -> Flow[list[LogLine]]:
-    """What the job's process wrote, from after that line on."""
-    params: dict[str, str | int] = {"after": after, "limit": limit, "format": "ndjson"}
-    answer = yield from ask(session, Call("GET", f"{job_url(job_id)}/logs", params))
-    # By "\n" alone: a line's text may hold marks that other rules take for the end of a line.
-    written = answer.content.decode().split("\n")
-    return [LogLine.model_validate_json(line, extra="ignore") for line in written if line]
-
-
-def report(session: Session, job_id: str) -> Flow[Report]:
-    """The account of a finished job: verdict, evidence, images, cameras."""
-    answer = yield from ask(session, Call("GET", f"{job_url(job_id)}/report"))
-    return answer.model(Report)
-
-
-def images(session: Session, job_id: str, *, sort: str = "", limit: int | None = None) -> Flow[ImageList]:
-    """What the report says of each image, sorted by a column (``-`` before it: the largest first)."""
-    params: dict[str, str | int] = {**({"sort": sort} if sort else {}), **({"limit": limit} if limit else {})}
-    answer = yield from ask(session, Call("GET", f"{job_url(job_id)}/images", params))
-    return answer.model(ImageList)
-
-
-def artifacts(session: Session, job_id: str) -> Flow[list[ArtifactView]]:
-    """The files of the job's result and of its exports; previews while it runs."""
-    answer = yield from ask(session, Call("GET", f"{job_url(job_id)}/artifacts"))
-    return answer.model(ArtifactList).items
-
-
-def share(session: Session, job_id: str, name: str, *, valid_s: int = 3600) -> Flow[ShareView]:
-    """A link to one file that needs no key; ``href`` is whole."""
-    body = NewShare(name=name, valid_s=valid_s).model_dump()
-    answer = yield from ask(session, Call("POST", f"{job_url(job_id)}/shares", json=body))
-    made = answer.model(ShareView)
-    return made.model_copy(update={"href": session.url + made.href})

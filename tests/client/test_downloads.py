@@ -11,7 +11,6 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import anyio
-import anyio.from_thread
 import pytest
 
 from biresnerf.client import AsyncClient
@@ -89,9 +88,7 @@ def test_a_download_that_is_cancelled_before_its_first_byte_leaves_nothing(
     async def cancelled_while_it_looks_what_is_there() -> None:
         async with AsyncClient(stalling) as client:
             with anyio.CancelScope() as scope:
-                await client.download(
-                    FILE, tmp_path / "a", on_bytes=lambda _: anyio.from_thread.run_sync(scope.cancel)
-                )
+                await client.download(FILE, tmp_path / "a", on_bytes=lambda _: scope.cancel())
             assert scope.cancelled_caught
 
     anyio.run(cancelled_while_it_looks_what_is_there)

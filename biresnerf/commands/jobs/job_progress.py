@@ -14,7 +14,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, ProgressColumn, T
 from biresnerf.wire.jobs import JobView
 
 if TYPE_CHECKING:
-    from biresnerf.client import Client, Happening, Sending
+    from biresnerf.client import Client, Sending, StreamEvent
 
 _LINE_EVERY_S = 10.0
 
@@ -126,20 +126,20 @@ class SendingView(BytesView):
 def watch(client: Client, job: JobView, view: JobProgressView, timeout_s: float | None = None) -> JobView:
     """Shows the job until it is over; returns it. Raises `ServiceError`, `JobNotOver`."""
     view.job(job)
-    for happening in client.events(job.id, timeout_s=timeout_s):
-        if (now := happening.job) is not None:
+    for event in client.events(job.id, timeout_s=timeout_s):
+        if (now := event.job) is not None:
             view.job(now)
-        elif (text := _worth_a_line(happening)) is not None:
+        elif (text := _worth_a_line(event)) is not None:
             view.note(text)
     return client.job(job.id)
 
 
-def _worth_a_line(happening: Happening) -> str | None:
-    if happening.kind == "attempt_crashed":
-        return f"Attempt {happening.data.get('attempt')} broke off; the job goes on from its last checkpoint."
-    if happening.kind == "retried_smaller":
+def _worth_a_line(event: StreamEvent) -> str | None:
+    if event.kind == "attempt_crashed":
+        return f"Attempt {event.data.get('attempt')} broke off; the job goes on from its last checkpoint."
+    if event.kind == "retried_smaller":
         return "It ran out of memory; the job begins again with less."
-    if happening.kind == "cancel_requested":
+    if event.kind == "cancel_requested":
         return "The job was asked to end."
     return None
 

@@ -16,7 +16,7 @@ import httpx
 import pytest
 
 from benchmarks.upload import Relay
-from biresnerf.client import AsyncClient, Client, Happening, JobNotOver, Sending, ServiceError
+from biresnerf.client import AsyncClient, Client, JobNotOver, Sending, ServiceError, StreamEvent
 from biresnerf.errors import InputError
 from biresnerf.wire.jobs import JobView
 from tests.service.conftest import Running, finished, scene_files, submit
@@ -34,9 +34,9 @@ class Awaited:
         method = getattr(self._client, name)
         return lambda *given, **named: self._portal.call(functools.partial(method, *given, **named))
 
-    def events(self, job_id: str) -> list[Happening]:
-        async def gathered() -> list[Happening]:
-            return [happening async for happening in self._client.events(job_id)]
+    def events(self, job_id: str) -> list[StreamEvent]:
+        async def gathered() -> list[StreamEvent]:
+            return [event async for event in self._client.events(job_id)]
 
         return self._portal.call(gathered)
 
@@ -70,7 +70,7 @@ def test_a_folder_becomes_a_job_and_its_result_a_folder(
         *("succeeded", {"name": scene.name, "run": "client"}, 20),
     )
     assert [job.progress.fraction for job in seen] == sorted(job.progress.fraction for job in seen)
-    kinds = [happening.kind for happening in client.events(job.id)]
+    kinds = [event.kind for event in client.events(job.id)]
     assert (kinds[0], kinds[-1]) == ("queued", "succeeded")
 
     done: list[int] = []

@@ -122,7 +122,7 @@ def test_what_goes_wrong_is_one_line_and_its_own_exit_status(
         (("status", "../jobs"), {}, exit_codes.INPUT, "neither a job's id nor its address"),
         (("status", "a b"), {}, exit_codes.NOT_FOUND, ""),
         (("status", job), {"BIRESNERF_URL": nobody}, exit_codes.AWAY, "biresnerf up"),
-        (("status", job), {"BIRESNERF_URL": "nonsense"}, exit_codes.INPUT, "no address"),
+        (("status", job), {"BIRESNERF_URL": "nonsense"}, exit_codes.INPUT, "not the address"),
         (("list",), {"BIRESNERF_URL": closed.url}, exit_codes.KEY, "API key"),
         (("list",), {"BIRESNERF_URL": closed.url, "BIRESNERF_API_KEY": "brn_x"}, exit_codes.KEY, "unknown"),
         (("fork", job, "--set", "warmup_steps=50"), {}, exit_codes.INPUT, "stage 1"),

@@ -1,0 +1,123 @@
+"""Submits a local folder as a job: manifest, missing files, check, queue."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from anyio import to_thread
+
+from biresnerf.client.dataset_calls import DatasetCalls
+from biresnerf.client.errors import ServiceError
+from biresnerf.client.job_calls import JobCalls, OptionsLike, as_options, idempotency_key_of, with_name
+from biresnerf.client.scene import look_at
+from biresnerf.client.transport import tell
+from biresnerf.client.uploads import LocalFile, Uploads
+from biresnerf.wire.datasets import DatasetView
+from biresnerf.wire.jobs import JobView, NewJob, PriorityName
+from biresnerf.wire.webhooks import JobWebhook
+
+
+@dataclass(frozen=True)
+class Sending:
+    """The progress of a submission. An interrupted one is resumed by its ``dataset_id``."""
+
+    step: Literal["reading", "sending", "checking", "queueing"]
+    files: int = 0
+    files_missing: int = 0
+    bytes_missing: int = 0
+    bytes_sent: int = 0
+    dataset_id: str | None = None
+
+
+class Submissions(DatasetCalls, JobCalls, Uploads):
+    """Submits local folders."""
+
+    async def submit(
+        self,
+        path: Path,
+        options: OptionsLike = None,
+        *,
+        name: str | None = None,
+        labels: Mapping[str, str] | None = None,
+        priority: PriorityName = "normal",
+        webhook: JobWebhook | None = None,
+        idempotency_key: str | None = None,
+        resume: str | None = None,
+        on_progress: Callable[[Sending], object] = lambda _: None,
+    ) -> JobView:
+        """Sends the missing files of a folder (or file with poses), has them checked, and queues a job.
+
+        If the service refuses the files, the dataset is deleted there. If the connection fails or the caller stops,
+        it stays: the same submission with ``resume`` sends the rest, or returns the job if it is queued already.
+
+        Args:
+            name: of the dataset, and of the job unless ``labels`` has a ``name``. Default: the folder's.
+            resume: the dataset of an interrupted submission.
+            on_progress: called at each step, and with the bytes sent.
+
+        Raises:
+            InputError: the folder or the options cannot be used; nothing was sent then.
+            ServiceError: the service refuses, or cannot be reached.
+        """
+        wanted = as_options(options)
+        await tell(on_progress, Sending("reading"))
+        files = await _local_files(path)
+        if resume is None:
+            folder = path.resolve()
+            title = (name or (folder.parent if folder.is_file() else folder).name or "scene")[:200]
+            target = await self.create_dataset(title, [file.entry for file in files])
+        else:
+            target = await self.dataset(resume)
+        try:
+            ready = await self._fill(target, files, on_progress)
+            await tell(on_progress, Sending("queueing", len(files), dataset_id=target.id))
+            body = NewJob(
+                dataset_id=ready.id,
+                options=wanted,
+                labels=with_name(labels or {}, target.name),
+                webhook=webhook,
+                priority=priority,
+            )
+            return await self._queue("/v1/jobs", body, idempotency_key or idempotency_key_of(body))
+        except ServiceError as error:
+            if error.users_fault and resume is None:
+                await self._discard(target, error)
+            raise
+
+    async def _fill(
+        self, target: DatasetView, files: list[LocalFile], on_progress: Callable[[Sending], object]
+    ) -> DatasetView:
+        """Sends the missing files and has the dataset checked."""
+        if target.state == "ready":  # the submission was interrupted after its check
+            return target
+        missing = set(target.missing)
+        sizes = [file.size for file in files if file.name in missing]
+        state = Sending("sending", len(files), len(sizes), sum(sizes), dataset_id=target.id)
+        await tell(on_progress, state)
+
+        async def count(more: int) -> None:
+            nonlocal state
+            state = replace(state, bytes_sent=state.bytes_sent + more)
+            await tell(on_progress, state)
+
+        await self.send_missing(target, files, count)
+        await tell(on_progress, replace(state, step="checking", bytes_sent=state.bytes_missing))
+        return await self.finalize(target.id)
+
+    async def _discard(self, target: DatasetView, cause: ServiceError) -> None:
+        try:
+            await self.delete_dataset(target.id)
+        except ServiceError as error:
+            cause.add_note(f"The dataset {target.id} remains on the service: {error}")
+
+
+async def _local_files(path: Path) -> list[LocalFile]:
+    """The files of the input at ``path``, with their digests; raises `InputError`."""
+    scene = await to_thread.run_sync(look_at, path, abandon_on_cancel=True)
+    return [
+        await to_thread.run_sync(LocalFile.at, name, file, abandon_on_cancel=True)
+        for name, file in scene.files
+    ]
