@@ -1,16 +1,16 @@
-"""What the engine knows of jobs, files and uploads beyond what `biresnerf.wire` tells everybody. Frozen, torch-free."""
+"""The records of the engine: those of `biresnerf.wire` and, never sent to clients, where files are stored."""
 
 from __future__ import annotations
 
-from datetime import datetime
-from typing import Generic, TypeVar
+from collections.abc import Mapping
+from typing import Any, Generic, TypeVar
 
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from biresnerf.wire.base import Record
-from biresnerf.wire.datasets import UploadKind, UploadState
-from biresnerf.wire.jobs import EventType, Job, JobEvent, PriorityName
-from biresnerf.wire.problems import JobError
+from biresnerf.wire.datasets import FileView, UploadView
+from biresnerf.wire.jobs import EventType, JobEvent, JobView, PriorityName
+from biresnerf.wire.results import ResultFile
 
 PRIORITIES: dict[PriorityName, int] = {"low": -1, "normal": 0, "high": 1}
 
@@ -33,53 +33,35 @@ def priority_name(number: int) -> PriorityName:
 class JobUpdate(Record):
     """What a subscriber gets at every change: the job now, and the events since the last update."""
 
-    job: Job
+    job: JobView
     events: tuple[JobEvent, ...] = ()
 
 
-class Artifact(Record):
+class Artifact(ResultFile):
     """One file of a job's published result (or ``log.txt`` of a failed one). Read it by ``key``."""
 
-    name: str = Field(description="Path relative to the result, for example renders/orbit.mp4.")
     key: str = Field(description="Key in the FileStore.")
-    size: int
-    sha256: str
-    media_type: str
 
     @property
     def preview(self) -> bool:
-        """Whether it shows a job that is not over yet; another one will take its place."""
+        """Whether it shows a job that is not over yet; a later preview replaces it."""
         return self.name.startswith(f"{PREVIEW_FOLDER}/")
 
 
-class DatasetFile(Record):
+class DatasetFile(FileView):
     """One file of a dataset. Read it by ``key``."""
 
-    path: str
-    key: str
-    size: int
-    sha256: str
-    created_at: datetime
+    key: str = Field(exclude=True)
 
 
-class Upload(Record):
-    """Bytes on their way into a dataset: an archive, one file, or one file that is sent to the store itself."""
+class Upload(UploadView):
+    """Bytes on their way into a dataset, and where their pieces are in the FileStore."""
 
-    id: str
-    dataset_id: str
-    kind: UploadKind
-    path: str | None = Field(None, description="The file's path; none for an archive.")
-    size: int
-    sha256: str | None = Field(None, description="As announced; what arrives must have it.")
-    state: UploadState
-    received: int = Field(description="Bytes that are safe; the next byte to send has this number.")
-    error: JobError | None = Field(None, description="Why it was rejected.")
-    created_at: datetime
-    expires_at: datetime = Field(description="It is given up then, unless it goes on.")
-    folder: str = Field(description="Where its pieces lie in the FileStore.")
+    folder: str = Field(exclude=True)
 
 
 T = TypeVar("T")
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class Page(Record, Generic[T]):
@@ -87,3 +69,8 @@ class Page(Record, Generic[T]):
 
     items: tuple[T, ...]
     next_cursor: str | None = None
+
+
+def record_from_row(model: type[Model], row: Mapping[str, Any], **others: Any) -> Model:
+    """The record of a database row: its columns that are fields of ``model``, and ``others``."""
+    return model.model_validate({name: row[name] for name in model.model_fields if name in row} | others)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 from urllib.parse import quote
 
 from pydantic import ConfigDict, Field, StringConstraints
@@ -41,7 +41,23 @@ class CheckReport(Record):
     warnings: tuple[str, ...]
 
 
-class DatasetRecord(Record):
+class DatasetLinks(Record):
+    """Where the parts of a dataset are."""
+
+    self: str
+    files: str
+    archive: str
+    uploads: str
+    finalize: str
+
+    @classmethod
+    def of(cls, dataset: dict[str, Any]) -> DatasetLinks:
+        """The links of the dataset with these fields."""
+        here = dataset_url(dataset["id"])
+        return cls(self=here, **{part: f"{here}/{part}" for part in cls.model_fields if part != "self"})
+
+
+class DatasetView(Record):
     """A set of uploaded files."""
 
     id: str
@@ -58,35 +74,7 @@ class DatasetRecord(Record):
         None, description="When its files go unless it is used; none while a job uses it, or never."
     )
     revision: int = 0
-
-
-class DatasetLinks(Record):
-    """Where the parts of a dataset are."""
-
-    self: str
-    files: str
-    archive: str
-    uploads: str
-    finalize: str
-
-
-class DatasetView(DatasetRecord):
-    """A dataset with links."""
-
-    links: DatasetLinks
-
-    @classmethod
-    def of(cls, dataset: DatasetRecord) -> DatasetView:
-        """The dataset as the wire has it."""
-        here = dataset_url(dataset.id)
-        links = DatasetLinks(
-            self=here,
-            files=f"{here}/files",
-            archive=f"{here}/archive",
-            uploads=f"{here}/uploads",
-            finalize=f"{here}/finalize",
-        )
-        return cls(**dict(dataset), links=links)
+    links: DatasetLinks = Field(default_factory=DatasetLinks.of)
 
 
 class DatasetList(Record):

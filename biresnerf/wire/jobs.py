@@ -49,7 +49,31 @@ class JobProgress(Record):
     eta_s: float | None = None
 
 
-class Job(Record):
+class JobLinks(Record):
+    """Where the parts of a job are."""
+
+    self: str
+    dataset: str
+    events: str
+    artifacts: str
+    report: str
+    images: str
+    logs: str
+    exports: str
+    cancel: str
+    fork: str
+
+    @classmethod
+    def of(cls, job: dict[str, Any]) -> JobLinks:
+        """The links of the job with these fields."""
+        here = job_url(job["id"])
+        parts = cls.model_fields.keys() - {"self", "dataset"}
+        return cls(
+            self=here, dataset=dataset_url(job["dataset_id"]), **{part: f"{here}/{part}" for part in parts}
+        )
+
+
+class JobView(Record):
     """A job as clients see it. ``revision`` grows with every change (use it as a weak ETag)."""
 
     id: str
@@ -91,6 +115,7 @@ class Job(Record):
     )
     labels: dict[str, str] = Field({})
     revision: int = 0
+    links: JobLinks = Field(default_factory=JobLinks.of)
 
     @property
     def final(self) -> bool:
@@ -117,45 +142,6 @@ class LogLine(Record):
     text: str
 
 
-class JobLinks(Record):
-    """Where the parts of a job are."""
-
-    self: str
-    dataset: str
-    events: str
-    artifacts: str
-    report: str
-    images: str
-    logs: str
-    exports: str
-    cancel: str
-    fork: str
-
-
-class JobView(Job):
-    """A job with links."""
-
-    links: JobLinks
-
-    @classmethod
-    def of(cls, job: Job) -> JobView:
-        """The job as the wire has it."""
-        here = job_url(job.id)
-        links = JobLinks(
-            self=here,
-            dataset=dataset_url(job.dataset_id),
-            events=f"{here}/events",
-            artifacts=f"{here}/artifacts",
-            report=f"{here}/report",
-            images=f"{here}/images",
-            logs=f"{here}/logs",
-            exports=f"{here}/exports",
-            cancel=f"{here}/cancel",
-            fork=f"{here}/fork",
-        )
-        return cls(**dict(job), links=links)
-
-
 class JobList(Record):
     """A page of jobs, newest first."""
 
@@ -163,10 +149,20 @@ class JobList(Record):
     next_cursor: str | None = Field(None, description="Opaque; null on the last page.")
 
 
-PRIORITY = "Before or after other jobs; `high` only where the operator allows it."
+class JobTexts(Record):
+    """What may be asked of a job besides its input; the text fields of the one-shot form."""
+
+    options: RefineOptions = RefineOptions()
+    labels: Labels = Field({})
+    webhook: JobWebhook | None = Field(
+        None, description="Where messages about this job go, besides all other webhooks."
+    )
+    priority: PriorityName = Field(
+        "normal", description="Before or after other jobs; `high` only where the operator allows it."
+    )
 
 
-class NewJob(Record):
+class NewJob(JobTexts):
     """A refinement to run."""
 
     model_config = ConfigDict(
@@ -176,19 +172,6 @@ class NewJob(Record):
     )
 
     dataset_id: str = Field(max_length=100)
-    options: RefineOptions = RefineOptions()
-    labels: Labels = Field({})
-    webhook: JobWebhook | None = Field(None, description="Who is told of this job, besides all webhooks.")
-    priority: PriorityName = Field("normal", description=PRIORITY)
-
-
-class JobTexts(Record):
-    """The text fields of the one-shot form."""
-
-    options: RefineOptions = RefineOptions()
-    labels: Labels = Field({})
-    webhook: JobWebhook | None = Field(None, description="Who is told of this job, besides all webhooks.")
-    priority: PriorityName = Field("normal", description=PRIORITY)
 
 
 class CancelJob(Record):

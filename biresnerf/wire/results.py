@@ -10,13 +10,18 @@ from biresnerf.report import ImageReport
 from biresnerf.wire.base import Record
 
 
-class ArtifactView(Record):
-    """One file of a result."""
+class ResultFile(Record):
+    """One file of a result, or the log of a failed job."""
 
-    name: str
+    name: str = Field(description="Path relative to the result, for example renders/orbit.mp4.")
     size: int
     sha256: str
     media_type: str
+
+
+class ArtifactView(ResultFile):
+    """One file of a result, and where it is."""
+
     preview: bool = Field(
         False, description="It shows a job that is not over; another one will take its place."
     )

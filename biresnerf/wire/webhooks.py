@@ -6,7 +6,7 @@ import base64
 import binascii
 import secrets
 from datetime import datetime
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 from urllib.parse import quote
 
 from pydantic import AfterValidator, ConfigDict, Field, StringConstraints
@@ -54,7 +54,22 @@ def _is_secret(text: str) -> str:
 Secret = Annotated[str, AfterValidator(_is_secret)]
 
 
-class Webhook(Record):
+class WebhookLinks(Record):
+    """Where the parts of a webhook are."""
+
+    self: str
+    deliveries: str
+    test: str
+    rotate: str
+
+    @classmethod
+    def of(cls, webhook: dict[str, Any]) -> WebhookLinks:
+        """The links of the webhook with these fields."""
+        here = webhook_url(webhook["id"])
+        return cls(self=here, deliveries=f"{here}/deliveries", test=f"{here}/test", rotate=f"{here}/secret")
+
+
+class WebhookView(Record):
     """Who hears of what. The secret is told once, when it is made."""
 
     id: str
@@ -70,6 +85,7 @@ class Webhook(Record):
         None, description="Until then messages are signed with the secret before the last one too."
     )
     created_at: datetime
+    links: WebhookLinks = Field(default_factory=WebhookLinks.of)
 
 
 class WebhookAttempt(Record):
@@ -82,7 +98,20 @@ class WebhookAttempt(Record):
     error: str | None = None
 
 
-class WebhookDelivery(Record):
+class DeliveryLinks(Record):
+    """Where the parts of a delivery are."""
+
+    self: str
+    redeliver: str
+
+    @classmethod
+    def of(cls, delivery: dict[str, Any]) -> DeliveryLinks:
+        """The links of the delivery with these fields."""
+        here = delivery_path(delivery["webhook_id"], delivery["id"])
+        return cls(self=here, redeliver=f"{here}/redeliver")
+
+
+class DeliveryView(Record):
     """One message to one webhook; ``id`` is what the receiver finds in the header `webhook-id`."""
 
     id: str
@@ -94,6 +123,7 @@ class WebhookDelivery(Record):
     finished_at: datetime | None = None
     body: str = Field(description="The message, byte for byte.")
     attempts: tuple[WebhookAttempt, ...] = ()
+    links: DeliveryLinks = Field(default_factory=DeliveryLinks.of)
 
 
 class JobWebhook(Record):
@@ -137,35 +167,10 @@ class WebhookChange(Record):
     enabled: bool | None = Field(None, description="Off drops what waits; on (again) forgets failures.")
 
 
-class WebhookLinks(Record):
-    """Where the parts of a webhook are."""
-
-    self: str
-    deliveries: str
-    test: str
-    rotate: str
-
-
-class WebhookView(Webhook):
-    """A webhook with links."""
-
-    links: WebhookLinks
-
-    @classmethod
-    def of(cls, webhook: Webhook) -> WebhookView:
-        """The webhook as the wire has it."""
-        return cls(**dict(webhook), links=_links(webhook.id))
-
-
 class WebhookWithSecret(WebhookView):
     """A webhook with the secret its messages are signed with, which is not told again."""
 
     secret: str = Field(examples=["whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSwMfKQ9r8GKYo="])
-
-    @classmethod
-    def made(cls, webhook: Webhook, secret: str) -> WebhookWithSecret:
-        """The answer to who made the webhook or a new secret of it."""
-        return cls(**dict(webhook), links=_links(webhook.id), secret=secret)
 
 
 class WebhookList(Record):
@@ -173,25 +178,6 @@ class WebhookList(Record):
 
     items: list[WebhookView]
     next_cursor: str | None = Field(None, description="Opaque; null on the last page.")
-
-
-class DeliveryLinks(Record):
-    """Where the parts of a delivery are."""
-
-    self: str
-    redeliver: str
-
-
-class DeliveryView(WebhookDelivery):
-    """A delivery with links."""
-
-    links: DeliveryLinks
-
-    @classmethod
-    def of(cls, delivery: WebhookDelivery) -> DeliveryView:
-        """The delivery as the wire has it."""
-        here = delivery_path(delivery.webhook_id, delivery.id)
-        return cls(**dict(delivery), links=DeliveryLinks(self=here, redeliver=f"{here}/redeliver"))
 
 
 class DeliveryList(Record):
@@ -209,10 +195,3 @@ def webhook_url(webhook_id: str) -> str:
 def delivery_path(webhook_id: str, delivery_id: str) -> str:
     """The path of a delivery."""
     return f"{webhook_url(webhook_id)}/deliveries/{quote(delivery_id, safe='')}"
-
-
-def _links(webhook_id: str) -> WebhookLinks:
-    here = webhook_url(webhook_id)
-    return WebhookLinks(
-        self=here, deliveries=f"{here}/deliveries", test=f"{here}/test", rotate=f"{here}/secret"
-    )

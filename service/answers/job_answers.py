@@ -7,7 +7,7 @@ import re
 
 from fastapi.responses import JSONResponse, Response
 
-from biresnerf.wire.jobs import Job, JobView, job_url
+from biresnerf.wire.jobs import JobView, job_url
 from service.http.problems import ProblemError
 from workers.jobs.jobs import JobStore
 from workers.process.waiting import first_done
@@ -25,14 +25,14 @@ def checked_key(idempotency_key: str | None) -> str | None:
     return idempotency_key
 
 
-def job_etag(job: Job) -> str:
+def job_etag(job: JobView) -> str:
     """A weak tag of the job as it is."""
     # Others move a queued job's place without touching the job.
     return f'W/"{job.revision}-{job.queue_position or 0}"'
 
 
 def job_answer(
-    job: Job, *, status: int = 200, new: bool = True, headers: dict[str, str] | None = None
+    job: JobView, *, status: int = 200, new: bool = True, headers: dict[str, str] | None = None
 ) -> Response:
     """The job; ``new`` is False where an earlier request made it."""
     made = {"ETag": job_etag(job), "Cache-Control": "no-cache"}
@@ -40,7 +40,7 @@ def job_answer(
         made |= {"Location": job_url(job.id), "Retry-After": POLL_S}
     if not new:
         made["Idempotent-Replayed"] = "true"
-    body = JobView.of(job).model_dump(mode="json")
+    body = job.model_dump(mode="json")
     return JSONResponse(body, status_code=status, headers={**made, **(headers or {})})
 
 
@@ -50,7 +50,7 @@ def preferred_wait_s(prefer: str | None) -> float | None:
     return None if found is None else min(float(found[1]), WAIT_MAX_S)
 
 
-async def waited_for(jobs: JobStore, job_id: str, seconds: float, closing: asyncio.Event) -> Job:
+async def waited_for(jobs: JobStore, job_id: str, seconds: float, closing: asyncio.Event) -> JobView:
     """The job when it is over, after so many seconds, or when the service stops."""
     waiting = asyncio.create_task(jobs.wait(job_id, timeout_s=seconds))
     try:

@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 from biresnerf.errors import FaultError
-from biresnerf.wire.datasets import DatasetRecord
+from biresnerf.wire.datasets import DatasetView
 from biresnerf.wire.problems import JobError
 from service.http.dependencies import Service
 from service.http.problems import ProblemError, problem_of
@@ -35,7 +35,7 @@ _KEPT_FOLDERS = {"images"}
 
 async def take_archive(
     service: Service, dataset_id: str, archive: Path, into: Path, upload_id: str | None = None
-) -> DatasetRecord:
+) -> DatasetView:
     """Unpacks ``archive`` in a child, into the empty folder ``into``; then stores what came out.
 
     ``upload_id``: the upload that it came by. Nothing is stored unless the whole archive is good.

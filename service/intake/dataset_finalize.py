@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 
 from biresnerf.errors import InputError
-from biresnerf.wire.datasets import DatasetRecord
+from biresnerf.wire.datasets import DatasetView
 from biresnerf.wire.safe_paths import NameSet
 from service.http.access import Caller
 from service.http.problems import ProblemError, problem_of
 from service.intake.archive_import import settle_uploads
 
 
-async def begin_check(caller: Caller, dataset_id: str) -> DatasetRecord:
+async def begin_check(caller: Caller, dataset_id: str) -> DatasetView:
     """Freezes the dataset and starts its check, which goes on when the client is gone.
 
     Raises:
@@ -37,7 +37,7 @@ async def begin_check(caller: Caller, dataset_id: str) -> DatasetRecord:
     return dataset
 
 
-async def finish_check(caller: Caller, dataset_id: str) -> DatasetRecord:
+async def finish_check(caller: Caller, dataset_id: str) -> DatasetView:
     """Waits for the check's outcome; raises ``ProblemError`` with what it found wrong."""
     for task in list(caller.service.background):
         if task.get_name() == f"check {dataset_id}":

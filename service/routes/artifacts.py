@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from urllib.parse import quote
+
 from fastapi import APIRouter, Request
 from fastapi.responses import Response, StreamingResponse
 
 from biresnerf.report import Report
-from biresnerf.wire.results import ArtifactList
+from biresnerf.wire.jobs import job_url
+from biresnerf.wire.results import ArtifactList, ArtifactView
 from service.answers.downloads import ANSWERS, Asked, answer_with, find_artifact
-from service.answers.views import artifact_view
 from service.http.access import Caller, CallerHere
 from service.http.dependencies import JobId
 from service.http.problems import ProblemError, declared
@@ -26,7 +28,15 @@ REPORT = "report.json"
 async def list_artifacts(job_id: JobId, caller: CallerHere) -> ArtifactList:
     """All files of the result and of its exports. While the job runs, previews: the poses so far and a render."""
     found = await caller.jobs.artifacts(job_id)
-    return ArtifactList(items=[artifact_view(job_id, artifact) for artifact in found])
+    items = [
+        ArtifactView(
+            **artifact.model_dump(exclude={"key"}),
+            preview=artifact.preview,
+            href=f"{job_url(job_id)}/artifacts/{quote(artifact.name)}",
+        )
+        for artifact in found
+    ]
+    return ArtifactList(items=items)
 
 
 @router.get(

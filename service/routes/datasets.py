@@ -20,7 +20,6 @@ from biresnerf.wire.datasets import (
     dataset_url,
 )
 from biresnerf.wire.safe_paths import checked_path
-from service.answers.views import file_view
 from service.http.access import CallerHere, DatasetWriterHere
 from service.http.dependencies import DatasetId, next_link, service_of
 from service.http.problems import ProblemError, declared
@@ -76,7 +75,7 @@ async def create_dataset(
     if body.manifest:
         dataset = await caller.datasets.fill_known(dataset.id)
     response.headers["Location"] = dataset_url(dataset.id)
-    return DatasetView.of(dataset)
+    return dataset
 
 
 @router.get("", operation_id="listDatasets", responses=declared("bad_cursor", "invalid_request", *_ALWAYS))
@@ -91,13 +90,13 @@ async def list_datasets(
     """Datasets, newest first."""
     page = await caller.datasets.list(state=state, limit=limit, cursor=cursor)
     response.headers.update(next_link(request, page.next_cursor))
-    return DatasetList(items=[DatasetView.of(item) for item in page.items], next_cursor=page.next_cursor)
+    return DatasetList(items=page.items, next_cursor=page.next_cursor)
 
 
 @router.get("/{dataset_id}", operation_id="getDataset", responses=declared("not_found", *_ALWAYS))
 async def get_dataset(dataset_id: DatasetId, caller: CallerHere) -> DatasetView:
     """The dataset, with what the check found in it once it is final."""
-    return DatasetView.of(await caller.datasets.get(dataset_id))
+    return await caller.datasets.get(dataset_id)
 
 
 @router.delete(
@@ -127,7 +126,7 @@ async def list_files(
     """The files received, by path."""
     page = await caller.datasets.files(dataset_id, limit=limit, cursor=cursor)
     response.headers.update(next_link(request, page.next_cursor))
-    return FileList(items=[file_view(item) for item in page.items], next_cursor=page.next_cursor)
+    return FileList(items=page.items, next_cursor=page.next_cursor)
 
 
 _TAKES = (
@@ -179,7 +178,7 @@ async def put_file(
         )
     if not new:
         return Response(status_code=204)
-    return JSONResponse(file_view(file).model_dump(mode="json"), status_code=201)
+    return JSONResponse(file.model_dump(mode="json"), status_code=201)
 
 
 def _announced_digest(header: str | None) -> str | None:
@@ -229,7 +228,7 @@ async def upload_archive(dataset_id: DatasetId, request: Request, caller: Datase
             await write_stream(request.stream(), folder / "archive", limit, caller.service.room)
             into = folder / "content"
             into.mkdir()
-            return DatasetView.of(await take_archive(caller.service, dataset_id, folder / "archive", into))
+            return await take_archive(caller.service, dataset_id, folder / "archive", into)
 
 
 @router.post(
@@ -253,7 +252,7 @@ async def finalize_dataset(
     """
     view = await begin_check(caller, dataset_id)
     if "respond-async" in prefer.lower() and view.state == "finalizing":
-        body = DatasetView.of(view).model_dump(mode="json")
+        body = view.model_dump(mode="json")
         headers = {
             "Location": dataset_url(dataset_id),
             "Retry-After": "2",
@@ -261,4 +260,4 @@ async def finalize_dataset(
         }
         return JSONResponse(body, status_code=202, headers=headers)
     checked = await finish_check(caller, dataset_id)
-    return JSONResponse(DatasetView.of(checked).model_dump(mode="json"))
+    return JSONResponse(checked.model_dump(mode="json"))

@@ -179,7 +179,7 @@ async def export_job(job_id: JobId, request: Request, caller: JobWriterHere) -> 
 async def list_exports(job_id: JobId, caller: CallerHere) -> JobList:
     """All exports of the job, the oldest first."""
     page = await _derived(caller).exports(job_id)
-    return JobList(items=[JobView.of(job) for job in page.items])
+    return JobList(items=page.items)
 
 
 def _derived(caller: Caller) -> DerivedJobs:

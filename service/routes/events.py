@@ -10,7 +10,6 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Query
 from fastapi.responses import StreamingResponse
 
-from biresnerf.wire.jobs import JobView
 from biresnerf.wire.problems import FieldProblem
 from service.http.access import CallerHere
 from service.http.dependencies import JobId
@@ -159,7 +158,7 @@ def _written(update: JobUpdate) -> str:
         f"id: {event.seq}\nevent: {event.type}\ndata: {event.model_dump_json()}\n\n"
         for event in update.events
     ]
-    progress = f"event: progress\ndata: {JobView.of(update.job).model_dump_json()}\n\n"
+    progress = f"event: progress\ndata: {update.job.model_dump_json()}\n\n"
     if update.job.final and parts:
         return "".join([*parts[:-1], progress, parts[-1]])
     return "".join([*parts, progress])

@@ -144,7 +144,7 @@ async def list_jobs(
         state=state, label=_label(label), created_after=created_after, limit=limit, cursor=cursor
     )
     response.headers.update(next_link(request, page.next_cursor))
-    return JobList(items=[JobView.of(job) for job in page.items], next_cursor=page.next_cursor)
+    return JobList(items=page.items, next_cursor=page.next_cursor)
 
 
 def _label(text: str | None) -> tuple[str, str] | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fastapi import Request
 
-from biresnerf.wire.jobs import Job, JobTexts
+from biresnerf.wire.jobs import JobTexts, JobView
 from biresnerf.wire.problems import FieldProblem
 from service.http.access import Caller
 from service.http.problems import ProblemError
@@ -26,7 +26,7 @@ TEXTS = frozenset(JobTexts.model_fields)
 PLAIN = "priority"
 
 
-async def submit_form(caller: Caller, request: Request, idempotency_key: str | None) -> tuple[Job, bool]:
+async def submit_form(caller: Caller, request: Request, idempotency_key: str | None) -> tuple[JobView, bool]:
     """Takes the form (`archive`, JSON `options`, `labels`, `webhook`, the word `priority`).
 
     Returns the job and whether it is new. A repeated request with the same key is known by the archive's digest,
@@ -42,7 +42,7 @@ async def submit_form(caller: Caller, request: Request, idempotency_key: str | N
 
 async def _taken(
     caller: Caller, request: Request, idempotency_key: str | None, limit: int
-) -> tuple[Job, bool]:
+) -> tuple[JobView, bool]:
     async with staging_folder(caller.service.staging_dir) as folder:
         archive = folder / "archive"
         form = Form("archive", TEXTS, archive, limit, caller.service.room)
@@ -68,7 +68,7 @@ async def _taken(
 
 async def _make_job(
     caller: Caller, archive: Path, into: Path, texts: JobTexts, digest: str, idempotency_key: str | None
-) -> tuple[Job, bool]:
+) -> tuple[JobView, bool]:
     datasets = caller.datasets
     dataset = await datasets.create("one-shot")
     used = False

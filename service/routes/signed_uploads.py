@@ -8,7 +8,6 @@ from fastapi import APIRouter, Depends, Request
 
 from biresnerf.wire.datasets import FileView, NewSignedUploads, SignedUpload, SignedUploads
 from biresnerf.wire.safe_paths import checked_path
-from service.answers.views import file_view, upload_view
 from service.http.access import Caller, DatasetWriterHere
 from service.http.dependencies import DatasetId, UploadId
 from service.http.problems import ProblemError, declared
@@ -52,9 +51,7 @@ async def sign_uploads(
         for file, path in zip(body.files, paths, strict=True)
     ]
     urls = await _addresses(caller, [_key(upload) for upload in uploads])
-    items = [
-        SignedUpload(upload=upload_view(upload), url=url) for upload, url in zip(uploads, urls, strict=True)
-    ]
+    items = [SignedUpload(upload=upload, url=url) for upload, url in zip(uploads, urls, strict=True)]
     return SignedUploads(items=items)
 
 
@@ -93,7 +90,7 @@ async def complete_upload(upload_id: UploadId, caller: DatasetWriterHere) -> Fil
     if upload.kind != "signed" or path is None or sha256 is None:
         raise ProblemError("state_conflict", "This upload completes with its last byte.")
     if upload.state == "stored":
-        return file_view(await caller.datasets.file(upload.dataset_id, path))
+        return await caller.datasets.file(upload.dataset_id, path)
     await caller.datasets.get(upload.dataset_id)
     try:
         file, _ = await caller.datasets.add_copy(
@@ -108,4 +105,4 @@ async def complete_upload(upload_id: UploadId, caller: DatasetWriterHere) -> Fil
     except NotFound:
         raise ProblemError("upload_incomplete", "No bytes have arrived at the signed address.") from None
     await caller.uploads.conclude_signed(upload_id, caller.service.settings.storage_presign_s)
-    return file_view(file)
+    return file

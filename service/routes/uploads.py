@@ -18,7 +18,6 @@ from fastapi.responses import JSONResponse, Response
 
 from biresnerf.wire.datasets import UploadView, upload_url
 from biresnerf.wire.safe_paths import checked_path
-from service.answers.views import upload_view
 from service.http.access import CallerHere, DatasetWriterHere
 from service.http.dependencies import DatasetId, UploadId
 from service.http.problems import ProblemError, declared
@@ -114,7 +113,7 @@ async def create_upload(
     if upload.state == "received":
         begin_taking(caller.service, upload.id)
     headers = {"Location": upload_url(upload.id), **_where(upload)}
-    return JSONResponse(upload_view(upload).model_dump(mode="json"), status_code=201, headers=headers)
+    return JSONResponse(upload.model_dump(mode="json"), status_code=201, headers=headers)
 
 
 def _metadata(header: str) -> dict[str, str]:
@@ -144,7 +143,7 @@ async def head_upload(upload_id: UploadId, caller: CallerHere) -> Response:
 @router.get("/uploads/{upload_id}", operation_id="getUpload", responses=declared("not_found", *_ALWAYS))
 async def get_upload(upload_id: UploadId, caller: CallerHere) -> UploadView:
     """How far the upload is, and once all is received, what became of it (`stored` or `rejected`)."""
-    return upload_view(await caller.uploads.get(upload_id))
+    return await caller.uploads.get(upload_id)
 
 
 _APPENDS: dict[str, Any] = {

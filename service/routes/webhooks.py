@@ -59,7 +59,7 @@ async def create_webhook(
     """A webhook for all jobs and datasets. The secret in the answer is not told again."""
     webhook, secret = await caller.webhooks.create(caller.tenant, body.url, body.events, body.description)
     response.headers["Location"] = webhook_url(webhook.id)
-    return WebhookWithSecret.made(webhook, secret)
+    return WebhookWithSecret(**dict(webhook), secret=secret)
 
 
 @router.get("", operation_id="listWebhooks", responses=declared("bad_cursor", "invalid_request", *_ALWAYS))
@@ -76,13 +76,13 @@ async def list_webhooks(
     """Webhooks for all jobs, or those sent along with one job; newest first."""
     page = await caller.webhooks.list(job_id=job, limit=limit, cursor=cursor)
     response.headers.update(next_link(request, page.next_cursor))
-    return WebhookList(items=[WebhookView.of(item) for item in page.items], next_cursor=page.next_cursor)
+    return WebhookList(items=page.items, next_cursor=page.next_cursor)
 
 
 @router.get("/{webhook_id}", operation_id="getWebhook", responses=declared("not_found", *_ALWAYS))
 async def get_webhook(webhook_id: WebhookId, caller: CallerHere) -> WebhookView:
     """The webhook, and whether it works."""
-    return WebhookView.of(await caller.webhooks.get(webhook_id))
+    return await caller.webhooks.get(webhook_id)
 
 
 @router.patch(
@@ -95,8 +95,7 @@ async def change_webhook(
     caller: JobWriterHere, webhook_id: WebhookId, body: Annotated[WebhookChange, Depends(_change)]
 ) -> WebhookView:
     """Changes what is given; switches it off or on again."""
-    changed = await caller.webhooks.change(webhook_id, **body.model_dump())
-    return WebhookView.of(changed)
+    return await caller.webhooks.change(webhook_id, **body.model_dump())
 
 
 @router.delete(
@@ -115,7 +114,8 @@ async def delete_webhook(webhook_id: WebhookId, caller: JobWriterHere) -> None:
 )
 async def rotate_secret(webhook_id: WebhookId, caller: JobWriterHere) -> WebhookWithSecret:
     """A new secret. For 24 hours messages are signed with the one before too."""
-    return WebhookWithSecret.made(*await caller.webhooks.rotate(webhook_id))
+    webhook, secret = await caller.webhooks.rotate(webhook_id)
+    return WebhookWithSecret(**dict(webhook), secret=secret)
 
 
 @router.post(
@@ -128,7 +128,7 @@ async def test_webhook(webhook_id: WebhookId, caller: JobWriterHere, response: R
     """Sends a message `webhook.test`; the delivery at `Location` tells what came of it."""
     delivery = await caller.webhooks.test(webhook_id)
     response.headers["Location"] = delivery_path(delivery.webhook_id, delivery.id)
-    return DeliveryView.of(delivery)
+    return delivery
 
 
 @router.get(
@@ -147,7 +147,7 @@ async def list_deliveries(
     """What was sent and what waits, newest first, with every attempt's time and status."""
     page = await caller.webhooks.deliveries(webhook_id, limit=limit, cursor=cursor)
     response.headers.update(next_link(request, page.next_cursor))
-    return DeliveryList(items=[DeliveryView.of(item) for item in page.items], next_cursor=page.next_cursor)
+    return DeliveryList(items=page.items, next_cursor=page.next_cursor)
 
 
 @router.get(
@@ -157,7 +157,7 @@ async def list_deliveries(
 )
 async def get_delivery(webhook_id: WebhookId, delivery_id: DeliveryId, caller: CallerHere) -> DeliveryView:
     """One message and its attempts."""
-    return DeliveryView.of(await caller.webhooks.delivery(webhook_id, delivery_id))
+    return await caller.webhooks.delivery(webhook_id, delivery_id)
 
 
 @router.post(
@@ -168,4 +168,4 @@ async def get_delivery(webhook_id: WebhookId, delivery_id: DeliveryId, caller: C
 )
 async def redeliver(webhook_id: WebhookId, delivery_id: DeliveryId, caller: JobWriterHere) -> DeliveryView:
     """Sends a message again at once, under the id it had, so that a receiver can tell."""
-    return DeliveryView.of(await caller.webhooks.redeliver(webhook_id, delivery_id))
+    return await caller.webhooks.redeliver(webhook_id, delivery_id)

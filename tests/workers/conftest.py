@@ -21,7 +21,7 @@ import psycopg
 import pytest
 
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.wire.jobs import Job
+from biresnerf.wire.jobs import JobView
 from workers.database.embedded_postgres import EmbeddedPostgres
 from workers.database.migrate import migrate
 from workers.engine import Stores, open_stores
@@ -187,7 +187,7 @@ class Counting:
         self.id = job.id
         return job.id
 
-    async def until(self, holds: Callable[[Job], bool], timeout_s: float = PATIENCE_S) -> Job:
+    async def until(self, holds: Callable[[JobView], bool], timeout_s: float = PATIENCE_S) -> JobView:
         """The job once ``holds``; fails the test after the timeout. A client tries again after a 503."""
         end = time.monotonic() + timeout_s
         while True:
@@ -197,14 +197,14 @@ class Counting:
                 assert time.monotonic() < end, "the database did not come back"
                 await asyncio.sleep(0.1)
 
-    async def _until(self, holds: Callable[[Job], bool], end: float) -> Job:
+    async def _until(self, holds: Callable[[JobView], bool], end: float) -> JobView:
         async for update in self.stores.jobs.subscribe(self.id, heartbeat_s=1.0):
             if update is not None and holds(update.job):
                 return update.job
             assert time.monotonic() < end, f"waited too long: {update}"
         raise AssertionError(f"the job ended otherwise: {await self.stores.jobs.get(self.id)}")
 
-    async def until_final(self, timeout_s: float = PATIENCE_S) -> Job:
+    async def until_final(self, timeout_s: float = PATIENCE_S) -> JobView:
         return await self.until(lambda job: job.final, timeout_s)
 
     def starts(self) -> list[dict[str, object]]:

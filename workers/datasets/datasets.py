@@ -11,7 +11,7 @@ from typing import Any
 from psycopg.types.json import Jsonb
 
 from biresnerf.errors import InputError
-from biresnerf.wire.datasets import DatasetRecord, DatasetState, ManifestEntry
+from biresnerf.wire.datasets import DatasetState, DatasetView, ManifestEntry
 from workers.database.database import Connection, Database
 from workers.database.ids import cursor_after, cursor_place, cursor_time, new_id
 from workers.datasets.dataset_check import Checker
@@ -26,7 +26,7 @@ from workers.datasets.dataset_rows import (
     require_place,
 )
 from workers.jobs.quotas import require_byte_quota
-from workers.records import DatasetFile, Page
+from workers.records import DatasetFile, Page, record_from_row
 from workers.run.claim import insist
 from workers.settings.errors import Conflict, Expired, LimitReached, NotFound
 from workers.settings.settings import Settings
@@ -56,7 +56,7 @@ class DatasetStore:
         bound._tenant = tenant
         return bound
 
-    async def create(self, name: str, manifest: Sequence[ManifestEntry] = ()) -> DatasetRecord:
+    async def create(self, name: str, manifest: Sequence[ManifestEntry] = ()) -> DatasetView:
         """An empty dataset in state ``open``; raises `LimitReached` (``too_many_files``)."""
         if len(manifest) > self._settings.max_files:
             raise LimitReached(
@@ -73,14 +73,14 @@ class DatasetStore:
             )
             return await self._required(connection, dataset_id)
 
-    async def get(self, dataset_id: str) -> DatasetRecord:
+    async def get(self, dataset_id: str) -> DatasetView:
         """The dataset; raises `NotFound`."""
         async with self._database.transaction() as connection:
             return await self._required(connection, dataset_id)
 
     async def list(
         self, *, state: DatasetState | None = None, limit: int = 50, cursor: str | None = None
-    ) -> Page[DatasetRecord]:
+    ) -> Page[DatasetView]:
         """Datasets, newest first; raises `InputError` (``bad_cursor``)."""
         created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
         rows = await self._database.fetch(
@@ -91,7 +91,7 @@ class DatasetStore:
             *((cursor_time(created),) * 2 if created else (None, None)),
             *(last_id, limit + 1),
         )
-        items = tuple(_record(row) for row in rows[:limit])
+        items = tuple(record_from_row(DatasetView, row) for row in rows[:limit])
         more = len(rows) > limit
         return Page(
             items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
@@ -153,7 +153,7 @@ class DatasetStore:
 
         return await self._add(dataset_id, path, copied, upload_id, overwrite=True)
 
-    async def fill_known(self, dataset_id: str) -> DatasetRecord:
+    async def fill_known(self, dataset_id: str) -> DatasetView:
         """Copy what the manifest names and the same tenant has sent before; returns the dataset.
 
         By digest and size, within one tenant: nobody learns what others have sent. Raises `NotFound`,
@@ -239,7 +239,7 @@ class DatasetStore:
         items = tuple(DatasetFile.model_validate(row) for row in rows[:limit])
         return Page(items=items, next_cursor=cursor_after(items[-1].path) if len(rows) > limit else None)
 
-    async def finalize(self, dataset_id: str) -> DatasetRecord:
+    async def finalize(self, dataset_id: str) -> DatasetView:
         """Freeze the content: ``open`` becomes ``finalizing`` (other states come back as they are).
 
         Raises `NotFound`, `Conflict` (``dataset_not_complete``: manifest files lack, or no file at all).
@@ -259,7 +259,7 @@ class DatasetStore:
             )
             return await self._required(connection, dataset_id)
 
-    async def check(self, dataset_id: str) -> DatasetRecord:
+    async def check(self, dataset_id: str) -> DatasetView:
         """Validate a ``finalizing`` dataset in a child process and write the outcome; idempotent.
 
         Only one check of a dataset runs at a time, over all processes; the others wait for its outcome. Other
@@ -288,13 +288,9 @@ class DatasetStore:
             await connection.execute("DELETE FROM datasets WHERE id = %s", (dataset_id,))
             await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (f"datasets/{dataset_id}",))
 
-    async def _required(self, connection: Connection, dataset_id: str) -> DatasetRecord:
+    async def _required(self, connection: Connection, dataset_id: str) -> DatasetView:
         sql = DATASET + f" WHERE datasets.id = %s AND {MINE}"
         row = await (await connection.execute(sql, (dataset_id, self._tenant))).fetchone()
         if row is None:
             raise NotFound(f"No dataset {dataset_id}.")
-        return _record(row)
-
-
-def _record(row: dict[str, Any]) -> DatasetRecord:
-    return DatasetRecord.model_validate({key: row[key] for key in DatasetRecord.model_fields})
+        return record_from_row(DatasetView, row)

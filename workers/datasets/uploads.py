@@ -20,7 +20,7 @@ from workers.database.database import Connection, Database
 from workers.database.ids import new_id
 from workers.datasets.dataset_rows import MINE, file_key, require_open
 from workers.jobs.quotas import require_byte_quota
-from workers.records import Upload
+from workers.records import Upload, record_from_row
 from workers.settings.errors import Conflict, LimitReached, NotFound
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
@@ -32,11 +32,7 @@ PIECE_MAX_BYTES = 4 * 2**20
 PIECE_MIN_BYTES = 2**18
 EXPIRE_BATCH = 100
 
-_UPLOAD = (
-    "SELECT uploads.id, uploads.dataset_id, uploads.kind, uploads.path, uploads.size, uploads.sha256,"
-    " uploads.state, uploads.received, uploads.error, uploads.created_at, uploads.expires_at, uploads.folder"
-    " FROM uploads JOIN datasets ON datasets.id = uploads.dataset_id"
-)
+_UPLOAD = "SELECT uploads.* FROM uploads JOIN datasets ON datasets.id = uploads.dataset_id"
 
 
 class UploadStore:
@@ -111,7 +107,7 @@ class UploadStore:
             _UPLOAD + f" WHERE dataset_id = %s AND {MINE} AND uploads.state <> 'stored' ORDER BY uploads.id",
             *(dataset_id, self._tenant),
         )
-        return tuple(Upload.model_validate(row) for row in rows)
+        return tuple(record_from_row(Upload, row) for row in rows)
 
     async def append(self, upload_id: str, start: int, chunks: AsyncIterable[bytes]) -> Upload:
         """Store what comes from byte ``start`` on; ``received`` of the answer says how far it got.
@@ -257,7 +253,7 @@ class UploadStore:
         row = await (await connection.execute(sql, (upload_id, self._tenant))).fetchone()
         if row is None:
             raise NotFound(f"No upload {upload_id}.")
-        return Upload.model_validate(row)
+        return record_from_row(Upload, row)
 
 
 def _elsewhere(upload: Upload) -> Conflict:

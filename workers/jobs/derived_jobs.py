@@ -10,7 +10,7 @@ from psycopg.types.json import Jsonb
 
 from biresnerf.options.formats import ExportName
 from biresnerf.stages import ReusableStage
-from biresnerf.wire.jobs import Job, WantedStage
+from biresnerf.wire.jobs import JobView, WantedStage
 from workers.database.database import Connection
 from workers.database.ids import new_id
 from workers.jobs.forks import LATEST_FIRST, plan_fork
@@ -42,7 +42,7 @@ class DerivedJobs(JobStore):
         *,
         labels: Mapping[str, str] | None = None,
         idempotency_key: str | None = None,
-    ) -> tuple[Job, bool]:
+    ) -> tuple[JobView, bool]:
         """Queue a job on the same dataset with other options, that takes over a stage's work.
 
         It has its own copy of that work, so that either job can be deleted. Returns the job and whether it is
@@ -86,7 +86,7 @@ class DerivedJobs(JobStore):
         parent: Mapping[str, Any],
         idempotency_key: str | None,
         fingerprint: str,
-    ) -> Job | None:
+    ) -> JobView | None:
         """The job of an earlier request with this key; none where there is room for a new one."""
         await submitting_for(connection, parent["dataset_id"], self._tenant)
         if idempotency_key is not None:
@@ -116,7 +116,7 @@ class DerivedJobs(JobStore):
             taken[name] = {"prefix": target, "files": reusable[name]["files"]}
         return taken
 
-    async def export(self, job_id: str, formats: Sequence[ExportName]) -> tuple[Job, bool]:
+    async def export(self, job_id: str, formats: Sequence[ExportName]) -> tuple[JobView, bool]:
         """Queue an export of the job's result in further forms; the same request finds the same export.
 
         Raises `Conflict` (``result_not_ready``; ``state_conflict``: there are no poses to export),
@@ -145,7 +145,7 @@ class DerivedJobs(JobStore):
             }
             return await self._insert_below(connection, parent, new_id("exp"), values), True
 
-    async def exports(self, job_id: str) -> Page[Job]:
+    async def exports(self, job_id: str) -> Page[JobView]:
         """All exports of a job, the oldest first."""
         async with self._database.transaction() as connection:
             await self._required(connection, job_id)
@@ -154,7 +154,7 @@ class DerivedJobs(JobStore):
 
     async def _insert_below(
         self, connection: Connection, parent: Mapping[str, Any], job_id: str, values: Mapping[str, Any]
-    ) -> Job:
+    ) -> JobView:
         """A queued job on the dataset of ``parent``, for its tenant."""
         row = {"id": job_id, "dataset_id": parent["dataset_id"], "tenant": parent["tenant"], **values}
         statement = sql.SQL("INSERT INTO jobs ({}) VALUES ({})").format(

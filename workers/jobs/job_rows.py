@@ -7,10 +7,9 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from biresnerf.wire.jobs import Job, JobEvent, JobProgress, PriorityName
-from biresnerf.wire.problems import JobError
+from biresnerf.wire.jobs import JobEvent, JobProgress, JobView, PriorityName
 from workers.database.database import Connection
-from workers.records import PREVIEW_FOLDER, THUMBNAIL_NAME, priority_name
+from workers.records import PREVIEW_FOLDER, THUMBNAIL_NAME, priority_name, record_from_row
 from workers.settings.errors import Conflict
 
 JOB = """
@@ -26,25 +25,15 @@ PLACES = """places AS (SELECT queue_id, row_number() OVER (ORDER BY queue_order,
 MINE = "jobs.tenant = coalesce(%s, jobs.tenant)"
 
 
-def job_from_row(row: dict[str, Any]) -> Job:
+def job_from_row(row: dict[str, Any]) -> JobView:
     """The public record of a row of `JOB`."""
-    same = (
-        "id",
-        "tenant",
-        "dataset_id",
-        "state",
-        "stage",
-        "queue_position",
-        "attempt",
-        "cancel_requested",
-        "created_at",
+    return record_from_row(
+        JobView,
+        row,
+        progress=record_from_row(JobProgress, row),
+        priority=priority_name(row["priority"]),
+        thumbnail=_thumbnail(row),
     )
-    also = ("started_at", "finished_at", "options", "metrics", "message", "verdict", "labels", "revision")
-    life = ("expires_at", "kind", "parent", "forked_from", "forked_stage", "smaller", "partial")
-    progress = JobProgress(**{key: row[key] for key in ("fraction", "step", "steps_total", "eta_s")})
-    error = JobError.model_validate(row["error"]) if row["error"] else None
-    values = {key: row[key] for key in same + also + life} | {"priority": priority_name(row["priority"])}
-    return Job(**values, progress=progress, error=error, thumbnail=_thumbnail(row))
 
 
 def _thumbnail(row: dict[str, Any]) -> str | None:
@@ -74,7 +63,7 @@ def fingerprint_of(
 
 async def known_job(
     connection: Connection, tenant: str, idempotency_key: str, fingerprint: str
-) -> Job | None:
+) -> JobView | None:
     """The job of an earlier request with this key; raises `Conflict` where that was a different one."""
     row = await one_row(
         connection, JOB + " WHERE tenant = %s AND idempotency_key = %s", *(tenant, idempotency_key)

@@ -11,7 +11,7 @@ from typing import Any
 from psycopg.types.json import Jsonb
 
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.wire.jobs import Job, JobEvent, JobState, LogLine, PriorityName
+from biresnerf.wire.jobs import JobEvent, JobState, JobView, LogLine, PriorityName
 from biresnerf.wire.webhooks import JobWebhook
 from workers.database.database import Connection, Database
 from workers.database.ids import cursor_after, cursor_place, cursor_time, new_id
@@ -66,7 +66,7 @@ class JobStore:
         request_digest: str | None = None,
         webhook: JobWebhook | None = None,
         priority: PriorityName = "normal",
-    ) -> tuple[Job, bool]:
+    ) -> tuple[JobView, bool]:
         """Queue a job at its tenant's turn; the job and its queue entry are written in one transaction.
 
         ``request_digest`` stands for the dataset when requests are compared, where the client sent the
@@ -100,7 +100,7 @@ class JobStore:
                 await add_job_webhook(connection, self._settings, tenant, job_id, webhook)
             return await self._queue(connection, job_id), True
 
-    async def _queue(self, connection: Connection, job_id: str) -> Job:
+    async def _queue(self, connection: Connection, job_id: str) -> JobView:
         """Put a job just written into the queue."""
         queue_id = await self._database.enqueue(connection, job_id)
         await connection.execute(
@@ -116,7 +116,7 @@ class JobStore:
         labels: Mapping[str, str],
         idempotency_key: str,
         priority: PriorityName = "normal",
-    ) -> Job | None:
+    ) -> JobView | None:
         """The job of an earlier request with this key, before anything is done for this one.
 
         Raises `Conflict` (``idempotency_key_reused``) where the earlier request was a different one.
@@ -126,7 +126,7 @@ class JobStore:
             fingerprint = fingerprint_of(request_digest, resolved, labels, priority)
             return await known_job(connection, self._tenant or LOCAL_TENANT, idempotency_key, fingerprint)
 
-    async def get(self, job_id: str) -> Job:
+    async def get(self, job_id: str) -> JobView:
         """The job now; raises `NotFound`."""
         async with self._database.transaction() as connection:
             return job_from_row(await self._required(connection, job_id))
@@ -139,7 +139,7 @@ class JobStore:
         created_after: datetime | None = None,
         limit: int = 50,
         cursor: str | None = None,
-    ) -> Page[Job]:
+    ) -> Page[JobView]:
         """Refinements, newest first; raises `InputError` (``bad_cursor``)."""
         created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
         rows = await self._database.fetch(
@@ -163,7 +163,7 @@ class JobStore:
             items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
         )
 
-    async def cancel(self, job_id: str, *, keep_partial: bool = False) -> Job:
+    async def cancel(self, job_id: str, *, keep_partial: bool = False) -> JobView:
         """Ask for the end of a job: a queued one is cancelled at once, a running one within seconds.
 
         With ``keep_partial`` the best poses so far are published, with a report that says that they are
@@ -263,7 +263,7 @@ class JobStore:
         """
         return follow(self.update, self._listener, self._tenant, job_id, after, heartbeat_s)
 
-    async def wait(self, job_id: str, *, timeout_s: float) -> Job:
+    async def wait(self, job_id: str, *, timeout_s: float) -> JobView:
         """The job as soon as it is final, or as it is after ``timeout_s`` (for long polls)."""
         job = await self.get(job_id)
         updates = follow(self.update, self._listener, self._tenant, job_id, 0, timeout_s)

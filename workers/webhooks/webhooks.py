@@ -12,16 +12,15 @@ from datetime import UTC, datetime
 from typing import Any
 
 from biresnerf.wire.webhooks import (
+    DeliveryView,
     JobWebhook,
-    Webhook,
-    WebhookAttempt,
-    WebhookDelivery,
     WebhookEvent,
+    WebhookView,
     new_secret,
 )
 from workers.database.database import Connection, Database
 from workers.database.ids import cursor_after, cursor_place, cursor_time, new_id
-from workers.records import Page
+from workers.records import Page, record_from_row
 from workers.settings.errors import Conflict, LimitReached, NotFound
 from workers.settings.settings import Settings
 from workers.webhooks.outbound import Policy, checked_url
@@ -50,7 +49,7 @@ class WebhookStore:
 
     async def create(
         self, tenant: str, url: str, events: Sequence[WebhookEvent], description: str = ""
-    ) -> tuple[Webhook, str]:
+    ) -> tuple[WebhookView, str]:
         """A new webhook and its secret.
 
         Raises `InputError` (``webhook_url_refused``), `LimitReached` (``too_many_webhooks``).
@@ -74,14 +73,14 @@ class WebhookStore:
             )
             return _webhook(await cursor.fetchone()), secret
 
-    async def get(self, webhook_id: str) -> Webhook:
+    async def get(self, webhook_id: str) -> WebhookView:
         """The webhook; raises `NotFound`."""
         async with self._database.transaction() as connection:
             return _webhook(await self._required(connection, webhook_id))
 
     async def list(
         self, *, job_id: str | None = None, limit: int = 50, cursor: str | None = None
-    ) -> Page[Webhook]:
+    ) -> Page[WebhookView]:
         """Webhooks, newest first: those for all jobs, or those of one; raises `InputError` (``bad_cursor``)."""
         created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
         rows = await self._database.fetch(
@@ -106,7 +105,7 @@ class WebhookStore:
         events: Sequence[WebhookEvent] | None = None,
         description: str | None = None,
         enabled: bool | None = None,
-    ) -> Webhook:
+    ) -> WebhookView:
         """Change what is given. Switching on (again) forgets that it failed; switching off drops what waits.
 
         Raises `NotFound`, `InputError` (``webhook_url_refused``).
@@ -129,7 +128,7 @@ class WebhookStore:
                 await drop_pending(connection, webhook_id)
             return _webhook(row)
 
-    async def rotate(self, webhook_id: str) -> tuple[Webhook, str]:
+    async def rotate(self, webhook_id: str) -> tuple[WebhookView, str]:
         """A new secret; for a day messages carry signatures of both. Raises `NotFound`."""
         secret = new_secret()
         async with self._database.transaction() as connection:
@@ -150,7 +149,7 @@ class WebhookStore:
         if not rows:
             raise NotFound(f"No webhook {webhook_id}.")
 
-    async def test(self, webhook_id: str) -> WebhookDelivery:
+    async def test(self, webhook_id: str) -> DeliveryView:
         """Queue a message ``webhook.test``; raises `NotFound`, `Conflict` (``state_conflict``)."""
         delivery_id = new_id("msg")
         said = {
@@ -169,7 +168,7 @@ class WebhookStore:
 
     async def deliveries(
         self, webhook_id: str, *, limit: int = 50, cursor: str | None = None
-    ) -> Page[WebhookDelivery]:
+    ) -> Page[DeliveryView]:
         """What was sent or is to be, newest first; raises `NotFound`, `InputError` (``bad_cursor``)."""
         created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
         async with self._database.transaction() as connection:
@@ -190,13 +189,13 @@ class WebhookStore:
             items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
         )
 
-    async def delivery(self, webhook_id: str, delivery_id: str) -> WebhookDelivery:
+    async def delivery(self, webhook_id: str, delivery_id: str) -> DeliveryView:
         """One message; raises `NotFound`."""
         async with self._database.transaction() as connection:
             await self._required(connection, webhook_id)
             return await _delivery(connection, webhook_id, delivery_id)
 
-    async def redeliver(self, webhook_id: str, delivery_id: str) -> WebhookDelivery:
+    async def redeliver(self, webhook_id: str, delivery_id: str) -> DeliveryView:
         """Send a message again, under the id it had, at once and with a fresh count of attempts.
 
         One that waits already comes at once; one under way comes twice.
@@ -254,7 +253,7 @@ async def drop_pending(connection: Connection, webhook_id: str) -> None:
     )
 
 
-async def _delivery(connection: Connection, webhook_id: str, delivery_id: str) -> WebhookDelivery:
+async def _delivery(connection: Connection, webhook_id: str, delivery_id: str) -> DeliveryView:
     cursor = await connection.execute(
         _DELIVERY + " WHERE id = %s AND webhook_id = %s", (delivery_id, webhook_id)
     )
@@ -264,20 +263,16 @@ async def _delivery(connection: Connection, webhook_id: str, delivery_id: str) -
     return _delivery_record(row)
 
 
-def _webhook(row: dict[str, Any] | None) -> Webhook:
+def _webhook(row: dict[str, Any] | None) -> WebhookView:
     assert row is not None, "RETURNING gives the row that was written"
-    same = ("id", "tenant", "url", "description", "events", "job_id", "enabled", "disabled_why")
     rotating = row["previous_until"] is not None and row["previous_until"] > datetime.now(UTC)
-    return Webhook(
-        **{key: row[key] for key in (*same, "failing_since", "created_at")},
-        previous_secret_until=row["previous_until"] if rotating else None,
+    return record_from_row(
+        WebhookView, row, previous_secret_until=row["previous_until"] if rotating else None
     )
 
 
-def _delivery_record(row: dict[str, Any]) -> WebhookDelivery:
-    same = ("id", "webhook_id", "event", "state", "created_at", "finished_at", "body")
-    return WebhookDelivery(
-        **{key: row[key] for key in same},
-        next_attempt_at=row["due_at"] if row["state"] == "pending" else None,
-        attempts=tuple(WebhookAttempt.model_validate(item) for item in row["log"]),
+def _delivery_record(row: dict[str, Any]) -> DeliveryView:
+    waits = row["state"] == "pending"
+    return record_from_row(
+        DeliveryView, row, next_attempt_at=row["due_at"] if waits else None, attempts=row["log"]
     )

@@ -12,7 +12,7 @@ import pytest
 
 from biresnerf.errors import InputError
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.wire.datasets import DatasetRecord, ManifestEntry
+from biresnerf.wire.datasets import DatasetView, ManifestEntry
 from tests.workers.conftest import ACCEPTED, quick_settings, ready_dataset
 from workers.engine import Stores, open_stores
 from workers.settings.errors import Conflict, LimitReached, NotFound
@@ -198,7 +198,7 @@ async def finalized_dataset(stores: Stores) -> str:
     return dataset.id
 
 
-async def checking(database_url: str, folder: Path, program: str) -> DatasetRecord:
+async def checking(database_url: str, folder: Path, program: str) -> DatasetView:
     """The outcome of a check by this program."""
     async with open_stores(checked_by(program, database_url, folder)) as stores:
         return await stores.datasets.check(await finalized_dataset(stores))

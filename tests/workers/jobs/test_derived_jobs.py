@@ -10,7 +10,7 @@ import pytest
 
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.wire.jobs import Job
+from biresnerf.wire.jobs import JobView
 from tests.workers.conftest import Counting, Slots, quick_settings, ready_dataset
 from workers.engine import Stores, open_stores
 from workers.jobs.derived_jobs import DerivedJobs
@@ -24,7 +24,7 @@ SMALL = RefineOptions(
 )  # fmt: skip
 
 
-async def over(stores: Stores, job: Job, tmp_path: Path) -> Job:
+async def over(stores: Stores, job: JobView, tmp_path: Path) -> JobView:
     watched = Counting(stores, tmp_path / "journal")
     watched.id = job.id
     done = await watched.until_final(timeout_s=300)
@@ -38,7 +38,7 @@ async def read(stores: Stores, job_id: str, name: str) -> bytes:
 
 
 async def no_copy_is_made_for_a_fork_that_is_there_or_has_no_room(
-    stores: Stores, derived: DerivedJobs, first: Job, fork: Job
+    stores: Stores, derived: DerivedJobs, first: JobView, fork: JobView
 ) -> None:
     async def copies() -> set[str]:
         return {file.key.split("/")[1] for file in await stores.files.list("jobs") if "/taken/" in file.key}

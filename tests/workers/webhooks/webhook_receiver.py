@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.wire.webhooks import WebhookDelivery
+from biresnerf.wire.webhooks import DeliveryView
 from tests.workers.conftest import Slots, quick_settings, ready_dataset
 from workers.engine import Stores
 from workers.settings.settings import Settings
@@ -116,7 +116,7 @@ class Dispatchers:
         await asyncio.gather(*self._tasks)
 
 
-async def concluded(stores: Stores, webhook_id: str, delivery_id: str) -> WebhookDelivery:
+async def concluded(stores: Stores, webhook_id: str, delivery_id: str) -> DeliveryView:
     end = time.monotonic() + PATIENCE_S
     while (delivery := await stores.webhooks.delivery(webhook_id, delivery_id)).state == "pending":
         assert time.monotonic() < end, delivery
