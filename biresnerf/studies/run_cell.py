@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf import __version__
-from biresnerf.data.formats.read_poses import read_poses
+from biresnerf.data.formats.read_dataset import read_poses
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.errors import Interrupted

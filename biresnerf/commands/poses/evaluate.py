@@ -47,7 +47,7 @@ def evaluate_command(result: Path, truth: Path, as_json: bool, paper_compat: boo
     """
     import numpy as np
 
-    from biresnerf.data.formats.read_poses import read_poses
+    from biresnerf.data.formats.read_dataset import read_poses
     from biresnerf.geometry.pose_error import paper_compat_error, pose_error
     from biresnerf.geometry.trajectory_error import trajectory_error
 

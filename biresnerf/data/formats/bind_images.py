@@ -1,12 +1,13 @@
-"""Images that a pose file other than transforms.json describes, checked against the files and made a dataset."""
+"""Poses as a file gives them, and how they are bound to image files to make a dataset."""
 
 from __future__ import annotations
 
 import posixpath
 import unicodedata
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from biresnerf.data.model.safe_names import refuse_outside
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
 from biresnerf.data.photos.image_files import ImageHeader, read_header
 from biresnerf.data.photos.mask_files import mask_beside
-from biresnerf.data.photos.named_images import few_names, refuse_too_few
+from biresnerf.data.photos.named_images import few_names, photos_beside, refuse_no_images, refuse_too_few
 from biresnerf.data.photos.orientation import (
     meant_orientations,
     orientation_notes,
@@ -26,42 +27,104 @@ from biresnerf.data.photos.orientation import (
     turned_header,
 )
 from biresnerf.errors import InputError
+from biresnerf.report import PoseSource
 
 _IMAGES = "images/"
+# The lens of an image by its header and name, where the pose file does not give it without them.
+LensOf: TypeAlias = Callable[[ImageHeader, str], Camera | None]
 
 
 @dataclass(frozen=True, eq=False)
-class GivenImage:
-    """One image as a pose file has it.
+class PoseEntry:
+    """One image as a pose file describes it, before any image file is opened.
 
     Attributes:
-        name: what the file calls it.
-        path: the image file.
-        camera: its intrinsics, for the size that the file means, which may be another than the image's; None where
-            nobody gave any.
+        name: what the file calls it; its number where the file has no names.
         world_from_cam: float64 [4, 4], OpenCV axes; None where the file has no pose for it.
         where: the file, and the place in it, for messages.
-        timestamp_s: when it was taken, where the file says so.
-        camera_id: the file's own number of the camera: cameras of different numbers stay apart, equal as they may be.
+        lens: its intrinsics, for the size that the file means, which may differ from the image's; None if unknown.
+        timestamp_s: when it was taken, where the file gives that.
+        camera_id: the file's own number of the camera: cameras of different numbers stay apart even if equal.
+        raw: the entry as a transforms.json has it.
     """
 
     name: str
-    path: Path
-    camera: Camera | None
     world_from_cam: NDArray[np.float64] | None
     where: str
+    lens: Camera | LensOf | None = None
     timestamp_s: float | None = None
     camera_id: int | None = None
+    raw: dict[str, Any] = field(default_factory=dict)
+
+
+# Pairs of an image file's name and its entry, in the order of the dataset, and notes for the user.
+Assignment: TypeAlias = tuple[list[tuple[str, PoseEntry]], list[str]]
+
+
+@dataclass(frozen=True, eq=False)
+class ParsedPoses:
+    """What a pose file says: names, poses and lenses.
+
+    Attributes:
+        source: the format, and the files that were read.
+        entries: in the file's order.
+        assign: which entry belongs to which image file, given the names of those files, sorted; by the entries' names
+            where left out. Raises InputError where that cannot be decided.
+        named: whether the file itself says which images its poses are for.
+        notes: for the user.
+    """
+
+    source: SourceFormat
+    entries: tuple[PoseEntry, ...]
+    assign: Callable[[Sequence[str]], Assignment] | None = None
+    named: bool = True
+    notes: tuple[str, ...] = ()
+
+
+def bind_images(parsed: ParsedPoses, root: Path, within: Path | None = None) -> Dataset:
+    """The dataset of parsed poses and the images in or below ``root``.
+
+    Args:
+        within: refuse files outside of this folder; for files of strangers.
+
+    Raises:
+        InputError: ``no_images``, ``image_missing``, ``pose_count_mismatch`` or a code of `dataset_of`.
+    """
+    files = photos_beside(root)
+    refuse_no_images(files, root)
+    names = sorted(files)
+    pairs, notes = parsed.assign(names) if parsed.assign is not None else by_name(parsed.entries, names)
+    images = [(files[name], entry) for name, entry in pairs]
+    return dataset_of(root, images, parsed.source, [*parsed.notes, *notes], within)
+
+
+def by_name(entries: Sequence[PoseEntry], names: Sequence[str]) -> Assignment:
+    """Each entry with the image file of its name. Raises InputError ``image_missing``."""
+    found, notes = match_files([entry.name for entry in entries], names, lambda i: entries[i].where)
+    return list(zip(found, entries, strict=True)), notes
+
+
+def in_order(entries: Sequence[PoseEntry], names: Sequence[str], file: str, hint: str) -> Assignment:
+    """The entries with the images in the order of their names. Raises InputError ``pose_count_mismatch``."""
+    if len(names) != len(entries):
+        raise InputError(
+            "pose_count_mismatch",
+            f"has {len(entries)} poses for {len(names)} images, and does not say which belongs to which.",
+            where=file,
+            hint=hint,
+        )
+    pairs = [(name, replace(entry, name=name)) for name, entry in zip(names, entries, strict=True)]
+    return pairs, [f"{file}: images were taken in the order of their names"]
 
 
 def dataset_of(
     root: Path,
-    images: Sequence[GivenImage],
+    images: Sequence[tuple[Path, PoseEntry]],
     source: SourceFormat,
     notes: Sequence[str],
     within: Path | None,
 ) -> Dataset:
-    """The dataset of these images, in their order; headers are read, masks/ is looked into.
+    """The dataset of these images, in their order; reads their headers and looks for masks in masks/.
 
     Raises:
         InputError: ``too_few_images``, ``unsafe_path``, ``image_size_mismatch``, ``poses_coincide``, or a code of
@@ -69,48 +132,51 @@ def dataset_of(
     """
     place = source.files[0].name if source.files else root.name
     refuse_too_few(len(images), place)
-    names = [image.name for image in images]
+    names = [entry.name for _, entry in images]
     if within is not None:
-        refuse_outside([image.path for image in images], names, within, place)
-    stored = [read_header(image.path, image.name) for image in images]
-    sizes = [
-        (None, None) if image.camera is None else (float(image.camera.width), float(image.camera.height))
-        for image in images
+        refuse_outside([path for path, _ in images], names, within, place)
+    stored = [read_header(path, entry.name) for path, entry in images]
+    lenses = [
+        entry.lens(header, entry.name) if callable(entry.lens) else entry.lens
+        for (_, entry), header in zip(images, stored, strict=True)
     ]
+    sizes = [(None, None) if lens is None else (float(lens.width), float(lens.height)) for lens in lenses]
     orientations = meant_orientations(stored, sizes)
     headers = [turned_header(header, turn) for header, turn in zip(stored, orientations, strict=True)]
-    said = [*notes, *orientation_notes(stored, orientations, names), *page_notes(stored, names)]
+    warnings = [*notes, *orientation_notes(stored, orientations, names), *page_notes(stored, names)]
     cameras: dict[tuple[Camera, IntrinsicsSource, int | None], int] = {}
     frames = []
-    for image, header, orientation in zip(images, headers, orientations, strict=True):
-        if image.camera is None:
+    for (path, entry), lens, header, orientation in zip(images, lenses, headers, orientations, strict=True):
+        if lens is None:
             fitted, by = guess_lens(header)
         else:
-            fitted, by = fitted_camera(image.camera, header, image, said), "given"
-        index = cameras.setdefault((fitted, by, image.camera_id), len(cameras))
-        mask, inverted = mask_beside(root, image.path, image.name, within)
-        pose_source = None if image.world_from_cam is None else "given"
+            fitted, by = fitted_camera(lens, header, entry, warnings), "given"
+        index = cameras.setdefault((fitted, by, entry.camera_id), len(cameras))
+        mask, inverted = mask_beside(root, path, entry.name, within)
+        pose_source: PoseSource | None = None if entry.world_from_cam is None else "given"
         frames.append(
             Frame(
-                image.name, image.path, index, image.world_from_cam, pose_source,  # type: ignore[arg-type]
-                mask=mask, mask_inverted=inverted, orientation=orientation, timestamp_s=image.timestamp_s,
+                entry.name, path, index, entry.world_from_cam, pose_source, entry.raw,
+                mask=mask, mask_inverted=inverted, orientation=orientation, timestamp_s=entry.timestamp_s,
             )
         )  # fmt: skip
-    refuse_coinciding([frame.world_from_cam for frame in frames if frame.world_from_cam is not None], place)
-    said += _pose_notes(frames) + _mask_notes(frames)
+    poses = [frame.world_from_cam for frame in frames if frame.world_from_cam is not None]
+    refuse_coinciding(poses, place)
+    warnings += _pose_notes(frames) + _mask_notes(frames)
     sources = tuple(by for _, by, _ in cameras)
-    said += [guess_note(by) for by in sources if by != "given"]
+    if poses:
+        warnings += [guess_note(by) for by in sources if by != "given"]
     return Dataset(
         root,
         tuple(camera for camera, _, _ in cameras),
         tuple(frames),
         source,
-        tuple(dict.fromkeys(said)),
+        tuple(dict.fromkeys(warnings)),
         sources,
     )
 
 
-def fitted_camera(camera: Camera, header: ImageHeader, image: GivenImage, notes: list[str]) -> Camera:
+def fitted_camera(camera: Camera, header: ImageHeader, image: PoseEntry, notes: list[str]) -> Camera:
     """``camera`` for the image's true size; resized where it is one factor away, refused where it is not."""
     size = (header.width, header.height)
     if (camera.width, camera.height) == size:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+from biresnerf.data.formats.bind_images import ParsedPoses, bind_images
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.options.formats import Format
@@ -27,9 +28,11 @@ class WriteContext:
     should_stop: Callable[[], bool] = lambda: False
 
 
-# The folder that images lie in or below, the pose file (or the folder of a COLMAP model), and the folder that no file
-# may lie outside of.
-Reader: TypeAlias = Callable[[Path, Path, Path | None], Dataset]
+# The folder that images lie in or below, and the pose file (or the folder of a COLMAP model). Opens no image. Raises
+# InputError, codes as in docs/input.md.
+Parser: TypeAlias = Callable[[Path, Path], ParsedPoses]
+# The parsed poses, the folder of the images, and the folder that no file may lie outside of.
+Binder: TypeAlias = Callable[[ParsedPoses, Path, Path | None], Dataset]
 # The set, the file or folder to write, which the format's declaration names, and the context. Raises InputError
 # ``export_not_possible`` where the format cannot hold the set.
 Writer: TypeAlias = Callable[[RefinedSet, Path, WriteContext], None]
@@ -41,7 +44,8 @@ class Codec:
 
     Attributes:
         format: the declaration.
-        read: None for formats that are only written.
+        parse: None for formats that are only written.
+        bind: how parsed poses become a dataset.
         recognises: whether what lies under one of the declared names is of this format.
         pose_place: for a file that the user names, the file or folder to be read; None where it is not of this format
             by its name.
@@ -51,7 +55,8 @@ class Codec:
     """
 
     format: Format
-    read: Reader | None = None
+    parse: Parser | None = None
+    bind: Binder = bind_images
     recognises: Callable[[Path], bool] = Path.is_file
     pose_place: Callable[[Path], Path | None] | None = None
     image_root: Callable[[Path], Path] = lambda place: place.parent

@@ -65,7 +65,7 @@ def look_at(file: Path) -> FolderContents:
     Raises:
         InputError: ``input_unsupported``.
     """
-    readable = [(name, codec) for name, codec in codecs().items() if codec.read is not None]
+    readable = [(name, codec) for name, codec in codecs().items() if codec.parse is not None]
     # A name that a format declares goes before a suffix, which several may share.
     for name, codec in sorted(readable, key=lambda item: file.name not in item[1].format.found_as):
         place = codec.place_of(file)

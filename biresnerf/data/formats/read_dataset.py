@@ -1,20 +1,26 @@
-"""Any input a user may give, read and validated: the one door into `biresnerf.data`."""
+"""Any input a user may give, read and validated."""
 
 from __future__ import annotations
 
+import posixpath
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, dataset_of
 from biresnerf.data.formats.folder import FolderContents, look_at, look_into
-from biresnerf.data.formats.image_folder import read_image_folder
 from biresnerf.data.formats.registry import codecs
-from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.photos.masks import refuse_unfit_mask
+from biresnerf.data.photos.named_images import photos_beside
 from biresnerf.errors import InputError
 
 
 def read_dataset(path: Path, within: Path | None = None) -> Dataset:
-    """Reads poses in any form that docs/formats.md names, with their images, or a folder of images alone.
+    """Reads poses in any format of docs/formats.md with their images, or a folder of images alone.
 
     Everything is validated but the pixels, which `photos.images.load_images` decodes. Frames may lack poses:
     `seeding.seed_poses` finds them.
@@ -28,14 +34,57 @@ def read_dataset(path: Path, within: Path | None = None) -> Dataset:
     """
     contents = find_input(Path(path))
     if contents.format is None or contents.poses is None:
-        dataset = read_image_folder(contents.root, contents.images, within)
+        dataset = _read_images(contents.root, contents.images, within)
     else:
-        read = codecs()[contents.format].read
-        assert read is not None, "only formats that are read are found"
-        dataset = read(contents.root, contents.poses, within)
+        codec = codecs()[contents.format]
+        dataset = codec.bind(_parse(contents.format, contents.root, contents.poses), contents.root, within)
     for index, frame in enumerate(dataset.frames):
         refuse_unfit_mask(frame, dataset.camera_of(index))
     return replace(dataset, warnings=contents.notes + dataset.warnings)
+
+
+def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
+    """``world_from_cam`` [4, 4] (OpenCV axes, in the world from before ``applied_transform``) by image name.
+
+    The images need not be there. Frames without a pose are left out. Names are as the file has them, with ``./`` and
+    the like resolved. Poses that a file gives without names (LLFF, KITTI, TUM) are those of the images beside it, where
+    these fit; else they are called by their time or number.
+
+    Args:
+        path: a file in any format that `read_dataset` reads, or a folder that holds one.
+
+    Raises:
+        InputError: ``pose_file_invalid`` or another code of the format's reader; ``where`` starts with the path.
+    """
+    hint = (
+        "Give a transforms.json as nerfstudio, instant-ngp or Blender write it, or one written by `refine`."
+    )
+    try:
+        contents = find_input(path)
+        name, place = contents.format, contents.poses
+    except InputError as error:
+        if error.code in ("input_missing", "input_unreadable"):
+            raise _at(path, error, path.name) from None
+        name, place = None, None
+    if name is None or place is None:
+        raise InputError("pose_file_invalid", "holds no poses that can be read.", where=str(path), hint=hint)
+    poses: dict[str, NDArray[np.float64]] = {}
+    seen: set[str] = set()
+    try:
+        for entry in _named_entries(_parse(name, contents.root, place), contents.root):
+            if not entry.name:
+                where = f"{entry.where}.file_path"
+                raise InputError("pose_file_invalid", "names no image.", where=where, hint=hint)
+            image = posixpath.normpath(entry.name)
+            if image in seen:
+                detail = f"{image!r} is there twice."
+                raise InputError("duplicate_image", detail, where=entry.where, hint="Remove one.")
+            seen.add(image)
+            if entry.world_from_cam is not None:
+                poses[image] = entry.world_from_cam
+    except InputError as error:
+        raise _at(place, error, place.name) from None
+    return poses
 
 
 def find_input(path: Path) -> FolderContents:
@@ -47,3 +96,35 @@ def find_input(path: Path) -> FolderContents:
     raise InputError(
         "input_missing", "does not exist.", where=str(path), hint="Give a folder, or a file with poses."
     )
+
+
+def _parse(name: str, root: Path, place: Path) -> ParsedPoses:
+    parse = codecs()[name].parse
+    assert parse is not None, "only formats that are read are found"
+    return parse(root, place)
+
+
+def _read_images(root: Path, images: Sequence[Path], within: Path | None) -> Dataset:
+    """The images as frames without pose, named by their path relative to ``root``."""
+    names = [path.relative_to(root).as_posix() for path in images]
+    root = root.resolve()  # "." has no name
+    entries = [(root / name, PoseEntry(name, None, name)) for name in names]
+    return dataset_of(root, entries, SourceFormat("images", None, {}, np.eye(4)), (), within)
+
+
+def _named_entries(parsed: ParsedPoses, root: Path) -> Sequence[PoseEntry]:
+    """The entries by names of their own, else by those of the images beside them, where these fit."""
+    beside = [] if parsed.named else sorted(photos_beside(root))
+    if beside and parsed.assign is not None:
+        try:
+            return [entry for _, entry in parsed.assign(beside)[0]]
+        except InputError:
+            pass  # images of something else
+    return parsed.entries
+
+
+def _at(path: Path, error: InputError, name: str) -> InputError:
+    # Two files are compared, often of one name: only the whole path says which.
+    own = error.where.startswith((name, str(path)))
+    where = str(path) + (error.where.removeprefix(str(path)).removeprefix(name) if own else f"/{error.where}")
+    return InputError(error.code, error.detail, where=where, hint=error.hint)

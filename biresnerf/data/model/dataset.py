@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 # Guesses from other images: worth trying, not worth believing.
 GUESSES: frozenset[PoseSource] = frozenset({"neighbours", "nearest-view"})
 IntrinsicsSource = Literal["given", "exif", "colmap", "guessed", "refined"]
-Dialect = Literal[
-    "nerfstudio", "instant-ngp", "blender", "images", "colmap", "llff", "tum", "kitti", "bundler", "metashape"
-]
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,8 @@ class SourceFormat:
     """How the input was written, so that the result can be written the same way.
 
     Attributes:
-        dialect: which convention the input follows; ``images`` for a folder without poses.
+        dialect: the format's name; for a transforms.json ``nerfstudio``, ``instant-ngp`` or ``blender``; for a
+            trajectory ``tum`` or ``kitti``; for a folder without poses ``images``.
         file: the transforms file, or None for other inputs.
         document: its top-level values other than ``frames``, in their order; and the place of ``frames`` kept
             as a None.
@@ -100,7 +98,7 @@ class SourceFormat:
         files: all files but images and masks that were read.
     """
 
-    dialect: Dialect
+    dialect: str
     file: Path | None
     document: dict[str, Any]
     applied_transform: NDArray[np.float64]

@@ -12,7 +12,7 @@ import pytest
 from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.result_formats import formats_given_back, write_result_formats
-from biresnerf.data.formats.simple.llff import LLFF, read_llff, read_llff_poses
+from biresnerf.data.formats.simple.llff import LLFF, parse_llff
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes, write_transforms
 from biresnerf.data.model.dataset import Camera, Dataset, Frame, SourceFormat
 from biresnerf.data.model.refined_set import refined_set
@@ -91,13 +91,16 @@ def llff_folder(folder: Path) -> np.ndarray:
 
 def test_llff_comes_back_as_its_own_file(tmp_path):
     rows = llff_folder(tmp_path / "in")
-    dataset = read_llff(tmp_path / "in", tmp_path / "in/poses_bounds.npy")
+    dataset = read_dataset(tmp_path / "in/poses_bounds.npy")
     same = refined_set(dataset, dataset.world_from_cam)
     write_result_formats(same, tmp_path / "same", context=WriteContext(dataset))
     np.testing.assert_allclose(np.load(tmp_path / "same" / LLFF.in_result), rows, atol=1e-12)
     moved = perturb_poses(dataset.world_from_cam, 0.1, 2)
     write_result_formats(refined_set(dataset, moved), tmp_path / "moved", context=WriteContext(dataset))
-    np.testing.assert_allclose(read_llff_poses(tmp_path / "moved" / LLFF.in_result), moved, atol=1e-12)
+    read = [
+        entry.world_from_cam for entry in parse_llff(tmp_path, tmp_path / "moved" / LLFF.in_result).entries
+    ]
+    np.testing.assert_allclose(read, moved, atol=1e-12)
     np.testing.assert_array_equal(np.load(tmp_path / "moved" / LLFF.in_result)[:, 14:], rows[:, 14:])
 
 

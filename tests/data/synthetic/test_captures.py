@@ -10,8 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from biresnerf.commands.poses.make_scene import KINDS, make_scene_command
-from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.formats.read_poses import read_poses
+from biresnerf.data.formats.read_dataset import read_dataset, read_poses
 from biresnerf.data.synthetic.captures import TABLE_SCENE, VASE, table_textures, walking_cameras
 from biresnerf.data.synthetic.scene import random_textures, render_shapes, synthetic_cameras, synthetic_focal
 from biresnerf.errors import InputError

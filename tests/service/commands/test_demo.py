@@ -17,7 +17,7 @@ import numpy as np
 import psutil
 import pytest
 
-from biresnerf.data.formats.read_poses import read_poses
+from biresnerf.data.formats.read_dataset import read_poses
 from biresnerf.report import Report
 from tests.service.conftest import PATIENCE_S
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from biresnerf.data.formats.read_poses import read_poses
+from biresnerf.data.formats.read_dataset import read_poses
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from biresnerf.data.formats.codec import Codec
-from biresnerf.data.formats.colmap.read_colmap import read_colmap_dataset
+from biresnerf.data.formats.colmap.read_colmap import bind_colmap, parse_colmap
 from biresnerf.data.formats.colmap.read_model import model_forms
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.colmap.write_text import write_colmap_text
@@ -62,7 +62,8 @@ def _image_root(folder: Path) -> Path:
 CODECS = (
     Codec(
         COLMAP,
-        read=read_colmap_dataset,
+        parse=parse_colmap,
+        bind=bind_colmap,
         recognises=lambda place: bool(model_forms(place)),
         pose_place=_model_folder,
         image_root=_image_root,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from biresnerf.data.formats.bind_images import GivenImage, dataset_of, match_files
+from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, by_name, dataset_of
 from biresnerf.data.formats.colmap.read_model import ColmapModel, read_colmap_model, world_from_cam_of
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.photos.image_files import read_header
@@ -17,48 +17,57 @@ from biresnerf.data.photos.orientation import same_shape
 from biresnerf.errors import InputError
 
 
-def read_colmap_dataset(root: Path, model_folder: Path, within: Path | None = None) -> Dataset:
-    """The images of a model, by name, and those beside them that the model has not registered, without pose.
+def parse_colmap(_root: Path, model_folder: Path) -> ParsedPoses:
+    """The registered images of a model, in the order of their names. Raises InputError as `read_colmap_model` does."""
+    model = read_colmap_model(model_folder)
+    table = _images_table(model)
+    entries = tuple(
+        PoseEntry(
+            image.name,
+            world_from_cam_of(image.cam_from_world),
+            f"{table} image {image.id}",
+            model.cameras[image.camera_id],
+            camera_id=image.camera_id,
+        )
+        for image in sorted(model.images.values(), key=lambda image: image.name)
+    )
+    tables = tuple(sorted(path for path in model_folder.iterdir() if path.suffix == Path(table).suffix))
+    source = SourceFormat("colmap", None, {}, np.eye(4), colmap=model, files=tables)
+    return ParsedPoses(source, entries, notes=(*model.notes, *_beside_notes(model_folder)))
+
+
+def bind_colmap(parsed: ParsedPoses, root: Path, within: Path | None = None) -> Dataset:
+    """The images of a model, and those beside them that the model has not registered, without pose.
 
     Images lie in ``root``/images, or in ``root`` itself and those of its folders that the model names.
 
     Raises:
         InputError: codes as in docs/input.md.
     """
-    model = read_colmap_model(model_folder)
+    model = parsed.source.colmap
+    assert model is not None, "parse_colmap gives it"
     files = images_beside(root)
     prefix = f"{IMAGE_FOLDER}/"
-    if model.images and all(image.name.startswith(prefix) for image in model.images.values()):
+    if parsed.entries and all(entry.name.startswith(prefix) for entry in parsed.entries):
         files = {(name if name.startswith(prefix) else prefix + name): path for name, path in files.items()}
     # Without images/, the model's folders of images lie in the root itself.
-    elsewhere = {image.name: root / image.name for image in model.images.values() if image.name not in files}
+    elsewhere = {entry.name: root / entry.name for entry in parsed.entries if entry.name not in files}
     files |= {name: path for name, path in elsewhere.items() if path.is_file()}
     refuse_no_images(files, root)
-    registered = sorted(model.images.values(), key=lambda image: image.name)
-    table = "images.bin" if model.form == "binary" else "images.txt"
-    found, notes = match_files(
-        [image.name for image in registered], list(files), lambda i: f"{table} image {registered[i].id}"
-    )
-    given = [
-        GivenImage(
-            image.name,
-            files[file],
-            model.cameras[image.camera_id],
-            world_from_cam_of(image.cam_from_world),
-            f"{table} image {image.id}",
-            camera_id=image.camera_id,
-        )
-        for image, file in zip(registered, found, strict=True)
-    ]
-    for file in sorted(files.keys() - set(found)):
-        number = _likely_camera(model, files[file], file)
-        camera = None if number is None else model.cameras[number]
-        given.append(GivenImage(file, files[file], camera, None, file, camera_id=number))
-    tables = tuple(sorted(path for path in model_folder.iterdir() if path.suffix == Path(table).suffix))
-    source = SourceFormat("colmap", None, {}, np.eye(4), colmap=model, files=tables)
-    ordered = sorted(given, key=lambda image: image.name)
-    dataset = dataset_of(root, ordered, source, [*model.notes, *notes, *_beside_notes(model_folder)], within)
-    return replace(dataset, source=replace(source, colmap=_for_these_images(model, dataset, table)))
+    pairs, notes = by_name(parsed.entries, list(files))
+    images = [(files[name], entry) for name, entry in pairs]
+    for name in sorted(files.keys() - {name for name, _ in pairs}):
+        number = _likely_camera(model, files[name], name)
+        lens = None if number is None else model.cameras[number]
+        images.append((files[name], PoseEntry(name, None, name, lens, camera_id=number)))
+    images.sort(key=lambda image: image[1].name)
+    dataset = dataset_of(root, images, parsed.source, [*parsed.notes, *notes], within)
+    fitted = _for_these_images(model, dataset, _images_table(model))
+    return replace(dataset, source=replace(parsed.source, colmap=fitted))
+
+
+def _images_table(model: ColmapModel) -> str:
+    return "images.bin" if model.form == "binary" else "images.txt"
 
 
 def _for_these_images(model: ColmapModel, dataset: Dataset, table: str) -> ColmapModel:

@@ -7,22 +7,22 @@ image's centre. Format: Bundler v0.4 user's manual, section 6.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import GivenImage, dataset_of, match_files
+from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, in_order
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.colmap_scene import ColmapModel
-from biresnerf.data.model.dataset import Camera, Dataset, SourceFormat
+from biresnerf.data.model.dataset import Camera, SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.text_file import read_text
-from biresnerf.data.photos.image_files import read_header
-from biresnerf.data.photos.named_images import image_files
+from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 
@@ -50,26 +50,29 @@ _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 _CENTRED_PX = 1e-6
 
 
-def read_bundler(root: Path, file: Path, within: Path | None = None) -> Dataset:
-    """The images of ``root`` with the cameras of a bundle file; those whose focal length is 0 have no pose.
+def parse_bundler(root: Path, file: Path) -> ParsedPoses:
+    """The cameras of a bundle file; those whose focal length is 0 have no pose.
 
     list.txt, beside the images or the file, says which image each camera is; without it their order by name does.
 
     Raises:
         InputError: codes as in docs/input.md.
     """
-    entries = read_cameras(file)
-    files = image_files(root)
-    names, list_file, notes = names_of_cameras(root, file, sorted(files), len(entries))
-    found, more = match_files(names, list(files), lambda i: f"{file.name} camera {i}")
-    given = []
-    for index, (name, place, (lens, pose)) in enumerate(zip(names, found, entries, strict=True)):
+    cameras = read_cameras(file)
+    list_file, listed = _listed_names(root, file, len(cameras))
+    entries = []
+    for index, (lens, pose) in enumerate(cameras):
         where = f"{file.name} camera {index}"
-        camera = None if pose is None else _camera(lens, files[place], name, where)
-        given.append(GivenImage(name, files[place], camera, pose, where))
-    read = (file,) if list_file is None else (file, list_file)
-    source = SourceFormat("bundler", None, {}, np.eye(4), files=read)
-    return dataset_of(root, given, source, [*notes, *more], within)
+        name = str(index) if list_file is None else listed[index]
+        entries.append(PoseEntry(name, pose, where, None if pose is None else partial(_camera, lens, where)))
+    files = (file,) if list_file is None else (file, list_file)
+    hint = "Give list.txt as it was written with the bundle file: one image a line, in its order."
+    return ParsedPoses(
+        SourceFormat("bundler", None, {}, np.eye(4), files=files),
+        tuple(entries),
+        assign=(lambda names: in_order(entries, names, file.name, hint)) if list_file is None else None,
+        named=list_file is not None,
+    )
 
 
 Lens = tuple[float, float, float]
@@ -128,43 +131,32 @@ def _numbers(lines: Sequence[Sequence[str]], rows: int, columns: int, where: str
     return values
 
 
-def names_of_cameras(
-    root: Path, file: Path, in_order: list[str], count: int
-) -> tuple[list[str], Path | None, list[str]]:
-    """The images' names in the order of the cameras, the list they come from, and notes.
-
-    Args:
-        in_order: what they are called where there is no list.
+def _listed_names(root: Path, file: Path, count: int) -> tuple[Path | None, list[str]]:
+    """The file that lists the images, and their names in the order of the cameras; None where there is no such file.
 
     Raises:
-        InputError: ``pose_count_mismatch``, or the list is bad.
+        InputError: ``pose_count_mismatch``, ``duplicate_image``, or a code of `image_name`.
     """
     places = [file.parent / "list.txt", *(root / name for name in LIST_NAMES)]
     table = next((path for path in places if path.is_file()), None)
     if table is None:
-        names, note = (
-            in_order,
-            f"{file.name}: without list.txt, images were taken in the order of their names",
-        )
-        where, notes = file.name, [note]
-    else:
-        # `name`, or `name 0 focal_length` as Bundler's own tools write it.
-        lines = [line.strip() for line in read_text(table).splitlines() if line.strip()]
-        names = [_without_focal(line) for line in lines]
-        names = [
-            image_name(name.removeprefix("./"), f"{table.name} line {i + 1}") for i, name in enumerate(names)
-        ]
-        where, notes = table.name, []
-        if len(set(names)) != len(names):
-            raise InputError("duplicate_image", "names an image twice.", where=where, hint="Remove one.")
+        return None, []
+    # `name`, or `name 0 focal_length` as Bundler's own tools write it.
+    lines = [_without_focal(line.strip()) for line in read_text(table).splitlines() if line.strip()]
+    names = [
+        image_name(line.removeprefix("./"), f"{table.name} line {number}")
+        for number, line in enumerate(lines, start=1)
+    ]
+    if len(set(names)) != len(names):
+        raise InputError("duplicate_image", "names an image twice.", where=table.name, hint="Remove one.")
     if len(names) != count:
         raise InputError(
             "pose_count_mismatch",
             f"{len(names)} images for the {count} cameras of {file.name}.",
-            where=where,
+            where=table.name,
             hint="Give list.txt as it was written with the bundle file: one image a line, in its order.",
         )
-    return names, table, notes
+    return table, names
 
 
 def _without_focal(line: str) -> str:
@@ -174,8 +166,7 @@ def _without_focal(line: str) -> str:
     )
 
 
-def _camera(lens: Lens, path: Path, name: str, where: str) -> Camera:
-    header = read_header(path, name)
+def _camera(lens: Lens, where: str, header: ImageHeader, _name: str) -> Camera:
     focal, k1, k2 = lens
     centre = (header.width / 2, header.height / 2)
     model, params = ("RADIAL", (focal, *centre, k1, k2)) if k1 or k2 else ("SIMPLE_PINHOLE", (focal, *centre))
@@ -267,7 +258,7 @@ def _point_lines(refined: RefinedSet) -> list[str]:
 CODECS = (
     Codec(
         BUNDLER,
-        read=read_bundler,
+        parse=parse_bundler,
         image_root=lambda file: file.parent.parent if file.parent.name == "bundle" else file.parent,
         write=lambda refined, path, _: write_bundler(refined, path.parent),
         given_back=lambda dataset: dataset.source.dialect == "bundler",

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
+from biresnerf.data.formats.bind_images import LensOf
 from biresnerf.data.formats.colmap import read_text as colmap_text
 from biresnerf.data.formats.colmap.model_checks import broken, camera_of_numbers
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.model.dataset import Camera
 from biresnerf.data.model.json_document import read_json_object
 from biresnerf.data.model.text_file import read_text
-from biresnerf.data.photos.image_files import read_header
+from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.errors import InputError
 
 CAMERA_NAMES = ("camera.json", "cameras.txt", "calib.txt")
-# The image file and its name -> its camera.
-CameraOf = Callable[[Path, str], Camera | None]
 
 
-def read_camera_file(root: Path) -> tuple[CameraOf, tuple[Path, ...]]:
-    """Who says which camera took an image, and the files that were read; None for each where there is no such file.
+def read_camera_file(root: Path) -> tuple[LensOf | None, tuple[Path, ...]]:
+    """The lens of the images, by their header, and the files that were read; None where there is no such file.
 
     camera.json has the keys of a transforms.json's top (``w``, ``h``, ``fl_x``, ``k1``, ...), cameras.txt is COLMAP's
     with one camera, calib.txt is KITTI's (its P0 belongs to the poses).
@@ -30,13 +28,13 @@ def read_camera_file(root: Path) -> tuple[CameraOf, tuple[Path, ...]]:
     """
     present = [root / name for name in CAMERA_NAMES if (root / name).is_file()]
     if not present:
-        return (lambda _path, _name: None), ()
+        return None, ()
     file = present[0]
     if file.suffix == ".json":
         document = read_json_object(file)
 
-        def of_json(path: Path, name: str) -> Camera:
-            found = camera_of_frame(Fields({}, document, file.name, 0), read_header(path, name), name)
+        def of_json(header: ImageHeader, name: str) -> Camera:
+            found = camera_of_frame(Fields({}, document, file.name, 0), header, name)
             if found.source != "given":
                 raise InputError(
                     "intrinsics_missing",
@@ -50,12 +48,11 @@ def read_camera_file(root: Path) -> tuple[CameraOf, tuple[Path, ...]]:
     if file.name == "cameras.txt":
         cameras = list(colmap_text.parse_cameras(read_text(file), file.name).values())
         if len(cameras) != 1:
-            raise broken(file.name, f"has {len(cameras)} cameras, and nothing says which image is whose")
-        return (lambda _path, _name: cameras[0]), (file,)
+            raise broken(file.name, f"has {len(cameras)} cameras, and does not say which image is by which")
+        return (lambda _header, _name: cameras[0]), (file,)
     focal_x, focal_y, cx, cy = _kitti_projection(file)
 
-    def of_calibration(path: Path, name: str) -> Camera:
-        header = read_header(path, name)
+    def of_calibration(header: ImageHeader, _name: str) -> Camera:
         params = (focal_x, focal_y, cx, cy)
         return camera_of_numbers("PINHOLE", header.width, header.height, params, f"{file.name} P0")
 

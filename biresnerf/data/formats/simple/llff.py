@@ -9,14 +9,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import GivenImage, dataset_of
+from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, in_order
 from biresnerf.data.formats.codec import Codec, WriteContext
 from biresnerf.data.formats.simple.bundler import bundler_problem, refuse_lenses
 from biresnerf.data.model.atomic_file import whole_file
-from biresnerf.data.model.dataset import Camera, Dataset, SourceFormat
+from biresnerf.data.model.dataset import Camera, SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.photos.named_images import image_files
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 
@@ -47,8 +46,8 @@ _HEADER = re.compile(
 )
 
 
-def read_llff(root: Path, file: Path, within: Path | None = None) -> Dataset:
-    """The images of ``root`` in the order of their names, with the poses and focal lengths of ``file``.
+def parse_llff(_root: Path, file: Path) -> ParsedPoses:
+    """Poses and focal lengths of ``file``, for images in the order of their names.
 
     A row is a matrix 3 x 5, whose columns are the camera's axes down, right and back, its centre, and height, width and
     focal length (px); then two bounds of depth, which are not used.
@@ -56,39 +55,19 @@ def read_llff(root: Path, file: Path, within: Path | None = None) -> Dataset:
     Raises:
         InputError: codes as in docs/input.md.
     """
-    rows = _rows(file)
-    files = image_files(root)
-    names = sorted(files)
-    if len(names) != len(rows):
-        raise InputError(
-            "pose_count_mismatch",
-            f"has {len(rows)} poses for {len(names)} images, and says not which is whose.",
-            where=file.name,
-            hint="Leave in images/ just the images that the poses are for; their order by name decides.",
-        )
-    given = []
-    for index, (name, row) in enumerate(zip(names, rows, strict=True)):
+    entries = []
+    for index, row in enumerate(_rows(file)):
         where = f"{file.name} row {index}"
-        matrix = row[:15].reshape(3, 5)
-        down, right, back, centre, (height, width, focal) = matrix.T
-        pose = np.stack([right, down, -back, centre], axis=1)
-        world_from_cam, _ = rigid_matrix(pose.tolist(), where)
-        given.append(
-            GivenImage(name, files[name], _camera(height, width, focal, where), world_from_cam, where)
-        )
-    source = SourceFormat("llff", None, {}, np.eye(4), files=(file,))
-    note = "poses_bounds.npy: images were taken in the order of their names"
-    return dataset_of(root, given, source, [note], within)
-
-
-def read_llff_poses(file: Path) -> list[NDArray[np.float64]]:
-    """``world_from_cam`` [4, 4] of each row. Raises InputError as `read_llff` does."""
-    return [_world_from_cam(row, f"{file.name} row {index}") for index, row in enumerate(_rows(file))]
-
-
-def _world_from_cam(row: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    down, right, back, centre, _ = row[:15].reshape(3, 5).T
-    return rigid_matrix(np.stack([right, down, -back, centre], axis=1).tolist(), where)[0]
+        down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
+        pose, _ = rigid_matrix(np.stack([right, down, -back, centre], axis=1).tolist(), where)
+        entries.append(PoseEntry(str(index), pose, where, _camera(height, width, focal, where)))
+    hint = "Leave in images/ just the images that the poses are for; their order by name decides."
+    return ParsedPoses(
+        SourceFormat("llff", None, {}, np.eye(4), files=(file,)),
+        tuple(entries),
+        assign=lambda names: in_order(entries, names, file.name, hint),
+        named=False,
+    )
 
 
 def _camera(height: float, width: float, focal: float, where: str) -> Camera:
@@ -226,5 +205,5 @@ def _write(refined: RefinedSet, path: Path, context: WriteContext) -> None:
 
 
 CODECS = (
-    Codec(LLFF, read=read_llff, write=_write, given_back=lambda dataset: dataset.source.dialect == "llff"),
+    Codec(LLFF, parse=parse_llff, write=_write, given_back=lambda dataset: dataset.source.dialect == "llff"),
 )

@@ -7,19 +7,21 @@ from __future__ import annotations
 
 import xml.parsers.expat
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import GivenImage, dataset_of
+from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntry
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
-from biresnerf.data.model.dataset import Camera, Dataset, SourceFormat
+from biresnerf.data.model.dataset import Camera, SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.text_file import read_text
-from biresnerf.data.photos.named_images import few_names, image_files
+from biresnerf.data.photos.named_images import few_names
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 
@@ -38,22 +40,48 @@ _HEAD_BYTES = 4096
 _MAX_DEPTH, _MAX_ELEMENTS = 50, 500_000
 
 
-def read_metashape(root: Path, file: Path, within: Path | None = None) -> Dataset:
-    """The images of ``root`` with the cameras of a Metashape export, in the order of their labels.
+def parse_metashape(_root: Path, file: Path) -> ParsedPoses:
+    """The cameras of a Metashape export, in the order of their labels.
 
     Labels are file names, with or without extension. The world is the chunk's own frame: the chunk's transform into
-    geographic coordinates is not applied. Cameras that are not aligned or stand in another component than most have no
-    pose.
+    geographic coordinates is not applied. Cameras that are not aligned, or belong to another component than most, have
+    no pose.
 
     Raises:
         InputError: codes as in docs/input.md.
     """
     chunk = _chunk(file)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
-    entries = _labelled(chunk, file)
-    files = image_files(root)
-    place_of = _places(list(files))
-    missing = [label for label in entries if label not in place_of]
+    cameras = _labelled(chunk, file)
+    components = Counter(
+        camera.get("component_id") for camera in cameras.values() if camera.find("transform") is not None
+    )
+    main = components.most_common(1)[0][0] if components else None
+    lenses: dict[str | None, Camera | None] = {}
+    entries, apart = [], []
+    for label, camera in sorted(cameras.items()):
+        where, sensor = f"{file.name} camera {label!r}", camera.get("sensor_id")
+        if sensor not in lenses:
+            lenses[sensor] = _camera(sensors.get(sensor), f"{file.name} sensor {sensor}")
+        pose = _pose(camera, where)
+        if pose is not None and camera.get("component_id") != main:
+            pose = None
+            apart.append(label)
+        entries.append(PoseEntry(label, pose, where, lenses[sensor]))
+    notes = [f"{file.name}: poses are in the chunk's own frame; its transform was not applied"]
+    if apart:
+        notes.append(
+            f"{len(apart)} images belong to another component; their poses were not taken: {few_names(apart)}"
+        )
+    source = SourceFormat("metashape", None, {}, np.eye(4), files=(file,))
+    return ParsedPoses(
+        source, tuple(entries), assign=lambda names: _assign(entries, names, file), notes=tuple(notes)
+    )
+
+
+def _assign(entries: list[PoseEntry], names: Sequence[str], file: Path) -> Assignment:
+    image_of_label = _images_of_labels(names)
+    missing = [entry.name for entry in entries if entry.name not in image_of_label]
     if missing:
         raise InputError(
             "image_missing",
@@ -61,36 +89,8 @@ def read_metashape(root: Path, file: Path, within: Path | None = None) -> Datase
             where=file.name,
             hint="Put the images into images/ under their labels.",
         )
-    components = Counter(
-        entry.get("component_id") for entry in entries.values() if entry.find("transform") is not None
-    )
-    main = components.most_common(1)[0][0] if components else None
-    lenses: dict[str | None, Camera | None] = {}
-    given, apart = [], []
-    for label, entry in sorted(entries.items()):
-        where, place = f"{file.name} camera {label!r}", place_of[label]
-        sensor = entry.get("sensor_id")
-        if sensor not in lenses:
-            lenses[sensor] = _camera(sensors.get(sensor), f"{file.name} sensor {sensor}")
-        pose = _pose(entry, where)
-        if pose is not None and entry.get("component_id") != main:
-            pose = None
-            apart.append(label)
-        given.append(GivenImage(place, files[place], lenses[sensor], pose, where))
-    notes = [f"{file.name}: poses are in the chunk's own frame; its transform was not applied"]
-    if apart:
-        notes.append(
-            f"{len(apart)} images stand in another component; their poses were not taken: {few_names(apart)}"
-        )
-    source = SourceFormat("metashape", None, {}, np.eye(4), files=(file,))
-    return dataset_of(root, given, source, notes, within)
-
-
-def read_metashape_poses(file: Path) -> dict[str, NDArray[np.float64]]:
-    """``world_from_cam`` [4, 4] by label, of the cameras that are aligned, in the chunk's own frame."""
-    entries = _labelled(_chunk(file), file)
-    poses = {label: _pose(entry, f"{file.name} camera {label!r}") for label, entry in entries.items()}
-    return {label: pose for label, pose in poses.items() if pose is not None}
+    images = [image_of_label[entry.name] for entry in entries]
+    return [(image, replace(entry, name=image)) for image, entry in zip(images, entries, strict=True)], []
 
 
 class _Builder(ElementTree.TreeBuilder):
@@ -142,7 +142,7 @@ def _labelled(chunk: ElementTree.Element, file: Path) -> dict[str, ElementTree.E
     return entries
 
 
-def _places(names: list[str]) -> dict[str, str]:
+def _images_of_labels(names: Sequence[str]) -> dict[str, str]:
     """The image that a label means: its path, its file name, or that without extension, where just one has it."""
     places: dict[str, list[str]] = {}
     for name in names:
@@ -244,4 +244,4 @@ def _is_metashape(path: Path) -> bool:
         return b"<chunk" in file.read(_HEAD_BYTES)
 
 
-CODECS = (Codec(METASHAPE, read=read_metashape, recognises=_is_metashape),)
+CODECS = (Codec(METASHAPE, parse=parse_metashape, recognises=_is_metashape),)

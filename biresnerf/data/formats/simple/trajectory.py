@@ -5,22 +5,22 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import GivenImage, dataset_of, match_files
+from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntry, match_files
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.simple.camera_file import read_camera_file
 from biresnerf.data.formats.simple.llff import rows_by_name
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation, rotation_from_quat_wxyz
-from biresnerf.data.model.dataset import Dataset, Dialect, SourceFormat
+from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.text_file import read_text
-from biresnerf.data.photos.named_images import image_files
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 
@@ -73,7 +73,7 @@ _QUAT_LENGTH_ERROR = 1e-2
 _TUM_HEAD = (
     "# timestamp tx ty tz qx qy qz qw: camera to world, OpenCV axes (x right, y down, z forward), the input's frame",
 )
-_COLUMNS: dict[int, Dialect] = {8: "tum", 12: "kitti"}
+_COLUMNS: dict[int, str] = {8: "tum", 12: "kitti"}
 # What `refine` writes above its poses: which image was taken when.
 _NAMED_TIME = re.compile(r"#\s*([-+0-9.eE]+)\s+(\S.*\S|\S)\s*$")
 
@@ -130,35 +130,43 @@ class Trajectory:
         return [self.name_of_time.get(time, f"{time:.17g}") for time in self.times_s]
 
 
-def read_trajectory(root: Path, file: Path, within: Path | None = None) -> Dataset:
-    """The images of ``root`` with the poses of the trajectory ``file``, camera to world with OpenCV axes.
+def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
+    """The poses of the trajectory ``file``, camera to world with OpenCV axes.
 
-    Which pose is whose, by the first of these that applies: names in the file's own comments; rgb.txt (times and
-    names, as in TUM's sets) or images named by their time, nearest within 0.02 s; times that are the images' numbers
-    from 0; as many poses as images, in order. The camera is that of `read_camera_file`, else a guess.
+    Which pose belongs to which image is decided by the first of these that applies: names in the file's own comments;
+    rgb.txt (times and names, as in TUM's sets) or images named by their time, nearest within 0.02 s; times that are the
+    images' numbers from 0; as many poses as images, in order. The camera is that of `read_camera_file`, else a guess.
 
     Raises:
         InputError: codes as in docs/input.md.
     """
     trajectory = Trajectory(file)
-    files = image_files(root)
-    names = sorted(files)
-    pose_of, how = matched(trajectory, names, root)
-    camera, camera_files = read_camera_file(root)
-    given = []
-    for name in names:
-        index = pose_of.get(name)
-        where = file.name if index is None else f"{file.name} line {trajectory.lines[index]}"
-        pose = None if index is None else trajectory.poses[index]
-        time = trajectory.times_s[index] if index is not None and trajectory.times_s else None
-        given.append(GivenImage(name, files[name], camera(files[name], name), pose, where, time))
+    lens, camera_files = read_camera_file(root)
+    times: Sequence[float | None] = trajectory.times_s or [None] * len(trajectory.poses)
+    entries = [
+        PoseEntry(name, pose, f"{file.name} line {line}", lens, time)
+        for name, pose, line, time in zip(
+            trajectory.names(), trajectory.poses, trajectory.lines, times, strict=True
+        )
+    ]
+
+    def assign(names: Sequence[str]) -> Assignment:
+        pose_of, how = matched(trajectory, names, root)
+        pairs = [
+            (name, replace(entries[pose_of[name]], name=name))
+            if name in pose_of
+            else (name, PoseEntry(name, None, file.name, lens))
+            for name in names
+        ]
+        return pairs, [f"{file.name}: images and poses were matched {how}"]
+
     table = (path for path in (root / TIMES_OF_IMAGES,) if path.is_file())
     source = SourceFormat(trajectory.dialect, None, {}, np.eye(4), files=(file, *camera_files, *table))
-    return dataset_of(root, given, source, [f"{file.name}: images and poses were matched {how}"], within)
+    return ParsedPoses(source, tuple(entries), assign, named=False)
 
 
 def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[dict[str, int], str]:
-    """Which pose (by index) each image has, and how that was found out: the rules of `read_trajectory`.
+    """Which pose (by index) each image has, and how that was found out: the rules of `parse_trajectory`.
 
     Args:
         names: of the images, sorted.
@@ -291,7 +299,7 @@ def _write_lines(path: Path, lines: list[str]) -> None:
 
 
 CODECS = (
-    Codec(TRAJECTORY, read=read_trajectory),
+    Codec(TRAJECTORY, parse=parse_trajectory),
     Codec(TUM, write=lambda refined, path, _: write_tum(refined, path)),
     Codec(
         KITTI,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from biresnerf.data.formats.codec import Codec
-from biresnerf.data.formats.transforms.read_transforms import read_transforms
+from biresnerf.data.formats.transforms.read_transforms import bind_transforms, parse_transforms
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
 from biresnerf.options.formats import Format
 
@@ -26,7 +26,8 @@ TRANSFORMS = Format(
 CODECS = (
     Codec(
         TRANSFORMS,
-        read=lambda _, file, within: read_transforms(file, within),
+        parse=parse_transforms,
+        bind=bind_transforms,
         write=lambda refined, path, context: (
             None
             if context.dataset is None

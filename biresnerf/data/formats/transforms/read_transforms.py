@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry
 from biresnerf.data.formats.transforms.older_nerfstudio import applied_transform_left_out
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.model.conventions import world_from_cam_of_file
-from biresnerf.data.model.dataset import Camera, Dataset, Dialect, Frame, IntrinsicsSource, SourceFormat
+from biresnerf.data.model.dataset import Camera, Dataset, Frame, IntrinsicsSource, SourceFormat
 from biresnerf.data.model.json_document import read_json_object
 from biresnerf.data.model.pose_validation import ROTATION_WARNED, refuse_coinciding, rigid_matrix
 from biresnerf.data.photos.image_files import ImageHeader, read_header
@@ -34,7 +36,7 @@ _NERFSTUDIO_KEYS = frozenset({"camera_model", "applied_transform", "ply_file_pat
 
 
 def read_transforms(path: Path, within: Path | None = None) -> Dataset:
-    """The validated image set that the transforms file ``path`` describes; image headers are read only.
+    """The validated image set that the transforms file ``path`` describes; of the images, only headers are read.
 
     Args:
         path: the file.
@@ -43,22 +45,57 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
     Raises:
         InputError: with the file, the field and a hint; codes as in docs/input.md.
     """
+    return bind_transforms(parse_transforms(path.parent, path), path.parent, within)
+
+
+def parse_transforms(_root: Path, path: Path) -> ParsedPoses:
+    """Names and poses of the frames; what does not name its image has an empty name. Raises InputError."""
     document = read_json_object(path)
     rows = _frame_objects(document, path.name)
-    names = _names(rows, path.name)
+    source = _source_format(document, path)
+    entries: list[PoseEntry] = []
+    worst, worst_name = 0.0, ""
+    for index, row in enumerate(rows):
+        where, pose = f"{path.name} frames[{index}]", None
+        name = row.get("file_path")
+        name = name if isinstance(name, str) else ""
+        if row.get("transform_matrix") is not None:
+            matrix, deviation = rigid_matrix(row["transform_matrix"], f"{where}.transform_matrix")
+            pose = world_from_cam_of_file(matrix, source.applied_transform, source.applied_scale)
+            if deviation > worst:
+                worst, worst_name = deviation, name
+        entries.append(PoseEntry(name, pose, where, raw=row))
+    notes: tuple[str, ...] = ()
+    if worst > ROTATION_WARNED:
+        notes = (f"rotations were made orthonormal; the worst was off by {worst:.1e} ({worst_name})",)
+    return ParsedPoses(source, tuple(entries), notes=notes)
+
+
+def bind_transforms(parsed: ParsedPoses, root: Path, within: Path | None = None) -> Dataset:
+    """The dataset of the images that the frames name, with their intrinsics and masks.
+
+    Raises:
+        InputError: codes as in docs/input.md.
+    """
+    path = parsed.source.file
+    assert path is not None, "parse_transforms gives it"
+    rows = [entry.raw for entry in parsed.entries]
+    refuse_too_few(len(rows), f"{path.name} frames")
+    names = _names(parsed.entries)
     if within is not None:
         refuse_names_outside(path, names, within, "file_path")
     paths = find_images(path, names)
-    source, notes = _source_format(document, path)
+    source, poses, notes = _with_older_transform(parsed, rows)
     stored = [read_header(image, name) for image, name in zip(paths, names, strict=True)]
-    sizes = [_named_size(row, document) for row in rows]
+    sizes = [_named_size(row, source.document) for row in rows]
     orientations = meant_orientations(stored, sizes)
     headers = [turned_header(header, o) for header, o in zip(stored, orientations, strict=True)]
     cameras, sources, camera_indices, more = _cameras(rows, source, headers, names, path.name)
-    poses, pose_notes = _poses(rows, names, source, path.name)
+    refuse_coinciding([pose for pose in poses if pose is not None], f"{path.name} frames")
     masks = _masks(path, rows, paths, within)
-    notes += more + pose_notes + orientation_notes(stored, orientations, names) + page_notes(stored, names)
-    notes += _other_notes(rows, document, masks)
+    notes += [*more, *parsed.notes, *_pose_notes(poses, names)]
+    notes += orientation_notes(stored, orientations, names) + page_notes(stored, names)
+    notes += _other_notes(rows, source.document, masks)
     notes += unused_image_notes(paths, [mask for mask, _ in masks if mask is not None])
     frames = tuple(
         Frame(
@@ -67,7 +104,7 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
         )
         for i, name in enumerate(names)
     )  # fmt: skip
-    return Dataset(path.parent, cameras, frames, source, tuple(notes), sources)
+    return Dataset(root, cameras, frames, source, tuple(notes), sources)
 
 
 def _named_size(row: dict[str, Any], document: dict[str, Any]) -> tuple[float | None, float | None]:
@@ -98,11 +135,10 @@ def _frame_objects(document: dict[str, Any], file: str) -> list[dict[str, Any]]:
                 where=f"{file} frames[{index}]",
                 hint="Give file_path and transform_matrix in each frame.",
             )
-    refuse_too_few(len(rows), f"{file} frames")
     return rows
 
 
-def _source_format(document: dict[str, Any], path: Path) -> tuple[SourceFormat, list[str]]:
+def _source_format(document: dict[str, Any], path: Path) -> SourceFormat:
     applied = document.get("applied_transform")
     matrix, scale = np.eye(4), document.get("applied_scale", 1.0)
     if applied is not None:
@@ -114,45 +150,49 @@ def _source_format(document: dict[str, Any], path: Path) -> tuple[SourceFormat, 
             where=f"{path.name} applied_scale",
             hint="Remove the key, or give the factor that was applied to the positions.",
         )
-    dialect, notes = _dialect(document), []
-    if applied is None and dialect == "nerfstudio":
-        older = applied_transform_left_out(path, document["frames"])
-        if older is not None:
-            matrix = older
-            notes.append(
-                "applied_transform is not given; colmap/sparse/0 shows that it was older nerfstudio's, so that model's "
-                "world is taken for the result's COLMAP model"
-            )
     kept = {key: None if key == "frames" else value for key, value in document.items()}
-    return SourceFormat(dialect, path, kept, matrix, float(scale), files=(path,)), notes
+    return SourceFormat(_dialect(document), path, kept, matrix, float(scale), files=(path,))
 
 
-def _dialect(document: dict[str, Any]) -> Dialect:
+def _dialect(document: dict[str, Any]) -> str:
     if document.keys() & _NERFSTUDIO_KEYS:
         return "nerfstudio"
     if document.keys() & _NGP_KEYS:
         return "instant-ngp"
-    first = document["frames"][0]
-    return (
-        "blender"
-        if "camera_angle_x" in document and "fl_x" not in document.keys() | first.keys()
-        else "nerfstudio"
+    keys = document.keys() | (document["frames"][0].keys() if document["frames"] else set())
+    return "blender" if "camera_angle_x" in document and "fl_x" not in keys else "nerfstudio"
+
+
+def _with_older_transform(
+    parsed: ParsedPoses, rows: list[dict[str, Any]]
+) -> tuple[SourceFormat, list[NDArray[np.float64] | None], list[str]]:
+    """Source, poses and notes; older nerfstudio's transform is undone where a model beside the file shows it."""
+    source, poses = parsed.source, [entry.world_from_cam for entry in parsed.entries]
+    assert source.file is not None, "parse_transforms gives it"
+    older = None
+    if source.dialect == "nerfstudio" and source.document.get("applied_transform") is None:
+        older = applied_transform_left_out(source.file, rows)
+    if older is None:
+        return source, poses, []
+    note = (
+        "applied_transform is not given; colmap/sparse/0 shows that it was older nerfstudio's, so that model's "
+        "world is taken for the result's COLMAP model"
     )
+    world_from_file = np.linalg.inv(older)
+    poses = [None if pose is None else world_from_file @ pose for pose in poses]
+    return replace(source, applied_transform=older), poses, [note]
 
 
-def _names(rows: list[dict[str, Any]], file: str) -> list[str]:
-    names = []
-    for index, row in enumerate(rows):
-        name = row.get("file_path")
-        if not isinstance(name, str) or not name:
+def _names(entries: Sequence[PoseEntry]) -> list[str]:
+    for entry in entries:
+        if not entry.name:
             raise InputError(
                 "frame_without_image",
                 "the frame names no image.",
-                where=f"{file} frames[{index}].file_path",
+                where=f"{entry.where}.file_path",
                 hint="Give the image's path relative to this file, or remove the frame.",
             )
-        names.append(name)
-    return names
+    return [entry.name for entry in entries]
 
 
 def _cameras(
@@ -182,28 +222,11 @@ def _cameras(
     return tuple(camera for camera, _ in cameras), sources, indices, list(notes)
 
 
-def _poses(
-    rows: list[dict[str, Any]], names: list[str], source: SourceFormat, file: str
-) -> tuple[list[NDArray[np.float64] | None], list[str]]:
-    """Each frame's pose, or None where the file has none for it, and notes."""
-    poses: list[NDArray[np.float64] | None] = []
-    worst, worst_name = 0.0, ""
-    for index, (row, name) in enumerate(zip(rows, names, strict=True)):
-        if row.get("transform_matrix") is None:
-            poses.append(None)
-            continue
-        matrix, deviation = rigid_matrix(row["transform_matrix"], f"{file} frames[{index}].transform_matrix")
-        poses.append(world_from_cam_of_file(matrix, source.applied_transform, source.applied_scale))
-        if deviation > worst:
-            worst, worst_name = deviation, name
-    notes = []
-    if worst > ROTATION_WARNED:
-        notes.append(f"rotations were made orthonormal; the worst was off by {worst:.1e} ({worst_name})")
+def _pose_notes(poses: Sequence[NDArray[np.float64] | None], names: Sequence[str]) -> list[str]:
     without = [name for name, pose in zip(names, poses, strict=True) if pose is None]
-    if without:
-        notes.append(f"{len(without)} of {len(rows)} frames have no pose yet: {few_names(without)}")
-    refuse_coinciding([pose for pose in poses if pose is not None], f"{file} frames")
-    return poses, notes
+    return (
+        [f"{len(without)} of {len(names)} frames have no pose yet: {few_names(without)}"] if without else []
+    )
 
 
 def _masks(
