@@ -138,10 +138,11 @@ def _begin(
         start = Start.from_json(notes["start"])
     else:
         start = _find_start(prepared, options, device, threads, report, stop)
+    options = start.stage_lengths(asked, options)
     message = f"{len(prepared.dataset)} images read"
     stage: Literal["seeding", "preparing"] = "seeding" if prepared.seeding is not None else "preparing"
     reusable = folder.seeding_files() if begun is None else {}
-    report(Progress(stage=stage, fraction=0.02, message=message, reusable=reusable))
+    report(Progress(stage=stage, fraction=0.02, message=message, reusable=reusable, options=options))
 
     given = RunInput(
         prepared.dataset,
@@ -150,7 +151,6 @@ def _begin(
         held_out_views(len(prepared.dataset), options.holdout, start.sound),
         _matches(folder, prepared.dataset, begun),
     )
-    options = start.stage_lengths(asked, options)
     optimiser = _optimiser(given, options, device, threads)
     stages = TwoStages(
         optimiser, folder.path, prepared.fingerprint, report, stop, prepared.seeding, start.as_json(), observer,
@@ -210,9 +210,9 @@ def _choose_backend(asked: RefineOptions, report: OnProgress) -> tuple[ResolvedO
     """The options resolved for the device there is, that device, and the threads taken; kernels compiled."""
     options, device = resolve_here(asked)
     threads = use_threads(options.threads)
+    message = "loading kernels (the first run compiles them)" if device.type == "cpu" else ""
+    report(Progress(stage="preparing", fraction=0.005, message=message, options=options))
     if device.type == "cpu":
-        message = "loading kernels (the first run compiles them)"
-        report(Progress(stage="preparing", fraction=0.005, message=message))
         compile_kernels()
     return options, device, threads
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.stages import ReusableStage, Stage
 
 
@@ -21,6 +22,10 @@ class Progress(BaseModel):
     eta_s: float | None = Field(None, ge=0.0, description="Estimated seconds to the end of the run.")
     metrics: dict[str, float] = Field(default_factory=dict)
     message: str = ""
+    options: ResolvedOptions | None = Field(
+        None,
+        description="Options as the run uses them, reported as soon as they are known and when they change.",
+    )
     checkpoint: str | None = Field(
         None, description="File name of a checkpoint just completed, relative to the output folder."
     )

@@ -57,7 +57,9 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     threads: Annotated[int, Option("coarse", changes_result=False)] = Field(
         0, ge=0, le=256, description="CPU threads; 0 takes all cores this process may use."
     )
-    max_image_size: Annotated[int | Open, Option("coarse", less_memory=lambda px: max(64, px // 2))] = Field(
+    max_image_size: Annotated[
+        int | Open, Option("coarse", less_memory=lambda px: min(px, max(64, px // 2)))
+    ] = Field(
         OPEN,
         ge=16,
         le=4096,

@@ -11,6 +11,7 @@ import signal
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import Progress
@@ -24,7 +25,7 @@ stopping = []
 signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
 
 
-def tell(stage: str, step: int, preview: tuple[str, ...] = ()) -> None:
+def tell(stage: str, step: int, **reported: Any) -> None:
     progress = Progress(
         stage=stage,
         step=step,
@@ -32,7 +33,7 @@ def tell(stage: str, step: int, preview: tuple[str, ...] = ()) -> None:
         fraction=step / steps,
         eta_s=(steps - step) * step_s,
         metrics={"loss": 1.0 / (step + 1)},
-        preview=preview,
+        **reported,
     )
     sys.stdout.write(progress.model_dump_json() + "\n")
     sys.stdout.flush()
@@ -42,9 +43,10 @@ if order.get("task") == "export":
     for form in order["options"]["formats"]:
         (output / f"{form}.txt").write_text("exported")
     sys.exit(0)
-options = parse_options(order["options"]).resolved("cpu").model_dump(mode="json")
+resolved = parse_options(order["options"]).resolved("cpu")
+options = resolved.model_dump(mode="json")
 steps, step_s = options["steps"], options["seed"] / 1000
-tell("preparing", 0)
+tell("preparing", 0, options=resolved)
 sys.stderr.write("images read\nline 2\n")
 if options["threads"] == 77:
     said = {"code": "diverged", "detail": "The loss is not finite.", "where": "", "hint": ""}
@@ -57,7 +59,7 @@ for step in range(1, steps + 1):
     if step % 20 == 0:
         (output / "preview").mkdir(exist_ok=True)
         (output / "preview" / "poses.json").write_text(json.dumps({"step": step}))
-        tell(stage, step, ("preview/poses.json",))
+        tell(stage, step, preview=("preview/poses.json",))
     if stopping:
         partial = {"state": "partial", "options": options, "images": []}
         (output / "poses.json").write_text(json.dumps({"step": step}))

@@ -12,6 +12,7 @@ import signal
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import Progress
@@ -25,13 +26,11 @@ stopping = []
 signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
 
 
-def tell(
-    step: int, stage: str = "coarse", checkpoint: str | None = None, preview: tuple[str, ...] = ()
-) -> None:
+def tell(step: int, stage: str = "coarse", **reported: Any) -> None:
     total = plan["steps"]
     progress = Progress(
         stage=stage, step=step, steps_total=total, fraction=step / total, metrics={"loss": 1.0 / (step + 1)},
-        checkpoint=checkpoint, preview=preview,
+        **reported,
     )  # fmt: skip
     sys.stdout.write(progress.model_dump_json() + "\n")
     sys.stdout.flush()
@@ -79,7 +78,8 @@ if plan.get("refuse"):
     }
     (folder / "error.json").write_text(json.dumps(said))
     sys.exit(2)
-tell(start, "preparing")
+options = parse_options(order["options"]).resolved(plan.get("device", "cpu"))
+tell(start, "preparing", options=options)
 for step in range(start + 1, plan["steps"] + 1):
     time.sleep(plan["step_s"])
     # Right at the end only if no step was lost, repeated or begun from another state.
@@ -96,8 +96,7 @@ for step in range(start + 1, plan["steps"] + 1):
         os.kill(os.getpid(), signal.SIGKILL)
     if step % plan.get("preview_every", 10**9) == 0:
         show(step)
-    size = parse_options(order["options"]).resolved("cpu").max_image_size or 0
-    if plan.get("hungry", 0) and step == 3 and size > plan["hungry"]:
+    if plan.get("hungry", 0) and step == 3 and options.max_image_size > plan["hungry"]:
         sys.exit(4)  # as `workers.run.job_process` says that memory ran out
     if stopping and plan.get("slow_to_end"):
         (output / "poses.json").write_text("half of a result")

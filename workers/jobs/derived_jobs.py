@@ -14,7 +14,7 @@ from biresnerf.wire.jobs import JobView, WantedStage
 from workers.database.database import Connection
 from workers.database.ids import new_id
 from workers.jobs.forks import LATEST_FIRST, plan_fork
-from workers.jobs.job_rows import JOB, fingerprint_of, job_from_row, known_job, one_row
+from workers.jobs.job_rows import JOB, asked_columns, fingerprint_of, job_from_row, known_job, one_row
 from workers.jobs.jobs import JobStore
 from workers.jobs.quotas import require_room, submitting_for
 from workers.records import PRIORITIES, Page
@@ -55,8 +55,8 @@ class DerivedJobs(JobStore):
             if parent["kind"] != "refine":
                 raise Conflict("fork_not_possible", f"{job_id} is an export.")
             options, stage = plan_fork(parent, changes, wanted)
-            resolved = options.resolved("cpu").model_dump(mode="json")
-            fingerprint = fingerprint_of(f"fork {job_id} {stage}", resolved, labels)
+            asked = asked_columns(options)
+            fingerprint = fingerprint_of(f"fork {job_id} {stage}", options.model_dump(mode="json"), labels)
             # Before anything is copied, which no quota counts until the fork is there.
             known = await self._known_or_room(connection, parent, idempotency_key, fingerprint)
             if known is not None:
@@ -68,8 +68,7 @@ class DerivedJobs(JobStore):
             if known is not None:
                 return known, False
             values = {
-                "options": Jsonb(resolved),
-                "asked": Jsonb(options.model_dump(mode="json", exclude_unset=True)),
+                **asked,
                 "labels": Jsonb(dict(labels or {})),
                 "idempotency_key": idempotency_key,
                 "fingerprint": fingerprint,

@@ -28,10 +28,13 @@ def plan_fork(
         InputError: ``invalid_options``.
     """
     # What memory did not allow would fail again.
-    asked = {**(parent["asked"] or parent["options"]), **parent["smaller"], **changes}
-    options = parse_options(asked)
-    new, old = options.resolved("cpu").model_dump(mode="json"), {**parent["options"], **parent["smaller"]}
-    changed = {name for name in new if new[name] != old.get(name)}
+    asked = {**parent["options"], **parent["smaller"]}
+    options = parse_options({**asked, **changes})
+    # A job that has not run has no work to take over, on any device.
+    device = (parent["resolved_options"] or {}).get("device", "cpu")
+    old = parse_options(asked).resolved(device).model_dump()
+    new = options.resolved(device if options.device == "auto" else options.device).model_dump()
+    changed = {name for name in new if new[name] != old[name]}
     reasons = []
     for stage in LATEST_FIRST if wanted == "auto" else (wanted,):
         reason = _why_not(stage, parent["reusable"], changed, new)

@@ -7,6 +7,9 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from psycopg.types.json import Jsonb
+
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.jobs import JobEvent, JobProgress, JobView, PriorityName
 from workers.database.database import Connection
 from workers.records import PREVIEW_FOLDER, THUMBNAIL_NAME, priority_name, record_from_row
@@ -47,6 +50,15 @@ def _thumbnail(row: dict[str, Any]) -> str | None:
 async def one_row(connection: Connection, sql: Any, *parameters: Any) -> dict[str, Any] | None:
     """The first row of a statement, if there is one."""
     return await (await connection.execute(sql, parameters)).fetchone()
+
+
+def asked_columns(options: RefineOptions) -> dict[str, Any]:
+    """The columns of a new job that come from its options.
+
+    Raises `InputError` (``invalid_options``) where they do not fit what preset and method fill in.
+    """
+    asked = options.model_dump(mode="json", exclude_unset=True)
+    return {"options": Jsonb(asked), "planned_steps": options.resolved("cpu").steps}
 
 
 def fingerprint_of(

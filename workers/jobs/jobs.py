@@ -20,6 +20,7 @@ from workers.jobs.job_rows import (
     JOB,
     MINE,
     PLACES,
+    asked_columns,
     events_of,
     fingerprint_of,
     job_from_row,
@@ -76,9 +77,9 @@ class JobStore:
         ``priority_not_allowed``), `LimitReached` (``queue_full``, ``quota_exhausted``),
         `InputError` (``webhook_url_refused``).
         """
-        resolved = options.resolved("cpu").model_dump(mode="json")
+        asked = asked_columns(options)
         subject = request_with(request_digest or dataset_id, webhook)
-        fingerprint = fingerprint_of(subject, resolved, labels, priority)
+        fingerprint = fingerprint_of(subject, options.model_dump(mode="json"), labels, priority)
         async with self._database.transaction() as connection:
             tenant = await submitting_for(connection, dataset_id, self._tenant)
             if idempotency_key is not None:
@@ -88,11 +89,11 @@ class JobStore:
             await require_room(connection, dataset_id, PRIORITIES[priority], self._settings.max_queued)
             job_id = new_id("job")
             await connection.execute(
-                "INSERT INTO jobs (id, dataset_id, tenant, priority, options, asked, labels, idempotency_key,"
+                "INSERT INTO jobs (id, dataset_id, tenant, priority, options, planned_steps, labels, idempotency_key,"
                 " fingerprint) VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s)",
                 (
-                    *(job_id, dataset_id, tenant, PRIORITIES[priority], Jsonb(resolved)),
-                    *(Jsonb(options.model_dump(mode="json", exclude_unset=True)), Jsonb(dict(labels or {}))),
+                    *(job_id, dataset_id, tenant, PRIORITIES[priority]),
+                    *(asked["options"], asked["planned_steps"], Jsonb(dict(labels or {}))),
                     *(idempotency_key, fingerprint),
                 ),
             )
@@ -121,9 +122,8 @@ class JobStore:
 
         Raises `Conflict` (``idempotency_key_reused``) where the earlier request was a different one.
         """
-        resolved = options.resolved("cpu").model_dump(mode="json")
+        fingerprint = fingerprint_of(request_digest, options.model_dump(mode="json"), labels, priority)
         async with self._database.transaction() as connection:
-            fingerprint = fingerprint_of(request_digest, resolved, labels, priority)
             return await known_job(connection, self._tenant or LOCAL_TENANT, idempotency_key, fingerprint)
 
     async def get(self, job_id: str) -> JobView:

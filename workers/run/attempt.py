@@ -9,10 +9,11 @@ import shutil
 import signal
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import ValidationError
 
+from biresnerf.options.refine_options import ResolvedOptions, parse_options
 from biresnerf.progress import Progress
 from biresnerf.report import Verdict, VerdictName
 from biresnerf.wire.problems import JobError
@@ -60,6 +61,7 @@ class Attempt:
         self._stop_reason: StopReason | None = None
         self._stop = asyncio.Event()
         self._timed_out = False
+        self._resolved: ResolvedOptions | None = None
         self._oom_kills = OomKills()
         self._oom_kills_before: int | None = None
 
@@ -144,7 +146,9 @@ class Attempt:
     async def _pump(self, child: Child, courier: Courier) -> None:
         async for line in child.lines():
             try:
-                courier.offer(Progress.model_validate_json(line))
+                progress = Progress.model_validate_json(line)
+                self._resolved = progress.options or self._resolved
+                courier.offer(progress)
             except ValidationError:
                 with self._log.open("ab") as file:  # a library printed something
                     file.write(line)
@@ -206,7 +210,10 @@ class Attempt:
     async def _ran_out_of_memory(self) -> bool:
         """Once more with less, from the start: a checkpoint is of the sizes that were too large."""
         tail, keep = log_tail(self._log), (self._claim.name, self._settings.stall_s)
-        smaller = smaller_options(self._claim.options) if self._claim.kind == "refine" else {}
+        smaller: dict[str, Any] = {}
+        if self._claim.kind == "refine":
+            # Before the process reported them: as on a CPU, which takes less than a GPU.
+            smaller = smaller_options(self._resolved or parse_options(self._claim.options).resolved("cpu"))
         if smaller and not self._claim.smaller and self._claim.attempt < self._settings.max_attempts:
             said = {"why": "out_of_memory", "options": smaller, "log_tail": tail}
             return await self._ledger.give_back(

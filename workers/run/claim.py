@@ -33,7 +33,7 @@ class Fenced(BaseException):
 class Claim:
     """One attempt of one job, owned by whoever holds ``token``.
 
-    ``asked`` are the options that were sent, ``options`` the same with all others as the preset has them.
+    ``options`` are those that were asked for; the job's process fills in the others for its device.
     """
 
     job_id: str
@@ -43,7 +43,6 @@ class Claim:
     kind: JobKind
     parent: str | None
     options: dict[str, Any]
-    asked: dict[str, Any]
     smaller: dict[str, Any]
     checkpoint: dict[str, Any] | None
     reusable: dict[str, Any]
@@ -94,12 +93,9 @@ async def _claim(database: Database, job_id: str, max_attempts: int, token: uuid
 
 def _claimed(row: dict[str, Any], token: uuid.UUID) -> Claim:
     same = ("dataset_id", "attempt", "kind", "parent", "options", "smaller", "checkpoint", "reusable")
-    # What was left open stays open: the run fills it in by its device, and by where its poses come from.
-    asked = row["options"] if row["asked"] is None else row["asked"]
     return Claim(
         row["id"],
         token=token,
-        asked=asked,
         forked_stage=row["forked_stage"],
         **{name: row[name] for name in same},
     )

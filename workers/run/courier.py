@@ -27,14 +27,14 @@ PERIOD_S = 1.0
 
 
 class Courier:
-    """Delivers every stage change, once a second the latest progress and the log, the latest checkpoint and preview.
+    """Delivers every change of stage or options; once a second the latest progress, log, checkpoint and preview.
 
     `offer` never waits; `run` delivers until `close` and the last delivery. `run` raises `Fenced`.
     """
 
     def __init__(self, ledger: Ledger, files: FileStore, output: Path, log_file: Path) -> None:
         self._ledger, self._files, self._output = ledger, files, output
-        self._stages: deque[Progress] = deque()
+        self._undroppable: deque[Progress] = deque()
         self._latest: Progress | None = None
         self._log = LogLines(log_file)
         self._checkpoints, self._previews = _Box(), _Box()
@@ -46,9 +46,11 @@ class Courier:
 
     def offer(self, progress: Progress) -> None:
         """Take note of a report."""
-        if self._latest is None or progress.stage != self._latest.stage:
-            self._stages.append(progress)
+        entered = self._latest is None or progress.stage != self._latest.stage
+        if entered:
             self._spans.enter(progress.stage)
+        if entered or progress.options is not None:
+            self._undroppable.append(progress)
         self._latest = progress
         self._progress_due.set()
         if progress.checkpoint is not None:
@@ -92,8 +94,8 @@ class Courier:
             await self._progress_due.wait()
             self._progress_due.clear()
             closed = self._closed.is_set()
-            while self._stages:
-                delivered = self._stages.popleft()
+            while self._undroppable:
+                delivered = self._undroppable.popleft()
                 await self._ledger.progress(delivered)
             if self._latest is not None and self._latest is not delivered:
                 delivered = self._latest

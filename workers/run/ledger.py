@@ -35,16 +35,19 @@ class Ledger:
         self._stage: str | None = None
 
     async def progress(self, now: Progress) -> None:
-        """Write the progress columns; a new stage is also an event."""
+        """Write the progress columns, and the options where they are reported; a new stage is also an event."""
+
+        resolved = None if now.options is None else Jsonb(now.options.model_dump(mode="json"))
 
         async def write(connection: Connection) -> None:
             await connection.execute(
                 "UPDATE jobs SET stage = %s, fraction = greatest(fraction, %s), step = %s, steps_total = %s,"
-                " eta_s = %s, metrics = metrics || %s, message = %s, revision = revision + 1,"
+                " eta_s = %s, metrics = metrics || %s, message = %s,"
+                " resolved_options = coalesce(%s, resolved_options), revision = revision + 1,"
                 " updated_at = clock_timestamp() WHERE id = %s",
                 (
                     *(now.stage, now.fraction, now.step, now.steps_total, now.eta_s),
-                    *(Jsonb(now.metrics), now.message, self.claim.job_id),
+                    *(Jsonb(now.metrics), now.message, resolved, self.claim.job_id),
                 ),
             )
             if now.stage != self._stage:

@@ -7,23 +7,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from biresnerf.options.refine_options import OPTIONS, ResolvedOptions
 from biresnerf.wire.problems import JobError
 
-# What a second try takes instead: the divisor, or what is subtracted, and the least that is allowed.
-DIVIDED: dict[str, tuple[int, int]] = {"samples_per_step": (4, 1024), "max_image_size": (2, 64)}
-LOWERED: dict[str, tuple[int, int]] = {"table_size_log2": (2, 10)}
-CHOSEN: dict[str, str] = {"seeding_effort": "low"}
 
-
-def smaller_options(options: Mapping[str, Any]) -> dict[str, Any]:
+def smaller_options(options: ResolvedOptions) -> dict[str, Any]:
     """The options that a second try uses with less; empty where nothing is left to lessen."""
-    changed: dict[str, Any] = {}
-    for name, (divisor, least) in DIVIDED.items():
-        changed[name] = max(least, options[name] // divisor) if options.get(name) else None
-    for name, (by, least) in LOWERED.items():
-        changed[name] = max(least, options[name] - by) if options.get(name) else None
-    lessened = {name: value for name, value in changed.items() if value is not None and value < options[name]}
-    return lessened | {name: least for name, least in CHOSEN.items() if options.get(name, least) != least}
+    now = options.model_dump()
+    less = {name: o.less_memory(now[name]) for name, o in OPTIONS.items() if o.less_memory is not None}
+    return {name: value for name, value in less.items() if value != now[name]}
 
 
 def out_of_memory(smaller: Mapping[str, Any], log_tail: str) -> JobError:

@@ -25,12 +25,12 @@ async def stage_job(database: Database, files: FileStore, claim: Claim, folder: 
     shutil.rmtree(folder, ignore_errors=True)
     for name in ("input", "output", "tmp"):
         (folder / name).mkdir(parents=True)
-    options = {**claim.asked, **claim.smaller}
+    options = {**claim.options, **claim.smaller}
     order: dict[str, Any] = {"input": "input", "output": "output", "options": options}
     if claim.kind == "export":
         order |= {"task": "export", "result": "result"}
         await _stage_result(database, files, claim, folder / "result")
-    if claim.kind == "refine" or _needs_photos(claim.asked["formats"]):
+    if claim.kind == "refine" or _needs_photos(claim.options["formats"]):
         rows = await database.fetch(
             "SELECT key, path FROM dataset_files WHERE dataset_id = %s", claim.dataset_id
         )

@@ -103,16 +103,12 @@ async def test_a_real_job_is_forked_and_exported(database_url: str, tmp_path: Pa
 
 
 PARENT = {
-    "options": SMALL.resolved("cpu").model_dump(mode="json"),
-    "asked": SMALL.model_dump(mode="json", exclude_unset=True),
+    "options": SMALL.model_dump(mode="json", exclude_unset=True),
+    "resolved_options": SMALL.resolved("cpu").model_dump(mode="json"),
     "smaller": {},
     "reusable": {"seeding": {}, "coarse": {}},
 }
-SEEDED = {
-    **PARENT,
-    "options": {**PARENT["options"], "start": "auto"},
-    "asked": {**PARENT["asked"], "start": "auto"},
-}
+SEEDED = {**PARENT, "options": {**PARENT["options"], "start": "auto"}}
 
 
 @pytest.mark.parametrize(
@@ -150,6 +146,17 @@ def test_a_fork_that_could_take_nothing_over_is_refused_with_the_reason(
     with pytest.raises(Conflict) as caught:
         plan_fork(parent, changes, wanted)
     assert caught.value.detail == reason
+
+
+def test_a_fork_of_a_job_that_ran_on_a_gpu_is_compared_with_what_a_gpu_takes():
+    asked = RefineOptions(preset="fast")
+    resolved = asked.resolved("cuda").model_dump(mode="json")
+    # Where matches placed the cameras, stage 1 was shorter than it would have been otherwise.
+    ran = {**PARENT, "options": {"preset": "fast"}, "resolved_options": {**resolved, "coarse_steps_max": 800}}
+    assert plan_fork(ran, {"max_image_size": resolved["max_image_size"]}, "auto")[1] == "coarse"
+    assert plan_fork(ran, {"device": "cuda"}, "auto")[1] == "coarse"
+    for change in ({"max_image_size": asked.resolved("cpu").max_image_size}, {"device": "cpu"}):
+        assert plan_fork(ran, change, "auto")[1] == "seeding"
 
 
 def test_a_fork_of_a_job_that_ran_out_of_memory_asks_for_as_little_as_its_second_try():

@@ -26,11 +26,11 @@ async def rows(settings: Settings, table: str) -> int:
         return row[0]
 
 
-async def test_a_submitted_job_is_queued_with_resolved_options(stores: Stores, dataset_id: str):
+async def test_a_submitted_job_is_queued_with_the_options_asked_for(stores: Stores, dataset_id: str):
     job, new = await stores.jobs.submit(dataset_id, FAST, labels={"scene": "fox"})
     assert new
     assert (job.state, job.queue_position, job.attempt, job.labels) == ("queued", 1, 0, {"scene": "fox"})
-    assert job.options["steps"] == 3000
+    assert (job.options, job.resolved_options) == ({"preset": "fast"}, None)
     assert job.id.startswith("job_")
     assert await stores.jobs.get(job.id) == job
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from biresnerf.options.refine_options import RefineOptions
 from tests.workers.conftest import Counting, Slots
 from workers.engine import Stores
 from workers.records import Artifact
@@ -118,7 +119,7 @@ async def test_a_job_without_memory_is_tried_once_more_with_less(
     await counting.submit(10, 0.02, hungry=100)
     job = await counting.until_final()
     assert (job.state, job.attempt) == ("succeeded", 2)
-    assert (job.options["max_image_size"], job.smaller["max_image_size"]) == (128, 64)
+    assert (job.resolved_options["max_image_size"], job.smaller["max_image_size"]) == (64, 64)
     (again,) = [e for e in await counting.stores.jobs.events(counting.id) if e.type == "retried_smaller"]
     assert again.data["options"] == job.smaller
     await counting.submit(10, 0.02, hungry=10)
@@ -126,6 +127,19 @@ async def test_a_job_without_memory_is_tried_once_more_with_less(
     assert job.error is not None
     assert (job.state, job.attempt, job.error.code) == ("failed", 2, "out_of_memory")
     assert "max_image_size" in job.error.hint
+
+
+async def test_what_a_gpu_worker_runs_is_what_the_job_shows_and_what_a_second_try_has_less_of(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    slots.start(settings, "a")
+    await counting.submit(10, 0.02, device="cuda", hungry=200)
+    job = await counting.until_final()
+    assert (job.state, job.attempt) == ("succeeded", 2)
+    assert job.smaller["max_image_size"] == 128, "half of the 256 px that a GPU takes"
+    assert job.resolved_options["max_image_size"] == 128
+    assert job.resolved_options["device"] == "cuda"
+    assert "max_image_size" not in job.options
 
 
 async def test_a_process_killed_while_the_kernel_counts_a_kill_ran_out_of_memory(
@@ -165,10 +179,13 @@ def test_the_kernels_count_is_read_from_the_innermost_group(tmp_path: Path):
 
 
 def test_a_second_try_asks_for_less_but_never_for_too_little():
-    options = {"samples_per_step": 2**17, "max_image_size": 400, "table_size_log2": 19, "steps": 5}
-    assert smaller_options(options) == {
+    quality = RefineOptions(preset="quality", seeding_effort="low").resolved("cpu")
+    assert smaller_options(quality) == {
         "samples_per_step": 2**15, "max_image_size": 200, "table_size_log2": 17,
     }  # fmt: skip
-    least = {"samples_per_step": 1024, "max_image_size": 64, "table_size_log2": 10, "seeding_effort": "low"}
-    assert smaller_options(least) == {}
-    assert smaller_options({**least, "seeding_effort": "full"}) == {"seeding_effort": "low"}
+    for side in (64, 32):
+        sizes = {"samples_per_step": 1024, "max_image_size": side, "table_size_log2": 10}
+        least = RefineOptions(**sizes, seeding_effort="low").resolved("cpu")
+        assert smaller_options(least) == {}
+        full = least.model_copy(update={"seeding_effort": "full"})
+        assert smaller_options(full) == {"seeding_effort": "low"}

@@ -41,7 +41,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
 def test_a_second_try_reaches_colmap(photos: Path, asked: list[dict[str, Any]], tmp_path: Path):
     first = RefineOptions(preset="fast").model_dump(exclude_unset=True)
-    smaller = smaller_options(RefineOptions(preset="fast").resolved("cpu").model_dump(mode="json"))
+    smaller = smaller_options(RefineOptions(preset="fast").resolved("cpu"))
     for name, options in (("first", first), ("second", {**first, **smaller})):
         with pytest.raises(Interrupted):
             refine_poses(photos, tmp_path / name, parse_options(options))

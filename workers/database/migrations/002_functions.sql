@@ -51,7 +51,7 @@ BEGIN
         _clock := 0;
     END IF;
     -- The work of a job with the preset balanced (8000 steps) is 1; a job is never for nothing.
-    _cost := least(10, greatest(0.1, coalesce((NEW.options ->> 'steps')::double precision, 800) / 8000));
+    _cost := least(10, greatest(0.1, coalesce(NEW.planned_steps, 800) / 8000.0));
     NEW.turn := _cost / _tenant.weight + greatest(_clock, (
         SELECT max(turn) FROM jobs WHERE tenant = NEW.tenant AND priority = NEW.priority AND state = 'queued'));
     NEW.queue_order := -700000000 * NEW.priority + least(699999999, 100 * NEW.turn)::int;
