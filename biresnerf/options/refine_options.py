@@ -26,6 +26,7 @@ PoseParametrisation = Literal["se3_world", "so3xr3", "so3xr3_camp"]
 StartPoses = Literal["auto", "given", "colmap", "none"]
 RefineIntrinsics = Literal["auto", "none", "focal", "all"]
 SeedingEffort = Literal["full", "low"]
+Exports = tuple[ExportName, ...]
 HeldOut = Annotated[int, Field(ge=0, le=200)] | Literal["auto"]
 
 # What else a field may hold: None in what was asked, nothing else once resolved.
@@ -41,42 +42,42 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    preset: Annotated[PresetName, Option("coarse")] = Field(
+    preset: Annotated[PresetName, Option("coarse", level="usual")] = Field(
         "balanced", description="Fills every option that is left out."
     )
-    method: Annotated[MethodName, Option("coarse", research=True)] = Field(
+    method: Annotated[MethodName, Option("coarse", level="research")] = Field(
         "biresnerf",
         description="biresnerf; the two stages as published, biresnerf-paper; or what it is compared with.",
     )
-    device: Annotated[DeviceName, Option("coarse")] = Field(
+    device: Annotated[DeviceName, Option("coarse", level="usual")] = Field(
         AUTO, description="Where to compute; auto takes CUDA where there is one."
     )
-    seed: Annotated[int, Option("seeding")] = Field(
+    seed: Annotated[int, Option("seeding", level="usual")] = Field(
         0, ge=0, lt=2**31, description="Same seed, same machine, same result on the CPU."
     )
     threads: Annotated[int, Option("coarse", changes_result=False)] = Field(
         0, ge=0, le=256, description="CPU threads; 0 takes all cores this process may use."
     )
     max_image_size: Annotated[
-        int | Open, Option("coarse", less_memory=lambda px: min(px, max(64, px // 2)))
+        int | Open, Option("coarse", level="usual", less_memory=lambda px: min(px, max(64, px // 2)))
     ] = Field(
         OPEN,
         ge=16,
         le=4096,
         description="Long side (px) that images are optimised at; results are full size.",
     )
-    holdout: Annotated[HeldOut | Open, Option("coarse")] = Field(
+    holdout: Annotated[HeldOut | Open, Option("coarse", level="usual")] = Field(
         OPEN, description="Views kept out of the field's training, to measure it; auto: a tenth, at most 10."
     )
-    background: Annotated[Background, Option("coarse")] = Field(
+    background: Annotated[Background, Option("coarse", level="usual")] = Field(
         "auto", description="What lies behind the scene: a colour, or none where photos show surroundings."
     )
-    exposure: Annotated[ExposureChoice | Open, Option("coarse")] = Field(
+    exposure: Annotated[ExposureChoice | Open, Option("coarse", level="usual")] = Field(
         OPEN,
         description="on: find how bright each photo is against the others, with poses and field; none: all alike; "
         "auto: on where opaque photos differ in brightness.",
     )
-    start: Annotated[StartPoses | Open, Option("seeding")] = Field(
+    start: Annotated[StartPoses | Open, Option("seeding", level="usual")] = Field(
         OPEN,
         description="auto: feature matches find missing poses, and poses they support are tried against the given "
         "ones; given: the given poses, of all images; colmap: COLMAP's poses, whatever is given; none: no feature "
@@ -87,17 +88,17 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         description="low: COLMAP looks for fewer features in smaller photos, in one thread; it takes less memory and "
         "places fewer photos.",
     )
-    fixed: Annotated[tuple[str, ...], Option("coarse")] = Field(
+    fixed: Annotated[tuple[str, ...], Option("coarse", level="usual")] = Field(
         (),
         max_length=10_000,
         description="Names of images whose poses stay as given, to the bit; the result's frame is tied to them.",
     )
-    refine_intrinsics: Annotated[RefineIntrinsics, Option("coarse")] = Field(
+    refine_intrinsics: Annotated[RefineIntrinsics, Option("coarse", level="usual")] = Field(
         "auto",
         description="What of the lenses is refined too; auto: focal lengths that were guessed or read from EXIF; all: "
         "principal point and distortion as well.",
     )
-    steps: Annotated[int | Open, Option("coarse")] = Field(
+    steps: Annotated[int | Open, Option("coarse", level="usual")] = Field(
         OPEN, ge=20, le=1_000_000, description="Steps of both stages together."
     )
     coarse_steps_min: Annotated[int | Open, Option("coarse")] = Field(
@@ -109,7 +110,7 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     check_every: Annotated[int | Open, Option("coarse")] = Field(
         OPEN, ge=5, description="Steps between two looks of the stability detector."
     )
-    detector: Annotated[DetectorName, Option("coarse", research=True)] = Field(
+    detector: Annotated[DetectorName, Option("coarse", level="research")] = Field(
         "trend",
         description="What calls the error stable: a flat line through it, as many rises as falls, or a small variance.",
     )
@@ -130,39 +131,39 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     field_rate_final: Annotated[float | Open, Option("coarse")] = Field(
         OPEN, gt=0, le=0.5, description="Field learning rate at the end."
     )
-    warmup_steps: Annotated[int | Open, Option("fine", research=True)] = Field(
+    warmup_steps: Annotated[int | Open, Option("fine", level="research")] = Field(
         OPEN, ge=1, description="Steps over which the reconstruction module's learning rate rises."
     )
-    double_pose_step: Annotated[bool | Open, Option("coarse", research=True)] = Field(
+    double_pose_step: Annotated[bool | Open, Option("coarse", level="research")] = Field(
         OPEN,
         description="A second Adam, at the field's learning rate, moves the poses too (as BAA-NGP's code).",
     )
-    pose_parametrisation: Annotated[PoseParametrisation, Option("coarse", research=True)] = Field(
+    pose_parametrisation: Annotated[PoseParametrisation, Option("coarse", level="research")] = Field(
         "se3_world",
         description="se3_world turns cameras about the scene, so3xr3 about themselves, so3xr3_camp with CamP's "
         "preconditioner.",
     )
-    wiring: Annotated[Wiring, Option("fine", research=True)] = Field(
+    wiring: Annotated[Wiring, Option("fine", level="research")] = Field(
         "concat",
         description="How the reconstruction module joins: beside the pose-estimation module's features, in their "
         "place with fresh networks, or with networks of its own whose outputs are added.",
     )
-    pose_levels: Annotated[int, Option("coarse", research=True)] = Field(
+    pose_levels: Annotated[int, Option("coarse", level="research")] = Field(
         3, ge=1, le=16, description="Levels of the pose-estimation module."
     )
-    pose_resolution_min: Annotated[int, Option("coarse", research=True)] = Field(
+    pose_resolution_min: Annotated[int, Option("coarse", level="research")] = Field(
         16, ge=2, le=128, description="Cells a side of its coarsest level."
     )
-    pose_resolution_max: Annotated[int, Option("coarse", research=True)] = Field(
+    pose_resolution_max: Annotated[int, Option("coarse", level="research")] = Field(
         72, ge=2, le=8192, description="Cells a side of its finest level."
     )
-    reconstruction_levels: Annotated[int | Open, Option("fine", research=True)] = Field(
+    reconstruction_levels: Annotated[int | Open, Option("fine", level="research")] = Field(
         OPEN, ge=1, le=16, description="Levels of the reconstruction module."
     )
-    reconstruction_resolution_min: Annotated[int | Open, Option("fine", research=True)] = Field(
+    reconstruction_resolution_min: Annotated[int | Open, Option("fine", level="research")] = Field(
         OPEN, ge=4, le=8192, description="Cells a side of its coarsest level."
     )
-    reconstruction_resolution_max: Annotated[int | Open, Option("fine", research=True)] = Field(
+    reconstruction_resolution_max: Annotated[int | Open, Option("fine", level="research")] = Field(
         OPEN, ge=4, le=16384, description="Cells a side of its finest level."
     )
     table_size_log2: Annotated[int | Open, Option("fine", less_memory=lambda log2: max(10, log2 - 2))] = (
@@ -193,7 +194,7 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         description="Views rendered at the end beside the held-out ones, spread over the set, to be looked at; fewer "
         "where they would take more than a twentieth of the run.",
     )
-    exports: Annotated[tuple[ExportName, ...], Option("exporting", changes_result=False)] = Field(
+    exports: Annotated[Exports, Option("exporting", level="usual", changes_result=False)] = Field(
         (),
         description="Formats to write the result in, beside those that every result has; pinhole: undistorted photos "
         "with a PINHOLE model.",

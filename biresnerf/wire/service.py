@@ -27,10 +27,15 @@ class TenantShare(Record):
 
 
 class OptionsView(Record):
-    """What may be asked for: the JSON Schema of `options`, and every preset with all values filled in."""
+    """What may be asked for: the JSON Schema of `options`, and every preset with all values filled in.
+
+    In the schema each option also has `stage`, the first whose work depends on it; `changes_result`; and `level`:
+    `usual`, `expert` or `research`.
+    """
 
     json_schema: dict[str, Any]
-    presets: dict[PresetName, ResolvedOptions]
+    presets: dict[PresetName, ResolvedOptions] = Field(description="As a worker without a GPU fills them in.")
+    presets_on_gpu: dict[PresetName, ResolvedOptions]
 
 
 class SizeLimits(Record):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from biresnerf.options.option import Level
 from biresnerf.options.presets import (
     COMMON_VALUES,
     CUDA_SCALE,
@@ -9,10 +10,15 @@ from biresnerf.options.presets import (
     METHOD_VALUES,
     PRESETS,
 )
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import OPTIONS, RefineOptions
 from docs.generate.markdown import DASH, code, table
 from docs.generate.schema_words import takes
 
+_LEVELS: dict[Level, str] = {
+    "usual": "The usual options",
+    "expert": "Schedule, sizes and output",
+    "research": "For research",
+}
 _HEAD = """# Options of a refinement
 
 Written by `make docs` from the models in `biresnerf/options/refine_options.py` and `biresnerf/options/presets.py`; a test fails when they differ.
@@ -26,6 +32,9 @@ JSON Schema.
 - A key that is left out takes the method's value, else the preset's, else its own.
 - With `steps` alone the preset's proportions are kept: `coarse_steps_min`, `coarse_steps_max`, `check_every`,
   `warmup_steps` are scaled. `trial_steps` becomes a quarter of `steps` where the preset has more.
+- *touches* names the first stage whose work depends on an option: with a change to it, [a fork](jobs.md) takes over the work
+  of the stages before. What does not touch the poses may also change when a run is resumed.
+- Options for research are not in the page's form.
 """
 
 
@@ -33,19 +42,23 @@ def options_page() -> str:
     """The page."""
     schema = RefineOptions.model_json_schema()
     definitions = schema.get("$defs", {})
-    rows, by_preset = [], []
+    rows: dict[Level, list[tuple[str, ...]]] = {level: [] for level in _LEVELS}
+    by_preset = []
     for key, field in schema["properties"].items():
-        rows.append(
-            (f"`{key}`", _default(key), takes(field, definitions), field.get("description", "").rstrip("."))
-        )
+        meaning = field["description"].rstrip(".")
+        option = OPTIONS[key]
+        touches = option.stage if option.changes_result else f"{option.stage}, not the poses"
+        rows[option.level].append((f"`{key}`", _default(key), takes(field, definitions), meaning, touches))
         if any(key in values for values in PRESETS.values()):
             by_preset.append((f"`{key}`", *(code(PRESETS[name][key]) for name in PRESETS)))
     scaled = " and ".join(f"{factor} times `{key}`" for key, factor in CUDA_SCALE.items())
     return "\n".join(
         (
             _HEAD,
-            "## All options\n",
-            table(("key", "default", "takes", "meaning"), rows),
+            *(
+                f"## {title}\n\n{table(('key', 'default', 'takes', 'meaning', 'touches'), rows[level])}"
+                for level, title in _LEVELS.items()
+            ),
             "## What the presets fill in\n",
             table(("key", *(f"`{name}`" for name in PRESETS)), by_preset),
             f"With `device` `cuda` every preset but `paper` takes {scaled}.\n",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from biresnerf.options.presets import PRESETS
+from biresnerf.options.presets import PRESETS, ComputeDevice
 from biresnerf.options.refine_options import RefineOptions
 from service.docs.webhook_examples import WEBHOOK_EXAMPLES
 
@@ -12,7 +12,13 @@ _AT = "2026-11-21T19:00:00Z"
 _SHA256 = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
 _DATASET_ID, _JOB_ID = "ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB", "job_01JD8Y3V1QKZ5M0C7W2N4T6XAB"
 _DATASET, _JOB = f"/v1/datasets/{_DATASET_ID}", f"/v1/jobs/{_JOB_ID}"
-_OPTIONS = RefineOptions(preset="fast").resolved("cpu").model_dump(mode="json")
+_ASKED = RefineOptions(preset="fast")
+_OPTIONS = _ASKED.resolved("cpu").model_dump(mode="json")
+
+
+def _presets(device: ComputeDevice) -> dict[str, Any]:
+    return {name: RefineOptions(preset=name).resolved(device).model_dump(mode="json") for name in PRESETS}
+
 
 _JOB_VIEW: dict[str, Any] = {
     "id": _JOB_ID,
@@ -26,7 +32,8 @@ _JOB_VIEW: dict[str, Any] = {
     "created_at": _AT,
     "started_at": "2026-11-21T19:00:02Z",
     "finished_at": None,
-    "options": _OPTIONS,
+    "options": _ASKED.model_dump(mode="json", exclude_unset=True),
+    "resolved_options": _OPTIONS,
     "metrics": {"loss": 0.012, "psnr": 19.2},
     "message": "",
     "verdict": None,
@@ -213,8 +220,7 @@ EXAMPLES: dict[str, Any] = {
     },
     "OptionsView": {
         "json_schema": {"type": "object", "properties": {"steps": {"type": "integer"}}},
-        "presets": {
-            name: RefineOptions(preset=name).resolved("cpu").model_dump(mode="json") for name in PRESETS
-        },
+        "presets": _presets("cpu"),
+        "presets_on_gpu": _presets("cuda"),
     },
 }

@@ -33,6 +33,7 @@ async def get_options(
     view = OptionsView(
         json_schema=RefineOptions.model_json_schema(),
         presets={name: RefineOptions(preset=name).resolved("cpu") for name in PRESETS},
+        presets_on_gpu={name: RefineOptions(preset=name).resolved("cuda") for name in PRESETS},
     )
     etag = f'"{hashlib.sha256(view.model_dump_json().encode()).hexdigest()[:32]}"'
     headers = {"ETag": etag, "Cache-Control": "max-age=300"}

@@ -28,10 +28,10 @@ def test_every_option_says_what_it_touches(name: str):
     said = [item for item in RefineOptions.model_fields[name].metadata if isinstance(item, Option)]
     assert len(said) == 1
     schema = RefineOptions.model_json_schema()["properties"][name]
-    assert {key: schema[key] for key in ("stage", "changes_result", "research")} == {
+    assert {key: schema[key] for key in ("stage", "changes_result", "level")} == {
         "stage": said[0].stage,
         "changes_result": said[0].changes_result,
-        "research": said[0].research,
+        "level": said[0].level,
     }
 
 
@@ -77,7 +77,7 @@ def test_a_run_made_shorter_by_its_steps_alone_keeps_the_proportions():
 def test_a_wrong_count_of_held_out_views_is_one_error_at_its_own_place(value):
     with pytest.raises(InputError) as caught:
         parse_options({"holdout": value})
-    assert "holdout: Value error, must be auto or a whole number from 0 to 200" in caught.value.what
+    assert "holdout: Value error, must be auto or a whole number from 0 to 200" in caught.value.detail
 
 
 def test_what_changes_no_result_may_change_on_resuming_and_what_comes_later_keeps_stage_1():

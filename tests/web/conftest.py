@@ -210,7 +210,7 @@ def job_url(desktop: Watched, service: Running, kitchen: Path) -> str:
     page.get_by_text("A look within minutes").click()
     page.get_by_label("steps", exact=True).fill("500")
     page.get_by_label("start", exact=True).select_option("given")
-    page.get_by_text("Method and schedule").click()
+    page.get_by_text("Schedule, sizes and output").click()
     for name, value in (
         ("checkpoint_every_s", 2),
         ("coarse_steps_min", 100),

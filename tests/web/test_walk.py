@@ -248,7 +248,7 @@ def test_a_fork_goes_on_after_stage_1_and_its_end_on_request_leaves_a_partial_re
 ) -> None:
     page = tab.page
     dialog = again(page, job_url)
-    dialog.get_by_text("Method and schedule").click()
+    dialog.get_by_text("Schedule, sizes and output").click()
     dialog.get_by_label("trial_steps", exact=True).fill("100000")  # it would take hours
     dialog.get_by_role("button", name="Fork: go on").click()
     fork = another_job(page, job_url)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from biresnerf.options.refine_options import STAGE_1_OPTIONS, RefineOptions, parse_options
+from biresnerf.options.refine_options import OPTIONS, STAGE_1_OPTIONS, RefineOptions, parse_options
 from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import WantedStage
 from workers.settings.errors import Conflict
@@ -58,4 +58,6 @@ def _why_not(
         return f"start={new['start']} does not ask COLMAP."
     if "seeding_effort" in changed and new["seeding_effort"] == "full":
         return "COLMAP's answer was found with seeding_effort=low."
-    return "COLMAP's answer depends on seed." if "seed" in changed else None
+    told_above = {"start", "seeding_effort"}
+    others = sorted(name for name in changed - told_above if OPTIONS[name].stage == "seeding")
+    return f"COLMAP's answer depends on {', '.join(others)}." if others else None

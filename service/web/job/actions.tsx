@@ -170,7 +170,7 @@ function Again({ job }: { job: JobView }) {
     <Asking button="Run again …" title="Run again with other options" wide wish={wish}>
       {(close) => (
         <>
-          <OptionsForm values={values} onChange={setValues} base={job.options} problems={problem?.errors ?? []} />
+          <OptionsForm values={values} onChange={setValues} base={job.resolved_options ?? job.options} problems={problem?.errors ?? []} />
           <p class="soft">
             A fork takes over COLMAP's answer or the whole of stage 1, whichever the changed options allow; where they allow
             neither, the service says why.

@@ -114,7 +114,7 @@ function Files({ live, seen }: { live: LiveJob; seen: Seen }) {
 function Facts({ job, seen }: { job: JobView; seen: Seen }) {
   const seconds = Object.entries(seen.report?.seconds ?? {});
   const warnings = seen.report?.warnings ?? [];
-  const options = Object.entries({ ...job.options, ...job.smaller }).sort(([a], [b]) => (a < b ? -1 : 1));
+  const options = Object.entries(job.resolved_options ?? job.options).sort(([a], [b]) => (a < b ? -1 : 1));
   return (
     <details class="panel">
       <summary>

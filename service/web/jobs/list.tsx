@@ -102,7 +102,7 @@ function JobCard({ job }: { job: JobView }) {
         </span>
         <StageBar job={job} />
         <span class="soft job-foot">
-          {moment(job.created_at)} · {String(job.options.preset)}
+          {moment(job.created_at)} · {String(job.options.preset ?? "balanced")}
         </span>
       </span>
     </a>

@@ -42,7 +42,8 @@ export function OptionsForm({ values, onChange, base, problems = [] }: Props) {
   if (problem) return <ProblemBox problem={problem} />;
   if (!view || !fields) return <p class="soft">Loading the options …</p>;
   const preset = String(values.preset ?? base?.preset ?? "balanced");
-  const fallback = (name: string) => (base && !values.preset ? words(base[name]) : presetValue(view, preset, name));
+  const fallback = (name: string) =>
+    base && !values.preset && name in base ? words(base[name]) : presetValue(view, preset, name);
   const set = (name: string, value: unknown) => {
     onChange(({ [name]: _, ...others }) => (value === undefined ? others : { ...others, [name]: value }));
   };
@@ -56,7 +57,7 @@ export function OptionsForm({ values, onChange, base, problems = [] }: Props) {
       onChange={(value) => set(field.name, value)}
     />
   );
-  const changed = fields.rest.filter(({ name }) => name in values).length;
+  const changed = fields.expert.filter(({ name }) => name in values).length;
   return (
     <div class="options">
       <fieldset class="presets">
@@ -67,17 +68,17 @@ export function OptionsForm({ values, onChange, base, problems = [] }: Props) {
             <strong>{name}</strong>
             <span>{PRESET_WORDS[name]}</span>
             <span class="soft">
-              {String(filled.steps)} steps at {String(filled.max_image_size)} px
+              {filled.steps} steps at {filled.max_image_size} px ({view.presets_on_gpu[name as keyof OptionsView["presets"]]?.max_image_size} px on a GPU)
             </span>
           </label>
         ))}
       </fieldset>
-      <div class="fields">{fields.first.map(row)}</div>
+      <div class="fields">{fields.usual.map(row)}</div>
       <details>
         <summary>
-          Method and schedule <span class="soft">{changed ? `${changed} changed` : "as the preset says"}</span>
+          Schedule, sizes and output <span class="soft">{changed ? `${changed} changed` : "as the preset says"}</span>
         </summary>
-        <div class="fields">{fields.rest.map(row)}</div>
+        <div class="fields">{fields.expert.map(row)}</div>
       </details>
     </div>
   );

@@ -9,6 +9,7 @@ interface Schema {
   readonly enum?: readonly (string | number)[];
   readonly anyOf?: readonly Schema[];
   readonly items?: Schema;
+  readonly level?: "usual" | "expert" | "research";
   readonly properties?: Readonly<Record<string, Schema>>;
   readonly minimum?: number;
   readonly maximum?: number;
@@ -29,19 +30,12 @@ export interface Field {
   most: number | null;
 }
 
-/** Those that people change; all others are in a second group, in the schema's order. */
-const FIRST = [
-  ...["max_image_size", "steps", "start", "background", "exposure", "refine_intrinsics", "holdout"],
-  ...["fixed", "exports", "device", "seed"],
-];
-
-export function fieldsOf(schema: Schema): { first: Field[]; rest: Field[] } {
-  const properties = schema.properties ?? {};
-  const fields = Object.entries(properties)
-    .filter(([name]) => name !== "preset")
-    .map(([name, said]) => fieldOf(name, said));
-  const first = FIRST.flatMap((name) => fields.filter((field) => field.name === name));
-  return { first, rest: fields.filter((field) => !FIRST.includes(field.name)) };
+/** The usual fields, and those for experts; the ones for research are left out. */
+export function fieldsOf(schema: Schema): { usual: Field[]; expert: Field[] } {
+  const properties = Object.entries(schema.properties ?? {}).filter(([name]) => name !== "preset");
+  const fields = (level: string) =>
+    properties.filter(([, said]) => said.level === level).map(([name, said]) => fieldOf(name, said));
+  return { usual: fields("usual"), expert: fields("expert") };
 }
 
 function fieldOf(name: string, said: Schema): Field {

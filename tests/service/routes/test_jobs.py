@@ -41,13 +41,16 @@ def test_a_submitted_job_is_202_with_location_and_runs_to_its_end(http: httpx.Cl
     assert int(answer.headers["retry-after"]) > 0
     assert job["state"] in {"queued", "running"}
     assert job["labels"] == {"run": "a"}
-    assert job["options"]["max_image_size"] == 128  # the preset's value: options come back resolved
+    assert job["options"] == {"preset": "fast", "steps": 60, "seed": 60}
     seen = until(http, job["id"], lambda found: found["stage"] == "coarse" and found["progress"]["step"] > 0)
     assert seen["progress"]["steps_total"] == 60
     assert 0 < seen["progress"]["fraction"] < 1
     assert seen["progress"]["eta_s"] > 0
     assert seen["metrics"]["loss"] > 0
     assert seen["verdict"] is None
+    assert (
+        seen["resolved_options"]["max_image_size"] == 128
+    )  # the preset's value, as the job's process took it
     done = finished(http, job["id"])
     assert done["verdict"] == "kept_input"  # as the report has it
     assert done["state"] == "succeeded"

@@ -33,6 +33,8 @@ def test_the_options_are_a_schema_and_resolved_presets(http: httpx.Client) -> No
     for values in body["presets"].values():
         assert RefineOptions.model_validate(values).resolved("cpu") == ResolvedOptions.model_validate(values)
         assert values["steps"] is not None
+    sizes = [body[key]["balanced"]["max_image_size"] for key in ("presets", "presets_on_gpu")]
+    assert sizes == [200, 400]
     assert http.get("/v1/options", headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
 
 
