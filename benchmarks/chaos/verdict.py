@@ -97,8 +97,8 @@ async def claims_about_rest(installation: Installation, database: Database, pati
 
 async def _queue(database: Database) -> list[str]:
     rows = await database.fetch(
-        "SELECT status::text AS what, count(*) AS n FROM procrastinate_jobs WHERE status IN ('todo', 'doing')"
-        " GROUP BY status UNION ALL SELECT state, count(*) FROM jobs WHERE state IN ('queued', 'running')"
+        "SELECT state AS what, count(*) AS n FROM queue_entries WHERE state IN ('todo', 'doing')"
+        " GROUP BY state UNION ALL SELECT state, count(*) FROM jobs WHERE state IN ('queued', 'running')"
         " GROUP BY state UNION ALL SELECT 'trash', count(*) FROM trash HAVING count(*) > 0"
     )
     return [f"{row['n']} {row['what']}" for row in rows]

@@ -17,6 +17,7 @@ from benchmarks.chaos.__main__ import new_folder
 from benchmarks.chaos.installation import Installation, Kept
 from benchmarks.load import parts
 from benchmarks.load.calls import Calls, Process
+from workers.database import job_queue
 from workers.database.database import open_database
 from workers.engine import open_stores
 
@@ -58,7 +59,9 @@ async def measure(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
                 tell(f"listeners to {spread_over}", heard)
             tell("an hour", await parts.an_hour(calls, process, jobs, dataset, asked.requests))
             await database.fetch("UPDATE jobs SET state = 'cancelled' WHERE state = 'queued'")
-            await database.fetch("DELETE FROM procrastinate_jobs")
+            for row in await database.fetch("SELECT id FROM queue_entries WHERE state = 'todo'"):
+                async with database.transaction() as connection:
+                    await job_queue.cancel(connection, row["id"])
             await start_workers(installation, asked.workers)
             tell("dispatch", await parts.dispatch(calls, dataset, asked.dispatched))
         tell("endpoints", calls.table())

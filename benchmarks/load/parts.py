@@ -13,6 +13,7 @@ from psycopg.types.json import Jsonb
 
 from benchmarks.load.calls import Calls, Process, at_once, spread
 from biresnerf.options.refine_options import RefineOptions
+from workers.database import job_queue
 from workers.database.database import Database
 from workers.engine import Stores
 
@@ -34,17 +35,20 @@ async def ready_dataset(calls: Calls) -> str:
 
 async def fill(database: Database, dataset: str, count: int) -> None:
     """Jobs that wait already, older than all others, written straight into the tables."""
-    await database.fetch(
-        "WITH rows AS (INSERT INTO procrastinate_jobs (queue_name, task_name, args)"
-        " SELECT 'refine', 'refine', jsonb_build_object('job_id', 'job_0load' || lpad(n::text, 7, '0'))"
-        " FROM generate_series(1, %s) AS n RETURNING id, args ->> 'job_id' AS job_id)"
-        " INSERT INTO jobs (id, dataset_id, options, fingerprint, queue_id, created_at)"
-        " SELECT job_id, %s, %s, '', id, now() - interval '1 day' + make_interval(secs => id) FROM rows",
-        *(count, dataset, Jsonb(RefineOptions(preset="fast").resolved("cpu").model_dump(mode="json"))),
-    )
+    options = Jsonb(RefineOptions(preset="fast").resolved("cpu").model_dump(mode="json"))
+    for first in range(0, count, 1000):
+        async with database.transaction() as connection:
+            for n in range(first, min(count, first + 1000)):
+                job_id = f"job_0load{n:07}"
+                entry_id = await job_queue.enqueue(connection, job_id, order=0, held=False)
+                await connection.execute(
+                    "INSERT INTO jobs (id, dataset_id, options, fingerprint, queue_id, created_at)"
+                    " VALUES (%s, %s, %s, '', %s, now() - interval '1 day' + make_interval(secs => %s))",
+                    (job_id, dataset, options, entry_id, n),
+                )
     async with database.pool.connection() as connection:
         await connection.set_autocommit(True)
-        await connection.execute("VACUUM ANALYZE jobs, procrastinate_jobs")  # as it would be after a while
+        await connection.execute("VACUUM ANALYZE")  # as it would be after a while
         await connection.set_autocommit(False)
 
 

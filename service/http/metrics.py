@@ -44,7 +44,7 @@ _COUNTERS = {
 _FROM_ZERO: dict[str, tuple[str, ...]] = {
     "job_events": get_args(EventType),
     "job_failures": ("engine_error", "timeout", "too_many_crashes"),
-    "job_requeues": ("lost", "receipt_lost", "shutdown", "worker_lost"),
+    "job_requeues": ("lost", "shutdown", "worker_lost"),
     "webhook_attempts": ("delivered", "failed"),
 }
 _DURATIONS = {

@@ -18,8 +18,8 @@ from service.http.problems import ProblemError, problem_of
 from service.intake.sandboxed_child import Limits, run_confined
 from service.intake.unpack import UnpackRequest
 from service.intake.uploads import staging_folder, write_stream
+from workers.process.waiting import retry_while_unavailable
 from workers.records import Upload
-from workers.run.claim import insist
 from workers.settings.errors import EngineError, NotFound, Unavailable
 
 logger = logging.getLogger(__name__)
@@ -110,7 +110,7 @@ async def take_upload(service: Service, upload_id: str) -> None:
     What is wrong on our side (storage away, disk full) is raised and leaves it received: it is tried again.
     """
     uploads, token = service.stores.uploads, uuid.uuid4()
-    if not await insist(lambda: uploads.take(upload_id, token)):
+    if not await retry_while_unavailable(lambda: uploads.take(upload_id, token)):
         return
     renewing = asyncio.create_task(_renew(service, upload_id, token))
     wrong: JobError | None = None
@@ -124,7 +124,7 @@ async def take_upload(service: Service, upload_id: str) -> None:
             raise
     finally:
         renewing.cancel()
-    await insist(lambda: uploads.conclude(upload_id, token, wrong))
+    await retry_while_unavailable(lambda: uploads.conclude(upload_id, token, wrong))
 
 
 async def _renew(service: Service, upload_id: str, token: uuid.UUID) -> None:

@@ -1,4 +1,4 @@
-"""Connections: one pool per process, the queue engine on the same pool, and errors translated once."""
+"""Connections: one pool per process, and errors translated once."""
 
 from __future__ import annotations
 
@@ -6,16 +6,11 @@ import asyncio
 import contextlib
 import logging
 import re
-import time
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from datetime import UTC, datetime
 from typing import Any, LiteralString
 
 import psycopg
-from procrastinate import App, PsycopgConnector
-from procrastinate.connector import Notify
-from procrastinate.exceptions import ConnectorException
 from psycopg.rows import DictRow, dict_row
 from psycopg_pool import AsyncConnectionPool, PoolClosed, PoolTimeout
 
@@ -29,8 +24,6 @@ AWAY = (
     *(psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout, PoolClosed),
     psycopg.errors.IdleInTransactionSessionTimeout,
 )
-QUEUE = "refine"
-TASK = "refine"
 # A peer that vanished without a word (a host that lost power) is noticed within a minute.
 CONNECT: dict[str, Any] = {
     "connect_timeout": 5,
@@ -40,64 +33,15 @@ CONNECT: dict[str, Any] = {
     # Keepalives rest while bytes are under way; without this a query into a dead line waits a quarter of an hour.
     "tcp_user_timeout": 60_000,
 }
-# When the queue offers a held job: not before `offer_held` says so.
-NOT_YET = datetime(9999, 1, 1, tzinfo=UTC)
 LISTEN_CHANNEL = "biresnerf_jobs"
 RECONNECT_S = 1.0
-QUIET_S = 60.0  # between two warnings of the same outage
-
-
-class PatientConnector(PsycopgConnector):
-    """The queue's connector, except that its listener outlives a restart of the database.
-
-    And that a query is given up where no answer comes: the line may be dead with both its ends alive.
-    """
-
-    def __init__(self, answer_s: float, **options: Any) -> None:
-        super().__init__(**options)
-        self._answer_s = answer_s
-
-    async def execute_query_async(self, query: LiteralString, **arguments: Any) -> None:
-        """As the engine's."""
-        async with self._in_time():
-            await super().execute_query_async(query, **arguments)
-
-    async def execute_query_one_async(self, query: LiteralString, **arguments: Any) -> dict[str, Any]:
-        """As the engine's."""
-        async with self._in_time():
-            return await super().execute_query_one_async(query, **arguments)
-
-    async def execute_query_all_async(self, query: LiteralString, **arguments: Any) -> list[dict[str, Any]]:
-        """As the engine's."""
-        async with self._in_time():
-            return await super().execute_query_all_async(query, **arguments)
-
-    @asynccontextmanager
-    async def _in_time(self) -> AsyncIterator[None]:
-        try:
-            async with asyncio.timeout(self._answer_s):
-                yield
-        except TimeoutError as error:
-            raise ConnectorException(f"no answer within {self._answer_s:g} s") from error
-
-    async def listen_notify(self, on_notification: Notify, channels: Iterable[str]) -> None:
-        """Listen for ever; while the database is away, try again each second (polling fills the gap)."""
-        wanted, said_at = list(channels), 0.0
-        while True:
-            try:
-                await super().listen_notify(on_notification, wanted)
-            except (ConnectorException, *AWAY) as error:
-                if time.monotonic() - said_at > QUIET_S:
-                    said_at = time.monotonic()
-                    log.warning("queue listener lost the database (%s)", first_line(error.__cause__ or error))
-                await asyncio.sleep(1)
 
 
 class Database:
-    """One process's pool and queue app. Use `open_database`."""
+    """One process's pool of connections. Use `open_database`."""
 
-    def __init__(self, url: str, pool: AsyncConnectionPool[Connection], app: App, answer_s: float) -> None:
-        self.url, self.pool, self.app, self._answer_s = url, pool, app, answer_s
+    def __init__(self, url: str, pool: AsyncConnectionPool[Connection], answer_s: float) -> None:
+        self.url, self.pool, self._answer_s = url, pool, answer_s
 
     @asynccontextmanager
     async def transaction(self) -> AsyncIterator[Connection]:
@@ -124,25 +68,6 @@ class Database:
             cursor = await connection.execute(sql, parameters)
             return await cursor.fetchall() if cursor.description else []
 
-    async def enqueue(self, connection: Connection, job_id: str) -> int:
-        """Put a job into the queue at its turn, in the caller's transaction; returns the queue row's id."""
-        sql = "SELECT queue_order, held FROM jobs WHERE id = %s"
-        row = await (await connection.execute(sql, (job_id,))).fetchone()
-        assert row is not None, "the caller has written it"
-        task = self.app.configure_task(
-            TASK,
-            queue=QUEUE,
-            connection=connection,
-            priority=-row["queue_order"],
-            schedule_at=NOT_YET if row["held"] else None,
-        )
-        try:
-            return await task.defer_async(job_id=job_id)
-        except ConnectorException as error:
-            if isinstance(error.__cause__, AWAY):
-                raise error.__cause__ from None
-            raise
-
 
 @asynccontextmanager
 async def open_database(
@@ -154,7 +79,7 @@ async def open_database(
     silence_s: float = 60.0,
     answer_s: float = 20.0,
 ) -> AsyncIterator[Database]:
-    """Pool and queue app, closed at the end.
+    """A pool of connections, closed at the end.
 
     Args:
         connections: most connections of the pool.
@@ -197,11 +122,9 @@ async def open_database(
             "database_unreachable", f"The database at {without_password(url)} does not answer."
         ) from None
     try:
-        app = App(connector=PatientConnector(answer_s, conninfo=url, kwargs=CONNECT))
-        async with app.open_async(pool):
-            database = Database(url, pool, app, answer_s)
-            await _require_schema(database)
-            yield database
+        database = Database(url, pool, answer_s)
+        await _require_schema(database)
+        yield database
     finally:
         await pool.close()
 

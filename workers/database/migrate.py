@@ -5,18 +5,16 @@ from __future__ import annotations
 import logging
 import time
 from importlib import resources
-from importlib.resources.abc import Traversable
 
 import psycopg
-from procrastinate.schema import SchemaManager
 
+from workers.database import job_queue
 from workers.settings.errors import SetupError
 
 log = logging.getLogger(__name__)
 
 # Any fixed number; two migrations that start together take turns on it.
 MIGRATION_LOCK = 7_201_603
-QUEUE_STEP = "000_procrastinate_3.10"
 
 
 def migrate(database_url: str, *, wait_s: float = 30.0) -> list[str]:
@@ -32,7 +30,8 @@ def migrate(database_url: str, *, wait_s: float = 30.0) -> list[str]:
             " (name text PRIMARY KEY, applied_at timestamptz NOT NULL DEFAULT now())"
         )
         done = {row[0] for row in connection.execute("SELECT name FROM schema_steps")}
-        steps = _steps()
+        queue, ours = job_queue.schema_steps(), _our_steps()
+        steps = queue + ours
         unknown = sorted(done - {name for name, _ in steps})
         if unknown:
             raise SetupError(
@@ -41,9 +40,11 @@ def migrate(database_url: str, *, wait_s: float = 30.0) -> list[str]:
                 "Install the newer version.",
             )
         applied = []
+        included = set() if done else {name for name, _ in queue[1:]}
         for name, sql in steps:
             if name not in done:
-                connection.execute(sql.encode())
+                if name not in included:
+                    connection.execute(sql.encode())
                 connection.execute("INSERT INTO schema_steps (name) VALUES (%s)", (name,))
                 applied.append(name)
                 log.info("applied %s", name)
@@ -52,19 +53,15 @@ def migrate(database_url: str, *, wait_s: float = 30.0) -> list[str]:
 
 def step_names() -> list[str]:
     """The steps that this version knows, in order."""
-    return [QUEUE_STEP, *(file.name.removesuffix(".sql") for file in _files())]
+    return [name for name, _ in (*job_queue.schema_steps(), *_our_steps())]
 
 
-def _steps() -> list[tuple[str, str]]:
-    ours = [(file.name.removesuffix(".sql"), file.read_text()) for file in _files()]
-    return [(QUEUE_STEP, SchemaManager.get_schema()), *ours]
-
-
-def _files() -> list[Traversable]:
+def _our_steps() -> list[tuple[str, str]]:
     folder = resources.files("workers.database").joinpath("migrations")
-    return sorted(
-        (file for file in folder.iterdir() if file.name.endswith(".sql")), key=lambda file: file.name
-    )
+    files = sorted(folder.iterdir(), key=lambda file: file.name)
+    return [
+        (file.name.removesuffix(".sql"), file.read_text()) for file in files if file.name.endswith(".sql")
+    ]
 
 
 def _connect(database_url: str, wait_s: float) -> psycopg.Connection:

@@ -1,4 +1,4 @@
-"""Following jobs: one LISTEN connection per process wakes local followers, who then read the tables.
+"""Notifications: one LISTEN connection per channel and process wakes local waiters, who then read the tables.
 
 A notification only says "look"; what happened is in the tables. A lost one costs a poll interval, no event.
 """
@@ -7,66 +7,76 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
-import time
 from collections import defaultdict
-from collections.abc import Iterator
-from typing import LiteralString
+from collections.abc import Callable, Iterator
 
 import psycopg
+from psycopg import sql
 
-from workers.database.database import AWAY, CONNECT, LISTEN_CHANNEL, QUIET_S, Database, first_line
+from workers.database.database import AWAY, CONNECT, LISTEN_CHANNEL, Database, first_line
+from workers.process.waiting import retry_while_unavailable
 from workers.settings.errors import Unavailable
 
-log = logging.getLogger(__name__)
-
+QUIET_S = 60.0  # without a notification: time to ask whether the connection lives
 ANSWER_S = 10.0
 
 
 class Listener:
-    """Wakes who waits for a job. ``poll_s`` is how long a lost notification can go unnoticed."""
+    """Wakes who waits for a subject, as a rule a job.
 
-    def __init__(self, database: Database, poll_s: float, channel: LiteralString = LISTEN_CHANNEL) -> None:
-        self.poll_s, self._channel = poll_s, channel
+    Args:
+        poll_s: how long a lost notification can go unnoticed.
+        channel: where to listen.
+        subject_of: what a notification is about.
+    """
+
+    def __init__(
+        self,
+        database: Database,
+        poll_s: float,
+        channel: str = LISTEN_CHANNEL,
+        subject_of: Callable[[str], str] = str,
+    ) -> None:
+        self.poll_s, self._channel, self._subject_of = poll_s, channel, subject_of
         self._database = database
         self._waiting: dict[str, set[asyncio.Event]] = defaultdict(set)
 
     @contextlib.contextmanager
-    def waiting(self, job_id: str) -> Iterator[asyncio.Event]:
-        """An event that is set at each change of the job."""
+    def waiting(self, subject: str) -> Iterator[asyncio.Event]:
+        """An event that is set at each notification about the subject."""
         event = asyncio.Event()
-        self._waiting[job_id].add(event)
+        self._waiting[subject].add(event)
         try:
             yield event
         finally:
-            self._waiting[job_id].discard(event)
-            if not self._waiting[job_id]:
-                del self._waiting[job_id]
+            self._waiting[subject].discard(event)
+            if not self._waiting[subject]:
+                del self._waiting[subject]
 
     async def run(self) -> None:
-        """Listen until cancelled; reconnects for ever, and wakes everybody after a gap."""
-        said_at = 0.0
-        while True:
-            try:
-                async with await psycopg.AsyncConnection.connect(
-                    self._database.url, autocommit=True, **CONNECT
-                ) as connection:
-                    await connection.execute(f"LISTEN {self._channel}".encode())
-                    for job_id in list(self._waiting):
-                        self._wake(job_id)
-                    while True:
-                        async for notification in connection.notifies(timeout=QUIET_S):
-                            self._wake(notification.payload)
-                        async with asyncio.timeout(ANSWER_S):
-                            await connection.execute("SELECT 1")  # a line can be dead without an end
-            except (*AWAY, TimeoutError) as error:
-                if time.monotonic() - said_at > QUIET_S:
-                    said_at = time.monotonic()
-                    log.warning("event listener lost the database (%s)", first_line(error))
-            await asyncio.sleep(0.5)
+        """Listen until cancelled; reconnects without end, and wakes everybody after a gap."""
+        await retry_while_unavailable(self._listen)
 
-    def _wake(self, job_id: str) -> None:
-        for event in self._waiting.get(job_id, ()):
+    async def _listen(self) -> None:
+        try:
+            async with await psycopg.AsyncConnection.connect(
+                self._database.url, autocommit=True, **CONNECT
+            ) as connection:
+                await connection.execute(sql.SQL("LISTEN {}").format(sql.Identifier(self._channel)))
+                for subject in list(self._waiting):
+                    self._wake(subject)
+                while True:
+                    async for notification in connection.notifies(timeout=QUIET_S):
+                        self._wake(self._subject_of(notification.payload))
+                    async with asyncio.timeout(ANSWER_S):
+                        await connection.execute("SELECT 1")  # a line can be dead without an end
+        except (*AWAY, TimeoutError) as error:
+            raise Unavailable(
+                "database_unavailable", f"The listener lost the database: {first_line(error)}"
+            ) from error
+
+    def _wake(self, subject: str) -> None:
+        for event in self._waiting.get(subject, ()):
             event.set()
 
     async def database_answers(self, timeout_s: float) -> bool:

@@ -51,10 +51,10 @@ class Statistics(BaseModel):
 
 _SLOTS = """
     SELECT CASE WHEN slots.name LIKE 'gpu%%' THEN 'gpu' ELSE 'cpu' END AS kind,
-        EXISTS (SELECT FROM procrastinate_jobs AS job
-            WHERE job.worker_id = worker.id AND job.status = 'doing') AS busy,
+        EXISTS (SELECT FROM queue_entries AS entry
+            WHERE entry.worker_id = worker.id AND entry.state = 'doing') AS busy,
         count(*) AS slots
-    FROM slots JOIN procrastinate_workers AS worker ON worker.id = slots.worker_id
+    FROM slots JOIN queue_workers AS worker ON worker.id = slots.worker_id
     WHERE worker.last_heartbeat > now() - make_interval(secs => %s) GROUP BY 1, 2"""
 _TALLIES = """
     SELECT name, label, bucket, sum(count)::bigint AS count, sum(amount) AS amount FROM (
@@ -114,8 +114,7 @@ async def announce_slot(database: Database, host: str, name: str, worker_id: int
     """Writes down which worker of the queue a slot is; forgets those that are gone."""
     async with database.transaction() as connection:
         await connection.execute(
-            "DELETE FROM slots WHERE NOT EXISTS"
-            " (SELECT FROM procrastinate_workers WHERE id = slots.worker_id)"
+            "DELETE FROM slots WHERE NOT EXISTS (SELECT FROM queue_workers WHERE id = slots.worker_id)"
         )
         await connection.execute(
             "INSERT INTO slots (host, name, worker_id) VALUES (%s, %s, %s)"

@@ -20,8 +20,8 @@ from biresnerf.wire.datasets import CheckReport
 from biresnerf.wire.problems import JobError
 from workers.database.database import Database
 from workers.process.turns import Turns
+from workers.process.waiting import retry_while_unavailable
 from workers.run.child import Child, log_tail
-from workers.run.claim import insist
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
@@ -48,16 +48,16 @@ class Checker:
     async def check(self, dataset_id: str) -> None:
         """Until the dataset is not ``finalizing`` any more, through our check or another process's."""
         token = uuid.uuid4()
-        owned = await insist(
+        owned = await retry_while_unavailable(
             lambda: self._database.fetch("SELECT tenant FROM datasets WHERE id = %s", dataset_id)
         )
         if not owned:
             return
         while True:
             async with self._turns.turn(owned[0]["tenant"]):
-                if await insist(lambda: self._take(dataset_id, token)):
+                if await retry_while_unavailable(lambda: self._take(dataset_id, token)):
                     await self._check(dataset_id, token)
-            rows = await insist(
+            rows = await retry_while_unavailable(
                 lambda: self._database.fetch("SELECT state FROM datasets WHERE id = %s", dataset_id)
             )
             if not rows or rows[0]["state"] != "finalizing":
@@ -84,7 +84,7 @@ class Checker:
         return bool(rows)
 
     async def _check(self, dataset_id: str, token: uuid.UUID) -> None:
-        rows = await insist(
+        rows = await retry_while_unavailable(
             lambda: self._database.fetch(
                 "SELECT key, path FROM dataset_files WHERE dataset_id = %s", dataset_id
             )
@@ -96,7 +96,7 @@ class Checker:
         finally:
             renewing.cancel()
         found = Jsonb(outcome.model_dump(mode="json"))
-        await insist(
+        await retry_while_unavailable(
             lambda: self._database.fetch(
                 "UPDATE datasets SET state = %s, report = %s, error = %s, revision = revision + 1,"
                 " check_token = NULL, check_until = NULL"

@@ -26,8 +26,8 @@ from workers.datasets.dataset_rows import (
     require_place,
 )
 from workers.jobs.quotas import require_byte_quota
+from workers.process.waiting import retry_while_unavailable
 from workers.records import DatasetFile, Page, record_from_row
-from workers.run.claim import insist
 from workers.settings.errors import Conflict, Expired, LimitReached, NotFound
 from workers.settings.settings import Settings
 from workers.store.files import FileStore, StoredFile
@@ -266,7 +266,7 @@ class DatasetStore:
         states come back as they are. Raises `NotFound`.
         """
         await self._checker.check(dataset_id)
-        return await insist(lambda: self.get(dataset_id))
+        return await retry_while_unavailable(lambda: self.get(dataset_id))
 
     async def unfinished(self) -> tuple[str, ...]:
         """Ids left in ``finalizing`` that nobody checks (their process died, or has others to do first)."""

@@ -11,6 +11,7 @@ from psycopg.types.json import Jsonb
 
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.jobs import JobEvent, JobProgress, JobView, PriorityName
+from workers.database import job_queue
 from workers.database.database import Connection
 from workers.records import PREVIEW_FOLDER, THUMBNAIL_NAME, priority_name, record_from_row
 from workers.settings.errors import Conflict
@@ -59,6 +60,14 @@ def asked_columns(options: RefineOptions) -> dict[str, Any]:
     """
     asked = options.model_dump(mode="json", exclude_unset=True)
     return {"options": Jsonb(asked), "planned_steps": options.resolved("cpu").steps}
+
+
+async def queue_job(connection: Connection, job_id: str) -> None:
+    """Put a job into the queue at its turn, in the caller's transaction."""
+    row = await one_row(connection, "SELECT queue_order, held FROM jobs WHERE id = %s", job_id)
+    assert row is not None, "the caller has written it"
+    entry_id = await job_queue.enqueue(connection, job_id, order=row["queue_order"], held=row["held"])
+    await connection.execute("UPDATE jobs SET queue_id = %s WHERE id = %s", (entry_id, job_id))
 
 
 def fingerprint_of(

@@ -13,6 +13,7 @@ from psycopg.types.json import Jsonb
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.jobs import JobEvent, JobState, JobView, LogLine, PriorityName
 from biresnerf.wire.webhooks import JobWebhook
+from workers.database import job_queue
 from workers.database.database import Connection, Database
 from workers.database.ids import cursor_after, cursor_place, cursor_time, new_id
 from workers.jobs.job_completion import finish_cancelled
@@ -26,6 +27,7 @@ from workers.jobs.job_rows import (
     job_from_row,
     known_job,
     one_row,
+    queue_job,
 )
 from workers.jobs.job_updates import JobListener, follow
 from workers.jobs.quotas import require_room, submitting_for
@@ -103,10 +105,8 @@ class JobStore:
 
     async def _queue(self, connection: Connection, job_id: str) -> JobView:
         """Put a job just written into the queue."""
-        queue_id = await self._database.enqueue(connection, job_id)
-        await connection.execute(
-            "UPDATE jobs SET queue_id = %s, trace = %s WHERE id = %s", (queue_id, traceparent(), job_id)
-        )
+        await queue_job(connection, job_id)
+        await connection.execute("UPDATE jobs SET trace = %s WHERE id = %s", (traceparent(), job_id))
         await connection.execute("SELECT add_job_event(%s, 'queued', '{}')", (job_id,))
         return job_from_row(await self._required(connection, job_id))
 
@@ -178,9 +178,7 @@ class JobStore:
                 *(keep_partial, job_id, self._tenant),
             )
             if changed is not None:
-                await connection.execute(
-                    "SELECT procrastinate_cancel_job_v1(%s, true, false)", (changed["queue_id"],)
-                )
+                await job_queue.cancel(connection, changed["queue_id"])
                 if changed["state"] == "queued":  # perhaps after an attempt that has shown something
                     await finish_cancelled(connection, job_id, stall_s=self._settings.stall_s)
                 else:

@@ -1,9 +1,20 @@
-"""Waiting for whichever of several things happens first."""
+"""Waiting: for the first of several things, or for a database or file store that is away."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable
+import logging
+import time
+from collections.abc import Awaitable, Callable
+from typing import TypeVar
+
+from workers.settings.errors import Unavailable
+
+log = logging.getLogger(__name__)
+
+RETRY_S = 0.5
+WARN_AGAIN_S = 60.0
+T = TypeVar("T")
 
 
 async def first_done(*waits: Awaitable[object]) -> None:
@@ -15,3 +26,16 @@ async def first_done(*waits: Awaitable[object]) -> None:
         for task, wait in zip(tasks, waits, strict=True):
             if task is not wait:
                 task.cancel()
+
+
+async def retry_while_unavailable(work: Callable[[], Awaitable[T]]) -> T:
+    """The answer of ``work``, tried again for as long as it raises `Unavailable`. Warns once a minute."""
+    warned_at = -WARN_AGAIN_S
+    while True:
+        try:
+            return await work()
+        except Unavailable as error:
+            if time.monotonic() - warned_at >= WARN_AGAIN_S:
+                warned_at = time.monotonic()
+                log.warning("%s; trying again until it answers", error)
+            await asyncio.sleep(RETRY_S)

@@ -1,4 +1,4 @@
-"""The worker's sign of life: a thread with a connection of its own."""
+"""The worker's heartbeat: a thread with a connection of its own."""
 
 from __future__ import annotations
 
@@ -6,78 +6,65 @@ import asyncio
 import contextlib
 import logging
 import threading
-from collections.abc import Callable
 
 import psycopg
 
 from workers.database.database import CONNECT, first_line
+from workers.database.job_queue import HEARTBEAT
 
 log = logging.getLogger(__name__)
 
-# Puts the worker on the list again where a janitor struck it off: it was frozen and has woken up. A job that it
-# had then has a new owner; it can take the next one.
-ALIVE = (
-    "INSERT INTO procrastinate_workers (id) OVERRIDING SYSTEM VALUE VALUES (%s)"
-    " ON CONFLICT (id) DO UPDATE SET last_heartbeat = now()"
-)
 
+class Heartbeat(threading.Thread):
+    """Tells the queue every ``period_s`` that the worker is alive, without end.
 
-class Beat(threading.Thread):
-    """Tells the queue every ``period_s`` that worker ``worker_id()`` lives; tries again for ever.
-
-    A thread, because the queue's own beat lives in the event loop, ends when the worker begins to drain, and
-    stops the worker when the database is away for half a minute. A connection on which no answer comes for
-    ``answer_s`` is given up.
+    A thread of its own, because deleting a large folder can hold up the event loop for longer than the stall time.
+    A connection on which no answer comes for ``answer_s`` is given up.
     """
 
-    def __init__(
-        self, url: str, period_s: float, worker_id: Callable[[], int | None], *, answer_s: float
-    ) -> None:
-        super().__init__(daemon=True, name="beat")
+    def __init__(self, url: str, period_s: float, worker_id: int, *, answer_s: float) -> None:
+        super().__init__(daemon=True, name="heartbeat")
         self._url, self._period_s, self._worker_id, self._answer_s = url, period_s, worker_id, answer_s
         self._loop = asyncio.new_event_loop()
         self._end = asyncio.Event()
 
     def run(self) -> None:
-        """Beat until `end`."""
+        """Until `end`."""
         self._loop.run_until_complete(self._beat())
         self._loop.close()
 
     def end(self) -> None:
-        """Stop; the last sign of life stays."""
+        """Stop; the last heartbeat stays."""
         with contextlib.suppress(RuntimeError):  # it has ended already
             self._loop.call_soon_threadsafe(self._end.set)
 
     async def _beat(self) -> None:
         connection: psycopg.AsyncConnection | None = None
-        while not await self._told_to_end():
-            worker_id = self._worker_id()
-            if worker_id is None:
-                continue
+        while not await self._ended():
             try:
                 if connection is None or connection.closed:
                     connection = await psycopg.AsyncConnection.connect(self._url, autocommit=True, **CONNECT)
-                await self._say(connection, worker_id)
+                await self._send(connection)
             except (psycopg.Error, TimeoutError) as error:
-                log.warning("no sign of life: %s", first_line(error))
+                log.warning("no heartbeat: %s", first_line(error))
                 if connection is not None:
                     await connection.close()
                 connection = None
         if connection is not None:
             await connection.close()
 
-    async def _say(self, connection: psycopg.AsyncConnection, worker_id: int) -> None:
+    async def _send(self, connection: psycopg.AsyncConnection) -> None:
         """Raises `TimeoutError`, and at once: a query that is cancelled waits five more seconds for its server."""
-        saying = asyncio.ensure_future(connection.execute(ALIVE, (worker_id,)))
-        await asyncio.wait({saying}, timeout=self._answer_s)
-        if not saying.done():
+        sending = asyncio.ensure_future(connection.execute(HEARTBEAT, (self._worker_id,)))
+        await asyncio.wait({sending}, timeout=self._answer_s)
+        if not sending.done():
             connection.pgconn.finish()
-            saying.cancel()
-            await asyncio.gather(saying, return_exceptions=True)
+            sending.cancel()
+            await asyncio.gather(sending, return_exceptions=True)
             raise TimeoutError(f"no answer within {self._answer_s:g} s")
-        saying.result()
+        sending.result()
 
-    async def _told_to_end(self) -> bool:
+    async def _ended(self) -> bool:
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._end.wait(), self._period_s)
         return self._end.is_set()

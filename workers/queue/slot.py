@@ -4,33 +4,32 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import fcntl
 import logging
 import os
 import platform
 import re
 import shutil
+import signal
 import sys
-from collections.abc import Callable, Mapping
-from datetime import UTC, datetime, timedelta
+from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
-from typing import IO, TypeVar
+from typing import IO
 
-from procrastinate import BaseRetryStrategy, JobContext, RetryDecision
-from procrastinate.exceptions import ConnectorException
-from procrastinate.job_context import AbortReason
-from procrastinate.jobs import Job
-
-from workers.database.database import QUEUE, TASK, Database, first_line, open_database
+from workers.database import job_queue
+from workers.database.database import Database, open_database
+from workers.database.job_queue import Entry
+from workers.database.notifications import Listener
 from workers.database.statistics import announce_slot
 from workers.process.disk_space import room_for_jobs
+from workers.process.waiting import first_done, retry_while_unavailable
 from workers.process.watchdog import watched
-from workers.queue.fenced_worker import FencedWorker
-from workers.queue.heartbeat import Beat
+from workers.queue.heartbeat import Heartbeat
 from workers.queue.janitor import Janitor, release_worker
 from workers.run.attempt import Attempt
-from workers.run.claim import Claim, Fenced, claim_job, insist
-from workers.settings.errors import LimitReached, SetupError
+from workers.run.claim import Claim, Fenced, claim_job
+from workers.settings.errors import LimitReached, SetupError, Unavailable
 from workers.settings.logs import about, set_up_logging
 from workers.settings.settings import Settings
 from workers.settings.traces import set_up_traces, span
@@ -40,26 +39,8 @@ from workers.store.store_identity import require_same_store
 log = logging.getLogger(__name__)
 
 EXIT_FENCED = 75
-NEVER_S = 10 * 365 * 86_400.0
 STORE_PATIENCE_S = 180.0  # a job that has run for an hour waits for its store to come back
-T = TypeVar("T")
-
-
-class BackToQueue(Exception):
-    """Tells the queue engine to offer the job again, after some seconds."""
-
-    def __init__(self, after_s: float = 0) -> None:
-        super().__init__(after_s)
-        self.after_s = after_s
-
-
-class OfferAgain(BaseRetryStrategy):
-    """No cap on the engine's side: attempts are counted in the job, where shutdowns do not count."""
-
-    def get_retry_decision(self, *, exception: BaseException, job: Job) -> RetryDecision:
-        """At once, unless the job was sent back to wait."""
-        wait_s = exception.after_s if isinstance(exception, BackToQueue) else 0
-        return RetryDecision(retry_at=datetime.now(UTC) + timedelta(seconds=wait_s))
+HOST = platform.node() or "localhost"
 
 
 class SlotLock:
@@ -69,7 +50,7 @@ class SlotLock:
         """Take the lock; raises `SetupError` where another process holds it."""
         folder = data_dir / "slots"
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{platform.node() or 'localhost'}.{name}"
+        path = folder / f"{HOST}.{name}"
         self._file: IO[str] = path.open("a+")
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # freed by the kernel, however we die
@@ -89,7 +70,7 @@ class SlotLock:
 
 
 class Slot:
-    """Claims jobs from the queue and runs them one after the other until told to stop."""
+    """Takes jobs from the queue and runs them one after the other until told to stop."""
 
     def __init__(self, settings: Settings, name: str) -> None:
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", name):
@@ -97,9 +78,8 @@ class Slot:
         self._settings, self._name = settings, name
         self._files = open_files(settings, patience_s=STORE_PATIENCE_S)
         self._lock = SlotLock(settings.data_dir, name)
-        self._scratch = settings.scratch_dir / f"{platform.node() or 'localhost'}.{name}"
-        self._running: set[int] = set()
-        self._worker: FencedWorker | None = None
+        self._scratch = settings.scratch_dir / f"{HOST}.{name}"
+        self._stop = asyncio.Event()
 
     async def run(self) -> None:
         """Until SIGTERM or SIGINT. A running job then writes a checkpoint and goes back to the queue."""
@@ -115,68 +95,115 @@ class Slot:
             ) as database,
         ):
             if (predecessor := self._lock.predecessor) is not None:
-                await insist(lambda: release_worker(database, predecessor))
+                await retry_while_unavailable(lambda: release_worker(database, predecessor))
             await require_same_store(database, self._files)
-            self._register(database)
-            worker = self._worker = FencedWorker(
-                database,
-                queues=[QUEUE],
-                name=self._name,
-                concurrency=1,
-                shutdown_graceful_timeout=0.1,  # the attempt writes its checkpoint after this, see `_relay`
-                update_heartbeat_interval=NEVER_S,  # see Beat
-                # It would prune living workers at our start, right after an outage; see Janitor.
-                stalled_worker_timeout=NEVER_S,
-                fetch_job_polling_interval=self._settings.poll_s,
-                abort_job_polling_interval=self._settings.poll_s,
-            )
-            # Time for a second try, on another connection, before anybody takes us for dead.
-            in_time_s = self._settings.stall_s / 3
-            beat = Beat(database.url, self._settings.beat_s, self._worker_id, answer_s=in_time_s)
-            beat.start()
-            janitor = Janitor(database, self._files, self._settings, self._worker_id, self._running)
-            side = [asyncio.create_task(janitor.run()), asyncio.create_task(self._remember(database))]
-            try:
-                log.info("slot %s is ready", self._name)
-                await worker.run()
-            finally:
-                beat.end()
-                for task in side:
-                    task.cancel()
+            async with self._registered(database) as worker_id:
+                listener = Listener(database, self._settings.poll_s, job_queue.CHANNEL, job_queue.subject_of)
+                janitor = Janitor(database, self._files, self._settings)
+                side = [asyncio.create_task(listener.run()), asyncio.create_task(janitor.run())]
+                try:
+                    log.info("slot %s is ready", self._name)
+                    await self._work(database, listener, worker_id)
+                finally:
+                    for task in side:
+                        task.cancel()
 
-    def _worker_id(self) -> int | None:
-        return self._worker.worker_id if self._worker is not None else None
+    @contextlib.asynccontextmanager
+    async def _registered(self, database: Database) -> AsyncIterator[int]:
+        """This slot's id as a worker of the queue, which gives signs of life until the end."""
 
-    async def _remember(self, database: Database) -> None:
-        while (worker_id := self._worker_id()) is None:
-            await asyncio.sleep(0.01)
+        async def register() -> int:
+            async with database.transaction() as connection:
+                return await job_queue.register_worker(connection)
+
+        worker_id = await retry_while_unavailable(register)
         self._lock.remember(worker_id)
-        host = platform.node() or "localhost"
-        await insist(lambda: announce_slot(database, host, self._name, worker_id))
+        await retry_while_unavailable(lambda: announce_slot(database, HOST, self._name, worker_id))
+        # Time for a second try, on another connection, before a janitor takes us for dead.
+        in_time_s = self._settings.stall_s / 3
+        heartbeat = Heartbeat(database.url, self._settings.beat_s, worker_id, answer_s=in_time_s)
+        heartbeat.start()
+        try:
+            yield worker_id
+        finally:
+            heartbeat.end()
+            with contextlib.suppress(Unavailable):  # then a janitor does it
+                async with database.transaction() as connection:
+                    await job_queue.unregister_worker(connection, worker_id)
 
-    def _register(self, database: Database) -> None:
-        @database.app.task(name=TASK, queue=QUEUE, pass_context=True, retry=OfferAgain())
-        async def refine(context: JobContext, job_id: str) -> None:
-            queue_id = context.job.id
-            assert queue_id is not None, "fetched from the database"
-            self._running.add(queue_id)
+    async def _work(self, database: Database, listener: Listener, worker_id: int) -> None:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            asyncio.get_running_loop().add_signal_handler(number, self._stop.set)
+        with listener.waiting(job_queue.NEW_ENTRY) as added:
+            while not self._stop.is_set():
+                added.clear()
+                try:
+                    async with database.transaction() as connection:
+                        entry = await job_queue.take(connection, worker_id)
+                except Unavailable as error:
+                    log.warning("no job can be taken: %s", error)
+                    entry = None
+                if entry is None:
+                    await first_done(added.wait(), self._stop.wait(), asyncio.sleep(self._settings.poll_s))
+                else:
+                    await self._work_on(database, listener, entry, worker_id)
+
+    async def _work_on(self, database: Database, listener: Listener, entry: Entry, worker_id: int) -> None:
+        with about(job_id=entry.job_id):
             try:
-                with about(job_id=job_id):
-                    if not await _relay(asyncio.create_task(self._has_room(database, job_id)), lambda: None):
-                        raise BackToQueue(self._settings.stall_s / 4)
-                    again = await self._run_job(database, context, job_id)
+                again_in_s = await self._run_job(database, listener, entry)
             except Fenced as fenced:
                 log.warning("%s; leaving", fenced)
-                # Without a word to the queue: its row belongs to the new owner.
-                os._exit(EXIT_FENCED)
-            finally:
-                self._running.discard(queue_id)
-            if again:
-                raise BackToQueue
+                os._exit(EXIT_FENCED)  # without a word to the queue: its entry belongs to the new owner
+            except Exception:  # a fault of ours; another slot may do better, and this one goes on
+                log.exception("the job goes back to the queue")
+                again_in_s = self._settings.stall_s / 4
+
+            async def acknowledge() -> bool:
+                async with database.transaction() as connection:
+                    return await job_queue.acknowledge(connection, entry.id, worker_id, again_in_s=again_in_s)
+
+            if not await retry_while_unavailable(acknowledge):
+                log.warning("queue entry %d is not ours any more", entry.id)
+
+    async def _run_job(self, database: Database, listener: Listener, entry: Entry) -> float | None:
+        """In how many seconds the queue offers the job again; none where it is over."""
+        if not await self._has_room(database, entry.job_id):
+            return self._settings.stall_s / 4
+        claim = await claim_job(database, entry.job_id, self._settings.max_attempts)
+        if claim is None:
+            return None
+        log.info("attempt %s begins", claim.name)
+        folder = self._scratch / f"{entry.job_id}-{claim.name}"
+        attempt = Attempt(database, self._files, self._settings, claim, folder, self._variables())
+        watching = asyncio.create_task(self._stop_when_asked(database, listener, entry, attempt))
+        try:
+            return 0.0 if await self._traced(database, attempt, claim) else None
+        finally:
+            watching.cancel()
+
+    async def _stop_when_asked(
+        self, database: Database, listener: Listener, entry: Entry, attempt: Attempt
+    ) -> None:
+        """Stop the attempt when its job is cancelled, or when this slot is told to end."""
+        with listener.waiting(str(entry.id)) as changed:
+            while True:
+                changed.clear()
+                if self._stop.is_set():
+                    attempt.ask_stop("shutdown")
+                with contextlib.suppress(Unavailable):
+                    rows = await database.fetch(
+                        "SELECT 1 FROM jobs WHERE id = %s AND cancel_requested", entry.job_id
+                    )
+                    if rows:
+                        attempt.ask_stop("cancel")
+                        return
+                stopped = [] if self._stop.is_set() else [self._stop.wait()]
+                await first_done(changed.wait(), asyncio.sleep(self._settings.poll_s), *stopped)
 
     async def _has_room(self, database: Database, job_id: str) -> bool:
         """Whether the job's files fit on the local disk; where not, another host may have room now, or we later."""
-        rows = await insist(
+        rows = await retry_while_unavailable(
             lambda: database.fetch(
                 "SELECT sum(file.size)::bigint AS bytes FROM jobs"
                 " JOIN dataset_files AS file ON file.dataset_id = jobs.dataset_id WHERE jobs.id = %s",
@@ -190,29 +217,13 @@ class Slot:
             return False
         return True
 
-    async def _run_job(self, database: Database, context: JobContext, job_id: str) -> bool:
-        claiming = asyncio.create_task(claim_job(database, job_id, self._settings.max_attempts))
-        stopped: list[str] = []
-        claim = await _relay(claiming, lambda: stopped.append("early"))
-        if claim is None:
-            return False
-        log.info("attempt %s begins", claim.name)
-        folder = self._scratch / f"{job_id}-{claim.name}"
-        attempt = Attempt(database, self._files, self._settings, claim, folder, self._variables())
-
-        def ask_stop() -> None:
-            cancelled = context.abort_reason() == AbortReason.USER_REQUEST
-            attempt.ask_stop("cancel" if cancelled else "shutdown")
-
-        if stopped:
-            ask_stop()
-        return await _relay(asyncio.create_task(self._traced(database, attempt, claim)), ask_stop)
-
     async def _traced(self, database: Database, attempt: Attempt, claim: Claim) -> bool:
-        """The attempt, as part of the trace of its submission."""
+        """Run the attempt, as part of the trace of its submission."""
         if self._settings.traces == "off":
             return await attempt.run()
-        rows = await insist(lambda: database.fetch("SELECT trace FROM jobs WHERE id = %s", claim.job_id))
+        rows = await retry_while_unavailable(
+            lambda: database.fetch("SELECT trace FROM jobs WHERE id = %s", claim.job_id)
+        )
         about_it: dict[str, str | int] = {"job": claim.job_id, "number": claim.attempt}
         with span("attempt", parent=rows[0]["trace"] if rows else None, about=about_it):
             return await attempt.run()
@@ -229,21 +240,6 @@ class Slot:
         return variables
 
 
-async def _relay(work: asyncio.Task[T], on_cancel: Callable[[], object]) -> T:
-    """Await ``work`` to its end, turning each cancellation of us into a call of ``on_cancel``.
-
-    The queue engine cancels its task both for a user's wish and for a shutdown, and may do so twice. The work
-    has a database to write to and must not be torn at any await.
-    """
-    while True:
-        try:
-            return await asyncio.shield(work)
-        except asyncio.CancelledError:
-            if work.cancelled():
-                raise
-            on_cancel()
-
-
 def main() -> int:
     """`python -m workers.queue.slot --slot NAME`, settings from the environment."""
     parser = argparse.ArgumentParser(description=main.__doc__)
@@ -251,17 +247,12 @@ def main() -> int:
     arguments = parser.parse_args()
     settings = Settings()
     set_up_logging(arguments.slot, settings)
-    logging.getLogger("procrastinate").setLevel(logging.CRITICAL)  # outcomes are in the job's own history
     try:
         set_up_traces(arguments.slot, settings)
         asyncio.run(Slot(settings, arguments.slot).run())
     except SetupError as error:
         sys.stderr.write(f"{error.detail}\n")
         return 2
-    except ConnectorException as error:
-        # Only while idle; the supervisor starts us again, and until the database is back there is no work.
-        log.error("lost the database: %s", first_line(error))
-        return 1
     return 0
 
 

@@ -18,10 +18,10 @@ from biresnerf.progress import Progress
 from biresnerf.report import Verdict, VerdictName
 from biresnerf.wire.problems import JobError
 from workers.database.database import Database
-from workers.process.waiting import first_done
+from workers.process.waiting import first_done, retry_while_unavailable
 from workers.records import LOG_NAME, Artifact
 from workers.run.child import Child, log_tail
-from workers.run.claim import Claim, Fenced, crashed_too_often, insist
+from workers.run.claim import Claim, Fenced, crashed_too_often
 from workers.run.courier import Courier
 from workers.run.ledger import Ledger
 from workers.run.memory import OomKills, out_of_memory, smaller_options
@@ -100,7 +100,7 @@ class Attempt:
         """Exit status of the process; none where a stop came before it was started."""
         # From the start again where database or store go away, which is no fault of the job.
         staging = asyncio.create_task(
-            insist(lambda: stage_job(self._database, self._files, self._claim, self._folder))
+            retry_while_unavailable(lambda: stage_job(self._database, self._files, self._claim, self._folder))
         )
         await first_done(staging, self._stop.wait())
         if not staging.done():

@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-import asyncio
-import logging
-import time
 import uuid
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from psycopg.types.json import Jsonb
 
 from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import JobKind
 from biresnerf.wire.problems import JobError
-from workers.database.database import QUIET_S, Database
+from workers.database.database import Database
 from workers.jobs.job_completion import finish, finish_cancelled
-from workers.settings.errors import Unavailable
-
-log = logging.getLogger(__name__)
-
-RETRY_S = 0.5
-T = TypeVar("T")
+from workers.process.waiting import retry_while_unavailable
 
 
 class Fenced(BaseException):
@@ -60,7 +51,7 @@ async def claim_job(database: Database, job_id: str, max_attempts: int) -> Claim
     A job whose cancellation was asked for ends ``cancelled``, one that had its attempts ends ``failed``.
     """
     token = uuid.uuid4()
-    return await insist(lambda: _claim(database, job_id, max_attempts, token))
+    return await retry_while_unavailable(lambda: _claim(database, job_id, max_attempts, token))
 
 
 async def _claim(database: Database, job_id: str, max_attempts: int, token: uuid.UUID) -> Claim | None:
@@ -109,16 +100,3 @@ def crashed_too_often(attempts: int, log_tail: str = "") -> JobError:
         hint="Try smaller options (preset fast, a smaller max_image_size) or a machine with more memory.",
         log_tail=log_tail,
     )
-
-
-async def insist(write: Callable[[], Awaitable[T]]) -> T:
-    """The answer of ``write``, tried again for as long as the database or the store is away."""
-    said_at = -QUIET_S
-    while True:
-        try:
-            return await write()
-        except Unavailable as error:
-            if time.monotonic() - said_at > QUIET_S:
-                said_at = time.monotonic()
-                log.warning("%s; trying again until it answers", error)
-            await asyncio.sleep(RETRY_S)

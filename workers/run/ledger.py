@@ -18,8 +18,9 @@ from biresnerf.wire.jobs import EventType
 from biresnerf.wire.problems import JobError
 from workers.database.database import Connection, Database
 from workers.jobs.job_completion import finish, finish_cancelled, trash_attempts
+from workers.process.waiting import retry_while_unavailable
 from workers.records import LOG_NAME, Artifact
-from workers.run.claim import Claim, Fenced, insist
+from workers.run.claim import Claim, Fenced
 
 PREVIEW_KEPT_S = 60.0  # after another one took its place: it may be on its way to somebody
 LOG_LINES_MAX = 20_000  # of one job
@@ -239,7 +240,7 @@ class Ledger:
                     return done  # type: ignore[return-value]
                 return await write(connection)
 
-        return await insist(once)
+        return await retry_while_unavailable(once)
 
 
 async def _add_event(connection: Connection, job_id: str, event: str, data: dict[str, Any]) -> None:

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path, PurePosixPath
 
+from workers.process.waiting import retry_while_unavailable
 from workers.records import LOG_NAME, POSES_NAME, PREVIEW_FOLDER, Artifact
-from workers.run.claim import insist
 from workers.store.files import FileStore
 
 log = logging.getLogger(__name__)
@@ -41,7 +41,9 @@ async def store_result(
     for name in sorted(names, key=lambda name: (name not in FIRST, name)):
         if enough():
             break
-        artifacts.append(await insist(partial(store_artifact, files, prefix, name, names[name])))
+        artifacts.append(
+            await retry_while_unavailable(partial(store_artifact, files, prefix, name, names[name]))
+        )
     return sorted(artifacts, key=lambda item: item.name)
 
 

@@ -45,7 +45,7 @@ class Monitor:
         return "" if await self._files.healthy() else "Files cannot be written."
 
     async def _queue_lacks(self) -> str:
-        await self._database.fetch("SELECT 1 FROM procrastinate_jobs LIMIT 1")
+        await self._database.fetch("SELECT 1 FROM queue_entries LIMIT 1")
         done = {row["name"] for row in await self._database.fetch("SELECT name FROM schema_steps")}
         missing = [name for name in step_names() if name not in done]
         return f"The database lacks {', '.join(missing)}: run `biresnerf migrate`." if missing else ""

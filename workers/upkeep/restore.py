@@ -57,7 +57,7 @@ def _forget_lost_checkpoints(url: str, index: BackupIndex) -> None:
 
 def _require_empty(url: str) -> None:
     with psycopg.connect(url, connect_timeout=10) as connection:
-        row = connection.execute("SELECT to_regclass('jobs'), to_regclass('procrastinate_jobs')").fetchone()
+        row = connection.execute("SELECT to_regclass('jobs'), to_regclass('queue_entries')").fetchone()
     if row is None or any(row):
         raise SetupError(
             "database_not_empty",

@@ -12,7 +12,8 @@ import pytest
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.jobs import PriorityName
 from tests.workers.conftest import ready_dataset
-from workers.database.database import QUEUE, Connection, Database, open_database
+from workers.database import job_queue
+from workers.database.database import Database, open_database
 from workers.engine import Stores, open_stores
 from workers.jobs.job_completion import finish
 from workers.run.claim import claim_job
@@ -50,13 +51,13 @@ class Line:
 
     async def start(self) -> str:
         """The name of the job that a free worker gets now; empty where it gets none."""
-        rows = await self.database.fetch(
-            "SELECT args ->> 'job_id' AS job FROM procrastinate_fetch_job_v2(ARRAY[%s::varchar], NULL)", QUEUE
-        )
-        if not rows or rows[0]["job"] is None:
+        async with self.database.transaction() as connection:
+            worker_id = await job_queue.register_worker(connection)
+            entry = await job_queue.take(connection, worker_id)
+        if entry is None:
             return ""
-        assert await claim_job(self.database, rows[0]["job"], 3) is not None
-        return self.ids[rows[0]["job"]]
+        assert await claim_job(self.database, entry.job_id, 3) is not None
+        return self.ids[entry.job_id]
 
     async def end(self, name: str) -> None:
         (job_id,) = [key for key, value in self.ids.items() if value == name]
@@ -208,15 +209,15 @@ async def test_a_janitor_and_an_end_that_offer_at_once_offer_no_more_than_the_li
 async def test_a_submit_that_hangs_holds_up_nobody_elses(line: Line, monkeypatch: pytest.MonkeyPatch):
     await line.submit("A0")
     await line.submit("B0")
-    real, reached, go_on = Database.enqueue, asyncio.Event(), asyncio.Event()
+    real, reached, go_on = job_queue.enqueue, asyncio.Event(), asyncio.Event()
 
-    async def hang_once(database: Database, connection: Connection, job_id: str) -> int:
+    async def hang_once(*arguments, **options) -> int:
         if not reached.is_set():
             reached.set()
             await go_on.wait()
-        return await real(database, connection, job_id)
+        return await real(*arguments, **options)
 
-    monkeypatch.setattr(Database, "enqueue", hang_once)
+    monkeypatch.setattr(job_queue, "enqueue", hang_once)
     hanging = asyncio.create_task(line.submit("A1"))
     await reached.wait()
     async with asyncio.timeout(15):

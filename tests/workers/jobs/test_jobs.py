@@ -11,6 +11,7 @@ import pytest
 from biresnerf.errors import InputError
 from biresnerf.options.refine_options import RefineOptions
 from tests.workers.conftest import Slots, ready_dataset
+from workers.database import job_queue
 from workers.database.database import Database, open_database
 from workers.engine import Stores, open_stores
 from workers.settings.errors import Conflict, LimitReached, NotFound, SetupError, Unavailable
@@ -38,17 +39,15 @@ async def test_a_submitted_job_is_queued_with_the_options_asked_for(stores: Stor
 async def test_a_failing_submit_leaves_neither_job_nor_queue_row(
     stores: Stores, dataset_id: str, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ):
-    async def fails_after_the_queue_row(self, connection, job_id):
-        await real(self, connection, job_id)
+    async def fails_after_the_queue_row(*arguments, **options):
+        await real(*arguments, **options)
         raise RuntimeError("the process dies here")
 
-    from workers.database.database import Database
-
-    real = Database.enqueue
-    monkeypatch.setattr(Database, "enqueue", fails_after_the_queue_row)
+    real = job_queue.enqueue
+    monkeypatch.setattr(job_queue, "enqueue", fails_after_the_queue_row)
     with pytest.raises(RuntimeError):
         await stores.jobs.submit(dataset_id, FAST)
-    assert [await rows(settings, table) for table in ("jobs", "procrastinate_jobs", "job_events")] == [
+    assert [await rows(settings, table) for table in ("jobs", "queue_entries", "job_events")] == [
         0,
         0,
         0,
@@ -57,7 +56,7 @@ async def test_a_failing_submit_leaves_neither_job_nor_queue_row(
 
 async def test_job_and_queue_row_are_written_together(stores: Stores, dataset_id: str, settings: Settings):
     await stores.jobs.submit(dataset_id, FAST)
-    assert [await rows(settings, table) for table in ("jobs", "procrastinate_jobs", "job_events")] == [
+    assert [await rows(settings, table) for table in ("jobs", "queue_entries", "job_events")] == [
         1,
         1,
         1,

@@ -7,16 +7,13 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from procrastinate import JobContext
-from procrastinate.jobs import Job, Status
-from procrastinate.retry import RetryDecision
-from procrastinate.utils import utcnow
 
 from biresnerf.options.refine_options import RefineOptions
 from tests.workers.conftest import ready_dataset
-from workers.database.database import QUEUE, Database, open_database
+from workers.database import job_queue
+from workers.database.database import Database, open_database
+from workers.database.job_queue import Entry
 from workers.engine import Stores
-from workers.queue.fenced_worker import FencedWorker
 from workers.queue.janitor import Janitor
 from workers.run import claim as claims
 from workers.run.attempt import Attempt
@@ -28,7 +25,6 @@ from workers.store.file_places import LocalPlace
 from workers.store.files import FileStore
 
 pytestmark = pytest.mark.anyio
-AGAIN = RetryDecision(retry_at=utcnow())
 
 
 @pytest.fixture
@@ -37,16 +33,16 @@ async def database(database_url: str) -> AsyncIterator[Database]:
         yield opened
 
 
-async def registered(database: Database) -> FencedWorker:
-    worker = FencedWorker(database, queues=[QUEUE])
-    worker.worker_id = await database.app.job_manager.register_worker()
-    return worker
+async def registered(database: Database) -> int:
+    async with database.transaction() as connection:
+        return await job_queue.register_worker(connection)
 
 
-async def fetched(database: Database, worker: FencedWorker) -> Job:
-    job = await database.app.job_manager.fetch_job(queues=[QUEUE], worker_id=worker.worker_id)
-    assert job is not None
-    return job
+async def taken(database: Database, worker_id: int) -> Entry:
+    async with database.transaction() as connection:
+        entry = await job_queue.take(connection, worker_id)
+    assert entry is not None
+    return entry
 
 
 async def queued(stores: Stores) -> str:
@@ -55,26 +51,47 @@ async def queued(stores: Stores) -> str:
     return job.id
 
 
-async def receipt(worker: FencedWorker, job: Job, status: Status, decision: RetryDecision | None) -> None:
-    context = JobContext(app=worker.app, job=job, abort_reason=lambda: None, start_timestamp=0.0)
-    await worker._persist_job_status(job, status, decision, context, None)
+async def acknowledged(database: Database, worker_id: int, entry: Entry, again_in_s: float | None) -> bool:
+    async with database.transaction() as connection:
+        return await job_queue.acknowledge(connection, entry.id, worker_id, again_in_s=again_in_s)
 
 
-@pytest.mark.parametrize("decision", [None, AGAIN])
+@pytest.mark.parametrize("again_in_s", [None, 0])
 async def test_a_late_receipt_leaves_a_row_that_another_worker_has_alone(
-    stores: Stores, database: Database, decision: RetryDecision | None
+    stores: Stores, database: Database, again_in_s: float | None
 ):
     await queued(stores)
     frozen, other = await registered(database), await registered(database)
-    job = await fetched(database, frozen)
-    await receipt(frozen, job, Status.FAILED, AGAIN)
-    await fetched(database, other)
-    await receipt(frozen, job, Status.SUCCEEDED, decision)
-    (row,) = await database.fetch("SELECT status, worker_id FROM procrastinate_jobs")
-    assert (row["status"], row["worker_id"]) == ("doing", other.worker_id)
-    await receipt(other, job, Status.SUCCEEDED, None)
-    (row,) = await database.fetch("SELECT status FROM procrastinate_jobs")
-    assert row["status"] == "succeeded"
+    entry = await taken(database, frozen)
+    assert await acknowledged(database, frozen, entry, 0)
+    assert await taken(database, other) == entry
+    assert not await acknowledged(database, frozen, entry, again_in_s)
+    (row,) = await database.fetch("SELECT state, worker_id FROM queue_entries")
+    assert (row["state"], row["worker_id"]) == ("doing", other)
+    assert await acknowledged(database, other, entry, None)
+    (row,) = await database.fetch("SELECT state FROM queue_entries")
+    assert row["state"] == "succeeded"
+
+
+async def test_an_entry_whose_answer_was_lost_is_the_next_that_its_worker_takes(
+    stores: Stores, database: Database
+):
+    first, _ = await queued(stores), await queued(stores)
+    worker_id = await registered(database)
+    entry = await taken(database, worker_id)  # and the connection broke after the commit
+    assert await taken(database, worker_id) == entry
+    assert entry.job_id == first
+
+
+async def test_an_entry_that_is_put_back_for_later_is_not_offered_before(stores: Stores, database: Database):
+    await queued(stores)
+    worker_id = await registered(database)
+    entry = await taken(database, worker_id)
+    assert await acknowledged(database, worker_id, entry, 0.5)
+    async with database.transaction() as connection:
+        assert await job_queue.take(connection, worker_id) is None
+    await asyncio.sleep(0.6)
+    assert await taken(database, worker_id) == entry
 
 
 async def test_a_job_whose_cancellation_was_answered_is_not_claimed_again(stores: Stores, database: Database):
@@ -110,14 +127,14 @@ async def test_a_machine_that_slept_takes_no_job_from_its_workers(
 ):
     """To who looks at the clock afterwards everybody was silent for long; who goes on being silent is dead."""
     await queued(stores)
-    await fetched(database, await registered(database))
+    await taken(database, await registered(database))
     quick = settings.model_copy(update={"stall_s": 0.8, "janitor_s": 0.1})
-    janitor = Janitor(database, FileStore(LocalPlace(tmp_path / "files")), quick, lambda: None, ())
+    janitor = Janitor(database, FileStore(LocalPlace(tmp_path / "files")), quick)
 
     async def status_after_a_round() -> str:
         await janitor._round()
-        (row,) = await database.fetch("SELECT status FROM procrastinate_jobs")
-        return str(row["status"])
+        (row,) = await database.fetch("SELECT state FROM queue_entries")
+        return str(row["state"])
 
     assert await status_after_a_round() == "doing"
     await asyncio.sleep(2.0)  # longer than the stall time, with every janitor and every beat asleep

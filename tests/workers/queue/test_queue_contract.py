@@ -1,48 +1,75 @@
-"""The names of the queue engine that we lean on beyond its documented surface. Red here: read its changelog."""
+"""What `workers.database.job_queue` needs of Procrastinate. Red here: read its changelog."""
 
 from __future__ import annotations
 
 import asyncio
 import inspect
+from pathlib import Path
 
-import procrastinate
 import psycopg
 import pytest
-from procrastinate import App, JobContext, PsycopgConnector, RetryStrategy
-from procrastinate.job_context import AbortReason
-from procrastinate.manager import get_channel_for_queues
-from procrastinate.worker import Worker
+from procrastinate.connector import BaseAsyncConnector
+from procrastinate.jobs import Job, Status
+from procrastinate.manager import JobManager, get_channel_for_queues
+from procrastinate.schema import SchemaManager
 
-from tests.workers.conftest import Slots
-from workers.database.database import QUEUE, Database, open_database
-from workers.queue.fenced_worker import FencedWorker
+from tests.workers.conftest import ROOT, Slots
+from workers.database import job_queue
+from workers.database.database import Database, open_database
+from workers.database.migrate import migrate
+from workers.jobs.job_rows import queue_job
 from workers.queue.janitor import Janitor, release, release_worker
 from workers.settings.settings import Settings
 from workers.store.file_places import LocalPlace
 from workers.store.files import FileStore
 
-FUNCTIONS = {
-    "procrastinate_cancel_job_v1": "bigint, boolean, boolean",
-    "procrastinate_finish_job_v1": "bigint, procrastinate_job_status, boolean",
-    "procrastinate_retry_job_v2": "bigint, timestamp with time zone, integer, character varying, character varying",
+METHODS = {
+    "defer_job_async": {"job"},
+    "fetch_job": {"queues", "worker_id"},
+    "finish_job_by_id_async": {"job_id", "status", "delete_job"},
+    "retry_job_by_id_async": {"job_id", "retry_at"},
+    "cancel_job_by_id_async": {"job_id", "abort"},
+    "get_stalled_jobs": {"queue", "seconds_since_heartbeat"},
+    "register_worker": set(),
+    "prune_stalled_workers": {"seconds_since_heartbeat"},
+    "delete_old_jobs": {"nb_hours", "include_failed", "include_cancelled", "include_aborted"},
 }
 
 
-def test_the_engine_is_the_minor_version_that_was_tested():
-    assert procrastinate.__version__.startswith("3.10.")
+def test_one_module_knows_procrastinate():
+    files = [
+        file
+        for folder in ("biresnerf", "workers", "service", "benchmarks")
+        for suffix in ("*.py", "*.sql")
+        for file in (ROOT / folder).rglob(suffix)
+        if "procrastinate" in file.read_text().lower()
+    ]
+    assert [file.relative_to(ROOT).as_posix() for file in files] == ["workers/database/job_queue.py"]
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_the_sql_function_exists_with_these_arguments(database_url: str, name: str):
+@pytest.mark.parametrize("name", METHODS)
+def test_the_manager_has_the_method_with_these_arguments(name: str):
+    assert METHODS[name] <= set(inspect.signature(getattr(JobManager, name)).parameters)
+
+
+@pytest.mark.parametrize(
+    "name", ["execute_query_async", "execute_query_one_async", "execute_query_all_async"]
+)
+def test_a_connector_is_asked_by_these_methods(name: str):
+    assert list(inspect.signature(getattr(BaseAsyncConnector, name)).parameters)[:2] == ["self", "query"]
+
+
+def test_an_entry_has_these_fields():
+    wanted = {"queue", "task_name", "priority", "lock", "queueing_lock", "task_kwargs", "scheduled_at", "id"}
+    assert wanted <= {field.name for field in Job.__attrs_attrs__}
+    assert {"SUCCEEDED", "ABORTED"} <= set(Status.__members__)
+
+
+def test_the_columns_that_our_statements_name_exist(database_url: str):
     with psycopg.connect(database_url) as connection:
-        row = connection.execute("SELECT to_regprocedure(%s)", (f"{name}({FUNCTIONS[name]})",)).fetchone()
-    assert row is not None
-    assert row[0] is not None
-
-
-def test_the_columns_the_janitor_reads_exist(database_url: str):
-    with psycopg.connect(database_url) as connection:
-        connection.execute("SELECT id, queue_name, status, worker_id FROM procrastinate_jobs")
+        connection.execute(
+            "SELECT id, queue_name, args, status, worker_id, scheduled_at FROM procrastinate_jobs"
+        )
         connection.execute("SELECT id, last_heartbeat FROM procrastinate_workers")
         states = connection.execute(
             "SELECT unnest(enum_range(NULL::procrastinate_job_status))::text"
@@ -50,36 +77,36 @@ def test_the_columns_the_janitor_reads_exist(database_url: str):
     assert {"todo", "doing", "succeeded", "failed", "cancelled", "aborted"} <= {state for (state,) in states}
 
 
-def test_the_worker_takes_our_arguments_and_shows_its_id():
-    wanted = {
-        *("queues", "name", "concurrency", "shutdown_graceful_timeout", "update_heartbeat_interval"),
-        *("stalled_worker_timeout", "fetch_job_polling_interval", "abort_job_polling_interval"),
-    }
-    assert wanted <= set(inspect.signature(Worker.__init__).parameters)
-    assert Worker(App(connector=PsycopgConnector())).worker_id is None
-
-
-def test_the_receipt_that_is_fenced_is_the_one_the_worker_gives():
-    given = list(inspect.signature(Worker._persist_job_status).parameters)
-    assert given == ["self", "job", "status", "retry_decision", "context", "job_result"]
-    assert list(inspect.signature(FencedWorker._persist_job_status).parameters) == given
-    assert Worker(App(connector=PsycopgConnector()))._job_ids_to_abort == {}
-
-
-def test_the_context_tells_a_users_wish_from_a_shutdown():
-    assert {"USER_REQUEST", "SHUTDOWN"} <= set(AbortReason.__members__)
-    assert "abort_reason" in {field.name for field in JobContext.__attrs_attrs__}
-
-
-def test_a_retry_strategy_without_a_maximum_retries_for_ever():
-    job = procrastinate.jobs.Job(
-        id=1, queue="q", lock=None, queueing_lock=None, task_name="t", attempts=10_000, task_kwargs={}
-    )
-    assert RetryStrategy(wait=0).get_retry_decision(exception=RuntimeError(), job=job) is not None
-
-
 def test_our_wake_up_uses_the_channel_workers_listen_on():
-    assert list(get_channel_for_queues([QUEUE])) == [f"procrastinate_queue_v1#{QUEUE}"]
+    assert list(get_channel_for_queues([job_queue.QUEUE])) == [job_queue.CHANNEL]
+
+
+def test_the_notifications_say_what_they_are_about(database_url: str):
+    with psycopg.connect(database_url, autocommit=True) as connection:
+        connection.execute(f'LISTEN "{job_queue.CHANNEL}"'.encode())
+        connection.execute(
+            "INSERT INTO procrastinate_jobs (id, queue_name, task_name) VALUES (7, %s, 'x')",
+            (job_queue.QUEUE,),
+        )
+        connection.execute("UPDATE procrastinate_jobs SET status = 'doing'")
+        connection.execute("SELECT procrastinate_cancel_job_v1(7, true, false)")
+        heard = [note.payload for note in connection.notifies(timeout=5, stop_after=2)]
+    assert [job_queue.subject_of(payload) for payload in heard] == [job_queue.NEW_ENTRY, "7"]
+
+
+def test_a_newer_version_brings_its_own_changes_of_the_schema(
+    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "03.03.00_01_older.sql").write_text("SELECT an_error;")
+    (tmp_path / "09.00.00_01_newer.sql").write_text(
+        "ALTER TABLE procrastinate_jobs ADD COLUMN novel int, ALTER COLUMN args TYPE json;"
+    )
+    monkeypatch.setattr(SchemaManager, "get_migrations_path", staticmethod(lambda: str(tmp_path)))
+    assert migrate(database_url) == ["000_procrastinate_09.00.00_01_newer"]
+    assert migrate(database_url) == []
+    with psycopg.connect(database_url) as connection:
+        connection.execute("SELECT novel FROM procrastinate_jobs")
+        connection.execute("SELECT id, job_id, state, worker_id FROM queue_entries")
 
 
 @pytest.mark.anyio
@@ -91,19 +118,19 @@ async def test_two_janitors_at_once_release_a_job_once(database_url: str, tmp_pa
                 "INSERT INTO jobs (id, dataset_id, options, fingerprint, state, attempt)"
                 " VALUES ('job_1', 'ds_1', '{}', '', 'running', 1)"
             )
-            queue_id = await one.enqueue(connection, "job_1")
-            await connection.execute("UPDATE jobs SET queue_id = %s", (queue_id,))
-            await connection.execute("UPDATE procrastinate_jobs SET status = 'doing'")
+            await queue_job(connection, "job_1")
+            entry = await job_queue.take(connection, await job_queue.register_worker(connection))
+            assert entry is not None
 
         async def clean(database) -> None:
             async with database.transaction() as connection:
-                await release(connection, queue_id, "worker_lost")
+                await release(connection, entry.id)
 
         await asyncio.gather(clean(one), clean(other), release_worker(one, None), release_worker(other, None))
         (job,) = await one.fetch("SELECT state, attempt, seq FROM jobs")
         assert (job["state"], job["attempt"], job["seq"]) == ("queued", 1, 1)
-        (row,) = await one.fetch("SELECT status FROM procrastinate_jobs")
-        assert row["status"] == "todo"
+        (row,) = await one.fetch("SELECT state FROM queue_entries")
+        assert row["state"] == "todo"
 
 
 @pytest.mark.anyio
@@ -115,16 +142,16 @@ async def test_a_job_that_the_queue_lost_is_queued_again(database_url: str, sett
                 "INSERT INTO jobs (id, dataset_id, options, fingerprint, queue_id, updated_at)"
                 " VALUES ('job_1', 'ds_1', '{}', '', 4711, now() - interval '1 hour')"
             )
-        janitor = Janitor(database, FileStore(LocalPlace(tmp_path / "files")), settings, lambda: None, ())
+        janitor = Janitor(database, FileStore(LocalPlace(tmp_path / "files")), settings)
         await janitor._round()
         (row,) = await database.fetch(
-            "SELECT queue.status FROM jobs JOIN procrastinate_jobs AS queue ON queue.id = jobs.queue_id"
+            "SELECT entry.state FROM jobs JOIN queue_entries AS entry ON entry.id = jobs.queue_id"
         )
-        assert row["status"] == "todo"
+        assert row["state"] == "todo"
 
 
 async def registered(database: Database) -> set[int]:
-    return {row["id"] for row in await database.fetch("SELECT id FROM procrastinate_workers")}
+    return {row["id"] for row in await database.fetch("SELECT id FROM queue_workers")}
 
 
 @pytest.mark.anyio

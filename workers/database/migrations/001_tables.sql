@@ -1,5 +1,5 @@
--- The first schema: tables and indexes. Their functions and triggers follow in 002_functions.sql; the tables of the
--- queue engine (procrastinate_*) lie beside them.
+-- The first schema: tables and indexes. Their functions and triggers follow in 002_functions.sql; the queue's own
+-- tables, views and functions come first, from workers/database/job_queue.py.
 
 -- Tenants, and the keys that identify them. `local` is the tenant of whoever runs the machine. A limit of 0 is no
 -- limit; where a limit is null, tenant_defaults holds.

@@ -93,11 +93,7 @@ BEGIN
             ORDER BY queue_order, queue_id LIMIT _room FOR NO KEY UPDATE SKIP LOCKED
     LOOP
         UPDATE jobs SET held = false WHERE id = _job.id;
-        UPDATE procrastinate_jobs SET scheduled_at = NULL WHERE id = _job.queue_id AND status = 'todo';
-        -- The queue engine notifies of new rows only.
-        PERFORM pg_notify('procrastinate_queue_v1#' || queue_name,
-            json_build_object('type', 'job_inserted', 'job_id', id)::text)
-            FROM procrastinate_jobs WHERE id = _job.queue_id;
+        PERFORM offer_queue_entry(_job.queue_id);
         _offered := _offered + 1;
     END LOOP;
     RETURN _offered;

@@ -1,0 +1,244 @@
+"""The queue of jobs: the one module that knows Procrastinate, which keeps it.
+
+Used of it: its schema and its public `JobManager`, inside transactions of ours. An entry of the queue is ``todo``,
+``doing`` (a worker has it) or over. Its `Worker` is not used: its heartbeats run in the event loop, stop when a worker
+begins to drain, and end the worker when the database is away; at its start it strikes off workers that an outage
+kept silent; and it reports the end of a job without asking whether the entry is still its own. Each of these breaks a
+promise (tests/workers/queue/test_heartbeat.py, test_fenced_worker.py, test_queue_contract.py). The loop of
+`workers.queue.slot` takes its place.
+
+Other SQL reads the queue through the views and writes it through the function that are defined here.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, LiteralString
+
+from procrastinate.connector import BaseAsyncConnector
+from procrastinate.jobs import Job, Status
+from procrastinate.manager import JobManager
+from procrastinate.schema import SchemaManager
+from psycopg import AsyncCursor
+from psycopg.rows import DictRow
+from psycopg.types.json import Jsonb
+
+from workers.database.database import Connection
+
+QUEUE = "refine"
+CHANNEL = f"procrastinate_queue_v1#{QUEUE}"
+NEW_ENTRY = ""  # see `subject_of`
+KEEP_ENTRIES_H = 24
+ALWAYS = datetime(1970, 1, 1, tzinfo=UTC)
+# When a held entry is due, unless `offer_queue_entry` is called.
+NEVER = datetime(9999, 1, 1, tzinfo=UTC)
+
+# Its last migration in the oldest version that we allow. A newer version's are steps of their own.
+SCHEMA_STEP, SCHEMA_UNTIL = "000_procrastinate", "03.04.00_50_post_add_retry_failed_job_procedure"
+_DROP_VIEWS = "DROP VIEW queue_entries, queue_workers;"
+_INTERFACE = """
+CREATE VIEW queue_entries AS
+    SELECT id, args ->> 'job_id' AS job_id, status::text AS state, worker_id FROM procrastinate_jobs;
+CREATE VIEW queue_workers AS SELECT id, last_heartbeat FROM procrastinate_workers;
+
+-- Makes an entry due now, and wakes idle workers: Procrastinate notifies of new entries only.
+CREATE OR REPLACE FUNCTION offer_queue_entry(_id bigint) RETURNS void LANGUAGE plpgsql AS $$
+BEGIN
+    UPDATE procrastinate_jobs SET scheduled_at = NULL WHERE id = _id AND status = 'todo';
+    PERFORM pg_notify('procrastinate_queue_v1#' || queue_name,
+        json_build_object('type', 'job_inserted', 'job_id', id)::text)
+        FROM procrastinate_jobs WHERE id = _id;
+END;
+$$;
+"""
+# Also puts a worker back on the list that was struck off while it was frozen.
+HEARTBEAT: LiteralString = (
+    "INSERT INTO procrastinate_workers (id) OVERRIDING SYSTEM VALUE VALUES (%s)"
+    " ON CONFLICT (id) DO UPDATE SET last_heartbeat = now()"
+)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A job in the queue."""
+
+    id: int
+    job_id: str
+
+
+def schema_steps() -> list[tuple[str, str]]:
+    """Name and SQL of the queue's schema, and of each migration that the installed version adds to it.
+
+    On an empty database the first is enough: it holds the others.
+    """
+    files = sorted(Path(SchemaManager.get_migrations_path()).glob("*.sql"))
+    later = [
+        (f"{SCHEMA_STEP}_{file.stem}", f"{_DROP_VIEWS}\n{file.read_text()}\n{_INTERFACE}")
+        for file in files
+        if file.stem > SCHEMA_UNTIL
+    ]
+    return [(SCHEMA_STEP, f"{SchemaManager.get_schema()}\n{_INTERFACE}"), *later]
+
+
+async def enqueue(connection: Connection, job_id: str, *, order: int, held: bool) -> int:
+    """Add a job and return the entry's id. Lower ``order`` runs earlier; ``held`` waits for `offer_queue_entry`."""
+    job = Job(
+        queue=QUEUE,
+        task_name=QUEUE,
+        priority=-order,
+        lock=None,
+        queueing_lock=None,
+        task_kwargs={"job_id": job_id},
+        scheduled_at=NEVER if held else None,
+    )
+    added = await _manager(connection).defer_job_async(job)
+    assert added.id is not None, "given by the database"
+    return added.id
+
+
+async def take(connection: Connection, worker_id: int) -> Entry | None:
+    """The next entry, for a worker that works on none; none where none is due.
+
+    An entry that the worker has already comes first: the answer that told of it was lost with the connection.
+    """
+    await connection.execute(HEARTBEAT, (worker_id,))
+    held = await _rows(
+        connection,
+        "SELECT id, args ->> 'job_id' AS job_id FROM procrastinate_jobs"
+        " WHERE worker_id = %s AND status = 'doing'",
+        worker_id,
+    )
+    if held:
+        return Entry(held[0]["id"], held[0]["job_id"])
+    job = await _manager(connection).fetch_job(queues=[QUEUE], worker_id=worker_id)
+    return None if job is None or job.id is None else Entry(job.id, str(job.task_kwargs["job_id"]))
+
+
+async def acknowledge(
+    connection: Connection, entry_id: int, worker_id: int, *, again_in_s: float | None
+) -> bool:
+    """End the worker's work on an entry: it is over, or due again in so many seconds.
+
+    False, and nothing is changed, where the entry is another worker's by now.
+    """
+    own = "SELECT 1 FROM procrastinate_jobs WHERE id = %s AND worker_id = %s AND status = 'doing' FOR UPDATE"
+    if not await _rows(connection, own, entry_id, worker_id):
+        return False
+    if again_in_s is None:
+        await _manager(connection).finish_job_by_id_async(entry_id, Status.SUCCEEDED, delete_job=False)
+    else:
+        await put_back(connection, entry_id, again_in_s)
+    return True
+
+
+async def lock_taken(connection: Connection, entry_id: int) -> bool:
+    """Whether some worker has the entry; it stays so until the end of the transaction."""
+    taken = "SELECT 1 FROM procrastinate_jobs WHERE id = %s AND status = 'doing' FOR UPDATE"
+    return bool(await _rows(connection, taken, entry_id))
+
+
+async def put_back(connection: Connection, entry_id: int, in_s: float = 0) -> None:
+    """Offer an entry again that a worker has."""
+    due = datetime.now(UTC) + timedelta(seconds=in_s) if in_s else ALWAYS
+    await _manager(connection).retry_job_by_id_async(entry_id, retry_at=due)
+    if not in_s:
+        await connection.execute("SELECT offer_queue_entry(%s)", (entry_id,))
+
+
+async def abort(connection: Connection, entry_id: int) -> None:
+    """Take an entry out of the queue that a dead worker has."""
+    await _manager(connection).finish_job_by_id_async(entry_id, Status.ABORTED, delete_job=False)
+
+
+async def cancel(connection: Connection, entry_id: int) -> None:
+    """Take a waiting entry out of the queue; wakes the worker that has it, see `subject_of`."""
+    await _manager(connection).cancel_job_by_id_async(entry_id, abort=True)
+
+
+def subject_of(notification: str) -> str:
+    """What a notification on `CHANNEL` is about: `NEW_ENTRY`, or the id of the entry that is to be cancelled."""
+    said = json.loads(notification)
+    return NEW_ENTRY if said["type"] == "job_inserted" else str(said["job_id"])
+
+
+async def register_worker(connection: Connection) -> int:
+    """Put a new worker on the list; it has to give signs of life (`HEARTBEAT`) from now on."""
+    return await _manager(connection).register_worker()
+
+
+async def unregister_worker(connection: Connection, worker_id: int | None) -> None:
+    """Take a worker off the list, or all of them."""
+    await connection.execute("DELETE FROM procrastinate_workers WHERE id = coalesce(%s, id)", (worker_id,))
+
+
+async def entries_of_worker(connection: Connection, worker_id: int | None) -> list[int]:
+    """Entries that the worker has, or any worker, in the order in which they are to be locked."""
+    rows = await _rows(
+        connection,
+        "SELECT id FROM procrastinate_jobs WHERE status = 'doing' AND queue_name = %s"
+        " AND (%s::bigint IS NULL OR worker_id = %s) ORDER BY id",
+        *(QUEUE, worker_id, worker_id),
+    )
+    return [row["id"] for row in rows]
+
+
+async def unregister_silent_workers(connection: Connection, silent_s: float) -> None:
+    """Take off the list who gave no sign of life for so long."""
+    await _manager(connection).prune_stalled_workers(silent_s)
+
+
+async def entries_of_silent_workers(connection: Connection, silent_s: float) -> list[int]:
+    """Entries whose worker is not on the list, or gave no sign of life for so long."""
+    stalled = await _manager(connection).get_stalled_jobs(queue=QUEUE, seconds_since_heartbeat=silent_s)
+    return sorted(job.id for job in stalled if job.id is not None)
+
+
+async def delete_old_entries(connection: Connection) -> None:
+    """Forget entries that were over a day ago."""
+    await _manager(connection).delete_old_jobs(
+        KEEP_ENTRIES_H, include_failed=True, include_cancelled=True, include_aborted=True
+    )
+
+
+class _InTransaction(BaseAsyncConnector):
+    """Runs the engine's queries on a connection of ours. Errors are psycopg's own."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    async def execute_query_async(self, query: LiteralString, **arguments: Any) -> None:
+        await self._run(query, arguments)
+
+    async def execute_query_one_async(self, query: LiteralString, **arguments: Any) -> dict[str, Any]:
+        row = await (await self._run(query, arguments)).fetchone()
+        assert row is not None, "asked only of queries that give a row"
+        return row
+
+    async def execute_query_all_async(self, query: LiteralString, **arguments: Any) -> list[dict[str, Any]]:
+        return await (await self._run(query, arguments)).fetchall()
+
+    async def _run(self, query: LiteralString, arguments: Mapping[str, Any]) -> AsyncCursor[DictRow]:
+        return await self._connection.execute(
+            query, {name: _adapted(value) for name, value in arguments.items()}
+        )
+
+
+def _manager(connection: Connection) -> JobManager:
+    return JobManager(_InTransaction(connection))
+
+
+def _adapted(value: Any) -> Any:
+    """With JSON where the engine has a dict."""
+    if isinstance(value, dict):
+        return Jsonb(value)
+    if isinstance(value, list):
+        return [_adapted(item) for item in value]
+    return tuple(map(_adapted, value)) if isinstance(value, tuple) else value
+
+
+async def _rows(connection: Connection, sql: LiteralString, *parameters: Any) -> list[DictRow]:
+    return await (await connection.execute(sql, parameters)).fetchall()
