@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
-from workers.database.database import open_database
-from workers.database.shared_keys import shared_key
+from workers.database.database import Database, open_database
 from workers.datasets.datasets import DatasetStore
 from workers.datasets.uploads import UploadStore
 from workers.jobs.job_updates import JobListener
@@ -22,6 +22,7 @@ from workers.upkeep.monitor import Monitor
 from workers.webhooks.webhooks import WebhookStore
 
 FOLLOW_POLL_S = 1.5
+KEY_BYTES = 32
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
         listening = asyncio.create_task(listener.run())
         try:
             given = settings.share_key
-            share_key = given.encode() if given else await shared_key(database, "share")
+            share_key = given.encode() if given else await _share_key(database)
             jobs = JobStore(database, listener, settings)
             monitor = Monitor(database, files, settings.stall_s)
             uploads = UploadStore(database, files, settings)
@@ -66,3 +67,13 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
             yield Stores(jobs, datasets, files, uploads, keys, tenants, monitor, webhooks, share_key)
         finally:
             listening.cancel()
+
+
+async def _share_key(database: Database) -> bytes:
+    """A key that every replica has, made by the first to ask. Deleting its row makes a new one at the next start."""
+    await database.fetch(
+        "INSERT INTO server_secrets (name, value) VALUES ('share', %s) ON CONFLICT DO NOTHING",
+        secrets.token_bytes(KEY_BYTES),
+    )
+    (row,) = await database.fetch("SELECT value FROM server_secrets WHERE name = 'share'")
+    return bytes(row["value"])

@@ -61,11 +61,9 @@ _TALLIES = """
         SELECT name, label, bucket, count, amount FROM tallies
         UNION ALL SELECT name, label, bucket, 1, amount FROM tally_log) AS counted
     GROUP BY 1, 2, 3 ORDER BY 1, 2, 3"""
-_QUEUED_AGE = """
-    SELECT coalesce(extract(epoch FROM clock_timestamp() - min(created_at)), 0)::float8 AS age_s
-    FROM jobs WHERE state = 'queued'"""
-
-
+_JOBS = """
+    SELECT state, jobs, greatest(extract(epoch FROM clock_timestamp() - oldest_at), 0)::float8 AS oldest_s
+    FROM job_counts"""
 _WEBHOOKS = """
     SELECT count(*) AS pending,
         greatest(coalesce(extract(epoch FROM clock_timestamp() - min(due_at)), 0), 0)::float8 AS late_s
@@ -76,16 +74,15 @@ async def read_statistics(database: Database, stall_s: float) -> Statistics:
     """Everything in one snapshot; raises `Unavailable`."""
     async with database.transaction() as connection:
         await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
-        jobs = await _rows(connection, "SELECT state, count(*) AS n FROM jobs GROUP BY state")
+        jobs = await _rows(connection, _JOBS)
         datasets = await _rows(connection, "SELECT state, count(*) AS n FROM datasets GROUP BY state")
-        (age,) = await _rows(connection, _QUEUED_AGE)
         (trash,) = await _rows(connection, "SELECT count(*) AS n FROM trash")
         (webhooks,) = await _rows(connection, _WEBHOOKS)
         (bounds,) = await _rows(connection, "SELECT tally_bounds() AS bounds_s")
         return Statistics(
-            jobs={row["state"]: row["n"] for row in jobs},
+            jobs={row["state"]: row["jobs"] for row in jobs},
             datasets={row["state"]: row["n"] for row in datasets},
-            oldest_queued_s=max(0.0, age["age_s"]),
+            oldest_queued_s=next((row["oldest_s"] for row in jobs if row["state"] == "queued"), 0.0),
             slots=tuple(SlotCount(**row) for row in await _rows(connection, _SLOTS, stall_s)),
             trash=trash["n"],
             webhooks_pending=webhooks["pending"],

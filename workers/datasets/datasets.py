@@ -25,6 +25,7 @@ from workers.datasets.dataset_rows import (
     require_open,
     require_place,
 )
+from workers.jobs.job_rows import jobs_of_dataset
 from workers.jobs.quotas import require_byte_quota
 from workers.process.waiting import retry_while_unavailable
 from workers.records import DatasetFile, Page, record_from_row
@@ -277,10 +278,7 @@ class DatasetStore:
         async with self._database.transaction() as connection:
             await locked(connection, dataset_id, self._tenant)
             await self._required(connection, dataset_id)
-            cursor = await connection.execute(
-                "SELECT id, state FROM jobs WHERE dataset_id = %s", (dataset_id,)
-            )
-            users = [f"{job['id']} ({job['state']})" for job in await cursor.fetchall()]
+            users = await jobs_of_dataset(connection, dataset_id)
             if users:
                 raise Conflict(
                     "dataset_in_use", f"Delete first the jobs of {dataset_id}: {', '.join(users[:5])}."

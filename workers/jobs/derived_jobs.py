@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from psycopg import sql
 from psycopg.types.json import Jsonb
 
 from biresnerf.options.formats import ExportName
@@ -15,6 +14,7 @@ from workers.database.database import Connection
 from workers.database.ids import new_id
 from workers.jobs.forks import LATEST_FIRST, plan_fork
 from workers.jobs.job_rows import JOB, asked_columns, fingerprint_of, job_from_row, known_job, one_row
+from workers.jobs.job_states import insert_job, queue_job
 from workers.jobs.jobs import JobStore
 from workers.jobs.quotas import require_room, submitting_for
 from workers.records import PRIORITIES, Page
@@ -156,11 +156,8 @@ class DerivedJobs(JobStore):
     ) -> JobView:
         """A queued job on the dataset of ``parent``, for its tenant."""
         row = {"id": job_id, "dataset_id": parent["dataset_id"], "tenant": parent["tenant"], **values}
-        statement = sql.SQL("INSERT INTO jobs ({}) VALUES ({})").format(
-            sql.SQL(", ").join(map(sql.Identifier, row)), sql.SQL(", ").join([sql.Placeholder()] * len(row))
-        )
-        await connection.execute(statement, list(row.values()))
-        return await self._queue(connection, job_id)
+        await queue_job(connection, await insert_job(connection, row))
+        return job_from_row(await self._required(connection, job_id))
 
 
 def _require_result(parent: Mapping[str, Any]) -> None:

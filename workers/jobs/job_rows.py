@@ -11,7 +11,6 @@ from psycopg.types.json import Jsonb
 
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.jobs import JobEvent, JobProgress, JobView, PriorityName
-from workers.database import job_queue
 from workers.database.database import Connection
 from workers.records import PREVIEW_FOLDER, THUMBNAIL_NAME, priority_name, record_from_row
 from workers.settings.errors import Conflict
@@ -62,12 +61,10 @@ def asked_columns(options: RefineOptions) -> dict[str, Any]:
     return {"options": Jsonb(asked), "planned_steps": options.resolved("cpu").steps}
 
 
-async def queue_job(connection: Connection, job_id: str) -> None:
-    """Put a job into the queue at its turn, in the caller's transaction."""
-    row = await one_row(connection, "SELECT queue_order, held FROM jobs WHERE id = %s", job_id)
-    assert row is not None, "the caller has written it"
-    entry_id = await job_queue.enqueue(connection, job_id, order=row["queue_order"], held=row["held"])
-    await connection.execute("UPDATE jobs SET queue_id = %s WHERE id = %s", (entry_id, job_id))
+async def jobs_of_dataset(connection: Connection, dataset_id: str) -> list[str]:
+    """Id and state of each job on the dataset, to show."""
+    cursor = await connection.execute("SELECT id, state FROM jobs WHERE dataset_id = %s", (dataset_id,))
+    return [f"{job['id']} ({job['state']})" for job in await cursor.fetchall()]
 
 
 def fingerprint_of(

@@ -13,10 +13,8 @@ from psycopg.types.json import Jsonb
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.jobs import JobEvent, JobState, JobView, LogLine, PriorityName
 from biresnerf.wire.webhooks import JobWebhook
-from workers.database import job_queue
 from workers.database.database import Connection, Database
 from workers.database.ids import cursor_after, cursor_place, cursor_time, new_id
-from workers.jobs.job_completion import finish_cancelled
 from workers.jobs.job_rows import (
     JOB,
     MINE,
@@ -27,14 +25,14 @@ from workers.jobs.job_rows import (
     job_from_row,
     known_job,
     one_row,
-    queue_job,
 )
+from workers.jobs.job_states import delete_job, insert_job, queue_job, request_cancel
 from workers.jobs.job_updates import JobListener, follow
 from workers.jobs.quotas import require_room, submitting_for
 from workers.records import LOG_NAME, PRIORITIES, Artifact, JobUpdate, Page
 from workers.settings.errors import Conflict, Expired, NotFound
 from workers.settings.settings import Settings
-from workers.settings.traces import traced, traceparent
+from workers.settings.traces import traced
 from workers.tenants.tenants import LOCAL_TENANT
 from workers.webhooks.webhook_records import request_with
 from workers.webhooks.webhooks import add_job_webhook
@@ -90,25 +88,21 @@ class JobStore:
                     return known, False
             await require_room(connection, dataset_id, PRIORITIES[priority], self._settings.max_queued)
             job_id = new_id("job")
-            await connection.execute(
-                "INSERT INTO jobs (id, dataset_id, tenant, priority, options, planned_steps, labels, idempotency_key,"
-                " fingerprint) VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s)",
-                (
-                    *(job_id, dataset_id, tenant, PRIORITIES[priority]),
-                    *(asked["options"], asked["planned_steps"], Jsonb(dict(labels or {}))),
-                    *(idempotency_key, fingerprint),
-                ),
-            )
+            values = {
+                "id": job_id,
+                "dataset_id": dataset_id,
+                "tenant": tenant,
+                "priority": PRIORITIES[priority],
+                **asked,
+                "labels": Jsonb(dict(labels or {})),
+                "idempotency_key": idempotency_key,
+                "fingerprint": fingerprint,
+            }
+            added = await insert_job(connection, values)
             if webhook is not None:
                 await add_job_webhook(connection, self._settings, tenant, job_id, webhook)
-            return await self._queue(connection, job_id), True
-
-    async def _queue(self, connection: Connection, job_id: str) -> JobView:
-        """Put a job just written into the queue."""
-        await queue_job(connection, job_id)
-        await connection.execute("UPDATE jobs SET trace = %s WHERE id = %s", (traceparent(), job_id))
-        await connection.execute("SELECT add_job_event(%s, 'queued', '{}')", (job_id,))
-        return job_from_row(await self._required(connection, job_id))
+            await queue_job(connection, added)  # an event that the webhook is to get
+            return job_from_row(await self._required(connection, job_id)), True
 
     async def repeated(
         self,
@@ -170,19 +164,7 @@ class JobStore:
         partial. The first request decides. A job already final is returned as it is. Raises `NotFound`.
         """
         async with self._database.transaction() as connection:
-            changed = await one_row(
-                connection,
-                "UPDATE jobs SET cancel_requested = true, keep_partial = %s"
-                f" WHERE id = %s AND {MINE} AND state IN ('queued', 'running') AND NOT cancel_requested"
-                " RETURNING queue_id, state",
-                *(keep_partial, job_id, self._tenant),
-            )
-            if changed is not None:
-                await job_queue.cancel(connection, changed["queue_id"])
-                if changed["state"] == "queued":  # perhaps after an attempt that has shown something
-                    await finish_cancelled(connection, job_id, stall_s=self._settings.stall_s)
-                else:
-                    await connection.execute("SELECT add_job_event(%s, 'cancel_requested', '{}')", (job_id,))
+            await request_cancel(connection, job_id, self._tenant, keep_partial, self._settings.stall_s)
             return job_from_row(await self._required(connection, job_id))
 
     async def delete(self, job_id: str) -> None:
@@ -204,9 +186,7 @@ class JobStore:
             )
             if busy is not None:
                 raise Conflict("state_conflict", f"Its export {busy['id']} is not over; cancel that first.")
-            # Its files, and its exports with theirs, go with it.
-            await connection.execute("DELETE FROM jobs WHERE id = %s", (job_id,))
-            await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job_id,))
+            await delete_job(connection, job_id)
 
     async def events(self, job_id: str, *, after: int = 0, limit: int = 1000) -> tuple[JobEvent, ...]:
         """The history after ``seq == after``, gapless and in order; raises `NotFound`."""

@@ -8,26 +8,28 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import time
 from collections.abc import Awaitable, Callable
 from functools import partial
 
-from psycopg.types.json import Jsonb
-
 from workers.database import job_queue
 from workers.database.database import Connection, Database
 from workers.database.statistics import fold_tallies
-from workers.jobs.job_completion import finish_cancelled
-from workers.jobs.job_rows import queue_job
+from workers.jobs.job_states import offer_held_jobs, requeue_lost, take_back
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
-from workers.store.trash import take_trash_out
 
 log = logging.getLogger(__name__)
 
 JANITOR_LOCK = 7_201_605
 UPKEEP_S = 3600
+TRASH_AT_ONCE = 20
+# What could not be deleted (a store that answered with an error, a file that came late) is tried again.
+TRASH_AGAIN_S = 60.0
+# A whole job or dataset, as opposed to a checkpoint that was replaced.
+_WHOLE = re.compile(r"(jobs|datasets)/[^/]+")
 
 
 class Janitor:
@@ -74,12 +76,8 @@ class Janitor:
             if row["mine"]:
                 if self._silence_means_death(row["database_age_s"]):
                     await self._release_stalled(connection)
-                await self._requeue_lost(connection)
-                # Ends make room by themselves; this is for limits that were changed, and jobs passed over.
-                await connection.execute(
-                    "SELECT offer_held(tenant)"
-                    " FROM (SELECT DISTINCT tenant FROM jobs WHERE held AND state = 'queued') AS waiting"
-                )
+                await requeue_lost(connection, self._settings.stall_s)
+                await offer_held_jobs(connection)
                 await fold_tallies(connection)
         if time.monotonic() >= self._upkeep_at:
             self._upkeep_at = time.monotonic() + UPKEEP_S
@@ -105,64 +103,44 @@ class Janitor:
 
     async def _release_stalled(self, connection: Connection) -> None:
         for entry_id in await job_queue.entries_of_silent_workers(connection, self._settings.stall_s):
-            await release(connection, entry_id)
+            await take_back(connection, entry_id)
         await job_queue.unregister_silent_workers(connection, self._settings.stall_s)
-
-    async def _requeue_lost(self, connection: Connection) -> None:
-        """Unfinished jobs that the queue does not know (any more)."""
-        cursor = await connection.execute(
-            "SELECT jobs.id FROM jobs LEFT JOIN queue_entries AS entry ON entry.id = jobs.queue_id"
-            " WHERE jobs.state IN ('queued', 'running')"
-            " AND jobs.updated_at < clock_timestamp() - make_interval(secs => %s)"
-            " AND coalesce(entry.state NOT IN ('todo', 'doing'), true) FOR UPDATE OF jobs SKIP LOCKED",
-            (self._settings.stall_s,),
-        )
-        for row in await cursor.fetchall():
-            log.warning("job %s was lost by the queue; queueing it again", row["id"])
-            await connection.execute(
-                "UPDATE jobs SET state = 'queued', run_token = NULL WHERE id = %s", (row["id"],)
-            )
-            await queue_job(connection, row["id"])
-            await connection.execute(
-                "SELECT add_job_event(%s, 'requeued', %s)", (row["id"], Jsonb({"why": "lost"}))
-            )
-
-
-async def release(connection: Connection, entry_id: int) -> None:
-    """Take a queue entry from a worker that is gone, in the caller's transaction.
-
-    The job goes back to the queue (its attempt stays counted); one that should be cancelled, or is final
-    already, leaves the queue. The token is dropped, so a worker that was only asleep is fenced from here on.
-    """
-    cursor = await connection.execute(
-        "SELECT id, cancel_requested FROM jobs"
-        " WHERE queue_id = %s AND state IN ('queued', 'running') FOR UPDATE",  # of these there is an index
-        (entry_id,),
-    )
-    job = await cursor.fetchone()
-    if not await job_queue.lock_taken(connection, entry_id):
-        return  # it came to an end in the meantime
-    if job is None:  # or final
-        await job_queue.abort(connection, entry_id)
-        return
-    log.warning("taking job %s back: its worker is gone", job["id"])
-    if job["cancel_requested"]:
-        await connection.execute("UPDATE jobs SET run_token = NULL WHERE id = %s", (job["id"],))
-        await finish_cancelled(connection, job["id"])
-        await job_queue.abort(connection, entry_id)
-        return
-    await connection.execute(
-        "UPDATE jobs SET state = 'queued', run_token = NULL, eta_s = NULL WHERE id = %s", (job["id"],)
-    )
-    await connection.execute(
-        "SELECT add_job_event(%s, 'requeued', %s)", (job["id"], Jsonb({"why": "worker_lost"}))
-    )
-    await job_queue.put_back(connection, entry_id)
 
 
 async def release_worker(database: Database, worker_id: int | None) -> None:
     """Release all of a worker known to be dead, at once; none means every worker of this database."""
     async with database.transaction() as connection:
         for entry_id in await job_queue.entries_of_worker(connection, worker_id):
-            await release(connection, entry_id)
+            await take_back(connection, entry_id)
         await job_queue.unregister_worker(connection, worker_id)
+
+
+async def take_trash_out(database: Database, files: FileStore) -> None:
+    """Delete files that nothing refers to any more, of at most 20 folders that are due. Raises `Unavailable`.
+
+    Outside of a transaction: a thousand files in a bucket take their time. Safe to run concurrently.
+    """
+    for row in await database.fetch(
+        "SELECT id, prefix, keep FROM trash WHERE not_before <= clock_timestamp() ORDER BY id LIMIT %s",
+        TRASH_AT_ONCE,
+    ):
+        prefix, keep = row["prefix"], row["keep"]
+        doomed = await _below(files, prefix, keep)
+        await files.delete_prefix(prefix, keep=keep)
+        left = await _below(files, prefix, keep)
+        if left:
+            log.error("%d files of %s could not be deleted; trying again", len(left), prefix)
+            await database.fetch(
+                "UPDATE trash SET not_before = clock_timestamp() + make_interval(secs => %s) WHERE id = %s",
+                *(TRASH_AGAIN_S, row["id"]),
+            )
+            continue
+        await database.fetch("DELETE FROM trash WHERE id = %s", row["id"])
+        level = logging.INFO if _WHOLE.fullmatch(prefix) else logging.DEBUG
+        log.log(level, "deleted %s: %d files, %d bytes; none is left", prefix, len(doomed), sum(doomed))
+
+
+async def _below(files: FileStore, prefix: str, keep: str | None) -> list[int]:
+    """Sizes of the files in a folder, less those in its sub-folder ``keep``."""
+    kept = None if keep is None else f"{prefix}/{keep}/"
+    return [file.size for file in await files.list(prefix) if kept is None or not file.key.startswith(kept)]

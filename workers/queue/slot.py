@@ -22,13 +22,13 @@ from workers.database.database import Database, open_database
 from workers.database.job_queue import Entry
 from workers.database.notifications import Listener
 from workers.database.statistics import announce_slot
+from workers.jobs.claim import Claim, Fenced, cancel_requested, claim_job, input_bytes
 from workers.process.disk_space import room_for_jobs
 from workers.process.waiting import first_done, retry_while_unavailable
 from workers.process.watchdog import watched
 from workers.queue.heartbeat import Heartbeat
 from workers.queue.janitor import Janitor, release_worker
 from workers.run.attempt import Attempt
-from workers.run.claim import Claim, Fenced, claim_job
 from workers.settings.errors import LimitReached, SetupError, Unavailable
 from workers.settings.logs import about, set_up_logging
 from workers.settings.settings import Settings
@@ -178,7 +178,7 @@ class Slot:
         attempt = Attempt(database, self._files, self._settings, claim, folder, self._variables())
         watching = asyncio.create_task(self._stop_when_asked(database, listener, entry, attempt))
         try:
-            return 0.0 if await self._traced(database, attempt, claim) else None
+            return 0.0 if await self._traced(attempt, claim) else None
         finally:
             watching.cancel()
 
@@ -192,10 +192,7 @@ class Slot:
                 if self._stop.is_set():
                     attempt.ask_stop("shutdown")
                 with contextlib.suppress(Unavailable):
-                    rows = await database.fetch(
-                        "SELECT 1 FROM jobs WHERE id = %s AND cancel_requested", entry.job_id
-                    )
-                    if rows:
+                    if await cancel_requested(database, entry.job_id):
                         attempt.ask_stop("cancel")
                         return
                 stopped = [] if self._stop.is_set() else [self._stop.wait()]
@@ -203,29 +200,20 @@ class Slot:
 
     async def _has_room(self, database: Database, job_id: str) -> bool:
         """Whether the job's files fit on the local disk; where not, another host may have room now, or we later."""
-        rows = await retry_while_unavailable(
-            lambda: database.fetch(
-                "SELECT sum(file.size)::bigint AS bytes FROM jobs"
-                " JOIN dataset_files AS file ON file.dataset_id = jobs.dataset_id WHERE jobs.id = %s",
-                job_id,
-            )
-        )
+        size = await retry_while_unavailable(lambda: input_bytes(database, job_id))
         try:
-            room_for_jobs(self._settings).require(rows[0]["bytes"] or 0)
+            room_for_jobs(self._settings).require(size)
         except LimitReached as full:
             log.warning("the job waits: %s", full.detail)
             return False
         return True
 
-    async def _traced(self, database: Database, attempt: Attempt, claim: Claim) -> bool:
+    async def _traced(self, attempt: Attempt, claim: Claim) -> bool:
         """Run the attempt, as part of the trace of its submission."""
         if self._settings.traces == "off":
             return await attempt.run()
-        rows = await retry_while_unavailable(
-            lambda: database.fetch("SELECT trace FROM jobs WHERE id = %s", claim.job_id)
-        )
         about_it: dict[str, str | int] = {"job": claim.job_id, "number": claim.attempt}
-        with span("attempt", parent=rows[0]["trace"] if rows else None, about=about_it):
+        with span("attempt", parent=claim.trace, about=about_it):
             return await attempt.run()
 
     def _variables(self) -> Mapping[str, str]:

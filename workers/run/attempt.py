@@ -18,12 +18,12 @@ from biresnerf.progress import Progress
 from biresnerf.report import Verdict, VerdictName
 from biresnerf.wire.problems import JobError
 from workers.database.database import Database
+from workers.jobs.claim import Claim, Fenced, crashed_too_often
+from workers.jobs.ledger import Ledger
 from workers.process.waiting import first_done, retry_while_unavailable
 from workers.records import LOG_NAME, Artifact
 from workers.run.child import Child, log_tail
-from workers.run.claim import Claim, Fenced, crashed_too_often
 from workers.run.courier import Courier
-from workers.run.ledger import Ledger
 from workers.run.memory import OomKills, out_of_memory, smaller_options
 from workers.run.results import store_result
 from workers.run.staging import stage_job

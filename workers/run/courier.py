@@ -13,9 +13,8 @@ from obstore.exceptions import BaseError as StoreError
 
 from biresnerf.progress import Progress
 from biresnerf.stages import ReusableStage
-from workers.run.claim import Fenced
-from workers.run.ledger import Ledger
-from workers.run.log_lines import LogLines
+from workers.jobs.claim import Fenced
+from workers.jobs.ledger import Ledger
 from workers.run.results import files_inside, store_artifact
 from workers.settings.errors import EngineError
 from workers.settings.traces import StageSpans
@@ -24,6 +23,9 @@ from workers.store.files import FileStore
 log = logging.getLogger(__name__)
 
 PERIOD_S = 1.0
+LINE_CHARACTERS_MAX = 2000  # of a line of the log
+LINES_AT_ONCE = 500
+_READ_BYTES = 2**18
 
 
 class Courier:
@@ -36,7 +38,7 @@ class Courier:
         self._ledger, self._files, self._output = ledger, files, output
         self._undroppable: deque[Progress] = deque()
         self._latest: Progress | None = None
-        self._log = LogLines(log_file)
+        self._log = _LogLines(log_file)
         self._checkpoints, self._previews = _Box(), _Box()
         self._reusable: dict[ReusableStage, _Box] = {"seeding": _Box(), "coarse": _Box()}
         self._stored = 0
@@ -184,3 +186,39 @@ class _Box:
     def put(self, progress: Progress) -> None:
         self.latest = progress
         self.due.set()
+
+
+class _LogLines:
+    """Gives each line of a file once, as soon as it is whole."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._offset, self._rest = path, 0, b""
+        self._lines: list[str] = []
+
+    def fresh(self, *, last: bool) -> list[str]:
+        """The next lines, `LINES_AT_ONCE` at most; none if there are no more. ``last``: the file is whole."""
+        while len(self._lines) < LINES_AT_ONCE and (read := self._read()):
+            *whole, self._rest = (self._rest + read).split(b"\n")
+            if len(self._rest) > _READ_BYTES:  # no line at all; its beginning will do
+                whole, self._rest = [*whole, self._rest], b""
+            self._lines += map(_shown, whole)
+        if last and self._rest and len(self._lines) < LINES_AT_ONCE:
+            self._lines, self._rest = [*self._lines, _shown(self._rest)], b""
+        given, self._lines = self._lines[:LINES_AT_ONCE], self._lines[LINES_AT_ONCE:]
+        return given
+
+    def _read(self) -> bytes:
+        try:
+            with self._path.open("rb") as file:
+                file.seek(self._offset)
+                read = file.read(_READ_BYTES)
+        except FileNotFoundError:
+            return b""
+        self._offset += len(read)
+        return read
+
+
+def _shown(line: bytes) -> str:
+    # A progress bar overwrites itself; what it showed last is the line. The database stores no NUL in text.
+    text = line.decode(errors="replace").rstrip("\r").rpartition("\r")[2].replace("\0", "\ufffd")
+    return text if len(text) <= LINE_CHARACTERS_MAX else text[: LINE_CHARACTERS_MAX - 1] + "\u2026"

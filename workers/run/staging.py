@@ -10,8 +10,7 @@ from typing import Any
 
 from biresnerf.options.formats import formats
 from workers.database.database import Database
-from workers.run.claim import Claim
-from workers.settings.errors import NotFound
+from workers.jobs.claim import Claim, published_files
 from workers.store.files import FileStore
 
 EXPORTED_FROM = ("poses.json", "colmap/sparse/0/")  # of a result; all other formats can be made from these
@@ -61,8 +60,6 @@ def _gone_on_from(claim: Claim) -> Iterator[tuple[str, str]]:
 
 async def _stage_result(database: Database, files: FileStore, claim: Claim, folder: Path) -> None:
     folder.mkdir()
-    rows = await database.fetch("SELECT artifacts FROM jobs WHERE id = %s", claim.parent)
-    if not rows:
-        raise NotFound(f"No job {claim.parent}.")
-    found = [(item["key"], item["name"]) for item in rows[0]["artifacts"]]
+    assert claim.parent is not None, "an export has one"
+    found = await published_files(database, claim.parent)
     await files.stage((pair for pair in found if pair[1].startswith(EXPORTED_FROM)), folder)

@@ -1,7 +1,7 @@
 """Tenants: who owns datasets and jobs, what share of the service each gets, and how much of it at most.
 
 A store bound to a tenant sees nothing of the others. Turns and limits are kept by the database itself
-(migration 008), so they hold for every way a job comes in.
+(`give_turn` in its schema), so they hold for every way a job comes in.
 """
 
 from __future__ import annotations
@@ -50,10 +50,7 @@ class TenantStore:
         """All tenants, by name, or the one."""
         rows = await self._database.fetch(
             "SELECT tenant_limits.*, coalesce(running, 0) AS running, coalesce(queued, 0) AS queued,"
-            " stored_bytes_of(id) AS stored_bytes FROM tenant_limits LEFT JOIN LATERAL"
-            " (SELECT count(*) FILTER (WHERE state = 'running') AS running,"
-            "  count(*) FILTER (WHERE state = 'queued') AS queued FROM jobs"
-            "  WHERE jobs.tenant = tenant_limits.id AND state IN ('queued', 'running')) AS used ON true"
+            " stored_bytes_of(id) AS stored_bytes FROM tenant_limits LEFT JOIN tenant_jobs ON tenant = id"
             " WHERE id = coalesce(%s, id) ORDER BY id",
             tenant,
         )

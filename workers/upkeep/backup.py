@@ -36,14 +36,7 @@ from workers.upkeep.backup_folder import (
 
 log = logging.getLogger(__name__)
 
-_NAMED = """
-    SELECT key FROM dataset_files
-    UNION SELECT item ->> 'key' FROM jobs, jsonb_array_elements(artifacts) AS item
-    UNION SELECT item ->> 'key' FROM jobs, jsonb_array_elements(previews -> 'artifacts') AS item
-    UNION SELECT (part.value ->> 'prefix') || '/' || name FROM jobs, jsonb_each(reusable) AS part,
-        jsonb_array_elements_text(part.value -> 'files') AS name
-    UNION SELECT (checkpoint ->> 'prefix') || '/' || name
-        FROM jobs, jsonb_array_elements_text(checkpoint -> 'files') AS name WHERE checkpoint IS NOT NULL"""
+_NAMED = "SELECT key FROM dataset_files UNION SELECT key FROM job_file_keys"
 _STEPS = "SELECT name FROM schema_steps ORDER BY name"
 
 

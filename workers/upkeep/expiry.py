@@ -1,19 +1,18 @@
 """Lets results, unused datasets, old records and idempotency keys go when their time is over.
 
 Files go through the trash, in the transaction that makes them unreachable; that they are gone is in the log of
-who takes the trash out (`workers.store.trash`). Each row expires once, however many dispatchers run.
+who takes the trash out (`workers.queue.janitor`). Each row expires once, however many dispatchers run.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from typing import Any
 
 import psycopg
-from psycopg.types.json import Jsonb
 
 from workers.database.database import Connection, Database
+from workers.jobs.job_expiry import date_jobs, delete_expired_jobs, expire_jobs, forget_keys
 from workers.process.waiting import first_done
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
@@ -23,17 +22,12 @@ log = logging.getLogger(__name__)
 BATCH = 100
 # One dispatcher at a time keeps the dates up and deletes; the others have webhooks to send.
 EXPIRY_LOCK = 7_201_606
-_DATE_JOBS = """
-    UPDATE jobs SET expires_at = finished_at + make_interval(secs => %s)
-    WHERE finished_at IS NOT NULL AND state <> 'expired'
-        AND expires_at IS DISTINCT FROM finished_at + make_interval(secs => %s)"""
 _DATE_DATASETS = """
     UPDATE datasets SET expires_at = due.at FROM (
-        SELECT datasets.id, CASE WHEN count(*) FILTER (WHERE jobs.state IN ('queued', 'running')) = 0 THEN
-            greatest(max(datasets.touched_at), max(jobs.created_at), max(jobs.finished_at))
-            + make_interval(secs => %s) END AS at
-        FROM datasets LEFT JOIN jobs ON jobs.dataset_id = datasets.id
-        WHERE datasets.state IN ('open', 'ready', 'rejected') GROUP BY datasets.id) AS due
+        SELECT id, CASE WHEN coalesce(unfinished, 0) = 0 THEN
+            greatest(touched_at, used_at) + make_interval(secs => %s) END AS at
+        FROM datasets LEFT JOIN dataset_jobs ON dataset_id = id
+        WHERE state IN ('open', 'ready', 'rejected')) AS due
     WHERE due.id = datasets.id AND datasets.expires_at IS DISTINCT FROM due.at"""
 DAY_S = 86_400.0
 
@@ -71,38 +65,13 @@ class Expiry:
         async with self._database.transaction() as connection:
             if not await _mine(connection):
                 return False
-            await connection.execute(_DATE_JOBS, (results_s, results_s))
+            await date_jobs(connection, results_s)
             await connection.execute(_DATE_DATASETS, (datasets_s,))
         return True
 
     async def _expire_jobs(self) -> int:
         async with self._database.transaction() as connection:
-            cursor = await connection.execute(
-                "SELECT id, tenant, finished_at, artifacts FROM jobs WHERE expires_at <= clock_timestamp()"
-                " AND state IN ('succeeded', 'failed', 'cancelled')"
-                # An export or a fork that waits or runs still reads its files.
-                " AND NOT EXISTS (SELECT 1 FROM jobs AS heir WHERE jobs.id IN (heir.parent, heir.forked_from)"
-                " AND heir.state IN ('queued', 'running'))"
-                " ORDER BY expires_at LIMIT %s FOR UPDATE SKIP LOCKED",
-                (BATCH,),
-            )
-            due = await cursor.fetchall()
-            for job in due:
-                await self._expire_job(connection, job)
-        return len(due)
-
-    async def _expire_job(self, connection: Connection, job: dict[str, Any]) -> None:
-        size = sum(item["size"] for item in job["artifacts"])
-        what = {"files": len(job["artifacts"]), "bytes": size}
-        await connection.execute(
-            "UPDATE jobs SET state = 'expired', artifacts = '[]', checkpoint = NULL, previews = NULL,"
-            " reusable = '{}' WHERE id = %s",
-            (job["id"],),
-        )
-        await connection.execute("SELECT add_job_event(%s, 'expired', %s)", (job["id"], Jsonb(what)))
-        await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (f"jobs/{job['id']}",))
-        over = f"{job['finished_at']:%Y-%m-%d %H:%M} UTC"
-        log.info("expired %s of %s, over since %s: %s", job["id"], job["tenant"], over, what)
+            return await expire_jobs(connection, BATCH)
 
     async def _expire_datasets(self) -> int:
         rows = await self._database.fetch(
@@ -123,7 +92,7 @@ class Expiry:
                 "UPDATE datasets SET state = 'expired', revision = revision + 1 WHERE id = %s"
                 " AND state IN ('open', 'ready', 'rejected') AND expires_at <= clock_timestamp()"
                 " AND touched_at < clock_timestamp() - make_interval(secs => %s)"
-                " AND NOT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = datasets.id AND (state IN ('queued', 'running')"
+                " AND NOT EXISTS (SELECT 1 FROM dataset_jobs WHERE dataset_id = datasets.id AND (unfinished > 0"
                 " OR finished_at > clock_timestamp() - make_interval(secs => %s)))"
                 " AND NOT EXISTS (SELECT 1 FROM uploads WHERE dataset_id = datasets.id"
                 " AND expires_at > clock_timestamp() AND state IN ('receiving', 'received'))"
@@ -146,19 +115,17 @@ class Expiry:
 
     async def _forget(self) -> None:
         """Idempotency keys a while after their jobs; then the records of what expired, and of deliveries."""
-        await self._database.fetch(
-            "UPDATE jobs SET idempotency_key = NULL WHERE idempotency_key IS NOT NULL"
-            " AND finished_at < clock_timestamp() - make_interval(secs => %s)",
-            self._settings.keep_keys_hours * 3600,
-        )
+        async with self._database.transaction() as connection:
+            await forget_keys(connection, self._settings.keep_keys_hours * 3600)
         if not self._settings.keep_records_days:
             return
         old_s = self._settings.keep_records_days * DAY_S
+        async with self._database.transaction() as connection:
+            await delete_expired_jobs(connection, old_s)
         for sql in (
-            "DELETE FROM jobs WHERE state = 'expired' AND expires_at < clock_timestamp() - make_interval(secs => %s)",
             "DELETE FROM datasets WHERE state = 'expired'"
             " AND expires_at < clock_timestamp() - make_interval(secs => %s)"
-            " AND NOT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = datasets.id)",
+            " AND NOT EXISTS (SELECT 1 FROM dataset_jobs WHERE dataset_id = datasets.id)",
             "DELETE FROM webhook_deliveries WHERE finished_at < clock_timestamp() - make_interval(secs => %s)",
         ):
             await self._database.fetch(sql, old_s)

@@ -10,6 +10,7 @@ import psycopg
 
 from biresnerf.errors import InputError
 from workers.database.migrate import migrate
+from workers.jobs.job_expiry import FORGET_CHECKPOINTS
 from workers.settings.errors import NotFound, SetupError
 from workers.settings.settings import Settings
 from workers.store.files import CHUNK_BYTES, FileStore, open_files
@@ -50,9 +51,7 @@ def _forget_lost_checkpoints(url: str, index: BackupIndex) -> None:
     """A job whose checkpoint was replaced while the backup was made starts over."""
     lost = list({key.rpartition("/")[0] for key in index.gone})
     with psycopg.connect(url, connect_timeout=10) as connection:
-        connection.execute(
-            "UPDATE jobs SET checkpoint = NULL WHERE checkpoint ->> 'prefix' = ANY (%s)", (lost,)
-        )
+        connection.execute(FORGET_CHECKPOINTS, (lost,))
 
 
 def _require_empty(url: str) -> None:

@@ -15,8 +15,8 @@ from tests.workers.conftest import ready_dataset
 from workers.database import job_queue
 from workers.database.database import Database, open_database
 from workers.engine import Stores, open_stores
-from workers.jobs.job_completion import finish
-from workers.run.claim import claim_job
+from workers.jobs.claim import claim_job
+from workers.jobs.job_states import finish
 from workers.settings.errors import Conflict, LimitReached
 from workers.settings.settings import Settings
 

@@ -14,11 +14,11 @@ from workers.database import job_queue
 from workers.database.database import Database, open_database
 from workers.database.job_queue import Entry
 from workers.engine import Stores
+from workers.jobs import claim as claims
+from workers.jobs.claim import Fenced, claim_job
+from workers.jobs.ledger import Ledger
 from workers.queue.janitor import Janitor
-from workers.run import claim as claims
 from workers.run.attempt import Attempt
-from workers.run.claim import Fenced, claim_job
-from workers.run.ledger import Ledger
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.store.file_places import LocalPlace

@@ -17,8 +17,8 @@ from tests.workers.conftest import ROOT, Slots
 from workers.database import job_queue
 from workers.database.database import Database, open_database
 from workers.database.migrate import migrate
-from workers.jobs.job_rows import queue_job
-from workers.queue.janitor import Janitor, release, release_worker
+from workers.jobs.job_states import insert_job, queue_job, take_back
+from workers.queue.janitor import Janitor, release_worker
 from workers.settings.settings import Settings
 from workers.store.file_places import LocalPlace
 from workers.store.files import FileStore
@@ -114,21 +114,18 @@ async def test_two_janitors_at_once_release_a_job_once(database_url: str, tmp_pa
     async with open_database(database_url) as one, open_database(database_url) as other:
         async with one.transaction() as connection:
             await connection.execute("INSERT INTO datasets (id, name, state) VALUES ('ds_1', 'x', 'ready')")
-            await connection.execute(
-                "INSERT INTO jobs (id, dataset_id, options, fingerprint, state, attempt)"
-                " VALUES ('job_1', 'ds_1', '{}', '', 'running', 1)"
-            )
-            await queue_job(connection, "job_1")
+            job = {"id": "job_1", "dataset_id": "ds_1", "options": "{}", "fingerprint": "", "attempt": 1}
+            await queue_job(connection, await insert_job(connection, {**job, "state": "running"}))
             entry = await job_queue.take(connection, await job_queue.register_worker(connection))
             assert entry is not None
 
         async def clean(database) -> None:
             async with database.transaction() as connection:
-                await release(connection, entry.id)
+                await take_back(connection, entry.id)
 
         await asyncio.gather(clean(one), clean(other), release_worker(one, None), release_worker(other, None))
         (job,) = await one.fetch("SELECT state, attempt, seq FROM jobs")
-        assert (job["state"], job["attempt"], job["seq"]) == ("queued", 1, 1)
+        assert (job["state"], job["attempt"], job["seq"]) == ("queued", 1, 2)
         (row,) = await one.fetch("SELECT state FROM queue_entries")
         assert row["state"] == "todo"
 

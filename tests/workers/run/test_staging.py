@@ -10,7 +10,7 @@ import pytest
 from biresnerf.options.refine_options import RefineOptions
 from tests.workers.conftest import ready_dataset
 from workers.engine import Stores
-from workers.run.claim import claim_job
+from workers.jobs.claim import claim_job
 from workers.run.staging import stage_job
 from workers.settings.settings import Settings
 

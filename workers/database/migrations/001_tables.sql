@@ -189,6 +189,24 @@ CREATE INDEX jobs_over ON jobs (finished_at) WHERE finished_at IS NOT NULL;
 CREATE UNIQUE INDEX jobs_one_export ON jobs (parent, fingerprint)
     WHERE kind = 'export' AND state IN ('queued', 'running', 'succeeded');
 
+-- What is asked of jobs from outside of workers/jobs.
+CREATE VIEW job_counts AS
+    SELECT state, count(*) AS jobs, min(created_at) AS oldest_at FROM jobs GROUP BY state;
+CREATE VIEW tenant_jobs AS
+    SELECT tenant, count(*) FILTER (WHERE state = 'running') AS running, count(*) FILTER (WHERE state = 'queued') AS queued
+    FROM jobs WHERE state IN ('queued', 'running') GROUP BY tenant;
+CREATE VIEW dataset_jobs AS
+    SELECT dataset_id, count(*) FILTER (WHERE state IN ('queued', 'running')) AS unfinished,
+        max(finished_at) AS finished_at, greatest(max(created_at), max(finished_at)) AS used_at
+    FROM jobs GROUP BY dataset_id;
+CREATE VIEW job_file_keys AS
+    SELECT item ->> 'key' AS key FROM jobs, jsonb_array_elements(artifacts) AS item
+    UNION SELECT item ->> 'key' FROM jobs, jsonb_array_elements(previews -> 'artifacts') AS item
+    UNION SELECT (part.value ->> 'prefix') || '/' || name FROM jobs, jsonb_each(reusable) AS part,
+        jsonb_array_elements_text(part.value -> 'files') AS name
+    UNION SELECT (checkpoint ->> 'prefix') || '/' || name
+        FROM jobs, jsonb_array_elements_text(checkpoint -> 'files') AS name WHERE checkpoint IS NOT NULL;
+
 CREATE TABLE job_events (
     job_id text NOT NULL REFERENCES jobs ON DELETE CASCADE,
     seq bigint NOT NULL,

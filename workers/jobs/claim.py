@@ -6,14 +6,13 @@ import uuid
 from dataclasses import dataclass
 from typing import Any
 
-from psycopg.types.json import Jsonb
-
 from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import JobKind
 from biresnerf.wire.problems import JobError
 from workers.database.database import Database
-from workers.jobs.job_completion import finish, finish_cancelled
+from workers.jobs.job_states import finish, finish_cancelled, start_attempt
 from workers.process.waiting import retry_while_unavailable
+from workers.settings.errors import NotFound
 
 
 class Fenced(BaseException):
@@ -38,6 +37,7 @@ class Claim:
     checkpoint: dict[str, Any] | None
     reusable: dict[str, Any]
     forked_stage: ReusableStage | None
+    trace: str | None
 
     @property
     def name(self) -> str:
@@ -69,26 +69,17 @@ async def _claim(database: Database, job_id: str, max_attempts: int, token: uuid
         if row["attempt"] >= max_attempts:
             await finish(connection, job_id, "failed", crashed_too_often(row["attempt"]))
             return None
-        cursor = await connection.execute(
-            "UPDATE jobs SET state = 'running', attempt = attempt + 1, run_token = %s, fraction = 0,"
-            " step = 0, stage = NULL, eta_s = NULL, message = '',"
-            " started_at = coalesce(started_at, clock_timestamp()) WHERE id = %s RETURNING *",
-            (token, job_id),
-        )
-        claimed = await cursor.fetchone()
-        assert claimed is not None, "the row is locked"
-        resumed = Jsonb({"resumed": claimed["checkpoint"] is not None})
-        await connection.execute("SELECT add_job_event(%s, 'started', %s)", (job_id, resumed))
-        return _claimed(claimed, token)
+        return _claimed(await start_attempt(connection, job_id, token), token)
 
 
 def _claimed(row: dict[str, Any], token: uuid.UUID) -> Claim:
-    same = ("dataset_id", "attempt", "kind", "parent", "options", "smaller", "checkpoint", "reusable")
+    same = ("dataset_id", "attempt", "kind", "parent", "options", "smaller")
+    also = ("checkpoint", "reusable", "trace")
     return Claim(
         row["id"],
         token=token,
         forked_stage=row["forked_stage"],
-        **{name: row[name] for name in same},
+        **{name: row[name] for name in (*same, *also)},
     )
 
 
@@ -100,3 +91,26 @@ def crashed_too_often(attempts: int, log_tail: str = "") -> JobError:
         hint="Try smaller options (preset fast, a smaller max_image_size) or a machine with more memory.",
         log_tail=log_tail,
     )
+
+
+async def cancel_requested(database: Database, job_id: str) -> bool:
+    """Whether the job's user wants it to end."""
+    return bool(await database.fetch("SELECT 1 FROM jobs WHERE id = %s AND cancel_requested", job_id))
+
+
+async def input_bytes(database: Database, job_id: str) -> int:
+    """Size of the files that an attempt stages."""
+    (row,) = await database.fetch(
+        "SELECT coalesce(sum(file.size), 0)::bigint AS bytes FROM jobs"
+        " JOIN dataset_files AS file ON file.dataset_id = jobs.dataset_id WHERE jobs.id = %s",
+        job_id,
+    )
+    return int(row["bytes"])
+
+
+async def published_files(database: Database, job_id: str) -> list[tuple[str, str]]:
+    """Key and name of each file of a job's result; raises `NotFound`."""
+    rows = await database.fetch("SELECT artifacts FROM jobs WHERE id = %s", job_id)
+    if not rows:
+        raise NotFound(f"No job {job_id}.")
+    return [(item["key"], item["name"]) for item in rows[0]["artifacts"]]

@@ -17,10 +17,10 @@ from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import EventType
 from biresnerf.wire.problems import JobError
 from workers.database.database import Connection, Database
-from workers.jobs.job_completion import finish, finish_cancelled, trash_attempts
+from workers.jobs.claim import Claim, Fenced
+from workers.jobs.job_states import add_event, finish, finish_cancelled, requeue, trash_attempts
 from workers.process.waiting import retry_while_unavailable
 from workers.records import LOG_NAME, Artifact
-from workers.run.claim import Claim, Fenced
 
 PREVIEW_KEPT_S = 60.0  # after another one took its place: it may be on its way to somebody
 LOG_LINES_MAX = 20_000  # of one job
@@ -52,7 +52,7 @@ class Ledger:
                 ),
             )
             if now.stage != self._stage:
-                await _add_event(connection, self.claim.job_id, "stage", {"stage": now.stage})
+                await add_event(connection, self.claim.job_id, "stage", {"stage": now.stage})
             else:
                 await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (self.claim.job_id,))
 
@@ -72,7 +72,7 @@ class Ledger:
                 "UPDATE jobs SET checkpoint = %s WHERE id = %s",
                 (Jsonb({"prefix": prefix, "files": list(files)}), self.claim.job_id),
             )
-            await _add_event(connection, self.claim.job_id, "checkpoint", {"step": step})
+            await add_event(connection, self.claim.job_id, "checkpoint", {"step": step})
 
         await self._fenced(write)
 
@@ -107,7 +107,7 @@ class Ledger:
                 "UPDATE jobs SET previews = %s WHERE id = %s", (Jsonb(shown), self.claim.job_id)
             )
             data = {"stage": now.stage, "step": now.step, "files": [item.name for item in artifacts]}
-            await _add_event(connection, self.claim.job_id, "preview", data)
+            await add_event(connection, self.claim.job_id, "preview", data)
 
         await self._fenced(write)
 
@@ -212,12 +212,15 @@ class Ledger:
             if await _cancel_requested(connection, self.claim.job_id):
                 await finish_cancelled(connection, self.claim.job_id)
                 return False
-            await connection.execute(
-                "UPDATE jobs SET state = 'queued', attempt = attempt - %s, eta_s = NULL,"
-                " checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END, smaller = smaller || %s WHERE id = %s",
-                (0 if counted else 1, forget_checkpoint, Jsonb(smaller or {}), self.claim.job_id),
+            await requeue(
+                connection,
+                self.claim.job_id,
+                event,
+                data,
+                uncounted=not counted,
+                forget_checkpoint=forget_checkpoint,
+                smaller=smaller,
             )
-            await _add_event(connection, self.claim.job_id, event, data)
             return True
 
         return await self._fenced(write, done=True)
@@ -241,10 +244,6 @@ class Ledger:
                 return await write(connection)
 
         return await retry_while_unavailable(once)
-
-
-async def _add_event(connection: Connection, job_id: str, event: str, data: dict[str, Any]) -> None:
-    await connection.execute("SELECT add_job_event(%s, %s, %s)", (job_id, event, Jsonb(data)))
 
 
 async def _cancel_requested(connection: Connection, job_id: str) -> bool:

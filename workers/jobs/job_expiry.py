@@ -1,0 +1,67 @@
+"""What is kept of ended jobs, and for how long. Each function runs in the caller's transaction."""
+
+from __future__ import annotations
+
+import logging
+
+from workers.database.database import Connection
+from workers.jobs.job_states import add_event
+
+log = logging.getLogger(__name__)
+
+# For checkpoints that a backup could not save: those jobs start over.
+FORGET_CHECKPOINTS = "UPDATE jobs SET checkpoint = NULL WHERE checkpoint ->> 'prefix' = ANY (%s)"
+
+
+async def date_jobs(connection: Connection, kept_s: float | None) -> None:
+    """Write down when results expire: ``kept_s`` after their jobs ended, or never."""
+    await connection.execute(
+        "UPDATE jobs SET expires_at = finished_at + make_interval(secs => %s)"
+        " WHERE finished_at IS NOT NULL AND state <> 'expired'"
+        " AND expires_at IS DISTINCT FROM finished_at + make_interval(secs => %s)",
+        (kept_s, kept_s),
+    )
+
+
+async def expire_jobs(connection: Connection, limit: int) -> int:
+    """Let the files of jobs go that are due, as many as ``limit``; returns how many."""
+    cursor = await connection.execute(
+        "SELECT id, tenant, finished_at, artifacts FROM jobs WHERE expires_at <= clock_timestamp()"
+        " AND state IN ('succeeded', 'failed', 'cancelled')"
+        # An export or a fork that waits or runs still reads its files.
+        " AND NOT EXISTS (SELECT 1 FROM jobs AS heir WHERE jobs.id IN (heir.parent, heir.forked_from)"
+        " AND heir.state IN ('queued', 'running'))"
+        " ORDER BY expires_at LIMIT %s FOR UPDATE SKIP LOCKED",
+        (limit,),
+    )
+    due = await cursor.fetchall()
+    for job in due:
+        freed = {"files": len(job["artifacts"]), "bytes": sum(item["size"] for item in job["artifacts"])}
+        await connection.execute(
+            "UPDATE jobs SET state = 'expired', artifacts = '[]', checkpoint = NULL, previews = NULL,"
+            " reusable = '{}' WHERE id = %s",
+            (job["id"],),
+        )
+        await add_event(connection, job["id"], "expired", freed)
+        await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (f"jobs/{job['id']}",))
+        over = f"{job['finished_at']:%Y-%m-%d %H:%M} UTC"
+        log.info("expired %s of %s, over since %s: %s", job["id"], job["tenant"], over, freed)
+    return len(due)
+
+
+async def forget_keys(connection: Connection, kept_s: float) -> None:
+    """Idempotency keys of jobs that ended so long ago can be used again."""
+    await connection.execute(
+        "UPDATE jobs SET idempotency_key = NULL WHERE idempotency_key IS NOT NULL"
+        " AND finished_at < clock_timestamp() - make_interval(secs => %s)",
+        (kept_s,),
+    )
+
+
+async def delete_expired_jobs(connection: Connection, kept_s: float) -> None:
+    """Delete the records of jobs that expired so long ago."""
+    await connection.execute(
+        "DELETE FROM jobs WHERE state = 'expired'"
+        " AND expires_at < clock_timestamp() - make_interval(secs => %s)",
+        (kept_s,),
+    )

@@ -1,0 +1,256 @@
+"""Every change of a job's state, from its submission to its end.
+
+Each function runs in the caller's transaction. Those that end a job ask for its row lock, which the caller holds.
+"""
+
+from __future__ import annotations
+
+import logging
+import uuid
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from psycopg import sql
+from psycopg.types.json import Jsonb
+
+from biresnerf.wire.jobs import EventType
+from biresnerf.wire.problems import JobError
+from workers.database import job_queue
+from workers.database.database import Connection
+from workers.records import LOG_NAME, POSES_NAME, PREVIEW_FOLDER, REPORT_NAME, Artifact
+from workers.settings.traces import traceparent
+
+log = logging.getLogger(__name__)
+
+End = Literal["succeeded", "failed", "cancelled"]
+STALL_S = 60.0
+
+
+async def add_event(
+    connection: Connection, job_id: str, event: EventType, data: Mapping[str, Any] | None = None
+) -> None:
+    """Append to the job's history, and wake who follows it."""
+    await connection.execute("SELECT add_job_event(%s, %s, %s)", (job_id, event, Jsonb(dict(data or {}))))
+
+
+async def insert_job(connection: Connection, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Write a new job, ``values`` by column; `queue_job` is given what this returns."""
+    row = {**values, "trace": traceparent()}
+    statement = sql.SQL("INSERT INTO jobs ({}) VALUES ({}) RETURNING id, queue_order, held").format(
+        sql.SQL(", ").join(map(sql.Identifier, row)), sql.SQL(", ").join([sql.Placeholder()] * len(row))
+    )
+    added = await (await connection.execute(statement, list(row.values()))).fetchone()
+    assert added is not None, "RETURNING"
+    return added
+
+
+async def queue_job(connection: Connection, job: Mapping[str, Any]) -> None:
+    """Put a new job into the queue at its tenant's turn."""
+    await _enqueue(connection, job)
+    await add_event(connection, job["id"], "queued")
+
+
+async def _enqueue(connection: Connection, job: Mapping[str, Any]) -> None:
+    entry_id = await job_queue.enqueue(connection, job["id"], order=job["queue_order"], held=job["held"])
+    await connection.execute("UPDATE jobs SET queue_id = %s WHERE id = %s", (entry_id, job["id"]))
+
+
+async def start_attempt(connection: Connection, job_id: str, token: uuid.UUID) -> dict[str, Any]:
+    """Begin one more attempt, which owns the job from now on; returns the row."""
+    cursor = await connection.execute(
+        "UPDATE jobs SET state = 'running', attempt = attempt + 1, run_token = %s, fraction = 0,"
+        " step = 0, stage = NULL, eta_s = NULL, message = '',"
+        " started_at = coalesce(started_at, clock_timestamp()) WHERE id = %s RETURNING *",
+        (token, job_id),
+    )
+    row = await cursor.fetchone()
+    assert row is not None, "the row is locked"
+    await add_event(connection, job_id, "started", {"resumed": row["checkpoint"] is not None})
+    return row
+
+
+async def requeue(
+    connection: Connection,
+    job_id: str,
+    event: EventType,
+    data: Mapping[str, Any],
+    *,
+    fence: bool = False,
+    uncounted: bool = False,
+    forget_checkpoint: bool = False,
+    smaller: Mapping[str, Any] | None = None,
+) -> None:
+    """Let the job wait again. Its queue entry is the caller's to put back.
+
+    Args:
+        fence: whoever ran it can write no more; for an owner that does not know of it.
+        uncounted: the attempt does not count.
+        smaller: options that attempts to come use in the place of those asked for.
+    """
+    await connection.execute(
+        "UPDATE jobs SET state = 'queued', attempt = attempt - %s, eta_s = NULL,"
+        " run_token = CASE WHEN %s THEN NULL ELSE run_token END,"
+        " checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END, smaller = smaller || %s WHERE id = %s",
+        (int(uncounted), fence, forget_checkpoint, Jsonb(dict(smaller or {})), job_id),
+    )
+    await add_event(connection, job_id, event, data)
+
+
+async def take_back(connection: Connection, entry_id: int) -> None:
+    """Take a queue entry from a worker that is gone.
+
+    The job goes back to the queue (its attempt stays counted); one that should be cancelled, or is final
+    already, leaves the queue. The token is dropped, so a worker that was only asleep is fenced from here on.
+    """
+    cursor = await connection.execute(
+        "SELECT id, cancel_requested FROM jobs"
+        " WHERE queue_id = %s AND state IN ('queued', 'running') FOR UPDATE",  # of these there is an index
+        (entry_id,),
+    )
+    job = await cursor.fetchone()
+    if not await job_queue.lock_taken(connection, entry_id):
+        return  # it came to an end in the meantime
+    if job is None:  # or final
+        await job_queue.abort(connection, entry_id)
+        return
+    log.warning("taking job %s back: its worker is gone", job["id"])
+    if job["cancel_requested"]:
+        await connection.execute("UPDATE jobs SET run_token = NULL WHERE id = %s", (job["id"],))
+        await finish_cancelled(connection, job["id"])
+        await job_queue.abort(connection, entry_id)
+        return
+    await requeue(connection, job["id"], "requeued", {"why": "worker_lost"}, fence=True)
+    await job_queue.put_back(connection, entry_id)
+
+
+async def requeue_lost(connection: Connection, silent_s: float) -> None:
+    """Queue again unfinished jobs that the queue does not know (any more), unchanged for ``silent_s``."""
+    cursor = await connection.execute(
+        "SELECT jobs.id, jobs.queue_order, jobs.held"
+        " FROM jobs LEFT JOIN queue_entries AS entry ON entry.id = jobs.queue_id"
+        " WHERE jobs.state IN ('queued', 'running')"
+        " AND jobs.updated_at < clock_timestamp() - make_interval(secs => %s)"
+        " AND coalesce(entry.state NOT IN ('todo', 'doing'), true) FOR UPDATE OF jobs SKIP LOCKED",
+        (silent_s,),
+    )
+    for job in await cursor.fetchall():
+        log.warning("job %s was lost by the queue; queueing it again", job["id"])
+        await _enqueue(connection, job)
+        await requeue(connection, job["id"], "requeued", {"why": "lost"}, fence=True)
+
+
+async def offer_held_jobs(connection: Connection) -> None:
+    """Offer held jobs as far as limits allow. Ends of jobs do so by themselves; this is for limits that changed."""
+    await connection.execute(
+        "SELECT offer_held(tenant)"
+        " FROM (SELECT DISTINCT tenant FROM jobs WHERE held AND state = 'queued') AS waiting"
+    )
+
+
+async def request_cancel(
+    connection: Connection, job_id: str, tenant: str | None, keep_partial: bool, stall_s: float
+) -> None:
+    """Cancel a queued job, or ask its worker to. Nothing is changed where that was asked for, or the job is over."""
+    cursor = await connection.execute(
+        "UPDATE jobs SET cancel_requested = true, keep_partial = %s"
+        " WHERE id = %s AND tenant = coalesce(%s, tenant) AND state IN ('queued', 'running')"
+        " AND NOT cancel_requested RETURNING queue_id, state",
+        (keep_partial, job_id, tenant),
+    )
+    job = await cursor.fetchone()
+    if job is None:
+        return
+    await job_queue.cancel(connection, job["queue_id"])
+    if job["state"] == "queued":  # perhaps after an attempt that has shown something
+        await finish_cancelled(connection, job_id, stall_s=stall_s)
+    else:
+        await add_event(connection, job_id, "cancel_requested")
+
+
+async def delete_job(connection: Connection, job_id: str) -> None:
+    """Delete a final job; its exports, and the files of all, go with it."""
+    await connection.execute("DELETE FROM jobs WHERE id = %s", (job_id,))
+    await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job_id,))
+
+
+async def finish(
+    connection: Connection,
+    job_id: str,
+    state: End,
+    error: JobError | None,
+    artifacts: Sequence[Artifact] = (),
+    *,
+    partial: bool = False,
+) -> None:
+    """Write the end and its event. Previews are over."""
+    await connection.execute(
+        "UPDATE jobs SET state = %s, error = %s, artifacts = %s, finished_at = clock_timestamp(),"
+        " eta_s = NULL, fraction = CASE WHEN %s = 'succeeded' THEN 1 ELSE fraction END,"
+        " partial = %s, previews = NULL WHERE id = %s",
+        (
+            *(state, Jsonb(error.model_dump()) if error else None),
+            *(Jsonb([item.model_dump() for item in artifacts]), state, partial, job_id),
+        ),
+    )
+    data: dict[str, Any] = {"code": error.code, "detail": error.detail} if error else {}
+    if state == "cancelled":
+        data = {"partial": partial}
+    await add_event(connection, job_id, state, data)
+
+
+async def finish_cancelled(
+    connection: Connection,
+    job_id: str,
+    artifacts: Sequence[Artifact] = (),
+    keep: str | None = None,
+    stall_s: float = STALL_S,
+) -> None:
+    """End a job on request, with what its user wants of the files: all there are, or the log alone.
+
+    Where a partial result is wanted and the process did not come to write one, the last preview is it.
+
+    Args:
+        artifacts: what the attempt could store.
+        keep: the attempt's name.
+        stall_s: how long a worker may be silent; nothing is deleted before twice that.
+    """
+    cursor = await connection.execute("SELECT keep_partial, previews FROM jobs WHERE id = %s", (job_id,))
+    row = await cursor.fetchone()
+    assert row is not None, "the row is locked"
+    logs = [item for item in artifacts if item.name == LOG_NAME]
+    kept, shown = list(artifacts), None
+    if row["keep_partial"] and not _is_whole(kept) and row["previews"] is not None:
+        shown = row["previews"]["prefix"].rpartition("/")[2]
+        kept = logs + [
+            item.model_copy(update={"name": item.name.removeprefix(f"{PREVIEW_FOLDER}/")})
+            for item in map(Artifact.model_validate, row["previews"]["artifacts"])
+        ]
+    partial = row["keep_partial"] and _is_whole(kept)
+    await finish(connection, job_id, "cancelled", None, kept if partial else logs, partial=partial)
+    await trash_attempts(connection, job_id, keep, stall_s, preview=shown)
+
+
+def _is_whole(artifacts: Sequence[Artifact]) -> bool:
+    """Whether there are poses and the report on them, which is written last: a process may have been killed between."""
+    return {POSES_NAME, REPORT_NAME} <= {item.name for item in artifacts}
+
+
+async def trash_attempts(
+    connection: Connection,
+    job_id: str,
+    keep: str | None,
+    stall_s: float = STALL_S,
+    *,
+    preview: str | None = None,
+) -> None:
+    """Give to the trash what attempts left, except the results of ``keep`` and the preview named ``preview``."""
+    # Twice the stall time: a frozen owner that wakes up later finds itself fenced at its first write.
+    await connection.execute(
+        "INSERT INTO trash (prefix, keep, not_before)"
+        " SELECT prefix, keep, clock_timestamp() + make_interval(secs => %s)"
+        " FROM (VALUES (%s, NULL), (%s, %s), (%s, %s)) AS garbage (prefix, keep)",
+        (
+            *(2 * stall_s, f"jobs/{job_id}/checkpoints", f"jobs/{job_id}/results", keep),
+            *(f"jobs/{job_id}/previews", preview),
+        ),
+    )
