@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from biresnerf.commands.machine.machine_checks import Check, Found
 from service.web_page import FOLDER
 from workers.database.embedded_postgres import EmbeddedPostgres
-from workers.process.disk_space import Room
+from workers.process.disk_space import DiskBudget
 from workers.settings.errors import SetupError
 from workers.settings.settings import Settings
 
@@ -60,7 +60,7 @@ def disk() -> Found:
         settings = Settings()
     except ValidationError:
         return Found("service disk", "missing", "not looked at, for wrong settings")
-    free = Room((settings.data_dir,), settings.disk_reserve_bytes).free_bytes()
+    free = DiskBudget((settings.data_dir,), settings.disk_reserve_bytes).free_bytes()
     detail = f"{free / 2**30:.1f} GiB may be used in {settings.data_dir}"
     if free > 0:
         return Found("service disk", "good", detail)

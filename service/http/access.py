@@ -96,22 +96,22 @@ class Caller:
     @property
     def jobs(self) -> JobStore:
         """The tenant's jobs."""
-        return self.service.stores.jobs.of(self.tenant)
+        return self.service.stores.jobs.for_tenant(self.tenant)
 
     @property
     def datasets(self) -> DatasetStore:
         """The tenant's datasets."""
-        return self.service.stores.datasets.of(self.tenant)
+        return self.service.stores.datasets.for_tenant(self.tenant)
 
     @property
     def uploads(self) -> UploadStore:
         """The uploads into the tenant's datasets."""
-        return self.service.stores.uploads.of(self.tenant)
+        return self.service.stores.uploads.for_tenant(self.tenant)
 
     @property
     def webhooks(self) -> WebhookStore:
         """The tenant's webhooks."""
-        return self.service.stores.webhooks.of(self.tenant)
+        return self.service.stores.webhooks.for_tenant(self.tenant)
 
 
 class Access:

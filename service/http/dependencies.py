@@ -15,7 +15,7 @@ from service.http.metrics import WebMetrics
 from service.http.problems import ProblemError
 from service.http.upload_places import UploadPlaces
 from workers.engine import Stores
-from workers.process.disk_space import Room, room_for_uploads
+from workers.process.disk_space import DiskBudget, upload_disk_budget
 from workers.process.turns import Turns
 from workers.settings.settings import Settings
 
@@ -46,9 +46,9 @@ class Service:
         return self.settings.data_dir / "staging"
 
     @property
-    def room(self) -> Room:
+    def disk_budget(self) -> DiskBudget:
         """What uploads may still take of the local disks."""
-        return room_for_uploads(self.settings)
+        return upload_disk_budget(self.settings)
 
     def keep_running(self, task: asyncio.Task[Any]) -> None:
         """Holds a task that outlives its request, so that it is not collected."""

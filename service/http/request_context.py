@@ -15,7 +15,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.problems import MEDIA_TYPE, ProblemError
-from workers.settings.logs import about
+from workers.settings.logs import log_context
 
 logger = logging.getLogger(__name__)
 # A browser sends at most 8 KiB of cookies; a few long headers beside them fit in too.
@@ -78,7 +78,7 @@ class RequestContext:
         try:
             _refuse_ambiguous(request)
             _refuse_other_sites(request)
-            with about(request_id=request_id(request)):
+            with log_context(request_id=request_id(request)):
                 await self._app(scope, receive, send_with_headers)
         except ProblemError as problem:
             await render(problem, request)(scope, receive, send_with_headers)

@@ -51,7 +51,7 @@ async def take_archive(
         )
     allowed = min(settings.max_unpacked_bytes, settings.max_dataset_bytes - dataset.bytes)
     # Twice: unpacked here, and then stored, which may be on the same disk.
-    room = await asyncio.to_thread(service.room.free_bytes) // 2
+    room = await asyncio.to_thread(service.disk_budget.free_bytes) // 2
     request = UnpackRequest(
         archive=archive,
         into=into,
@@ -152,7 +152,7 @@ async def _bring_in(service: Service, upload: Upload) -> None:
     async with staging_folder(service.staging_dir) as folder:
         archive, into = folder / "archive", folder / "content"
         into.mkdir()
-        await write_stream(uploads.content(upload), archive, upload.size, service.room)
+        await write_stream(uploads.content(upload), archive, upload.size, service.disk_budget)
         if upload.sha256 is not None:
             found = await asyncio.to_thread(file_sha256, archive)
             if found != upload.sha256:

@@ -18,7 +18,7 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 
 from biresnerf.wire.problems import FieldProblem
 from service.http.problems import ProblemError
-from workers.process.disk_space import Room
+from workers.process.disk_space import DiskBudget
 
 _FIELD_BYTES_MAX = 256 * 1024
 _HEADER_BYTES_MAX = 8 * 1024
@@ -37,7 +37,9 @@ def too_large(limit_bytes: int) -> ProblemError:
     )
 
 
-def refuse_announced_excess(content_length: str | None, limit_bytes: int, room: Room | None = None) -> None:
+def refuse_announced_excess(
+    content_length: str | None, limit_bytes: int, room: DiskBudget | None = None
+) -> None:
     """Refuses by Content-Length before a byte is read; the count while reading holds in any case."""
     if content_length is not None and content_length.isdigit():
         if int(content_length) > limit_bytes:
@@ -47,7 +49,7 @@ def refuse_announced_excess(content_length: str | None, limit_bytes: int, room: 
 
 
 async def capped(
-    stream: AsyncIterator[bytes], limit_bytes: int, idle_s: float = IDLE_S, room: Room | None = None
+    stream: AsyncIterator[bytes], limit_bytes: int, idle_s: float = IDLE_S, room: DiskBudget | None = None
 ) -> AsyncIterator[bytes]:
     """The stream.
 
@@ -75,7 +77,7 @@ async def capped(
 
 
 async def write_stream(
-    stream: AsyncIterator[bytes], target: Path, limit_bytes: int, room: Room | None = None
+    stream: AsyncIterator[bytes], target: Path, limit_bytes: int, room: DiskBudget | None = None
 ) -> int:
     """Writes the stream into a new file; returns its bytes. Raises as `capped` does."""
     total = 0
@@ -133,7 +135,7 @@ class Form:
         text_fields: Collection[str],
         target: Path,
         limit_bytes: int,
-        room: Room | None = None,
+        room: DiskBudget | None = None,
     ) -> None:
         self.texts: dict[str, str] = {}
         self.has_file = False

@@ -166,13 +166,13 @@ async def put_file(
     limit = caller.service.settings.max_file_bytes
     safe = checked_path(path)
     refuse_announced_excess(
-        None if content_length is None else str(content_length), limit, caller.service.room
+        None if content_length is None else str(content_length), limit, caller.service.disk_budget
     )
     with caller.sending():
         file, new = await caller.datasets.add_file(
             dataset_id,
             safe,
-            capped(request.stream(), limit, room=caller.service.room),
+            capped(request.stream(), limit, room=caller.service.disk_budget),
             sha256=_announced_digest(repr_digest),
             overwrite=(if_none_match or "").strip() != "*",
         )
@@ -221,11 +221,11 @@ async def upload_archive(dataset_id: DatasetId, request: Request, caller: Datase
     All or nothing: where one entry is not acceptable, no file is taken.
     """
     limit = caller.service.settings.max_archive_bytes
-    refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.room)
+    refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.disk_budget)
     await caller.datasets.get(dataset_id)
     with caller.sending():
         async with staging_folder(caller.service.staging_dir) as folder:
-            await write_stream(request.stream(), folder / "archive", limit, caller.service.room)
+            await write_stream(request.stream(), folder / "archive", limit, caller.service.disk_budget)
             into = folder / "content"
             into.mkdir()
             return await take_archive(caller.service, dataset_id, folder / "archive", into)

@@ -17,7 +17,7 @@ from service.intake.dataset_finalize import begin_check, finish_check
 from service.intake.json_body import fit, load_json
 from service.intake.uploads import Form, refuse_announced_excess, staging_folder
 from workers.settings.errors import EngineError
-from workers.webhooks.webhook_records import request_with
+from workers.webhooks.webhooks import request_with
 
 # Room for the text fields and the form's own lines beside the archive.
 _FORM_BYTES = 2**20
@@ -35,7 +35,7 @@ async def submit_form(caller: Caller, request: Request, idempotency_key: str | N
     """
     caller.require("datasets:write")
     limit = caller.service.settings.max_archive_bytes + _FORM_BYTES
-    refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.room)
+    refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.disk_budget)
     with caller.sending():
         return await _taken(caller, request, idempotency_key, limit)
 
@@ -45,7 +45,7 @@ async def _taken(
 ) -> tuple[JobView, bool]:
     async with staging_folder(caller.service.staging_dir) as folder:
         archive = folder / "archive"
-        form = Form("archive", TEXTS, archive, limit, caller.service.room)
+        form = Form("archive", TEXTS, archive, limit, caller.service.disk_budget)
         await form.read(request.headers["content-type"], request.stream())
         if not form.has_file:
             detail = "The form has no file field `archive`."

@@ -102,7 +102,7 @@ async def create_upload(
     path, sha256 = said.get("path"), said.get("sha256")
     if sha256 is not None and not _DIGEST.fullmatch(sha256):
         raise ProblemError("invalid_request", "The value of sha256 is no SHA-256.", where="Upload-Metadata")
-    await asyncio.to_thread(caller.service.room.require, upload_length)
+    await asyncio.to_thread(caller.service.disk_budget.require, upload_length)
     upload = await caller.uploads.create(
         dataset_id,
         "archive" if path is None else "file",
@@ -182,7 +182,7 @@ async def append_upload(
     upload = await uploads.get(upload_id)
     room = upload.size - upload_offset
     refuse_announced_excess(request.headers.get("content-length"), max(room, 0))
-    body = capped(request.stream(), max(room, 0), room=caller.service.room)
+    body = capped(request.stream(), max(room, 0), room=caller.service.disk_budget)
     with caller.sending():
         upload = await uploads.append(upload_id, upload_offset, body)
     if upload.state == "received":

@@ -41,7 +41,7 @@ FILE = "SELECT path, key, size, sha256, created_at FROM dataset_files"
 class DatasetStore:
     """Datasets in the database and the file store. Get one from `workers.engine.open_stores`.
 
-    As opened it sees everybody's datasets; `of` gives it as one tenant sees it, to whom a dataset of another
+    As opened it sees everybody's datasets; `for_tenant` gives it as one tenant sees it, to whom a dataset of another
     is as unknown as one that never was. Every method raises `Unavailable` (``database_unavailable``) where
     the database does not answer.
     """
@@ -51,7 +51,7 @@ class DatasetStore:
         self._checker = Checker(database, files, settings)
         self._tenant: str | None = None
 
-    def of(self, tenant: str | None) -> DatasetStore:
+    def for_tenant(self, tenant: str | None) -> DatasetStore:
         """The store as this tenant sees it; none: as the operator does."""
         bound = copy(self)
         bound._tenant = tenant

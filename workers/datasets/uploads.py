@@ -38,7 +38,7 @@ _UPLOAD = "SELECT uploads.* FROM uploads JOIN datasets ON datasets.id = uploads.
 class UploadStore:
     """Uploads in the database, their pieces in the file store. Get one from `workers.engine.open_stores`.
 
-    As opened it sees everybody's uploads; `of` gives it as one tenant sees it. Every method raises
+    As opened it sees everybody's uploads; `for_tenant` gives it as one tenant sees it. Every method raises
     `Unavailable` where database or store does not answer.
     """
 
@@ -47,7 +47,7 @@ class UploadStore:
         self._appending = [0]  # shared by the views of all tenants
         self._tenant: str | None = None
 
-    def of(self, tenant: str | None) -> UploadStore:
+    def for_tenant(self, tenant: str | None) -> UploadStore:
         """The store as this tenant sees it; none: as the operator does."""
         bound = copy(self)
         bound._tenant = tenant

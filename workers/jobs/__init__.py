@@ -1,1 +1,1 @@
-"""The record of a job: submitted, listed, followed, ended. Running it is `run`'s."""
+"""The record of a job, and all SQL on it: submitted, listed, followed, claimed, reported on, ended, expired."""

@@ -34,14 +34,13 @@ from workers.settings.errors import Conflict, Expired, NotFound
 from workers.settings.settings import Settings
 from workers.settings.traces import traced
 from workers.tenants.tenants import LOCAL_TENANT
-from workers.webhooks.webhook_records import request_with
-from workers.webhooks.webhooks import add_job_webhook
+from workers.webhooks.webhooks import add_job_webhook, request_with
 
 
 class JobStore:
     """Jobs in the database. Get one from `workers.engine.open_stores`.
 
-    As opened it sees everybody's jobs; `of` gives it as one tenant sees it, to whom a job of another is as
+    As opened it sees everybody's jobs; `for_tenant` gives it as one tenant sees it, to whom a job of another is as
     unknown as one that never was. Every method raises `Unavailable` (``database_unavailable``) where the
     database does not answer.
     """
@@ -52,7 +51,7 @@ class JobStore:
         self._database, self._listener, self._settings = database, listener, settings
         self._tenant = tenant
 
-    def of(self, tenant: str | None) -> JobStore:
+    def for_tenant(self, tenant: str | None) -> JobStore:
         """The store as this tenant sees it; none: as the operator does."""
         return JobStore(self._database, self._listener, self._settings, tenant)
 

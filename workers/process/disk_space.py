@@ -1,4 +1,4 @@
-"""Room on local disks: what is left is kept for the jobs that run, so that a full disk is refused, not hit."""
+"""Space on local disks: a reserve is kept for running jobs, so that uploads are refused before a disk is full."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from workers.settings.errors import LimitReached
 from workers.settings.settings import Settings
 
 
-class Room:
+class DiskBudget:
     """The disks under some folders (which need not exist yet), of which ``reserve_bytes`` each stay free."""
 
     def __init__(self, folders: Sequence[Path], reserve_bytes: int) -> None:
@@ -28,15 +28,15 @@ class Room:
             raise LimitReached("storage_full", "The disk is full but for what running jobs need.")
 
 
-def room_for_uploads(settings: Settings) -> Room:
+def upload_disk_budget(settings: Settings) -> DiskBudget:
     """Where bodies lie while they are checked, and where they end up if that is a folder."""
     local = [settings.files_dir] if settings.storage_url is None else []
-    return Room([settings.data_dir, *local], settings.disk_reserve_bytes)
+    return DiskBudget([settings.data_dir, *local], settings.disk_reserve_bytes)
 
 
-def room_for_jobs(settings: Settings) -> Room:
+def job_disk_budget(settings: Settings) -> DiskBudget:
     """Where jobs have their working copies."""
-    return Room([settings.scratch_dir], settings.disk_reserve_bytes)
+    return DiskBudget([settings.scratch_dir], settings.disk_reserve_bytes)
 
 
 def _existing(folder: Path) -> Path:

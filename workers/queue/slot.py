@@ -23,14 +23,14 @@ from workers.database.job_queue import Entry
 from workers.database.notifications import Listener
 from workers.database.statistics import announce_slot
 from workers.jobs.claim import Claim, Fenced, cancel_requested, claim_job, input_bytes
-from workers.process.disk_space import room_for_jobs
+from workers.process.disk_space import job_disk_budget
 from workers.process.waiting import first_done, retry_while_unavailable
 from workers.process.watchdog import watched
 from workers.queue.heartbeat import Heartbeat
 from workers.queue.janitor import Janitor, release_worker
 from workers.run.attempt import Attempt
 from workers.settings.errors import LimitReached, SetupError, Unavailable
-from workers.settings.logs import about, set_up_logging
+from workers.settings.logs import log_context, set_up_logging
 from workers.settings.settings import Settings
 from workers.settings.traces import set_up_traces, span
 from workers.store.files import open_files
@@ -149,7 +149,7 @@ class Slot:
                     await self._work_on(database, listener, entry, worker_id)
 
     async def _work_on(self, database: Database, listener: Listener, entry: Entry, worker_id: int) -> None:
-        with about(job_id=entry.job_id):
+        with log_context(job_id=entry.job_id):
             try:
                 again_in_s = await self._run_job(database, listener, entry)
             except Fenced as fenced:
@@ -202,7 +202,7 @@ class Slot:
         """Whether the job's files fit on the local disk; where not, another host may have room now, or we later."""
         size = await retry_while_unavailable(lambda: input_bytes(database, job_id))
         try:
-            room_for_jobs(self._settings).require(size)
+            job_disk_budget(self._settings).require(size)
         except LimitReached as full:
             log.warning("the job waits: %s", full.detail)
             return False

@@ -1,1 +1,1 @@
-"""One attempt at one job: claimed, staged, run in a child process, its reports and result carried away."""
+"""One attempt at one job: staged, run in a child process, its reports and result delivered."""

@@ -44,7 +44,7 @@ _QUIET = {"httpx": logging.WARNING, "httpcore": logging.WARNING, "psycopg.pool":
 
 
 @contextlib.contextmanager
-def about(**what: str | None) -> Iterator[None]:
+def log_context(**what: str | None) -> Iterator[None]:
     """Every record logged in the block, in this task and those it starts, carries ``what`` (none is left out)."""
     token = _CONTEXT.set({**_CONTEXT.get(), **{name: text for name, text in what.items() if text}})
     try:

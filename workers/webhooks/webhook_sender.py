@@ -7,10 +7,14 @@ once the lease is over. Receivers see a message at least once, under the same id
 from __future__ import annotations
 
 import asyncio
+import base64
+import hashlib
+import hmac
 import logging
 import random
 import ssl
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
@@ -21,13 +25,13 @@ import httpcore
 import psycopg
 
 from biresnerf import __version__
+from biresnerf.wire.webhooks import key_of
 from workers.database.database import Connection, Database
 from workers.database.notifications import Listener
 from workers.process.waiting import first_done
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.webhooks.outbound import Outbound, Refused
-from workers.webhooks.webhook_records import signed_headers
 from workers.webhooks.webhooks import drop_pending
 
 log = logging.getLogger(__name__)
@@ -238,3 +242,21 @@ def _of_tls(error: BaseException) -> bool:
             return True
         error = cause
     return False
+
+
+def signed_headers(delivery_id: str, at: int, body: bytes, valid: Sequence[str]) -> dict[str, str]:
+    """The three headers of Standard Webhooks, with one signature for each valid secret.
+
+    Args:
+        at: seconds since 1970; a receiver refuses what is older than five minutes.
+    """
+    content = f"{delivery_id}.{at}.".encode() + body
+    signatures = [
+        "v1," + base64.b64encode(hmac.new(key_of(secret), content, hashlib.sha256).digest()).decode()
+        for secret in valid
+    ]
+    return {
+        "webhook-id": delivery_id,
+        "webhook-timestamp": str(at),
+        "webhook-signature": " ".join(signatures),
+    }

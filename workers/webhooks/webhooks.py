@@ -1,7 +1,7 @@
-"""Webhooks as their owners see them: make, change, delete, test, look what was delivered, send again.
+"""Webhooks as their owners see them: create, change, delete, test, list deliveries, send again.
 
-Messages come into the outbox by triggers (migration 005), in the transaction of what they tell of; who sends
-them is `workers.webhooks.webhook_sender`.
+Triggers of the schema put messages into the outbox, in the transaction of the change that they report;
+`workers.webhooks.webhook_sender` sends them.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from workers.records import Page, record_from_row
 from workers.settings.errors import Conflict, LimitReached, NotFound
 from workers.settings.settings import Settings
 from workers.webhooks.outbound import Policy, checked_url
-from workers.webhooks.webhook_records import TEST_EVENT
 
 ROTATION_HOURS = 24
+TEST_EVENT = "webhook.test"
 _MINE = "tenant = coalesce(%s, tenant)"
 _DELIVERY = """
     SELECT webhook_deliveries.*, (SELECT coalesce(jsonb_agg(to_jsonb(attempt) - 'delivery_id' ORDER BY number), '[]')
@@ -37,13 +37,13 @@ _DELIVERY = """
 class WebhookStore:
     """Webhooks in the database. Get one from `workers.engine.open_stores`.
 
-    `of` gives it as one tenant sees it. Every method raises `Unavailable` where the database is away.
+    `for_tenant` gives it as one tenant sees it. Every method raises `Unavailable` where the database is away.
     """
 
     def __init__(self, database: Database, settings: Settings, tenant: str | None = None) -> None:
         self._database, self._settings, self._tenant = database, settings, tenant
 
-    def of(self, tenant: str | None) -> WebhookStore:
+    def for_tenant(self, tenant: str | None) -> WebhookStore:
         """The store as this tenant sees it; none: as the operator does."""
         return WebhookStore(self._database, self._settings, tenant)
 
@@ -276,3 +276,8 @@ def _delivery_record(row: dict[str, Any]) -> DeliveryView:
     return record_from_row(
         DeliveryView, row, next_attempt_at=row["due_at"] if waits else None, attempts=row["log"]
     )
+
+
+def request_with(subject: str, webhook: JobWebhook | None) -> str:
+    """What a request for a job is about, for its comparison with another one of the same Idempotency-Key."""
+    return subject if webhook is None else f"{subject} {webhook.model_dump_json()}"

@@ -172,7 +172,7 @@ async def test_many_checks_of_one_tenant_do_not_hold_up_anothers(database_url: s
         finalized = []
         for tenant in "aaaaaab":
             await stores.keys.create(tenant, "key", ["admin"])
-            mine = stores.datasets.of(tenant)
+            mine = stores.datasets.for_tenant(tenant)
             dataset = await mine.create("fox")
             await mine.add_file(dataset.id, "a", chunks(tenant.encode()))
             await mine.finalize(dataset.id)

@@ -138,7 +138,7 @@ async def stored(stores: Stores) -> int:
 
 async def test_an_upload_that_fills_the_quota_is_brought_in_and_counted_once(stores: Stores):
     await stores.tenants.set("anna", max_stored_bytes=1000)
-    dataset = await stores.datasets.of("anna").create("full")
+    dataset = await stores.datasets.for_tenant("anna").create("full")
     upload = await stores.uploads.create(dataset.id, "file", 1000, path="a.png")
     upload = await stores.uploads.append(upload.id, 0, stream(bytes(1000)))
     assert await stored(stores) == 1000
@@ -151,7 +151,7 @@ async def test_an_upload_that_fills_the_quota_is_brought_in_and_counted_once(sto
 
 async def test_what_an_archive_unpacks_to_is_counted_and_the_archive_only_until_then(stores: Stores):
     await stores.tenants.set("anna", max_stored_bytes=1500)
-    dataset = await stores.datasets.of("anna").create("packed")
+    dataset = await stores.datasets.for_tenant("anna").create("packed")
     upload = await stores.uploads.create(dataset.id, "archive", 1000)
     upload = await stores.uploads.append(upload.id, 0, stream(bytes(1000)))
     await stores.datasets.add_file(dataset.id, "a.png", stream(bytes(400)), upload_id=upload.id)

@@ -44,9 +44,11 @@ class Line:
                 await connection.execute(
                     "INSERT INTO tenants (id, max_running) VALUES (%s, 0) ON CONFLICT DO NOTHING", (tenant,)
                 )
-            own = Stores(**{**vars(self.stores), "datasets": self.stores.datasets.of(tenant)})
+            own = Stores(**{**vars(self.stores), "datasets": self.stores.datasets.for_tenant(tenant)})
             self._datasets[tenant] = await ready_dataset(own, {"plan.json": b"{}"})
-        job, _ = await self.stores.jobs.of(tenant).submit(self._datasets[tenant], options, priority=priority)
+        job, _ = await self.stores.jobs.for_tenant(tenant).submit(
+            self._datasets[tenant], options, priority=priority
+        )
         self.ids[job.id] = name
 
     async def start(self) -> str:
@@ -262,7 +264,7 @@ async def test_a_tenant_with_a_full_queue_is_refused_and_others_are_not(line: Li
 
 async def test_stored_bytes_are_counted_over_datasets_uploads_and_results(line: Line):
     await line.submit("A0")
-    store = line.stores.datasets.of("a")
+    store = line.stores.datasets.for_tenant("a")
     before = (await line.stores.tenants.share("a")).stored_bytes
     assert before == len(b"{}")
     dataset = await store.create("more")
@@ -272,7 +274,7 @@ async def test_stored_bytes_are_counted_over_datasets_uploads_and_results(line: 
 
     await store.add_file(dataset.id, "a.png", content())
     await store.add_file(dataset.id, "a.png", content())  # in place of the first
-    upload = await line.stores.uploads.of("a").create(dataset.id, "archive", 500)
+    upload = await line.stores.uploads.for_tenant("a").create(dataset.id, "archive", 500)
     async with line.database.transaction() as connection:
         await connection.execute(
             "UPDATE jobs SET artifacts = '[{\"size\": 7}, {\"size\": 3}]' WHERE tenant = 'a'"
@@ -285,8 +287,8 @@ async def test_stored_bytes_are_counted_over_datasets_uploads_and_results(line: 
     assert refused.value.code == "quota_exhausted"
     assert (await store.get(dataset.id)).files == 1
     with pytest.raises(LimitReached):
-        await line.stores.uploads.of("a").create(dataset.id, "archive", 1000)
-    await line.stores.uploads.of("a").delete(upload.id)
+        await line.stores.uploads.for_tenant("a").create(dataset.id, "archive", 1000)
+    await line.stores.uploads.for_tenant("a").delete(upload.id)
     await store.add_file(dataset.id, "b.png", content())
     await store.delete(dataset.id)
     assert (await line.stores.tenants.share("a")).stored_bytes == before + 10

@@ -10,21 +10,21 @@ from pathlib import Path
 import pytest
 
 from tests.workers.conftest import PATIENCE_S, Counting, Slots, quick_settings
-from workers.process.disk_space import Room
+from workers.process.disk_space import DiskBudget
 from workers.settings.errors import LimitReached
 from workers.settings.settings import Settings
 
 
 def test_the_reserve_is_never_given_out(tmp_path: Path):
     free = shutil.disk_usage(tmp_path).free
-    roomy = Room([tmp_path / "not" / "there", tmp_path], reserve_bytes=free // 2)
+    roomy = DiskBudget([tmp_path / "not" / "there", tmp_path], reserve_bytes=free // 2)
     assert 0 < roomy.free_bytes() < free * 0.6
     roomy.require(free // 4)
     for more in (free, free * 3 // 4):
         with pytest.raises(LimitReached) as caught:
             roomy.require(more)
         assert caught.value.code == "storage_full"
-    full = Room([tmp_path], reserve_bytes=free * 2)
+    full = DiskBudget([tmp_path], reserve_bytes=free * 2)
     assert full.free_bytes() == 0
     with pytest.raises(LimitReached):
         full.require()

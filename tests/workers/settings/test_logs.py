@@ -10,13 +10,13 @@ import pytest
 HOSTILE = "a\nfake line\r\x1b[2J\u2028\u202e\x00\ud800"
 PROGRAM = f"""
 import asyncio, logging
-from workers.settings.logs import about, set_up_logging
+from workers.settings.logs import log_context, set_up_logging
 from workers.settings.settings import Settings
 
 set_up_logging("api", Settings())
 log = logging.getLogger("test")
 log.info("said %s", {HOSTILE!r})
-with about(request_id="r1", job_id=None):
+with log_context(request_id="r1", job_id=None):
     log.info("within", extra={{"fields": {{"route": {HOSTILE!r}}}}})
 
     async def task():

@@ -71,7 +71,7 @@ async def test_only_what_was_asked_for_comes_and_only_to_its_tenant(
         assert (message.data["id"], message.data["state"]) == (job_id, "cancelled")
         assert other.messages == []
         assert (await stores.webhooks.deliveries(foreign.id)).items == ()
-        local = stores.webhooks.of("local")
+        local = stores.webhooks.for_tenant("local")
         for call in (local.get, local.delete, local.test, local.rotate, local.deliveries, local.change):
             with pytest.raises(NotFound):
                 await call(foreign.id)
