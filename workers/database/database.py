@@ -92,7 +92,7 @@ async def open_database(
     """
 
     async def end_if_silent(connection: Connection) -> None:
-        # A process frozen within a transaction, or a host gone without a word, would hold its locks for ever.
+        # A process frozen within a transaction, or a host gone without a word, would hold its locks forever.
         await connection.execute(
             "SELECT set_config('idle_in_transaction_session_timeout', %s, false)",
             (str(round(1000 * silence_s)),),

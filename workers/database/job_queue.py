@@ -1,8 +1,8 @@
 """The queue of jobs: the one module that knows Procrastinate, which keeps it.
 
-Used of it: its schema and its public `JobManager`, inside transactions of ours. An entry of the queue is ``todo``,
+We use its schema and its public `JobManager`, inside our own transactions. An entry of the queue is ``todo``,
 ``doing`` (a worker has it) or over. Its `Worker` is not used: its heartbeats run in the event loop, stop when a worker
-begins to drain, and end the worker when the database is away; at its start it strikes off workers that an outage
+begins to drain, and end the worker when the database is away; at its start it unregisters workers that an outage
 kept silent; and it reports the end of a job without asking whether the entry is still its own. Each of these breaks a
 promise (tests/workers/queue/test_heartbeat.py, test_fenced_worker.py, test_queue_contract.py). The loop of
 `workers.queue.slot` takes its place.
@@ -55,7 +55,7 @@ BEGIN
 END;
 $$;
 """
-# Also puts a worker back on the list that was struck off while it was frozen.
+# Also registers a worker again that was unregistered while it was frozen.
 HEARTBEAT: LiteralString = (
     "INSERT INTO procrastinate_workers (id) OVERRIDING SYSTEM VALUE VALUES (%s)"
     " ON CONFLICT (id) DO UPDATE SET last_heartbeat = now()"
@@ -103,7 +103,7 @@ async def enqueue(connection: Connection, job_id: str, *, order: int, held: bool
 async def take(connection: Connection, worker_id: int) -> Entry | None:
     """The next entry, for a worker that works on none; none where none is due.
 
-    An entry that the worker has already comes first: the answer that told of it was lost with the connection.
+    An entry that the worker already has comes first: the answer was lost with the connection.
     """
     await connection.execute(HEARTBEAT, (worker_id,))
     held = await _rows(
@@ -161,17 +161,17 @@ async def cancel(connection: Connection, entry_id: int) -> None:
 
 def subject_of(notification: str) -> str:
     """What a notification on `CHANNEL` is about: `NEW_ENTRY`, or the id of the entry that is to be cancelled."""
-    said = json.loads(notification)
-    return NEW_ENTRY if said["type"] == "job_inserted" else str(said["job_id"])
+    content = json.loads(notification)
+    return NEW_ENTRY if content["type"] == "job_inserted" else str(content["job_id"])
 
 
 async def register_worker(connection: Connection) -> int:
-    """Put a new worker on the list; it has to give signs of life (`HEARTBEAT`) from now on."""
+    """Register a new worker; it has to send heartbeats (`HEARTBEAT`) from now on."""
     return await _manager(connection).register_worker()
 
 
 async def unregister_worker(connection: Connection, worker_id: int | None) -> None:
-    """Take a worker off the list, or all of them."""
+    """Unregister a worker, or all of them."""
     await connection.execute("DELETE FROM procrastinate_workers WHERE id = coalesce(%s, id)", (worker_id,))
 
 
@@ -187,12 +187,12 @@ async def entries_of_worker(connection: Connection, worker_id: int | None) -> li
 
 
 async def unregister_silent_workers(connection: Connection, silent_s: float) -> None:
-    """Take off the list who gave no sign of life for so long."""
+    """Unregister workers that sent no heartbeat for ``silent_s``."""
     await _manager(connection).prune_stalled_workers(silent_s)
 
 
 async def entries_of_silent_workers(connection: Connection, silent_s: float) -> list[int]:
-    """Entries whose worker is not on the list, or gave no sign of life for so long."""
+    """Entries whose worker is not registered, or sent no heartbeat for ``silent_s``."""
     stalled = await _manager(connection).get_stalled_jobs(queue=QUEUE, seconds_since_heartbeat=silent_s)
     return sorted(job.id for job in stalled if job.id is not None)
 

@@ -47,12 +47,12 @@ def find_binaries(pg_bin: Path | None) -> Path:
 
 def server_version(binaries: Path) -> str:
     """Version of the server, for example ``18.4``."""
-    said = subprocess.run([binaries / "postgres", "--version"], capture_output=True, text=True, check=True)
-    return said.stdout.split()[2]
+    answer = subprocess.run([binaries / "postgres", "--version"], capture_output=True, text=True, check=True)
+    return answer.stdout.split()[2]
 
 
 def unprivileged_user() -> str | None:
-    """Whom the server runs as: us (none), or, as it refuses root, ``postgres`` or ``nobody``."""
+    """The user that the server runs as: none for ours; PostgreSQL refuses root, so then ``postgres`` or ``nobody``."""
     if os.geteuid() != 0:
         return None
     for name in ("postgres", "nobody"):

@@ -65,7 +65,7 @@ class Checker:
             await asyncio.sleep(LOOK_S)
 
     async def unfinished(self) -> tuple[str, ...]:
-        """Ids of ``finalizing`` datasets that nobody checks just now; clears away what the dead left here."""
+        """Ids of ``finalizing`` datasets that no process checks; removes folders of processes that died."""
         await asyncio.to_thread(_sweep, self._settings.scratch_dir / CHECKS)
         rows = await self._database.fetch(
             "SELECT id FROM datasets WHERE state = 'finalizing'"
@@ -155,7 +155,7 @@ async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[CheckRe
     child = await Child.start(settings.check_command, dataset, errors, {"OMP_NUM_THREADS": "1"})
     try:
         async with asyncio.timeout(settings.check_timeout_s):
-            said = b"".join([line async for line in child.lines()])
+            output = b"".join([line async for line in child.lines()])
             status = await child.wait()
     except TimeoutError:
         detail = f"The check took longer than {settings.check_timeout_s:g} s."
@@ -165,7 +165,7 @@ async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[CheckRe
         child.kill()
         await child.wait()
     try:
-        answer = json.loads(said)
+        answer = json.loads(output)
         if status == 0:
             return CheckReport.model_validate(answer["report"]), False
         if status == EXIT_INPUT_ERROR:

@@ -21,7 +21,7 @@ DATASET = """
             ORDER BY place) AS missing
     FROM datasets LEFT JOIN LATERAL (SELECT count(*) AS files, sum(size) AS bytes
         FROM dataset_files WHERE dataset_id = datasets.id) AS total ON true"""
-# With the store's tenant as parameter; none for everybody's.
+# With the store's tenant as parameter; none for all tenants.
 MINE = "datasets.tenant = coalesce(%s, datasets.tenant)"
 # Files of the manifest that lack, and a key where the same tenant's same bytes lie.
 KNOWN = f"""

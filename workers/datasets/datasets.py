@@ -141,7 +141,7 @@ class DatasetStore:
             if size > room:
                 raise LimitReached("body_too_large", f"{path} has more than the {room} bytes left for it.")
             file = await self._files.copy(source, key)
-            # Of the copy, which nobody else can write to: the source may change while it is read.
+            # Of the copy, which no other process can write to: the source may change while it is read.
             found = sha256 if trusted else await self._files.sha256(key)
             if (file.size, found) != (size, sha256):
                 raise InputError(
@@ -157,7 +157,7 @@ class DatasetStore:
     async def fill_known(self, dataset_id: str) -> DatasetView:
         """Copy what the manifest names and the same tenant has sent before; returns the dataset.
 
-        By digest and size, within one tenant: nobody learns what others have sent. Raises `NotFound`,
+        By digest and size, within one tenant: no tenant learns what others have sent. Raises `NotFound`,
         `LimitReached`.
         """
         known = await self._database.fetch(KNOWN, dataset_id, self._tenant)
@@ -270,7 +270,7 @@ class DatasetStore:
         return await retry_while_unavailable(lambda: self.get(dataset_id))
 
     async def unfinished(self) -> tuple[str, ...]:
-        """Ids left in ``finalizing`` that nobody checks (their process died, or has others to do first)."""
+        """Ids left in ``finalizing`` that no process checks (it died, or has others to do first)."""
         return await self._checker.unfinished()
 
     async def delete(self, dataset_id: str) -> None:

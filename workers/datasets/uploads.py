@@ -149,7 +149,7 @@ class UploadStore:
 
     async def _add_piece(self, upload: Upload, piece: bytes) -> Upload:
         start, end = upload.received, upload.received + len(piece)
-        # A name that nobody else uses: a slower connection never touches the piece of a faster one.
+        # A unique name: a slower connection never touches the piece of a faster one.
         key = f"{upload.folder}/{start:014d}-{secrets.token_hex(4)}"
         await self._files.put(key, _once(piece), limit_bytes=len(piece))
         async with self._database.transaction() as connection:
@@ -220,7 +220,7 @@ class UploadStore:
         )
 
     async def untaken(self) -> tuple[str, ...]:
-        """Ids of received uploads that nobody brings into their dataset just now."""
+        """Ids of received uploads that no process is bringing into their dataset."""
         rows = await self._database.fetch(
             "SELECT id FROM uploads WHERE state = 'received'"
             " AND coalesce(take_until < clock_timestamp(), true) ORDER BY created_at"

@@ -1,4 +1,4 @@
-"""Taking a job over: from the claim on, only its owner can write into the job."""
+"""Claiming a job: from then on only the attempt that holds the token can write into it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from workers.settings.errors import NotFound
 
 
 class Fenced(BaseException):
-    """Somebody else has claimed the job since. Not an `Exception`: nothing may swallow it."""
+    """Another attempt has claimed the job since. Not an `Exception`: no handler may swallow it."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class Claim:
 
 
 async def claim_job(database: Database, job_id: str, max_attempts: int) -> Claim | None:
-    """Take a job over with a fresh token; none where there is nothing to run.
+    """Claim a job with a fresh token; none where there is nothing to run.
 
-    A job whose cancellation was asked for ends ``cancelled``, one that had its attempts ends ``failed``.
+    A job whose cancellation was asked for ends ``cancelled``, one that has used up its attempts ends ``failed``.
     """
     token = uuid.uuid4()
     return await retry_while_unavailable(lambda: _claim(database, job_id, max_attempts, token))
@@ -84,7 +84,7 @@ def _claimed(row: dict[str, Any], token: uuid.UUID) -> Claim:
 
 
 def crashed_too_often(attempts: int, log_tail: str = "") -> JobError:
-    """The error of a job whose every attempt died."""
+    """The error of a job of which every attempt died."""
     return JobError(
         code="too_many_crashes",
         detail=f"The job's process died in each of {attempts} attempts.",

@@ -1,4 +1,4 @@
-"""Jobs that begin where another one is: forks of its work, and exports of its result."""
+"""Jobs derived from another: forks that start from its work, and exports of its result."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ EXPORTABLE = ("poses.json", "colmap/sparse/0/cameras.bin", "colmap/sparse/0/imag
 
 
 class DerivedJobs(JobStore):
-    """The same jobs, with the means to make others of them. What is said here raises `NotFound` too."""
+    """The same jobs, and how to derive others from them. Every method raises `NotFound` as well."""
 
     def __init__(self, jobs: JobStore, files: FileStore) -> None:
         super().__init__(jobs._database, jobs._listener, jobs._settings, jobs._tenant)

@@ -21,10 +21,10 @@ JOB = """
             AND (ahead.queue_order, ahead.queue_id) <= (jobs.queue_order, jobs.queue_id))
         END AS queue_position
     FROM jobs"""
-# The same for many at once: counting for each who is ahead of it takes seconds where thousands wait.
+# The same for many at once: counting for each job takes seconds where thousands wait.
 PLACES = """places AS (SELECT queue_id, row_number() OVER (ORDER BY queue_order, queue_id) AS queue_position
     FROM jobs WHERE state = 'queued')"""
-# With the store's tenant as parameter; none for everybody's.
+# With the store's tenant as parameter; none for all tenants.
 MINE = "jobs.tenant = coalesce(%s, jobs.tenant)"
 
 
@@ -73,9 +73,9 @@ def fingerprint_of(
     labels: Mapping[str, str] | None,
     priority: PriorityName = "normal",
 ) -> str:
-    """By which a repeated request is told from another one with the same key."""
-    said = [subject, options, dict(labels or {}), *([priority] if priority != "normal" else [])]
-    request = json.dumps(said, sort_keys=True)
+    """A digest of a request: two requests with one idempotency key are the same where these are equal."""
+    parts = [subject, options, dict(labels or {}), *([priority] if priority != "normal" else [])]
+    request = json.dumps(parts, sort_keys=True)
     return hashlib.sha256(request.encode()).hexdigest()
 
 

@@ -83,7 +83,7 @@ async def requeue(
     """Let the job wait again. Its queue entry is the caller's to put back.
 
     Args:
-        fence: whoever ran it can write no more; for an owner that does not know of it.
+        fence: drop the token, so that the attempt that ran it can write no more.
         uncounted: the attempt does not count.
         smaller: options that attempts to come use in the place of those asked for.
     """

@@ -1,4 +1,4 @@
-"""Many who follow jobs, at the cost of few queries: one look for all, and one read for who follows the same."""
+"""Shares one poll among all subscribers of jobs, and one read among all subscribers of the same job."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workers.settings.errors import Unavailable
 
 
 class JobListener(Listener):
-    """Wakes who follows a job. ``poll_s`` is how long a lost notification can go unnoticed."""
+    """Wakes subscribers of jobs. ``poll_s`` is how long a lost notification can go unnoticed."""
 
     def __init__(self, database: Database, poll_s: float) -> None:
         super().__init__(database, poll_s)
@@ -28,14 +28,14 @@ class JobListener(Listener):
         """Listen and look until cancelled."""
         await asyncio.gather(super().run(), self._look())
 
-    async def together(
+    async def read_shared(
         self,
         viewer: str | None,
         job_id: str,
         after: int,
         read: Callable[[str, int], Awaitable[JobUpdate]],
     ) -> JobUpdate:
-        """What ``read`` says, shared with all of the same ``viewer`` who ask for the same since the last change.
+        """The answer of ``read``, shared with all requests of the same ``viewer`` for the same since the last change.
 
         Call it only while `waiting` for the job: a change during the read then wakes the caller again.
         """
@@ -49,7 +49,7 @@ class JobListener(Listener):
     def _has_read(self, key: tuple[object, ...], reading: asyncio.Task[JobUpdate]) -> None:
         del self._reads[key]
         if not reading.cancelled():
-            reading.exception()  # seen, if by nobody else: they may all have left
+            reading.exception()  # marks it as retrieved: all who asked may have left
 
     def _wake(self, job_id: str) -> None:
         if job_id in self._waiting:
@@ -87,26 +87,26 @@ async def follow(
     heartbeat_s: float,
 ) -> AsyncGenerator[JobUpdate | None]:
     """See `JobStore.subscribe`."""
-    revision, said = -1, time.monotonic()
+    revision, sent_at = -1, time.monotonic()
     with listener.waiting(job_id) as changed:
         while True:
             changed.clear()  # before reading: a change during the read is not missed
             try:
-                update = await listener.together(viewer, job_id, after, read)
+                update = await listener.read_shared(viewer, job_id, after, read)
                 pause_s = heartbeat_s
             except Unavailable:
                 if revision < 0:
                     raise
                 update, pause_s = None, listener.poll_s
             if update is not None and update.job.revision != revision:
-                revision, said = update.job.revision, time.monotonic()
+                revision, sent_at = update.job.revision, time.monotonic()
                 after = update.events[-1].seq if update.events else after
                 yield update
                 if update.job.final:
                     return
-            elif time.monotonic() - said >= heartbeat_s:
-                said = time.monotonic()
+            elif time.monotonic() - sent_at >= heartbeat_s:
+                sent_at = time.monotonic()
                 yield None
-            left = heartbeat_s - (time.monotonic() - said)
+            left = heartbeat_s - (time.monotonic() - sent_at)
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(changed.wait(), max(0.01, min(pause_s, left)))

@@ -159,7 +159,7 @@ class Ledger:
     ) -> bool:
         """Make the result the job's one result; False where a cancellation was asked for first.
 
-        What other attempts left is deleted once nobody can be writing it any more.
+        Files of other attempts are deleted once no process can still be writing them.
         """
 
         async def write(connection: Connection) -> bool:

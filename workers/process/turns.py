@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager
 class Turns:
     """At most ``at_once`` turns at a time. Tenants that wait take them one after the other.
 
-    So whoever asks for a hundred delays everybody else by one, not by a hundred.
+    A tenant with a hundred requests delays each other tenant by one, not by a hundred.
     """
 
     def __init__(self, at_once: int) -> None:

@@ -1,4 +1,4 @@
-"""Ends a process whose event loop stands still: hung is worse than dead, for the dead are started again."""
+"""Ends a process whose event loop hangs: a process that ended is started again, one that hangs is not."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class _Watchdog(threading.Thread):
             await asyncio.sleep(self._period_s / 2)
 
     def run(self) -> None:
-        """Look until told to end."""
+        """Check until `end` is set."""
         # Looks are counted, not seconds: of a process that was frozen as a whole, this thread was frozen too.
         seen, in_vain = -1, 0
         while not self.end.wait(self._period_s):

@@ -57,7 +57,7 @@ class Janitor:
                 log.warning("janitor: %s", error)
                 if error.code == "database_unavailable":
                     self._healthy_since, self._saw_outage = None, True
-            except Exception:  # it must not end: nobody would take its place here
+            except Exception:  # it must not end: nothing would replace it in this process
                 log.exception("janitor: this round failed")
 
     async def _round(self) -> None:

@@ -39,7 +39,7 @@ EXIT_MEMORY = 4
 KILLED, CHILD_KILLED = -signal.SIGKILL, "seeding_crashed"
 # Ours to fix, not the user's: a checkpoint of an older version, for example. The job starts over.
 STALE_CHECKPOINT = {"output_not_resumable", "checkpoint_invalid"}
-DISCARDED_GRACE_S = 2.0  # for a cancelled job whose result nobody wants
+DISCARDED_GRACE_S = 2.0  # for a cancelled job of which no partial result is wanted
 
 
 class Attempt:
@@ -79,7 +79,7 @@ class Attempt:
         try:
             return await self._run()
         except Fenced:
-            # What was stored meanwhile is nobody's; the trash of this job may be gone already.
+            # Nothing refers to what was stored meanwhile, and the trash of this job may have been emptied already.
             await self._files.delete_prefix(self._result_prefix)
             raise
         finally:
@@ -188,9 +188,9 @@ class Attempt:
     async def _crashed(self, how: str, *, forget_checkpoint: bool = False) -> bool:
         tail = log_tail(self._log)
         if self._claim.attempt < self._settings.max_attempts:
-            said = {"how": how, "log_tail": tail}
+            data = {"how": how, "log_tail": tail}
             return await self._ledger.give_back(
-                "attempt_crashed", said, counted=True, forget_checkpoint=forget_checkpoint
+                "attempt_crashed", data, counted=True, forget_checkpoint=forget_checkpoint
             )
         error = crashed_too_often(self._claim.attempt, tail)
         error = error.model_copy(update={"detail": f"{error.detail} The last time: {how}."})
@@ -215,9 +215,9 @@ class Attempt:
             # Before the process reported them: as on a CPU, which takes less than a GPU.
             smaller = smaller_options(self._resolved or parse_options(self._claim.options).resolved("cpu"))
         if smaller and not self._claim.smaller and self._claim.attempt < self._settings.max_attempts:
-            said = {"why": "out_of_memory", "options": smaller, "log_tail": tail}
+            data = {"why": "out_of_memory", "options": smaller, "log_tail": tail}
             return await self._ledger.give_back(
-                "retried_smaller", said, counted=True, forget_checkpoint=True, smaller=smaller
+                "retried_smaller", data, counted=True, forget_checkpoint=True, smaller=smaller
             )
         await self._ledger.fail(
             out_of_memory(self._claim.smaller, tail), await self._store(log_only=True), *keep
@@ -239,8 +239,8 @@ class Attempt:
         """What the process wrote to ``error.json`` before it exited with 2 or 3."""
         tail = log_tail(self._log)
         try:
-            said = json.loads((self._folder / "error.json").read_text())
-            return JobError(**said, log_tail=tail)
+            reported = json.loads((self._folder / "error.json").read_text())
+            return JobError(**reported, log_tail=tail)
         except (OSError, ValueError, TypeError) as error:
             detail = f"The job failed and its error report could not be read ({error})."
             return JobError(code="engine_error", detail=detail, log_tail=tail)

@@ -1,4 +1,4 @@
-"""Carries what a job's process reports to the database and the file store, without ever holding it up."""
+"""Delivers the reports of a job's process to the database and the file store, without blocking the process."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Courier:
             self._reusable[stage].put(progress)
 
     def close(self, *, last_checkpoint: bool = True) -> None:
-        """No more reports will come; nobody goes on from the job's ``last_checkpoint`` where it is cancelled."""
+        """No more reports will come. Of a cancelled job the ``last_checkpoint`` is not needed."""
         if not last_checkpoint:
             self._checkpoints.latest = None
         self._closed.set()
@@ -167,7 +167,7 @@ class Courier:
         try:
             await writing
         except Fenced:
-            await self._files.delete_prefix(prefix)  # the new owner knows nothing of it, nor does the trash
+            await self._files.delete_prefix(prefix)  # neither the new owner nor the trash refers to it
             raise
 
     def _new_prefix(self, kind: str) -> str:

@@ -1,7 +1,7 @@
 """The program of one job's child process: `python -m workers.run.job_process JOB_FOLDER`.
 
 Reads ``job.json``, writes one line of JSON per report to standard output, everything else to standard error.
-Exit status: 0 done; 2 the user's mistake, 3 the refinement failed (both told in ``error.json``); 4 out of
+Exit status: 0 done; 2 the user's mistake, 3 the refinement failed (both described in ``error.json``); 4 out of
 memory; 143 stopped by SIGTERM after writing a checkpoint, if there was anything to keep; 1 anything else.
 """
 
@@ -92,8 +92,8 @@ def is_want_of_memory(error: Exception) -> bool:
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
     # torch's own, of the GPU (a class) and of the CPU (a text); not imported here, as most jobs never fail.
-    said = type(error).__name__ == "OutOfMemoryError" or "DefaultCPUAllocator" in str(error)
-    return isinstance(error, RuntimeError) and said
+    reported = type(error).__name__ == "OutOfMemoryError" or "DefaultCPUAllocator" in str(error)
+    return isinstance(error, RuntimeError) and reported
 
 
 def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop) -> None:
@@ -119,7 +119,7 @@ def _export(order: Order, stop: _Stop) -> None:
     from biresnerf.data.formats.codec import WriteContext
     from biresnerf.data.formats.result_formats import read_result, write_format
 
-    assert order.result is not None, "said with every export"
+    assert order.result is not None, "every export names it"
     names = TypeAdapter(tuple[ExportName, ...]).validate_python(order.options["formats"])
     photos = order.input if any(order.input.iterdir()) else None
     refined = read_result(order.result, photos)
@@ -138,5 +138,5 @@ if __name__ == "__main__":
     status = main(Path(sys.argv[1]))
     logging.shutdown()
     sys.stderr.flush()
-    # All is on disk and reported. Taking torch apart takes a while, in which whoever cancelled a job would wait.
+    # All is on disk and reported. Unloading torch takes a while, for which a cancelling user would wait.
     os._exit(status)

@@ -39,7 +39,7 @@ _SECRETS = (
     ),
 )
 _HIDDEN_LENGTH_MIN = 6
-# Libraries whose lines would tell addresses with secrets in them, or tell our own outcomes a second time.
+# Libraries that log addresses with secrets in them, or log our own outcomes a second time.
 _QUIET = {"httpx": logging.WARNING, "httpcore": logging.WARNING, "psycopg.pool": logging.ERROR}
 
 
@@ -133,7 +133,7 @@ class JsonLines(_Lines):
 
     def format(self, record: logging.LogRecord) -> str:
         """The record as one line of JSON."""
-        said: dict[str, Any] = {
+        line: dict[str, Any] = {
             "time": self._time(record),
             "level": record.levelname,
             "process": self._process,
@@ -142,8 +142,8 @@ class JsonLines(_Lines):
             **self._context(record),
         }
         if record.exc_info:
-            said["exception"] = self._exception(record)
-        return json.dumps(said, default=str)
+            line["exception"] = self._exception(record)
+        return json.dumps(line, default=str)
 
 
 def _log_uncaught(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:

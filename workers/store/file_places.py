@@ -72,7 +72,7 @@ class LocalPlace:
             shutil.rmtree(folder, ignore_errors=True)
 
     async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
-        """None: nobody but us serves a folder."""
+        """None: only we serve a folder."""
         return None
 
     def attributes(self, media_type: str | None) -> dict[str, str] | None:

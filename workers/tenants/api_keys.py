@@ -59,7 +59,7 @@ class KeyStore:
     async def create(
         self, tenant: str, name: str, scopes: Iterable[Scope], *, lives: timedelta | None = None
     ) -> tuple[ApiKey, str]:
-        """A new key and its text, which is told here and never again; makes the tenant if it is new.
+        """A new key and its text, which cannot be read again; makes the tenant if it is new.
 
         Raises `InputError` (``bad_tenant``, ``bad_scope``).
         """

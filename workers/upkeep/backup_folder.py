@@ -75,7 +75,7 @@ def sha256_of(path: Path) -> str:
 
 
 def run_postgres_program(settings: Settings, url: str, name: str, *arguments: str) -> None:
-    """Run ``pg_dump`` or ``pg_restore`` on the database at ``url``; raises `SetupError` with what it said."""
+    """Run ``pg_dump`` or ``pg_restore`` on the database at ``url``; raises `SetupError` with its output."""
     program = find_binaries(settings.pg_bin) / name
     if not program.is_file():
         raise SetupError(
@@ -84,11 +84,11 @@ def run_postgres_program(settings: Settings, url: str, name: str, *arguments: st
     parts: dict[str, Any] = conninfo_to_dict(url)
     password = parts.pop("password", None)  # not on the command line, which everybody can read
     variables = {} if password is None else {"PGPASSWORD": str(password)}
-    said = subprocess.run(
+    ended = subprocess.run(
         [str(program), *arguments, f"--dbname={make_conninfo(**parts)}"],
         env={**os.environ, **variables},
         capture_output=True,
         text=True,
     )
-    if said.returncode != 0:
-        raise SetupError(f"{name}_failed", f"{name} failed: {said.stderr.strip()[-1500:]}")
+    if ended.returncode != 0:
+        raise SetupError(f"{name}_failed", f"{name} failed: {ended.stderr.strip()[-1500:]}")

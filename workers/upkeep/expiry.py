@@ -1,7 +1,7 @@
-"""Lets results, unused datasets, old records and idempotency keys go when their time is over.
+"""Expires results, unused datasets, old records and idempotency keys.
 
-Files go through the trash, in the transaction that makes them unreachable; that they are gone is in the log of
-who takes the trash out (`workers.queue.janitor`). Each row expires once, however many dispatchers run.
+Files go to the trash in the transaction that makes them unreachable; `workers.queue.janitor` deletes them and logs
+it. Each row expires once, however many dispatchers run.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Expiry:
             await first_done(stop.wait(), asyncio.sleep(self._settings.expiry_s))
 
     async def round(self) -> None:
-        """Write down when things expire, and let go whose time is over; raises `Unavailable`."""
+        """Update the dates of expiry, and expire what is due; raises `Unavailable`."""
         if not await self._set_dates():
             return
         for expire in (self._expire_jobs, self._expire_datasets):

@@ -57,7 +57,7 @@ def slot_specs(settings: Settings) -> list[ChildSpec]:
 
 
 def dispatcher_spec(settings: Settings) -> ChildSpec:
-    """The process that sends webhooks; what it is sending when told to stop, it finishes."""
+    """The process that sends webhooks; on SIGTERM it finishes what it is sending."""
     grace_s = settings.webhook_timeout_s + KILL_AFTER_S
     return ChildSpec("dispatcher", (sys.executable, "-m", "workers.upkeep.dispatcher"), stop_grace_s=grace_s)
 
@@ -84,7 +84,7 @@ async def supervise(
         url = postgres.url if postgres is not None else settings.require_database_url()
         migrate(url)
         if postgres is not None:
-            # The folder is locked by us and all workers died with our predecessor: nobody runs anything.
+            # We hold the lock of the folder, and all workers died with our predecessor: no job runs.
             async with open_database(url, connections=1) as database:
                 await release_worker(database, None)
         return await _Supervisor(settings, url, postgres, children).run(on_ready)
@@ -145,7 +145,7 @@ class _Supervisor:
                     env={**self._environment, **spec.variables},
                     start_new_session=True,
                 )
-            except OSError as error:  # too many processes, or no memory for one more: not for ever
+            except OSError as error:  # too many processes, or no memory for one more: that passes
                 log.error("%s cannot be started (%s); again in %.1f s", spec.name, error, LONGEST_PAUSE_S)
                 await first_done(asyncio.sleep(LONGEST_PAUSE_S), self._stop.wait())
                 continue

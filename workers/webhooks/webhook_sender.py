@@ -42,7 +42,7 @@ PER_WEBHOOK, PER_FAILING, PER_TENANT = 4, 1, 8
 ROUNDS_MAX = 12
 PAUSE_FACTOR, PAUSE_MAX_S = 4.0, 12 * 3600.0
 JITTER = 0.2
-# Beyond the longest delivery: time to write down what came of it.
+# Beyond the longest delivery: time to record its outcome.
 LEASE_SPARE_S = 30.0
 AGAIN = {408, 409, 429}
 Outcome = Literal["delivered", "again", "failed", "gone"]
@@ -145,7 +145,7 @@ class WebhookSender:
         except httpcore.ProtocolError:
             return Result("again", error="not_http")
         except Exception:
-            # A fault of ours with this one message must not be met again every minute for ever.
+            # Our own failure on this one message must not repeat every minute without end.
             log.exception("webhook message %s could not be sent", headers["webhook-id"])
             return Result("again", error="internal")
         return Result(outcome_of(answer.status), answer.status, None, retry_after(answer.retry_after))
@@ -153,7 +153,7 @@ class WebhookSender:
     async def _conclude(
         self, connection: Connection, row: dict[str, Any], result: Result, at: datetime, seconds: float
     ) -> None:
-        """Write down what came of it. What it means for the message counts only while the lease is ours."""
+        """Record the outcome. The state of the message changes only while the lease is ours."""
         cursor = await connection.execute(
             "UPDATE webhook_deliveries SET attempts = attempts + 1 WHERE id = %s RETURNING attempts",
             (row["id"],),

@@ -152,7 +152,7 @@ class WebhookStore:
     async def test(self, webhook_id: str) -> DeliveryView:
         """Queue a message ``webhook.test``; raises `NotFound`, `Conflict` (``state_conflict``)."""
         delivery_id = new_id("msg")
-        said = {
+        message = {
             "type": TEST_EVENT,
             "timestamp": datetime.now(UTC).isoformat().replace("+00:00", "Z"),
             "data": {"webhook_id": webhook_id},
@@ -161,7 +161,7 @@ class WebhookStore:
             await self._require_enabled(connection, webhook_id)
             await connection.execute(
                 "INSERT INTO webhook_deliveries (id, webhook_id, event, body) VALUES (%s, %s, %s, %s)",
-                (delivery_id, webhook_id, TEST_EVENT, json.dumps(said)),
+                (delivery_id, webhook_id, TEST_EVENT, json.dumps(message)),
             )
             await connection.execute("SELECT pg_notify('biresnerf_webhooks', '')")
             return await _delivery(connection, webhook_id, delivery_id)
