@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 
+from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.registry import codecs
 from biresnerf.data.photos.named_images import IMAGE_FOLDER, images_below, images_in, visible
 from biresnerf.errors import InputError
@@ -66,8 +67,13 @@ def look_at(file: Path) -> FolderContents:
         InputError: ``input_unsupported``.
     """
     readable = [(name, codec) for name, codec in codecs().items() if codec.parse is not None]
+
+    def by_suffix_alone(item: tuple[str, Codec]) -> bool:
+        codec = item[1]
+        return file.name not in codec.format.found_as or not codec.recognises(file)
+
     # A name that a format declares goes before a suffix, which several may share.
-    for name, codec in sorted(readable, key=lambda item: file.name not in item[1].format.found_as):
+    for name, codec in sorted(readable, key=by_suffix_alone):
         place = codec.place_of(file)
         if place is not None:
             return FolderContents(codec.image_root(place), name, place, (), ())

@@ -113,6 +113,13 @@ def test_every_form_that_is_read_becomes_every_form_that_is_written(tmp_path: Pa
     assert not any(path.is_symlink() for path in (tmp_path / "all").rglob("*"))
 
 
+@pytest.mark.parametrize("form", PLACES)
+def test_the_folder_that_was_written_is_read_with_its_poses(tmp_path: Path, form: str) -> None:
+    write_set(tmp_path / "given", seed=1, count=4, k1=0.0)
+    converted(tmp_path / "given", tmp_path / "there", "--to", form, *(BOUNDS if form == "llff" else ()))
+    assert_same(read_dataset(tmp_path / "there"), read_dataset(tmp_path / "given"))
+
+
 def test_the_command_offers_every_form_there_is() -> None:
     [option] = [one for one in convert_command.params if one.name == "names"]
     assert set(option.type.choices) == {*PLACES, "pinhole", "poses", "scene"} == set(FORMS)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.transforms.read_transforms import bind_transforms, parse_transforms
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.model.dataset import Camera
@@ -26,6 +27,10 @@ INSTANT_NGP = Format(
     name="instant-ngp",
     title="transforms_ngp.json (instant-ngp)",
     rank=30,
+    found_as=("transforms_ngp.json",),
+    suffixes=(".json",),
+    gives="poses and intrinsics, as a transforms.json",
+    checked_against="files that `convert` and `export` wrote",
     in_set="transforms_ngp.json",
     in_result="transforms_ngp.json",
     loses=("rigs", "points", "mask paths"),
@@ -110,4 +115,11 @@ def _impossible(why: str) -> InputError:
     )
 
 
-CODECS = (Codec(INSTANT_NGP, write=lambda refined, path, _: write_transforms_ngp(refined, path)),)
+CODECS = (
+    Codec(
+        INSTANT_NGP,
+        parse=parse_transforms,
+        bind=bind_transforms,
+        write=lambda refined, path, _: write_transforms_ngp(refined, path),
+    ),
+)
