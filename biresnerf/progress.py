@@ -24,7 +24,7 @@ class Progress(BaseModel):
     message: str = ""
     options: ResolvedOptions | None = Field(
         None,
-        description="Options as the run uses them, reported as soon as they are known and when they change.",
+        description="Options as the run uses them; reported once they are known, and again if they change.",
     )
     checkpoint: str | None = Field(
         None, description="File name of a checkpoint just completed, relative to the output folder."

@@ -35,15 +35,15 @@ async def ready_dataset(calls: Calls) -> str:
 
 async def fill(database: Database, dataset: str, count: int) -> None:
     """Jobs that wait already, older than all others, written straight into the tables."""
-    options = Jsonb(RefineOptions(preset="fast").resolved("cpu").model_dump(mode="json"))
+    options = Jsonb({"preset": "fast"})
     for first in range(0, count, 1000):
         async with database.transaction() as connection:
             for n in range(first, min(count, first + 1000)):
                 job_id = f"job_0load{n:07}"
                 entry_id = await job_queue.enqueue(connection, job_id, order=0, held=False)
                 await connection.execute(
-                    "INSERT INTO jobs (id, dataset_id, options, fingerprint, queue_id, created_at)"
-                    " VALUES (%s, %s, %s, '', %s, now() - interval '1 day' + make_interval(secs => %s))",
+                    "INSERT INTO jobs (id, dataset_id, options, planned_steps, fingerprint, queue_id, created_at)"
+                    " VALUES (%s, %s, %s, 3000, '', %s, now() - interval '1 day' + make_interval(secs => %s))",
                     (job_id, dataset, options, entry_id, n),
                 )
     async with database.pool.connection() as connection:

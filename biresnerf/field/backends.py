@@ -47,9 +47,9 @@ def choose_device(device: Device) -> torch.device:
 
 
 def resolve_here(options: RefineOptions) -> tuple[ResolvedOptions, torch.device]:
-    """The options with nothing left open, for the device that they ask for on this machine; and that device.
+    """The options resolved for the device that they request, and that device.
 
-    Raises `InputError` for CUDA that cannot be used, and for options that do not fit together.
+    Raises `InputError` if CUDA is requested and cannot be used, and for options that contradict each other.
     """
     device = choose_device(options.device)
     return options.resolved("cuda" if device.type == "cuda" else "cpu"), device

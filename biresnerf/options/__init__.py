@@ -1,1 +1,1 @@
-"""What a user may ask of a refinement, and the presets. Imports neither torch nor numpy; reads no files."""
+"""Options of a refinement and the presets. Imports neither torch nor numpy; reads no files."""

@@ -1,4 +1,4 @@
-"""What an option says of itself, where it is declared."""
+"""Metadata of an option."""
 
 from __future__ import annotations
 
@@ -14,21 +14,31 @@ Schema = dict[str, Any]
 
 @dataclass(frozen=True)
 class Option:
-    """What an option says of itself; stands beside its type. The JSON schema has all but `less_memory`.
+    """Metadata of an option, declared beside its type; all but `smaller` are in the JSON schema.
 
     Attributes:
         stage: the first stage whose work depends on it.
-        changes_result: whether poses, field or verdict depend on it. Those that do not may change on resuming.
-        level: whom it is for: everybody, those who know the method, or experiments with it. Forms show the usual ones
-            first and those for research not at all.
-        less_memory: its value for a second try after the first ran out of memory; None where it saves none.
+        changes_result: whether poses, field or verdict depend on it. Other options may change when a run resumes.
+        level: usual: for every user; expert: for users who know the method; research: for experiments with the method,
+            left out of forms.
+        smaller: from the value of a try that ran out of memory to that of the next; None if it saves none.
     """
 
     stage: Stage
     changes_result: bool = True
     level: Level = "expert"
-    less_memory: Callable[[Any], Any] | None = None
+    smaller: Callable[[Any], Any] | None = None
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Callable[[Any], Schema]) -> Schema:
-        told = {"stage": self.stage, "changes_result": self.changes_result, "level": self.level}
-        return {**handler(schema), **told}
+        metadata = {"stage": self.stage, "changes_result": self.changes_result, "level": self.level}
+        return {**handler(schema), **metadata}
+
+
+def divided(by: int, least: int) -> Callable[[int], int]:
+    """``value // by``, but not below `least`."""
+    return lambda value: min(value, max(least, value // by))
+
+
+def lowered(by: int, least: int) -> Callable[[int], int]:
+    """``value - by``, but not below `least`."""
+    return lambda value: min(value, max(least, value - by))

@@ -1,4 +1,4 @@
-"""The values of options that were left open: by preset, by method, and on a GPU."""
+"""Values of options that are left out: by preset, by method, and on a GPU."""
 
 from __future__ import annotations
 
@@ -145,17 +145,17 @@ METHOD_PAPER_VALUES: dict[MethodName, dict[str, Any]] = {
 def preset_values(
     preset: PresetName, method: MethodName, device: ComputeDevice, steps: int | None
 ) -> dict[str, Any]:
-    """The values of options that were left open; `steps` is None where that was, too."""
+    """Values of options that are left out. `steps`: as requested; None if left out as well."""
     values = {**COMMON_VALUES, **PRESETS[preset], **METHOD_VALUES[method]}
     if preset == "paper":
         values |= METHOD_PAPER_VALUES[method]
     elif device == "cuda":
         values |= {key: values[key] * factor for key, factor in CUDA_SCALE.items()}
     if steps is not None:
-        # A run made shorter by `steps` alone keeps the preset's proportions.
+        # A run with fewer steps keeps the preset's proportions.
         ratio = steps / values["steps"]
         for key in ("coarse_steps_min", "coarse_steps_max", "check_every", "warmup_steps"):
             values[key] = max(10, round(values[key] * ratio))
-        # In proportion, trials would be too short to tell good poses from better ones.
+        # In proportion, trials would be too short to distinguish good poses from better ones.
         values["trial_steps"] = max(10, min(values["trial_steps"], steps // 4))
     return values

@@ -96,11 +96,11 @@ class JobView(Record):
     expires_at: datetime | None = Field(
         None, description="When its files go, once it is over; none where they are kept for ever."
     )
-    options: dict[str, Any] = Field(description="RefineOptions as asked for; of an export, its formats.")
+    options: dict[str, Any] = Field(description="RefineOptions as requested; of an export, its formats.")
     resolved_options: dict[str, Any] | None = Field(
         None,
-        description="ResolvedOptions: every option as the latest attempt used it, with what was left open filled in by "
-        "preset, method and the device of its worker. Null until it runs.",
+        description="ResolvedOptions: every option as the latest attempt used it, filled in from preset, method and "
+        "the worker's device. Null until the job runs.",
     )
     smaller: dict[str, Any] = Field(
         {}, description="Options that a second try uses instead, after the first ran out of memory."

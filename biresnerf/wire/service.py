@@ -34,8 +34,10 @@ class OptionsView(Record):
     """
 
     json_schema: dict[str, Any]
-    presets: dict[PresetName, ResolvedOptions] = Field(description="As a worker without a GPU fills them in.")
-    presets_on_gpu: dict[PresetName, ResolvedOptions]
+    presets: dict[PresetName, ResolvedOptions] = Field(description="As resolved by a worker without a GPU.")
+    presets_on_gpu: dict[PresetName, ResolvedOptions] = Field(
+        description="As resolved by a worker with a GPU."
+    )
 
 
 class SizeLimits(Record):

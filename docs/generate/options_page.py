@@ -32,9 +32,10 @@ JSON Schema.
 - A key that is left out takes the method's value, else the preset's, else its own.
 - With `steps` alone the preset's proportions are kept: `coarse_steps_min`, `coarse_steps_max`, `check_every`,
   `warmup_steps` are scaled. `trial_steps` becomes a quarter of `steps` where the preset has more.
-- *touches* names the first stage whose work depends on an option: with a change to it, [a fork](jobs.md) takes over the work
-  of the stages before. What does not touch the poses may also change when a run is resumed.
-- Options for research are not in the page's form.
+- *touches* is the first stage that an option affects; [a fork](jobs.md) that changes it takes over the stages before. Options
+  that do not affect the poses may also change when a run resumes.
+- The worker resolves options for its device. A job shows them as `options` (as requested) and `resolved_options` (as used).
+- The page's form leaves out the options for research.
 """
 
 
@@ -47,7 +48,7 @@ def options_page() -> str:
     for key, field in schema["properties"].items():
         meaning = field["description"].rstrip(".")
         option = OPTIONS[key]
-        touches = option.stage if option.changes_result else f"{option.stage}, not the poses"
+        touches = option.stage if option.changes_result else f"{option.stage}; not the poses"
         rows[option.level].append((f"`{key}`", _default(key), takes(field, definitions), meaning, touches))
         if any(key in values for values in PRESETS.values()):
             by_preset.append((f"`{key}`", *(code(PRESETS[name][key]) for name in PRESETS)))

@@ -7,7 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from biresnerf.commands.poses.refine import refine_command
 from biresnerf.errors import InputError
 from biresnerf.options.option import Option
 from biresnerf.options.presets import METHOD_VALUES, PRESETS
@@ -106,3 +108,9 @@ def test_the_type_checker_tells_options_asked_for_from_resolved_ones(tmp_path: P
     assert found.returncode == 1, found.stdout + found.stderr
     wrong = {int(line.split(":")[1]) for line in found.stdout.splitlines() if ": error:" in line}
     assert wrong == {5, 6}, found.stdout
+
+
+def test_the_first_screen_of_help_names_no_option_for_research():
+    screen = CliRunner().invoke(refine_command, ["--help"]).output
+    assert "--preset" in screen
+    assert not [name for name, option in OPTIONS.items() if option.level == "research" and name in screen]

@@ -23,7 +23,7 @@ class Fenced(BaseException):
 class Claim:
     """One attempt of one job, owned by whoever holds ``token``.
 
-    ``options`` are those that were asked for; the job's process fills in the others for its device.
+    ``options`` are as requested; the job's process resolves them for its device.
     """
 
     job_id: str

@@ -1,4 +1,4 @@
-"""Which work of a job another one can take over, given what is to be different."""
+"""Which work of a job a fork can take over, given the options that change."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ LATEST_FIRST: tuple[ReusableStage, ...] = ("coarse", "seeding")
 def plan_fork(
     parent: Mapping[str, Any], changes: Mapping[str, Any], wanted: WantedStage
 ) -> tuple[RefineOptions, ReusableStage]:
-    """Options of the new job, and the latest stage whose work it can take over.
+    """Options of the fork, and the latest stage that it can take over.
 
     Args:
-        parent: the row of the job that it starts from.
-        changes: options that are to be different; all others are as they were asked for.
+        parent: the row of the forked job.
+        changes: options that change; all others stay as requested.
         wanted: a stage, or ``auto`` for the latest that the changes allow.
 
     Raises:
         Conflict: ``fork_not_possible``, with the reason.
         InputError: ``invalid_options``.
     """
-    # What memory did not allow would fail again.
+    # Sizes that ran out of memory would do so again.
     asked = {**parent["options"], **parent["smaller"]}
     options = parse_options({**asked, **changes})
-    # A job that has not run has no work to take over, on any device.
+    # Without resolved options the job has not run, and there is nothing to take over on any device.
     device = (parent["resolved_options"] or {}).get("device", "cpu")
     old = parse_options(asked).resolved(device).model_dump()
     new = options.resolved(device if options.device == "auto" else options.device).model_dump()
@@ -58,6 +58,6 @@ def _why_not(
         return f"start={new['start']} does not ask COLMAP."
     if "seeding_effort" in changed and new["seeding_effort"] == "full":
         return "COLMAP's answer was found with seeding_effort=low."
-    told_above = {"start", "seeding_effort"}
-    others = sorted(name for name in changed - told_above if OPTIONS[name].stage == "seeding")
+    checked_above = {"start", "seeding_effort"}
+    others = sorted(name for name in changed - checked_above if OPTIONS[name].stage == "seeding")
     return f"COLMAP's answer depends on {', '.join(others)}." if others else None

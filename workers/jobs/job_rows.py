@@ -53,9 +53,9 @@ async def one_row(connection: Connection, sql: Any, *parameters: Any) -> dict[st
 
 
 def asked_columns(options: RefineOptions) -> dict[str, Any]:
-    """The columns of a new job that come from its options.
+    """Columns of a new job that follow from its options.
 
-    Raises `InputError` (``invalid_options``) where they do not fit what preset and method fill in.
+    Raises `InputError` (``invalid_options``) if they contradict the values of preset and method.
     """
     asked = options.model_dump(mode="json", exclude_unset=True)
     return {"options": Jsonb(asked), "planned_steps": options.resolved("cpu").steps}

@@ -212,7 +212,7 @@ class Attempt:
         tail, keep = log_tail(self._log), (self._claim.name, self._settings.stall_s)
         smaller: dict[str, Any] = {}
         if self._claim.kind == "refine":
-            # Before the process reported them: as on a CPU, which takes less than a GPU.
+            # Until the process reports its options, assume a CPU, which takes less than a GPU.
             smaller = smaller_options(self._resolved or parse_options(self._claim.options).resolved("cpu"))
         if smaller and not self._claim.smaller and self._claim.attempt < self._settings.max_attempts:
             data = {"why": "out_of_memory", "options": smaller, "log_tail": tail}

@@ -12,9 +12,9 @@ from biresnerf.wire.problems import JobError
 
 
 def smaller_options(options: ResolvedOptions) -> dict[str, Any]:
-    """The options that a second try uses with less; empty where nothing is left to lessen."""
+    """Options of a second try that change to take less memory; empty if none can."""
     now = options.model_dump()
-    less = {name: o.less_memory(now[name]) for name, o in OPTIONS.items() if o.less_memory is not None}
+    less = {name: o.smaller(now[name]) for name, o in OPTIONS.items() if o.smaller is not None}
     return {name: value for name, value in less.items() if value != now[name]}
 
 

@@ -118,8 +118,8 @@ $$;
 
 -- `queue_order`: priority first, then turn; lower runs earlier. `held`: the tenant has as many jobs offered or
 -- running as it may; the queue does not offer this one until one of those ends. `trace`: the W3C traceparent of the
--- submission, which attempts join. An export of a result is a job below its `parent`. `options`: as asked for;
--- `resolved_options`: as the latest attempt used them; `planned_steps`: of the asked for, by which turns are given.
+-- submission, which attempts join. An export of a result is a job below its `parent`. `options`: as requested;
+-- `resolved_options`: as the latest attempt used them; `planned_steps`: the cost of the job, which decides its turn.
 -- fillfactor leaves space in each page, so that progress updates stay HOT (no index writes).
 CREATE TABLE jobs (
     id text PRIMARY KEY,
