@@ -2,7 +2,7 @@
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { between, centreOf, medianOf, spreadOf, turnDeg } from "../result/poses";
 import type { PointLayer, SceneCamera } from "../result/widget_data";
-import { Button, ImageStepper } from "../widgets/controls";
+import { Button, ImageStepper, Slider } from "../widgets/controls";
 import { fixed, short } from "../widgets/numbers";
 import { hexColour, themeColour, useDark, useStill } from "../widgets/theme";
 import { sourceWords } from "../widgets/words";
@@ -88,7 +88,16 @@ export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: S
       >
         <Legend {...{ by: choice.by, cap, kinds, dark }} unknown={cameras.some((camera) => camera.delta_psnr === null)} />
       </div>
-      <Slider share={share} onChange={setShare} />
+      <label class="scene-slider">
+        <span>Input</span>
+        <Slider
+          value={share}
+          label="From the input's poses to the refined ones"
+          text={share === 0 ? "input" : share === 1 ? "refined" : `${Math.round(100 * share)} % of the way`}
+          onChange={setShare}
+        />
+        <span>Refined</span>
+      </label>
       <div class="scene-foot">
         <ImageStepper names={cameras.map((camera) => camera.name)} selected={selected} onSelect={onSelect} />
         <Button disabled={!chosen} pressed={through} onClick={() => (through ? back() : setThrough(true))}>
@@ -98,25 +107,6 @@ export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: S
         {chosen && <Readout camera={chosen} share={share} />}
       </div>
     </section>
-  );
-}
-
-function Slider({ share, onChange }: { share: number; onChange: (share: number) => void }) {
-  return (
-    <label class="scene-slider">
-      <span>Input</span>
-      <input
-        type="range"
-        min={0}
-        max={1}
-        step={0.01}
-        value={share}
-        aria-label="From the input's poses to the refined ones"
-        aria-valuetext={share === 0 ? "input" : share === 1 ? "refined" : `${Math.round(100 * share)} % of the way`}
-        onInput={(event) => onChange(Number(event.currentTarget.value))}
-      />
-      <span>Refined</span>
-    </label>
   );
 }
 

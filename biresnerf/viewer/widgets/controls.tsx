@@ -68,6 +68,22 @@ export function Switch(props: { label: string; on: boolean; onChange: (on: boole
   );
 }
 
+/** A slider from 0 to 1. */
+export function Slider(props: { value: number; label: string; text: string; onChange: (value: number) => void }) {
+  return (
+    <input
+      type="range"
+      min={0}
+      max={1}
+      step={0.01}
+      value={props.value}
+      aria-label={props.label}
+      aria-valuetext={props.text}
+      onInput={(event) => props.onChange(Number(event.currentTarget.value))}
+    />
+  );
+}
+
 export function Button(props: {
   onClick: () => void;
   children: ComponentChildren;

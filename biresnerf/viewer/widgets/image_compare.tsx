@@ -3,7 +3,7 @@ import { useMemo, useState } from "preact/hooks";
 import type { ShownPictures, ShownView } from "schemas";
 import { length, minus, type Triple } from "../result/poses";
 import type { UrlOf } from "../result/widget_data";
-import { Choice, ImageStepper } from "./controls";
+import { Choice, ImageStepper, Slider } from "./controls";
 import { fixed } from "./numbers";
 
 export interface ImageCompareProps {
@@ -92,15 +92,11 @@ function Picture(props: { view: ShownView; name: string; mode: Mode; urlOf: Imag
             render
           </span>
           <span class="compare-edge" style={{ left: `${100 * at}%` }} aria-hidden="true" />
-          <input
-            type="range"
-            min={0}
-            max={1}
-            step={0.01}
+          <Slider
             value={at}
-            aria-label="Swipe between photo and render"
-            aria-valuetext={`${Math.round(100 * at)} % photo`}
-            onInput={(event) => setAt(Number(event.currentTarget.value))}
+            label="Swipe between photo and render"
+            text={`${Math.round(100 * at)} % photo`}
+            onChange={setAt}
           />
         </div>
       ) : (

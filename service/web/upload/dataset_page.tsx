@@ -12,16 +12,17 @@ import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 import { CheckTable } from "./check_table";
 import { DropZone } from "./drop";
-import { type Sending, sendings } from "./send";
+import { transfers } from "./send";
 import { StillToCome } from "./still_to_come";
+import type { Transfer } from "./transfer";
 
 const LOOK_EVERY_MS = 700;
-const NOBODY = new Store<Sending | null>(null);
+const NOBODY = new Store<Transfer | null>(null);
 
 export function DatasetPage({ id }: { id: string }) {
   const { dataset, problem, look } = useDataset(id);
   const [, redraw] = useState(0);
-  const sending = useStore<Sending | null>((sendings.get(id) as Store<Sending | null> | undefined) ?? NOBODY);
+  const sending = useStore<Transfer | null>((transfers.get(id) as Store<Transfer | null> | undefined) ?? NOBODY);
   useTitle(dataset ? `${dataset.name} · new job` : "New job");
   useEffect(look, [sending?.phase]);
   if (problem) return <ProblemBox problem={problem} />;
@@ -76,7 +77,7 @@ function useDataset(id: string) {
   return { dataset, problem, look: useCallback(() => setAsked((n) => n + 1), []) };
 }
 
-function Progress({ sending }: { sending: Sending }) {
+function Progress({ sending }: { sending: Transfer }) {
   const share = sending.bytes ? Math.min(1, sending.bytesDone / sending.bytes) : 1;
   const seconds = (Date.now() - sending.startedAt) / 1000;
   const rate = seconds > 1 ? sending.bytesDone / seconds : 0;

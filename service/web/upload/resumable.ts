@@ -2,7 +2,7 @@
 import type { DatasetView, UploadView } from "schemas";
 import { ask, asProblem, call, Problem } from "../api/http";
 import type { Store } from "../api/store";
-import { persistently, put, type Sending } from "./send";
+import { put, retrying, type Transfer } from "./transfer";
 
 const PIECE_BYTES = 16 * 2 ** 20;
 const TUS = { "Tus-Resumable": "1.0.0" };
@@ -23,7 +23,7 @@ export interface ArchiveSent {
 export async function sendArchive(
   file: File,
   name: string,
-  state: Store<Sending>,
+  state: Store<Transfer>,
   dataset?: string,
 ): Promise<ArchiveSent> {
   const place = `biresnerf-upload ${file.name} ${file.size} ${file.lastModified}`;
@@ -62,11 +62,11 @@ export async function giveUpRejected(upload: string): Promise<Problem | null> {
   return new Problem(422, error.code, "The archive was not accepted", error.detail, error.hint, error.where);
 }
 
-async function sendPieces(upload: string, file: File, state: Store<Sending>): Promise<void> {
+async function sendPieces(upload: string, file: File, state: Store<Transfer>): Promise<void> {
   state.change({ phase: "sending" });
   let offset = await offsetOf(upload);
   while (offset < file.size) {
-    await persistently(state, async () => {
+    await retrying(state, async () => {
       offset = await offsetOf(upload); // as the service has it, whatever went wrong before
       if (offset >= file.size) return;
       const headers = {

@@ -1,38 +1,19 @@
 // Brings files to the service: only those it has not, several at a time, each again where the connection breaks.
 import type { DatasetView, Info, SizeLimits } from "schemas";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
-import { address, asProblem, call, noteRefusal, pause, Problem, withKey } from "../api/http";
-import { Store } from "../api/store";
+import { asProblem, call, Problem } from "../api/http";
+import type { Store } from "../api/store";
 import { bytes as inBytes } from "../parts/format";
 import { type Chosen, type Gathered, isArchive } from "./gather";
 import { giveUpRejected, sendArchive } from "./resumable";
+import { newTransfer, put, retrying, type Transfer } from "./transfer";
 
 const AT_ONCE = 4;
-const TRIES = 6;
 /** Beyond this a file is not held in memory to be hashed; it is sent without its digest. */
 const HASHED_MAX_BYTES = 256 * 2 ** 20;
 
-export interface Sending {
-  phase: "hashing" | "sending" | "checking" | "done" | "stopped";
-  files: number;
-  filesDone: number;
-  /** Files that the service had already. */
-  known: number;
-  bytes: number;
-  bytesDone: number;
-  startedAt: number;
-  /** A passing fault: the page tries again. */
-  waiting: string;
-  problem: Problem | null;
-}
-
 /** What is on its way from this tab, by dataset. */
-export const sendings = new Map<string, Store<Sending>>();
-
-const NOTHING: Sending = {
-  ...{ phase: "hashing", files: 0, filesDone: 0, known: 0, bytes: 0, bytesDone: 0 },
-  ...{ startedAt: 0, waiting: "", problem: null },
-};
+export const transfers = new Map<string, Store<Transfer>>();
 
 /** What the service would refuse anyway is said before anything is sent, file by file. */
 function refuseTooMuch(chosen: readonly Chosen[], bytes: number, limits: SizeLimits): void {
@@ -68,7 +49,7 @@ export async function begin(gathered: Gathered, onHashing: (share: number) => vo
   const chosen = gathered.files;
   const name = gathered.name.slice(0, 200) || "dataset";
   const bytes = chosen.reduce((sum, { file }) => sum + file.size, 0);
-  const state = new Store<Sending>({ ...NOTHING, files: chosen.length, bytes, startedAt: Date.now() });
+  const state = newTransfer(chosen.length, bytes);
   refuseTooMuch(chosen, bytes, (await call<Info>("GET", "v1/info")).limits);
   if (isArchive(chosen)) {
     const file = chosen[0]!.file;
@@ -83,7 +64,7 @@ export async function begin(gathered: Gathered, onHashing: (share: number) => vo
 /** Goes on with a dataset of which not all arrived. Throws `Problem` where these are other files. */
 export async function goOn(dataset: DatasetView, chosen: Chosen[]): Promise<void> {
   const bytes = chosen.reduce((sum, { file }) => sum + file.size, 0);
-  const state = new Store<Sending>({ ...NOTHING, files: chosen.length, bytes, startedAt: Date.now() });
+  const state = newTransfer(chosen.length, bytes);
   const unlisted = dataset.missing.length === 0; // an archive, or a folder in the place of one
   if (unlisted && isArchive(chosen)) {
     keep(await sendArchive(chosen[0]!.file, dataset.name, state, dataset.id), state);
@@ -103,19 +84,20 @@ export async function goOn(dataset: DatasetView, chosen: Chosen[]): Promise<void
 /** Has a dataset checked of which everything arrived, but nobody was there to say so. */
 export function checkArrived(dataset: DatasetView): void {
   const { files, bytes } = dataset;
-  const state = new Store<Sending>({ ...NOTHING, files, filesDone: files, bytes, bytesDone: bytes });
+  const state = newTransfer(files, bytes);
+  state.change({ filesDone: files, bytesDone: bytes });
   keep({ dataset: dataset.id, sent: Promise.resolve() }, state);
 }
 
-function keep(begun: { dataset: string; upload?: string; sent: Promise<void> }, state: Store<Sending>): string {
-  sendings.set(begun.dataset, state);
+function keep(begun: { dataset: string; upload?: string; sent: Promise<void> }, state: Store<Transfer>): string {
+  transfers.set(begun.dataset, state);
   begun.sent
     .then(() => finalize(begun.dataset, begun.upload, state))
     .catch((error) => state.change({ phase: "stopped", problem: asProblem(error) }));
   return begun.dataset;
 }
 
-async function finalize(dataset: string, upload: string | undefined, state: Store<Sending>): Promise<void> {
+async function finalize(dataset: string, upload: string | undefined, state: Store<Transfer>): Promise<void> {
   state.change({ phase: "checking", waiting: "" });
   try {
     await call("POST", `v1/datasets/${dataset}/finalize`, { headers: { Prefer: "respond-async" } });
@@ -142,7 +124,7 @@ async function hashed(chosen: Chosen[], bytes: number, onHashing: (share: number
   return entries;
 }
 
-async function sendMissing(dataset: DatasetView, entries: Entry[], state: Store<Sending>): Promise<void> {
+async function sendMissing(dataset: DatasetView, entries: Entry[], state: Store<Transfer>): Promise<void> {
   const missing = new Set(dataset.missing);
   const queue = entries.filter(({ path }) => missing.has(path));
   const known = entries.length - queue.length;
@@ -161,7 +143,7 @@ async function sendMissing(dataset: DatasetView, entries: Entry[], state: Store<
   await Promise.all(Array.from({ length: AT_ONCE }, lane));
 }
 
-async function sendFile(dataset: string, entry: Entry, state: Store<Sending>): Promise<void> {
+async function sendFile(dataset: string, entry: Entry, state: Store<Transfer>): Promise<void> {
   const path = entry.path.split("/").map(encodeURIComponent).join("/");
   const headers: Record<string, string> = entry.sha256 ? { "Repr-Digest": `sha-256=:${base64(entry.sha256)}:` } : {};
   let told = 0;
@@ -170,7 +152,7 @@ async function sendFile(dataset: string, entry: Entry, state: Store<Sending>): P
     told = sent;
   };
   try {
-    await persistently(state, async () => {
+    await retrying(state, async () => {
       onSent(0);
       await put("PUT", `v1/datasets/${dataset}/files/${path}`, headers, entry.file, onSent);
     });
@@ -179,46 +161,6 @@ async function sendFile(dataset: string, entry: Entry, state: Store<Sending>): P
   }
   onSent(entry.file.size);
   state.change({ filesDone: state.value.filesDone + 1 });
-}
-
-/** Tries again while the fault is one that passes. */
-export async function persistently(state: Store<Sending>, attempt: () => Promise<void>): Promise<void> {
-  for (let tried = 1; ; tried += 1) {
-    try {
-      await attempt();
-      if (state.value.waiting) state.change({ waiting: "" });
-      return;
-    } catch (error) {
-      const problem = asProblem(error);
-      if (!problem.passing || tried === TRIES) throw problem;
-      state.change({ waiting: problem.title });
-      await pause(Math.max(1000 * problem.waitS, Math.min(15000, 500 * 2 ** tried)));
-    }
-  }
-}
-
-/** Sends a body and tells how much of it is on its way, which fetch cannot. */
-export function put(
-  method: string,
-  path: string,
-  headers: Record<string, string>,
-  body: Blob,
-  onSent: (bytes: number) => void,
-): Promise<XMLHttpRequest> {
-  return new Promise((done, failed) => {
-    const request = new XMLHttpRequest();
-    request.open(method, address(path));
-    for (const [name, value] of Object.entries(withKey(headers))) request.setRequestHeader(name, value);
-    if (!("Content-Type" in headers)) request.setRequestHeader("Content-Type", "application/octet-stream");
-    request.upload.onprogress = (event) => onSent(event.loaded);
-    request.onerror = () => failed(Problem.unreachable());
-    request.onload = () => {
-      if (request.status < 300) return done(request);
-      const problem = Problem.of(request.status, request.responseText, request.getResponseHeader("Retry-After"));
-      failed(noteRefusal(problem));
-    };
-    request.send(body);
-  });
 }
 
 function hex(digest: ArrayBuffer): string {
