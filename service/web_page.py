@@ -19,7 +19,7 @@ CSP = (
     "default-src 'self'; img-src 'self' blob: data:; media-src 'self' blob:; worker-src 'self' blob:; "
     "object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-_NAME = re.compile(r"[a-z]+-[A-Z0-9]{8}\.(js|css|svg)|licences\.txt")
+_NAME = re.compile(r"[a-z-]+-[A-Z0-9]{8}\.(js|css|svg)|licences\.txt")
 _MEDIA_TYPES = {
     ".html": "text/html",
     ".js": "text/javascript",

@@ -1,19 +1,19 @@
-// Who the files of a result are for.
+// The programs that read the files of a result, and how to get them.
 import type { ArtifactView } from "schemas";
 
 export interface Consumer {
   name: string;
   words: string;
-  /** A file, or a folder (with a slash at its end). */
+  /** A file, or a folder (ending in a slash). */
   files: string;
-  /** The form that has to be asked for, where it is not always written. */
+  /** The format to request if it is not written by default. */
   pack?: string;
 }
 
 export const CONSUMERS: readonly Consumer[] = [
   {
     name: "For nerfstudio",
-    words: "Put it in the place of the photos' transforms.json, then: ns-train nerfacto --data FOLDER",
+    words: "Replaces the transforms.json of the photos; then: ns-train nerfacto --data FOLDER",
     files: "transforms.json",
   },
   {
@@ -24,33 +24,33 @@ export const CONSUMERS: readonly Consumer[] = [
   },
   {
     name: "For COLMAP",
-    words: "A binary model with the input's ids; gsplat and 3DGS read it too where lenses have no distortion",
+    words: "A binary model with the input's ids; gsplat and 3DGS read it too if the lenses have no distortion",
     files: "colmap/sparse/",
   },
-  { name: "For COLMAP, as text", words: "For what reads no binary models", files: "colmap/sparse_txt/", pack: "colmap-text" },
+  { name: "For COLMAP, as text", words: "For programs that read no binary models", files: "colmap/sparse_txt/", pack: "colmap-text" },
   {
     name: "For instant-ngp",
-    words: "Put it into the photos' folder, then open it in instant-ngp",
+    words: "Put it into the folder of the photos and open it in instant-ngp",
     files: "transforms_ngp.json",
     pack: "instant-ngp",
   },
   { name: "For Blender", words: "Cameras before and after, and points: File › Import › glTF", files: "scene.glb" },
   {
     name: "For Metashape",
-    words: "Bundler's form: File › Import › Import Cameras",
+    words: "Bundler format: File › Import › Import Cameras",
     files: "bundler/",
     pack: "bundler",
   },
-  { name: "For evo and SLAM tools", words: "A trajectory in TUM's form", files: "tum.txt" },
-  { name: "For odometry tools", words: "A trajectory in KITTI's form", files: "kitti.txt", pack: "kitti" },
-  { name: "For LLFF", words: "In the form of the input", files: "poses_bounds.npy" },
-  { name: "For your own programs", words: "Each pose before and after, with all digits", files: "poses.json" },
-  { name: "To show to others", words: "This page as one file that needs no network", files: "report.html" },
-  { name: "To show to others, moving", words: "A flight around the scene", files: "renders/orbit.mp4" },
-  { name: "Figures and evidence", words: "The verdict's numbers, and what became of each image", files: "report.json" },
+  { name: "For evo and SLAM tools", words: "A trajectory in TUM format", files: "tum.txt" },
+  { name: "For odometry tools", words: "A trajectory in KITTI format", files: "kitti.txt", pack: "kitti" },
+  { name: "For LLFF", words: "In the format of the input", files: "poses_bounds.npy" },
+  { name: "For your own programs", words: "Each pose before and after, in full precision", files: "poses.json" },
+  { name: "To share", words: "The views of this page in one file that needs no network", files: "report.html" },
+  { name: "To share, as a video", words: "A flight around the scene", files: "renders/orbit.mp4" },
+  { name: "Numbers and evidence", words: "The figures behind the verdict, and the outcome for each image", files: "report.json" },
   {
-    name: "The refined poses, which the verdict did not take",
-    words: "In the same forms as the result",
+    name: "The refined poses, which the verdict rejected",
+    words: "In the same formats as the result",
     files: "refined/",
   },
 ];
@@ -60,11 +60,11 @@ export function filesFor(consumer: Consumer, artifacts: readonly ArtifactView[])
   return artifacts.filter(({ name }) => (files.endsWith("/") ? name.startsWith(files) : name === files));
 }
 
-/** Shell and Python lines that bring the same files. */
+/** Shell lines that download the same files. */
 export function curlLines(jobUrl: string, consumer: Consumer, found: readonly ArtifactView[], keyed: boolean): string {
   const key = keyed ? ' -H "Authorization: Bearer $BIRESNERF_API_KEY"' : "";
-  const lone = found.length === 1 ? found[0] : undefined;
-  if (lone) return `curl -fL${key} -O ${new URL(lone.href, jobUrl).href}`;
+  const single = found.length === 1 ? found[0] : undefined;
+  if (single) return `curl -fL${key} -O ${new URL(single.href, jobUrl).href}`;
   const origin = new URL(jobUrl).origin;
   return [
     `curl -f${key} ${jobUrl}/artifacts |`,
@@ -73,6 +73,7 @@ export function curlLines(jobUrl: string, consumer: Consumer, found: readonly Ar
   ].join("\n");
 }
 
+/** Python lines that download the same files. */
 export function pythonLines(jobUrl: string, id: string, consumer: Consumer, keyed: boolean): string {
   const url = new URL(jobUrl).origin;
   const wanted = consumer.files.endsWith("/") ? `${consumer.files}*` : consumer.files;

@@ -1,16 +1,15 @@
-// The result, by who it is for.
+// The files of a result, grouped by the program that reads them.
 import { useState } from "preact/hooks";
 import type { ArtifactView, JobView, ShareView } from "schemas";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
-import { address, apiKey, ask, asProblem, call, pause, Problem } from "../api/http";
-import { direct } from "../api/picture_urls";
+import { address, apiKey, asProblem, pause, Problem, request, requestJson } from "../api/http";
+import { artifactUrl } from "../api/picture_urls";
 import { useStore } from "../api/store";
 import { isOver } from "../jobs/state";
 import { CopyButton } from "../parts/copy_button";
 import { bytes, percent } from "../parts/format";
 import { ProblemBox } from "../parts/problem_box";
 import { type Consumer, CONSUMERS, curlLines, filesFor, pythonLines } from "./consumers";
-import { fitsOneZip, Zip } from "./zip";
 
 const SHARED_S = 7 * 86_400;
 
@@ -21,10 +20,10 @@ interface Props {
 }
 
 export function Downloads({ job, artifacts, onNewFiles }: Props) {
-  const whole = artifacts.filter(({ preview }) => !preview);
-  // Only a whole result, complete or partial, can be written in further forms.
-  const exportable = whole.some(({ name }) => name === "poses.json");
-  const rows = CONSUMERS.map((consumer) => ({ consumer, files: filesFor(consumer, whole) }));
+  const results = artifacts.filter(({ preview }) => !preview);
+  // Further formats are written from poses.json, which a preview does not have.
+  const exportable = results.some(({ name }) => name === "poses.json");
+  const rows = CONSUMERS.map((consumer) => ({ consumer, files: filesFor(consumer, results) }));
   const shown = rows.filter(({ consumer, files }) => files.length || (consumer.pack && exportable));
   return (
     <ul class="downloads">
@@ -43,21 +42,21 @@ interface RowProps {
 }
 
 function Row({ job, consumer, files, onNewFiles }: RowProps) {
-  const [said, setSaid] = useState("");
+  const [status, setStatus] = useState("");
   const [problem, setProblem] = useState<Problem | null>(null);
   const [open, setOpen] = useState(false);
   const keyed = useStore(apiKey) !== null;
   const jobUrl = address(`v1/jobs/${job.id}`);
-  const lone = files.length === 1 ? files[0] : undefined;
-  const attempt = async (doing: () => Promise<void>) => {
+  const single = files.length === 1 ? files[0] : undefined;
+  const attempt = async (action: () => Promise<void>) => {
     setProblem(null);
     try {
-      await doing();
+      await action();
     } catch (error) {
       setProblem(asProblem(error));
-      setOpen(files.length > 0); // the lines bring what the page cannot
+      setOpen(files.length > 0); // curl and Python may succeed where the page failed
     }
-    setSaid("");
+    setStatus("");
   };
   const size = files.reduce((sum, file) => sum + file.size, 0);
   return (
@@ -69,7 +68,7 @@ function Row({ job, consumer, files, onNewFiles }: RowProps) {
       <div class="download-act">
         {files.length > 0 && (
           <span class="soft number">
-            {lone ? lone.name.split("/").at(-1) : count(files.length, "file")} · {bytes(size)}
+            {single ? single.name.split("/").at(-1) : count(files.length, "file")} · {bytes(size)}
           </span>
         )}
         {files.length > 0 && (
@@ -86,26 +85,26 @@ function Row({ job, consumer, files, onNewFiles }: RowProps) {
         {files.length === 0 && (
           <button
             class="act small"
-            disabled={said !== ""}
-            aria-label={`${said || "Write it"} ${consumer.name}`}
-            onClick={() => attempt(() => exported(job, consumer, setSaid, onNewFiles))}
+            disabled={status !== ""}
+            aria-label={`${status || "Create"} ${consumer.name}`}
+            onClick={() => attempt(() => exported(job, consumer, setStatus, onNewFiles))}
           >
-            {said || "Write it"}
+            {status || "Create"}
           </button>
         )}
-        {lone && !keyed && (
-          <a class="act small" href={direct(lone.href)} download={lone.name.split("/").at(-1)} aria-label={`Download ${consumer.name}`}>
+        {single && !keyed && (
+          <a class="act small" href={artifactUrl(single.href)} download={single.name.split("/").at(-1)} aria-label={`Download ${consumer.name}`}>
             Download
           </a>
         )}
-        {files.length > 0 && (keyed || !lone) && (
+        {files.length > 0 && (keyed || !single) && (
           <button
             class="act small"
-            disabled={said !== ""}
-            aria-label={`${said || (lone ? "Download" : "Download .zip")} ${consumer.name}`}
-            onClick={() => attempt(() => (lone ? saveOne(lone) : saveAll(job, consumer, files, setSaid)))}
+            disabled={status !== ""}
+            aria-label={`${status || (single ? "Download" : "Download .zip")} ${consumer.name}`}
+            onClick={() => attempt(() => (single ? saveOne(single) : saveAll(job, consumer, files, setStatus)))}
           >
-            {said || (lone ? "Download" : "Download .zip")}
+            {status || (single ? "Download" : "Download .zip")}
           </button>
         )}
       </div>
@@ -113,7 +112,7 @@ function Row({ job, consumer, files, onNewFiles }: RowProps) {
         <div class="download-lines">
           <Lines label="curl" text={curlLines(jobUrl, consumer, files, keyed)} />
           <Lines label="Python" text={pythonLines(jobUrl, job.id, consumer, keyed)} />
-          {lone && <Share job={job} file={lone} />}
+          {single && <Share job={job} file={single} />}
         </div>
       )}
       {problem && <ProblemBox problem={problem} />}
@@ -141,16 +140,16 @@ function Share({ job, file }: { job: JobView; file: ArtifactView }) {
   const make = async () => {
     try {
       const json = { name: file.name, valid_s: SHARED_S };
-      setLink(address((await call<ShareView>("POST", `v1/jobs/${job.id}/shares`, { json })).href));
+      setLink(address((await requestJson<ShareView>("POST", `v1/jobs/${job.id}/shares`, { json })).href));
     } catch (error) {
       setProblem(asProblem(error));
     }
   };
-  if (link) return <Lines label="Link, good for 7 days and without a key" text={link} />;
+  if (link) return <Lines label="Link that needs no key, valid for 7 days" text={link} />;
   return (
     <>
       <button class="act" onClick={make}>
-        Make a link that needs no key
+        Create a link that needs no key
       </button>
       {problem && <ProblemBox problem={problem} />}
     </>
@@ -165,33 +164,41 @@ async function exported(
 ): Promise<void> {
   say("Writing …");
   const json = { formats: [consumer.pack] };
-  let made = await call<JobView>("POST", `v1/jobs/${job.id}/exports`, { json });
+  let made = await requestJson<JobView>("POST", `v1/jobs/${job.id}/exports`, { json });
   while (!isOver(made)) {
     if (made.state === "queued" && made.queue_position) say(`Waiting, number ${made.queue_position}`);
     else say("Writing …");
     await pause(400);
-    made = await call<JobView>("GET", `v1/jobs/${made.id}`);
+    made = await requestJson<JobView>("GET", `v1/jobs/${made.id}`);
   }
   if (made.error) throw new Error(`${made.error.detail} ${made.error.hint}`);
   await onNewFiles();
 }
 
 async function saveOne(file: ArtifactView): Promise<void> {
-  const answer = await ask("GET", `${file.href}?redirect=false`);
+  const answer = await request("GET", `${file.href}?redirect=false`);
   save(await answer.blob(), file.name.split("/").at(-1) ?? file.name);
 }
 
+/** All files as one zip, packed as they arrive: none is held in memory whole. */
 async function saveAll(job: JobView, consumer: Consumer, files: ArtifactView[], say: (text: string) => void) {
-  if (!fitsOneZip(files.map(({ size }) => size))) {
-    const detail = "The browser packs the files, and it can pack no more than 4 GB.";
-    throw new Problem(0, "too_much", "It is too much for one download", detail, "Fetch them by the lines below.");
+  const { downloadZip } = await import("client-zip");
+  let failure: unknown; // a stream passes on no error but its own
+  async function* fetched() {
+    for (const [index, file] of files.entries()) {
+      say(`Fetching ${percent(index / files.length)}`);
+      try {
+        yield { name: file.name, input: await request("GET", `${file.href}?redirect=false`) };
+      } catch (error) {
+        failure = error;
+        throw error;
+      }
+    }
   }
-  const zip = new Zip();
-  for (const [index, file] of files.entries()) {
-    say(`Fetching ${percent(index / files.length)}`);
-    await zip.add(file.name, await (await ask("GET", `${file.href}?redirect=false`)).blob());
-  }
-  save(zip.finish(), `${job.labels.name ?? job.id}-${consumer.files.replaceAll("/", "-")}.zip`.replace("-.zip", ".zip"));
+  const zip = await downloadZip(fetched()).blob().catch((error) => {
+    throw failure ?? error;
+  });
+  save(zip, `${job.labels.name ?? job.id}-${consumer.files.replaceAll("/", "-")}.zip`.replace("-.zip", ".zip"));
 }
 
 function save(content: Blob, name: string): void {
