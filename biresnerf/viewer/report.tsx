@@ -1,4 +1,4 @@
-// report.html: reads the data that the library wrote into the page, and shows it. Nothing is fetched.
+// report.html: shows the data that the library embedded in the page. Nothing is fetched.
 import { render } from "preact";
 import { useCallback, useMemo, useState } from "preact/hooks";
 import type { PosesDocument, Report, ViewFile } from "schemas";
@@ -67,7 +67,7 @@ function ReportPage({ data, licences }: { data: Embedded; licences: string }) {
         </details>
       </main>
       <footer class="soft">
-        BiResNeRF {report.version}, {data.written}. All of it is in this file; nothing is loaded from elsewhere.
+        BiResNeRF {report.version}, {data.written}. This file is complete; it loads nothing from elsewhere.
         <details>
           <summary>Licences of the libraries in this file</summary>
           <pre tabIndex={0}>{licences}</pre>
@@ -77,7 +77,7 @@ function ReportPage({ data, licences }: { data: Embedded; licences: string }) {
   );
 }
 
-/** Everything there is to see, with one image chosen in all of it. */
+/** All widgets; one image is selected in all of them. */
 function Widgets({ data, points }: { data: Embedded; points: readonly PointLayer[] }) {
   const { poses, report, view } = data;
   const urlOf = useCallback((file: string) => data.files[file] ?? null, [data]);
@@ -103,7 +103,7 @@ function Widgets({ data, points }: { data: Embedded; points: readonly PointLayer
         <ImageTable rows={rows} cellOf={cellOf} {...choice} />
       </div>
       <div class="panel">
-        <h2>The run</h2>
+        <h2>Progress of the run</h2>
         <Curves {...{ lines }} switchStep={report.switch_step} switchReason={report.switch_reason} steps={report.steps_done} />
       </div>
     </div>

@@ -1,6 +1,6 @@
 """``report.html``: one file that shows a result in any browser, opened from disk, without network.
 
-The bundle that draws it is built from the TypeScript beside this file (docs/formats.md says how the page is fed).
+Its script is built from the TypeScript in this folder; docs/formats.md lists the data that it embeds.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from biresnerf.report import Report
 
 REPORT_HTML, HISTORY = "report.html", "history.jsonl"
 BUNDLE = Path(__file__).parent / "dist"
-# Of pictures, points and video before base64, for a page of 12 MB; what more there is lies beside it.
+# Pictures, points and video before base64, for a page of 12 MB; the rest stays in the result's folder.
 MOST_BYTES = 8_000_000
 MOST_VIDEO_BYTES = 2_000_000
-PICTURE_PX, QUALITY = 640, 82  # long side and JPEG's quality of a picture in the page
+PICTURE_PX, QUALITY = 640, 82  # long side and JPEG quality of an embedded picture
 _MEDIA = {".jpg": "image/jpeg", ".mp4": "video/mp4", ".bin": "application/octet-stream"}
 NOT_BUILT = (
     "report.html was not written: its viewer is not built. Run `make web`, then `biresnerf report OUT`."
@@ -34,16 +34,16 @@ NOT_BUILT = (
 
 
 def write_report_html(folder: Path, report: Report, title: str | None = None) -> tuple[str, ...]:
-    """Writes the page of the result in ``folder``, whole or not at all.
+    """Writes the page of the result in ``folder`` atomically.
 
     Args:
-        title: what it is of; how many images there are where left out.
+        title: the heading; by default the number of images.
 
     Returns:
-        a sentence where it could not be written.
+        a warning if it could not be written.
 
     Raises:
-        InputError: a file of the result is not as it was written.
+        InputError: a file of the result was changed.
     """
     try:
         script, style, licences = (
@@ -103,7 +103,7 @@ def read_report(folder: Path) -> Report:
 
 
 def _embedded(folder: Path, view: ViewFile | None) -> tuple[dict[str, str], list[str]]:
-    """The result's files as data: URLs within the limit, the most telling first; and what was left out."""
+    """The result's files as data: URLs, the most important ones first, up to the limit; and what was left out."""
     if view is None:
         return {}, ["Pictures: this result has no view.json."]
     files: dict[str, str] = {}
@@ -128,15 +128,15 @@ def _embedded(folder: Path, view: ViewFile | None) -> tuple[dict[str, str], list
             left_out.append(f"The orbit video ({len(video) / 1e6:.1f} MB): {view.orbit}")
     if over:
         left_out.append(
-            f"{over} pictures, beyond {MOST_BYTES / 1e6:g} MB; they lie in renders/ beside the page."
+            f"{over} pictures, beyond {MOST_BYTES / 1e6:g} MB; they are in renders/ beside the page."
         )
     if missing:
-        left_out.append(f"{missing} files that view.json names and that are not there.")
+        left_out.append(f"{missing} files that view.json lists but that are missing.")
     return files, left_out
 
 
 def _wanted(view: ViewFile) -> Iterator[str]:
-    """Names of the files to embed, in the order of their use."""
+    """Names of the files to embed, in order of importance."""
     yield from (points.file for points in view.points)
     if view.contact_sheet is not None:
         yield view.contact_sheet.file
@@ -145,7 +145,7 @@ def _wanted(view: ViewFile) -> Iterator[str]:
 
 
 def _content(path: Path) -> tuple[bytes, str]:
-    """A file's bytes, pictures made small, and their type."""
+    """The bytes of a file, pictures scaled down, and their media type."""
     if path.suffix != ".png":
         return path.read_bytes(), _MEDIA[path.suffix]
     with Image.open(path) as picture:
@@ -157,7 +157,7 @@ def _content(path: Path) -> tuple[bytes, str]:
 
 
 def _as_script(data: object) -> str:
-    """JSON that no name can break out of: a script's content ends at ``</script``, wherever that stands."""
+    """JSON that cannot end its script element: HTML ends a script at any ``</script``, even within a string."""
     text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
@@ -165,13 +165,13 @@ def _as_script(data: object) -> str:
 
 
 def _inside(tag: str, code: str) -> str:
-    """Our own code, checked rather than changed: within JavaScript there is no one way to escape it."""
+    """Our own code, checked for end tags: JavaScript has no uniform way to escape them."""
     if f"</{tag}" in code.lower() or (tag == "script" and "<!--" in code):
-        raise ValueError(f"the bundle holds what ends a {tag}")
+        raise ValueError(f"the bundle holds the end of a {tag} element")
     return code
 
 
-# The policy has the browser itself refuse whatever would leave the page.
+# The policy makes the browser block every request.
 _PAGE = """<!doctype html>
 <html lang="en">
 <head>
@@ -185,7 +185,7 @@ style-src 'unsafe-inline'; img-src data: blob:; media-src data:; base-uri 'none'
 </head>
 <body>
 <div id="report"></div>
-<noscript>This page is drawn by a script that it carries; report.json beside it says the same in numbers.</noscript>
+<noscript>This page needs JavaScript. report.json in the same folder holds the numbers.</noscript>
 <script type="application/json" id="data">{data}</script>
 <script type="application/json" id="licences">{licences}</script>
 <script>{script}</script>

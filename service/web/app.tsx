@@ -1,7 +1,7 @@
-// The page that the service shows at `/`: what is after the `#` of its address says what of it.
+// The service's page at `/`; the part of the URL after `#` selects the view.
 import { render } from "preact";
 import { useEffect, useRef, useState } from "preact/hooks";
-import { apiKey, forgetKey, keyWanted } from "./api/http";
+import { apiKey, forgetKey, keyRequired } from "./api/http";
 import { useStore } from "./api/store";
 import { JobPage } from "./job/page";
 import { JobsPage } from "./jobs/list";
@@ -22,7 +22,7 @@ function routeOf(hash: string): Route {
 
 function App() {
   const [route, setRoute] = useState(() => routeOf(location.hash));
-  const wanted = useStore(keyWanted);
+  const keyError = useStore(keyRequired);
   const key = useStore(apiKey);
   const main = useRef<HTMLElement>(null);
   useEffect(() => {
@@ -37,7 +37,7 @@ function App() {
   return (
     <>
       <a class="skip" href="#main" onClick={(event) => skip(event, main.current)}>
-        Skip to the content
+        Skip to content
       </a>
       <header class="top">
         <a class="brand" href="#/" aria-current={route.name === "jobs" ? "page" : undefined}>
@@ -47,7 +47,7 @@ function App() {
           <a href="#/" aria-current={route.name === "jobs" ? "page" : undefined}>
             Jobs
           </a>
-          <a href="docs">HTTP interface</a>
+          <a href="docs">API</a>
           {key && (
             <button class="plain-link" onClick={forgetKey}>
               Forget the key
@@ -56,13 +56,13 @@ function App() {
         </nav>
       </header>
       <main id="main" ref={main} tabIndex={-1}>
-        {wanted !== null ? <KeyForm said={wanted} /> : <Shown key={`${route.name} ${route.id} ${key}`} {...route} />}
+        {keyError !== null ? <KeyForm error={keyError} /> : <View key={`${route.name} ${route.id} ${key}`} {...route} />}
       </main>
     </>
   );
 }
 
-function Shown({ name, id }: Route) {
+function View({ name, id }: Route) {
   if (name === "job") return <JobPage id={id} />;
   if (name === "dataset") return <DatasetPage id={id} />;
   return <JobsPage />;

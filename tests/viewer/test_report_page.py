@@ -179,12 +179,12 @@ def test_a_photo_that_does_not_say_where_its_camera_stood_is_marked_and_found(br
     folder = shutil.copytree(result.folder, tmp_path / "out")
     write_report_html(folder, result.report.model_copy(update={"images": images}))
     page = open_report(browser, folder / "report.html").page
-    page.locator(".images").get_by_label("Show").select_option(label="place unsure")
+    page.locator(".images").get_by_label("Show").select_option(label="pose uncertain")
     assert table(page) == [4]
     page.context.close()
 
 
-def test_without_webgl_the_cameras_stand_in_a_table(result, browser):
+def test_without_webgl_the_cameras_are_listed_in_a_table(result, browser):
     blind = browser.browser_type.launch(executable_path=str(CHROMIUM), args=[*ARGUMENTS, "--disable-3d-apis"])
     page = open_report(blind, result.folder / "report.html").page
     rows = page.locator(".scene tbody tr")

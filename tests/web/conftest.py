@@ -207,7 +207,7 @@ def job_url(desktop: Watched, service: Running, kitchen: Path) -> str:
     expect(submit).to_be_visible()
     expect(check_row(page, "Poses")).to_contain_text("10 of 10 given")
     assert desktop.serious_findings() == []
-    page.get_by_text("A look within minutes").click()
+    page.get_by_text("A first result within minutes").click()
     page.get_by_label("steps", exact=True).fill("500")
     page.get_by_label("start", exact=True).select_option("given")
     page.get_by_text("Schedule, sizes and output").click()

@@ -128,7 +128,7 @@ def test_an_archive_goes_on_after_a_reload_from_its_last_byte(
     while not offsets or offsets[-1] == 0:
         page.wait_for_timeout(50)
     page.reload()
-    expect(page.get_by_role("heading", name="Nothing has arrived in whole")).to_be_visible()
+    expect(page.get_by_role("heading", name="Nothing has arrived completely")).to_be_visible()
     page.unroute_all()
     with page.expect_request(lambda request: request.method == "PATCH") as going_on:
         page.locator("input[type=file]").nth(1).set_input_files(archive)
@@ -143,7 +143,7 @@ def test_an_archive_that_cannot_be_taken_says_why_and_another_takes_its_place(
     broken.write_bytes(broken.read_bytes()[:-100])
     page.goto(service.url)
     page.locator("input[type=file]").nth(1).set_input_files(broken)
-    expect(page.get_by_role("alert")).to_contain_text("The archive was not accepted")
+    expect(page.get_by_role("alert")).to_contain_text("The archive was rejected")
     expect(page.get_by_role("alert")).to_contain_text("archive_rejected")
     page.locator("input[type=file]").nth(1).set_input_files(zip_of(kitchen, tmp_path / "whole.zip"))
     expect(page.get_by_role("button", name="Refine the poses")).to_be_visible()

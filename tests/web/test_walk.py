@@ -91,8 +91,8 @@ def test_the_table_sorts_and_chooses(desktop: Watched, done: dict[str, Any]) -> 
 def test_ticked_images_are_held_in_another_run(desktop: Watched, done: dict[str, Any]) -> None:
     page = desktop.page
     for name in ("./train/r_3", "./train/r_8"):
-        page.get_by_label(f"Choose {name}", exact=True).check()
-    page.get_by_role("button", name="Run again with their given poses held").click()
+        page.get_by_label(f"Select {name}", exact=True).check()
+    page.get_by_role("button", name="Run again with their given poses fixed").click()
     dialog = page.get_by_role("dialog", name="Run again with other options")
     expect(dialog.get_by_label("fixed", exact=True)).to_have_value("./train/r_3, ./train/r_8")
     page.keyboard.press("Escape")
@@ -150,7 +150,7 @@ def test_the_lines_beside_a_download_bring_the_same(
 
 def test_a_form_that_is_not_there_is_written_on_demand(desktop: Watched, done: dict[str, Any]) -> None:
     row = desktop.page.get_by_role("listitem").filter(has_text="For odometry tools")
-    row.get_by_role("button", name="Write it").click()
+    row.get_by_role("button", name="Create").click()
     expect(row.get_by_role("link", name="Download For odometry tools")).to_be_visible()
     row.get_by_role("button", name="curl, Python").click()
     expect(row.get_by_label("curl", exact=True)).to_contain_text("/artifacts/kitti.txt")
@@ -235,7 +235,7 @@ def test_a_job_is_run_again_ended_and_deleted(
     options = api.get(f"/jobs/{job}").json()["options"]
     assert options == {**done["options"], "steps": 20000}
     page.get_by_role("button", name="Cancel", exact=True).click()
-    page.get_by_role("button", name="End it, keep nothing").click()
+    page.get_by_role("button", name="Cancel and keep nothing").click()
     expect(page.get_by_role("heading", level=1)).to_contain_text("cancelled")
     page.get_by_role("button", name="Delete", exact=True).click()
     page.get_by_role("button", name="Delete it").click()
@@ -250,16 +250,16 @@ def test_a_fork_goes_on_after_stage_1_and_its_end_on_request_leaves_a_partial_re
     dialog = again(page, job_url)
     dialog.get_by_text("Schedule, sizes and output").click()
     dialog.get_by_label("trial_steps", exact=True).fill("100000")  # it would take hours
-    dialog.get_by_role("button", name="Fork: go on").click()
+    dialog.get_by_role("button", name="Fork: continue").click()
     fork = another_job(page, job_url)
     made = api.get(f"/jobs/{fork}").json()
     assert (made["forked_from"], made["forked_stage"]) == (done["id"], "coarse")
     assert made["options"] == {**done["options"], "trial_steps": 100_000}
     expect(page.get_by_role("img", name="render of one view")).to_be_visible()
     page.get_by_role("button", name="Cancel", exact=True).click()
-    page.get_by_role("button", name="End it, keep the poses so far").click()
+    page.get_by_role("button", name="Cancel and keep the poses so far").click()
     expect(page.get_by_role("heading", level=1)).to_contain_text("partial result")
-    expect(page.get_by_role("region", name="Verdict")).to_contain_text("nobody has compared them")
+    expect(page.get_by_role("region", name="Verdict")).to_contain_text("not compared")
     ended = api.get(f"/jobs/{fork}").json()
     assert (ended["state"], ended["partial"], ended["verdict"]) == ("cancelled", True, None)
     with page.expect_download() as coming:

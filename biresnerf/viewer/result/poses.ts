@@ -1,4 +1,4 @@
-// Poses in numbers: between two of them, how far apart they are, what a lens sees. No drawing, no page.
+// Arithmetic on poses: interpolation, distances, fields of view.
 import type { PoseCamera, PoseImage } from "schemas";
 
 export type Triple = readonly [number, number, number];
@@ -7,7 +7,7 @@ export type Matrix = PoseImage["world_from_cam"];
 export type Row = Matrix[number];
 
 /** Unit quaternion w, x, y, z. */
-export type Quaternion = readonly [number, number, number, number];
+type Quaternion = readonly [number, number, number, number];
 
 export const centreOf = (pose: Matrix): Triple => [pose[0][3], pose[1][3], pose[2][3]];
 
@@ -21,20 +21,20 @@ export const axisOf = (pose: Matrix, column: 0 | 1 | 2): Triple => [
 export const minus = (a: Triple, b: Triple): Triple => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
 export const plus = (a: Triple, b: Triple): Triple => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
 export const length = (a: Triple): number => Math.hypot(a[0], a[1], a[2]);
-export const mix = (a: Triple, b: Triple, share: number): Triple => [
+const mix = (a: Triple, b: Triple, share: number): Triple => [
   a[0] + share * (b[0] - a[0]),
   a[1] + share * (b[1] - a[1]),
   a[2] + share * (b[2] - a[2]),
 ];
 
-/** Where a point of the camera's frame lies in the world. */
+/** A point in the camera's frame, in the world. */
 export const inWorld = (pose: Matrix, p: Triple): Triple => {
   const along = (row: Row) => row[0] * p[0] + row[1] * p[1] + row[2] * p[2] + row[3];
   return [along(pose[0]), along(pose[1]), along(pose[2])];
 };
 
-/** The rotation of a pose; the largest component is found first, so that no turn is badly conditioned. */
-export function quaternionOf(pose: Matrix): Quaternion {
+/** The rotation of a pose, from its largest component: well conditioned for every rotation. */
+function quaternionOf(pose: Matrix): Quaternion {
   const [[a, b, c], [d, e, f], [g, h, i]] = pose;
   const parts: readonly [number, Quaternion][] = [
     [1 + a + e + i, [1 + a + e + i, h - f, c - g, d - b]],
@@ -48,7 +48,7 @@ export function quaternionOf(pose: Matrix): Quaternion {
 }
 
 /** The pose of a rotation and a centre. */
-export function poseOf([w, x, y, z]: Quaternion, centre: Triple): Matrix {
+function poseOf([w, x, y, z]: Quaternion, centre: Triple): Matrix {
   return [
     [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), centre[0]],
     [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), centre[1]],
@@ -58,7 +58,7 @@ export function poseOf([w, x, y, z]: Quaternion, centre: Triple): Matrix {
 
 const dot = (a: Quaternion, b: Quaternion): number => a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
 
-/** The pose at `share` of the way: the centre on the line between the two, the rotation on the shortest turn. */
+/** The pose at `share` of the way: the centre on a straight line, the rotation on the shortest arc. */
 export function between(first: Matrix, second: Matrix, share: number): Matrix {
   if (share === 0) return first;
   if (share === 1) return second;
@@ -68,7 +68,7 @@ export function between(first: Matrix, second: Matrix, share: number): Matrix {
   const cosine = Math.min(1, dot(from, to));
   const angle = Math.acos(cosine);
   const sine = Math.sin(angle);
-  // Nearly equal rotations: the chord is the arc, and the sines would vanish.
+  // For nearly equal rotations the sines vanish: interpolate linearly.
   const [p, q] =
     sine < 1e-7 ? [1 - share, share] : [Math.sin((1 - share) * angle) / sine, Math.sin(share * angle) / sine];
   const turned: Quaternion = [
@@ -84,7 +84,7 @@ export function between(first: Matrix, second: Matrix, share: number): Matrix {
   );
 }
 
-/** Angle of the turn from one pose to another, degrees; exact near zero and near a half turn alike. */
+/** Rotation angle between two poses, degrees; accurate near 0 and near 180. */
 export function turnDeg(first: Matrix, second: Matrix): number {
   const a = quaternionOf(first);
   const b = quaternionOf(second);
@@ -95,10 +95,10 @@ export function turnDeg(first: Matrix, second: Matrix): number {
   return (2 * Math.atan2(Math.hypot(x, y, z), Math.abs(w)) * 180) / Math.PI;
 }
 
-/** Borders of the picture at distance 1 before the lens: left, top, right, bottom; a drawing, so without distortion. */
+/** Borders of the image at distance 1 in front of the lens: left, top, right, bottom; without distortion. */
 export function bordersOf(camera: PoseCamera): [number, number, number, number] {
   const { width, height, params } = camera;
-  // COLMAP's models with one focal length say f, cx, cy; the others fx, fy, cx, cy.
+  // COLMAP's models with one focal length have f, cx, cy; the others fx, fy, cx, cy.
   const single = /^(SIMPLE_|RADIAL)/.test(camera.model);
   const fx = params[0] ?? width;
   const fy = (single ? params[0] : params[1]) ?? fx;
@@ -107,7 +107,7 @@ export function bordersOf(camera: PoseCamera): [number, number, number, number] 
   return [-cx / fx, -cy / fy, (width - cx) / fx, (height - cy) / fy];
 }
 
-/** The middle of many points: of each coordinate the median. */
+/** The median of each coordinate. */
 export function medianOf(points: readonly Triple[]): Triple {
   const middle = (axis: 0 | 1 | 2) => {
     const sorted = points.map((p) => p[axis]).sort((a, b) => a - b);
@@ -116,7 +116,7 @@ export function medianOf(points: readonly Triple[]): Triple {
   return [middle(0), middle(1), middle(2)];
 }
 
-/** How far points lie from their middle: the root of the mean square. */
+/** Root mean square distance of points from their middle. */
 export function spreadOf(points: readonly Triple[], middle: Triple): number {
   const squares = points.map((p) => length(minus(p, middle)) ** 2);
   return Math.sqrt(squares.reduce((a, b) => a + b, 0) / Math.max(1, squares.length));

@@ -1,13 +1,13 @@
-// From the files of a result to what widgets take.
+// Prepares the files of a result for the widgets, which fetch nothing themselves.
 import { useMemo } from "preact/hooks";
 import type { HistoryLine, PosesDocument, Report, ShownPoints, ViewFile } from "schemas";
 import { type Flag, FLAGS } from "../widgets/words";
 import { bordersOf, centreOf, length, type Matrix, minus, type Triple, turnDeg } from "./poses";
 
-/** URL of a file of the result (`renders/…`, `view/…`), or null where there is none (left out, not there yet). */
+/** URL of a file of the result (`renders/…`, `view/…`), or null if it is not there (yet). */
 export type UrlOf = (file: string) => string | null;
 
-/** What the curves show of a check. */
+/** The part of a history line that the curves show. */
 export type CurvePoint = Pick<
   HistoryLine,
   "step" | "stage" | "psnr" | "loss" | "moved_deg" | "still_deg" | "trend_db" | "level_db"
@@ -17,13 +17,13 @@ export interface SceneCamera {
   readonly name: string;
   readonly before: Matrix | null;
   readonly after: Matrix;
-  /** The picture's borders at distance 1 before the lens: left, top, right, bottom. */
+  /** Borders of the image at distance 1 in front of the lens: left, top, right, bottom. */
   readonly borders: readonly [number, number, number, number];
-  /** Whose pose it started from: `given`, `colmap`, `neighbours`, … */
+  /** Source of its initial pose: `given`, `colmap`, `neighbours`, … */
   readonly source: string;
   readonly moved_deg: number;
   readonly moved_units: number;
-  /** Refined minus input in the verdict's trainings, dB, where measured. */
+  /** PSNR on refined poses minus on the input's, dB, in the verdict's trainings; null if not measured. */
   readonly delta_psnr: number | null;
   readonly flags: readonly string[];
 }
@@ -59,34 +59,34 @@ export interface SheetCell {
   readonly y: number;
   readonly width: number;
   readonly height: number;
-  /** Size of the whole sheet, for those who show it smaller. */
+  /** Size of the whole sheet. */
   readonly sheet_width: number;
   readonly sheet_height: number;
 }
 
-/** Cameras before and after; what the report measured of them joins by index, as both files keep the input's order. */
-export function camerasOf(poses: PosesDocument, report: Report | null): SceneCamera[] {
+/** Cameras before and after, joined by index with the report: both files keep the input's order. */
+function camerasOf(poses: PosesDocument, report: Report | null): SceneCamera[] {
   const borders = poses.cameras.map(bordersOf);
   return poses.images.map((image, index) => {
     const before = image.world_from_cam_before;
     const after = image.world_from_cam;
-    const told = report?.images[index];
-    const measured = told?.trial_psnr_after != null && told.trial_psnr_before != null;
+    const measures = report?.images[index];
+    const measured = measures?.trial_psnr_after != null && measures.trial_psnr_before != null;
     return {
       name: image.name,
       before,
       after,
       borders: borders[image.camera] ?? [-0.5, -0.5, 0.5, 0.5],
       source: image.pose_source,
-      moved_deg: before ? turnDeg(before, after) : (told?.moved_deg ?? 0),
-      moved_units: before ? length(minus(centreOf(after), centreOf(before))) : (told?.moved_units ?? 0),
-      delta_psnr: measured ? (told.trial_psnr_after ?? 0) - (told.trial_psnr_before ?? 0) : null,
+      moved_deg: before ? turnDeg(before, after) : (measures?.moved_deg ?? 0),
+      moved_units: before ? length(minus(centreOf(after), centreOf(before))) : (measures?.moved_units ?? 0),
+      delta_psnr: measured ? (measures.trial_psnr_after ?? 0) - (measures.trial_psnr_before ?? 0) : null,
       flags: image.flags,
     };
   });
 }
 
-export function rowsOf(report: Report): ImageRow[] {
+function rowsOf(report: Report): ImageRow[] {
   const flags = Object.keys(FLAGS) as Flag[];
   return report.images.map((image, index) => ({
     image: index,
@@ -103,7 +103,7 @@ export function rowsOf(report: Report): ImageRow[] {
   }));
 }
 
-/** Lines of history.jsonl; one that is torn off, or none at all, is left out. */
+/** The lines of history.jsonl, without an incomplete last one. */
 export function historyOf(text: string): CurvePoint[] {
   const lines: CurvePoint[] = [];
   for (const line of text.split("\n")) {
@@ -111,13 +111,13 @@ export function historyOf(text: string): CurvePoint[] {
       const read: unknown = JSON.parse(line);
       if (typeof read === "object" && read !== null && "step" in read) lines.push(read as HistoryLine);
     } catch {
-      // The last line of a run that is being written.
+      // The last line while it is being written.
     }
   }
   return lines;
 }
 
-/** Points from the bytes of a file that view.json lists. */
+/** Points from the bytes of a file listed in view.json. */
 export function pointsOf(entry: ShownPoints, bytes: ArrayBuffer): PointLayer {
   const positions = new Float32Array(entry.count * 3);
   const view = new DataView(bytes);
@@ -127,7 +127,7 @@ export function pointsOf(entry: ShownPoints, bytes: ArrayBuffer): PointLayer {
 }
 
 /** Where each image's photo lies in the contact sheet. */
-export function cellsOf(view: ViewFile | null, images: number, urlOf: UrlOf): (image: number) => SheetCell | null {
+function cellsOf(view: ViewFile | null, images: number, urlOf: UrlOf): (image: number) => SheetCell | null {
   const sheet = view?.contact_sheet;
   const url = sheet ? urlOf(sheet.file) : null;
   if (!sheet || !url) return () => null;
@@ -143,7 +143,7 @@ export function cellsOf(view: ViewFile | null, images: number, urlOf: UrlOf): (i
   });
 }
 
-/** What the widgets of one result share; worked out again where its files change. */
+/** The data that the widgets of one result share. */
 export function useWidgetData(poses: PosesDocument | null, report: Report | null, view: ViewFile | null, urlOf: UrlOf) {
   const names = useMemo(() => poses?.images.map(({ name }) => name) ?? [], [poses]);
   const cameras = useMemo(() => (poses ? camerasOf(poses, report) : []), [poses, report]);

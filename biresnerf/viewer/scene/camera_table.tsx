@@ -1,4 +1,4 @@
-// What takes the place of the three-dimensional picture where the browser cannot draw it.
+// Stands in for the three-dimensional view if the browser has no WebGL.
 import { centreOf, type Triple } from "../result/poses";
 import type { SceneCamera } from "../result/widget_data";
 import { short } from "../widgets/numbers";
@@ -12,7 +12,7 @@ export function CameraTable(props: {
 }) {
   return (
     <section class="scene" aria-label="Cameras">
-      <p class="notice">This browser shows no WebGL, so the cameras stand in a table instead of a picture.</p>
+      <p class="notice">This browser has no WebGL, so the cameras are listed in a table.</p>
       <div class="table-scroll" tabIndex={0} role="region" aria-label="Positions of the cameras">
         <table class="table">
           <thead>

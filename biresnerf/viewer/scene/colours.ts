@@ -1,10 +1,10 @@
-// Colours of values, on absolute scales: the same value has the same colour in every job and on every page.
+// Colours of values on absolute scales: the same value has the same colour in every job.
 import type { SceneCamera } from "../result/widget_data";
 
 export type ColourBy = "moved_deg" | "moved_units" | "delta_psnr" | "source";
 export type Colour = readonly [number, number, number]; // 0 to 255
 
-// Viridis, as in the pictures of differences and depths: even steps look even, also without colour vision.
+// Viridis, as in difference and depth images: perceptually uniform, also for colour-blind readers.
 const VIRIDIS: readonly Colour[] = [
   [68, 1, 84],
   [71, 44, 122],
@@ -16,12 +16,12 @@ const VIRIDIS: readonly Colour[] = [
   [170, 220, 50],
   [253, 231, 37],
 ];
-// Orange is worse, blue is better; the two that people with any colour vision tell apart.
+// Orange is worse, blue is better: colour-blind readers can tell them apart.
 const WORSE: Colour = [213, 94, 0];
 const BETTER: Colour = [0, 114, 178];
 const BETTER_ON_DARK: Colour = [86, 180, 233];
 export const UNKNOWN: Colour = [128, 134, 140];
-// Okabe and Ito's, without black and yellow, which one ground or the other hides.
+// The palette of Okabe and Ito without black and yellow, which vanish on a dark or light background.
 const KINDS: readonly Colour[] = [
   [0, 114, 178],
   [230, 159, 0],
@@ -37,7 +37,7 @@ const blend = (a: Colour, b: Colour, share: number): Colour => [
   Math.round(a[2] + share * (b[2] - a[2])),
 ];
 
-/** Colour of 0 to 1; values outside take the ends. The end that the ground would hide is left out. */
+/** Colour of a value from 0 to 1, clamped. The end of the map that would vanish on the background is left out. */
 export function rampColour(value: number, dark: boolean): Colour {
   const inside = Math.min(1, Math.max(0, value));
   const position = (dark ? 0.22 + 0.78 * inside : 0.88 * inside) * (VIRIDIS.length - 1);
@@ -59,15 +59,15 @@ export function kindColour(kind: string, kinds: readonly string[]): Colour {
 
 export const css = ([r, g, b]: Colour): string => `rgb(${r} ${g} ${b})`;
 
-export interface Scale {
+interface Scale {
   readonly label: string;
   readonly unit: string;
-  /** Caps to choose from; the first is where it starts. None for a scale of kinds. */
+  /** Upper ends to choose from, the default first; none for categories. */
   readonly caps: readonly number[];
   readonly signed: boolean;
 }
 
-/** The scales, absolute: caps do not depend on the data, but in world units, which have no size of their own. */
+/** Caps do not depend on the data, except in world units, which have no absolute size. */
 export function scaleOf(by: ColourBy, spread: number): Scale {
   switch (by) {
     case "moved_deg":
@@ -81,13 +81,13 @@ export function scaleOf(by: ColourBy, spread: number): Scale {
   }
 }
 
-/** Round numbers about a tenth of the rig's size, in its own units. */
-export function unitCaps(spread: number): number[] {
+/** Round numbers near a tenth of the cameras' spread, in world units. */
+function unitCaps(spread: number): number[] {
   const power = 10 ** Math.floor(Math.log10(Math.max(spread, 1e-12) / 10));
   return [1, 0.1, 10, 100].map((times) => Number((times * power).toPrecision(1)));
 }
 
-export function valueOf(camera: SceneCamera, by: ColourBy): number | null {
+function valueOf(camera: SceneCamera, by: ColourBy): number | null {
   switch (by) {
     case "moved_deg":
       return camera.moved_deg;

@@ -1,4 +1,4 @@
-// The three-dimensional picture itself: what is drawn, from where it is seen, what lies under the pointer.
+// The three-dimensional view: its objects, its viewpoint, and which camera is under the pointer.
 import {
   BufferGeometry,
   Group,
@@ -44,7 +44,7 @@ export class SceneDrawing {
   readonly origin: Triple;
   readonly spread: number;
 
-  /** Throws where the browser has no WebGL. */
+  /** Throws if the browser has no WebGL. */
   constructor(
     host: HTMLElement,
     private readonly cameras: readonly SceneCamera[],
@@ -70,7 +70,7 @@ export class SceneDrawing {
       if (camera.before) this.before.place(index, camera.before);
       else this.before.hide(index);
     }
-    // Drawn at a size of about one, whatever the input's unit: depth buffers have few digits.
+    // Scaled to a size of about one, whatever the input's unit: depth buffers have few digits.
     this.world.scale.setScalar(1 / this.spread);
     this.world.add(this.before.lines, this.after.lines, this.paths, this.chosen.lines, this.chosenSides);
     this.chosen.lines.renderOrder = 2;
@@ -83,7 +83,7 @@ export class SceneDrawing {
     this.overview(false);
   }
 
-  /** Everything from aside and a little above. */
+  /** Shows everything, from the side and slightly above. */
   overview(animated: boolean): void {
     const side = new Vector3(...(this.cameras[0] ? axisOf(this.cameras[0].after, 0) : [1, 0, 0]));
     const { at, target } = overviewOf(this.shownPoints(), this.eye.up, side, this.eye.aspect || 1, VIEW_DEG);
@@ -102,7 +102,7 @@ export class SceneDrawing {
     return all;
   }
 
-  /** The picture as a camera took it; the next touch of the controls leaves it. */
+  /** Looks through a camera, until the controls are used. */
   lookThrough(index: number, animated: boolean): void {
     const camera = this.cameras[index];
     if (!camera) return;
@@ -113,11 +113,11 @@ export class SceneDrawing {
     const ahead = new Vector3(...axisOf(pose, 2));
     this.fly(at, at.clone().add(ahead), Math.min(120, (1.1 * high * 180) / Math.PI), animated, pose);
     this.through = index;
-    this.hideInside();
+    this.updateSelected();
   }
 
-  /** From within, the drawing of the camera itself would be in the way. */
-  private hideInside(): void {
+  /** Hides the selected camera while looking through it: it would be in the way. */
+  private updateSelected(): void {
     if (this.look) this.choose(this.look);
     this.draw();
   }
@@ -129,7 +129,7 @@ export class SceneDrawing {
     this.eye.fov = VIEW_DEG;
     this.eye.updateProjectionMatrix();
     this.onLeave();
-    this.hideInside();
+    this.updateSelected();
   };
 
   private fly(to: Vector3, target: Vector3, fov: number, animated: boolean, pose?: Matrix): void {
@@ -145,7 +145,7 @@ export class SceneDrawing {
       this.eye.fov = from.fov + eased * (fov - from.fov);
       this.eye.updateProjectionMatrix();
       this.controls.update();
-      if (share === 1 && pose) this.turnAs(pose);
+      if (share === 1 && pose) this.rollTo(pose);
       this.draw();
       if (share < 1) this.flight = requestAnimationFrame(step);
     };
@@ -153,8 +153,8 @@ export class SceneDrawing {
     else step(began);
   }
 
-  /** Photos lie askew at times, which orbiting cannot: the eye turns as the camera was. */
-  private turnAs(pose: Matrix): void {
+  /** Rolls the view with the camera, which orbit controls cannot. */
+  private rollTo(pose: Matrix): void {
     const [x, y, z] = [axisOf(pose, 0), axisOf(pose, 1), axisOf(pose, 2)];
     this.eye.matrix.makeBasis(new Vector3(...x), new Vector3(...y).negate(), new Vector3(...z).negate());
     this.eye.quaternion.setFromRotationMatrix(this.eye.matrix);
@@ -168,7 +168,7 @@ export class SceneDrawing {
     return camera.before ? between(camera.before, camera.after, this.look?.share ?? 1) : camera.after;
   }
 
-  /** Shows what a look says. */
+  /** Draws with these settings; only what has changed is updated. */
   show(look: Look): void {
     const last = this.look;
     this.look = look;
@@ -232,7 +232,7 @@ export class SceneDrawing {
     this.draw();
   }
 
-  /** The camera nearest to a point of the page, if one is near. */
+  /** The camera nearest to a point of the page, or null if none is near. */
   pick(clientX: number, clientY: number): number | null {
     const box = this.renderer.domElement.getBoundingClientRect();
     let best = PICK_PX;
@@ -247,7 +247,7 @@ export class SceneDrawing {
     return found;
   }
 
-  /** Where a vertex lies on the drawing, CSS pixels; null where it is behind the eye. */
+  /** Position of a vertex in the view, CSS pixels; null if it is behind the viewer. */
   onScreen(index: number, vertex: number): [number, number] | null {
     const { clientWidth, clientHeight } = this.renderer.domElement;
     this.eye.updateMatrixWorld();
@@ -255,23 +255,23 @@ export class SceneDrawing {
     return Math.abs(at.z) > 1 ? null : [((at.x + 1) / 2) * clientWidth, ((1 - at.y) / 2) * clientHeight];
   }
 
-  /** Where a camera's centre is drawn, in the world: read back from what the GPU was given. */
+  /** A camera's centre as drawn, in the world: read back from the buffer of the GPU. */
   drawnCentre(index: number): Triple {
     return plus(this.after.drawn(index, 0), this.origin);
   }
 
-  /** From where it is seen, in the world, so that another drawing can be seen from there. */
+  /** The viewpoint in the world, to restore it in another drawing. */
   viewpoint(): Viewpoint {
     const inWorld = (p: Vector3) => plus(p.clone().multiplyScalar(this.spread).toArray(), this.origin);
     return { at: inWorld(this.eye.position), target: inWorld(this.controls.target) };
   }
 
-  seeFrom({ at, target }: Viewpoint): void {
+  setViewpoint({ at, target }: Viewpoint): void {
     this.placed = true;
     this.fly(this.drawnPoint(at), this.drawnPoint(target), VIEW_DEG, false);
   }
 
-  /** At the next frame, once: nothing is drawn while nothing changes. */
+  /** Draws at the next frame, once. */
   private readonly draw = (): void => {
     if (this.frame) return;
     this.frame = requestAnimationFrame(() => {

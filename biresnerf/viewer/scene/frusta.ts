@@ -1,4 +1,4 @@
-// Cameras as lines: one buffer for all of them, so that hundreds cost one draw call.
+// Camera frusta as lines, all in one buffer: hundreds cost one draw call.
 import {
   BufferAttribute,
   BufferGeometry,
@@ -18,8 +18,8 @@ const SIDES = [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 1, 1, 2, 3, 1, 3, 4];
 const EDGES = [0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1, 1, 5, 5, 2];
 export const VERTICES = 6;
 
-/** Corners of a camera's drawing in its own frame, `depth` before the lens. */
-export function cornersOf(camera: SceneCamera, depth: number): Triple[] {
+/** Corners of a frustum in the camera's frame, `depth` in front of the lens. */
+function cornersOf(camera: SceneCamera, depth: number): Triple[] {
   const [left, top, right, bottom] = camera.borders;
   const tip = top - 0.35 * (bottom - top);
   const flat: [number, number][] = [
@@ -57,12 +57,12 @@ export class Frusta {
     this.lines.frustumCulled = false;
   }
 
-  /** Has camera 0 drawn as another one is. */
+  /** Gives camera 0 the shape of another one. */
   become(camera: SceneCamera): void {
     this.corners[0] = cornersOf(camera, this.depth);
   }
 
-  /** The sides of camera 0, filled; they follow its lines. */
+  /** The sides of camera 0, filled. */
   filled(opacity: number): Mesh {
     const geometry = new BufferGeometry();
     geometry.setAttribute("position", this.positions);
@@ -75,7 +75,7 @@ export class Frusta {
     return mesh;
   }
 
-  /** Puts a camera where `pose` says; the origin is taken off in double precision, for worlds far from zero. */
+  /** Moves a camera to `pose`. The origin is subtracted in double precision, for worlds far from zero. */
   place(index: number, pose: Matrix): void {
     this.corners[index]?.forEach((corner, vertex) => {
       const [x, y, z] = inWorld(pose, corner);
@@ -85,7 +85,7 @@ export class Frusta {
     this.positions.needsUpdate = true;
   }
 
-  /** Leaves a camera out: all its vertices in one place. */
+  /** Hides a camera: all its vertices in one place. */
   hide(index: number): void {
     for (let vertex = 0; vertex < VERTICES; vertex++) this.positions.setXYZ(index * VERTICES + vertex, 0, 0, 0);
     this.positions.needsUpdate = true;
@@ -109,7 +109,7 @@ export class Frusta {
   }
 }
 
-/** 0..255 as stored in pictures to the linear light that three.js paints with. */
+/** sRGB (0 to 255) to the linear light (0 to 1) that three.js takes. */
 export function srgb(r: number, g: number, b: number): [number, number, number] {
   const linear = (value: number) => (value <= 10.31475 ? value / 3294.6 : ((value / 255 + 0.055) / 1.055) ** 2.4);
   return [linear(r), linear(g), linear(b)];

@@ -1,11 +1,11 @@
-// What the three-dimensional picture is put together from: where it is seen from at first, and clouds of points.
+// Geometry of the three-dimensional view: the first viewpoint, point clouds, and lines between poses.
 import { BufferAttribute, BufferGeometry, Points, PointsMaterial, Vector3 } from "three";
 import { axisOf, centreOf, length, minus, type Triple } from "../result/poses";
 import type { PointLayer, SceneCamera } from "../result/widget_data";
 import type { Colour } from "./colours";
 import { srgb } from "./frusta";
 
-/** What is to be shown, and how. */
+/** What to draw. */
 export interface Look {
   readonly share: number;
   readonly lines: 0 | 1 | 10;
@@ -22,14 +22,14 @@ export interface Viewpoint {
   readonly target: Triple;
 }
 
-/** Which way is up: where most pictures have their top. */
+/** The up direction: the mean of the cameras' up directions. */
 export function upwardsOf(cameras: readonly SceneCamera[]): Triple {
   const sum = cameras.reduce<Triple>((total, camera) => minus(total, axisOf(camera.after, 1)), [0, 0, 0]);
   const size = length(sum);
   return size > 1e-3 * cameras.length ? [sum[0] / size, sum[1] / size, sum[2] / size] : [0, 0, 1];
 }
 
-/** A place from aside and a little above, as near as all of `seen` fits but a few strays. */
+/** A viewpoint from the side and slightly above, as near as 98 % of `seen` fit in the view. */
 export function overviewOf(
   seen: readonly Vector3[],
   up: Vector3,
@@ -46,27 +46,27 @@ export function overviewOf(
   const above = new Vector3().crossVectors(from, right);
   const target = new Vector3();
   const slope = 0.94 * Math.tan((viewDeg * Math.PI) / 360);
-  let back = Math.max(0.1, 3 * share(seen.map((p) => p.length()), 0.98));
-  // What is near looks larger and lower than what is far, so the middle is looked for as it is seen.
+  let back = Math.max(0.1, 3 * quantile(seen.map((p) => p.length()), 0.98));
+  // Near points look larger and lower than far ones, so the middle is found in the projection.
   for (let round = 0; round < 6; round++) {
     const apart = seen.map((p) => p.clone().sub(target));
     const ahead = (off: Vector3) => Math.max(0.05 * back, back - off.dot(from));
     for (const axis of [right, above]) {
       const seenAt = apart.map((off) => off.dot(axis) / ahead(off));
-      target.addScaledVector(axis, ((share(seenAt, 0.02) + share(seenAt, 0.98)) / 2) * back);
+      target.addScaledVector(axis, ((quantile(seenAt, 0.02) + quantile(seenAt, 0.98)) / 2) * back);
     }
     const needed = seen.map((p) => {
       const off = p.clone().sub(target);
       const across = Math.max(Math.abs(off.dot(above)), Math.abs(off.dot(right)) / aspect);
       return off.dot(from) + across / slope;
     });
-    back = Math.max(0.1, share(needed, 0.98));
+    back = Math.max(0.1, quantile(needed, 0.98));
   }
   return { at: target.clone().addScaledVector(from, back), target };
 }
 
-/** The value that this share of all do not exceed. */
-function share(values: readonly number[], part: number): number {
+/** The quantile of some values. */
+function quantile(values: readonly number[], part: number): number {
   const sorted = [...values].sort((a, b) => a - b);
   return sorted[Math.floor(part * (sorted.length - 1))] ?? 0;
 }
@@ -84,7 +84,7 @@ export function cloudOf(layer: PointLayer): Points {
   return points;
 }
 
-/** Lines from where cameras were to where they went, or ten times as far; in the world minus `origin`. */
+/** Lines from the centres before towards those after, scaled by `look.lines`; in the world minus `origin`. */
 export function pathsOf(cameras: readonly SceneCamera[], look: Look, origin: Triple): BufferGeometry {
   const positions: number[] = [];
   const colours: number[] = [];

@@ -1,17 +1,17 @@
-// What of the three-dimensional picture can be chosen, and what its colours mean.
+// The controls of the three-dimensional view, and the legend of its colours.
 import type { PointLayer } from "../result/widget_data";
 import { Choice, Pick, Switch } from "../widgets/controls";
 import { sourceWords } from "../widgets/words";
 import { type ColourBy, css, kindColour, rampColour, scaleOf, signedColour, UNKNOWN } from "./colours";
 
-/** What the reader has chosen. */
-export interface SceneChoice {
+/** The settings of the controls. */
+interface SceneChoice {
   readonly lines: 0 | 1 | 10;
   readonly before: boolean;
   readonly by: ColourBy;
-  /** Of each scale, where its colours end. */
+  /** The upper end of each colour scale. */
   readonly caps: Readonly<Partial<Record<ColourBy, number>>>;
-  /** Null until chosen: points may come later than the cameras. */
+  /** Null until set: points may arrive later than the cameras. */
   readonly layer: string | null;
 }
 
@@ -21,7 +21,7 @@ const COLOURS: readonly { value: ColourBy; text: string }[] = [
   { value: "moved_deg", text: "turned (°)" },
   { value: "moved_units", text: "moved (units)" },
   { value: "delta_psnr", text: "PSNR gain (dB)" },
-  { value: "source", text: "where the pose is from" },
+  { value: "source", text: "source of the pose" },
 ];
 
 const LAYERS: Readonly<Record<PointLayer["source"], string>> = {
@@ -29,10 +29,10 @@ const LAYERS: Readonly<Record<PointLayer["source"], string>> = {
   features: "feature matches",
   tracks: "the input's tracks",
   moved: "the input's points, moved",
-  field: "surface in the field",
+  field: "surface of the field",
 };
 
-/** The points to show: those chosen, else the densest. */
+/** The points to show: those selected, otherwise the densest. */
 export function layerOf(points: readonly PointLayer[], chosen: string | null): PointLayer | null {
   if (chosen !== null) return points.find((layer) => layer.source === chosen) ?? null;
   return points.find((layer) => layer.source === "field") ?? points[0] ?? null;

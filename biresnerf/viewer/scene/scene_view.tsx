@@ -1,10 +1,10 @@
-// (1) Cameras before and after, in three dimensions.
+// Cameras before and after, in three dimensions; a table takes their place if the browser has no WebGL.
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { between, centreOf, medianOf, spreadOf, turnDeg } from "../result/poses";
 import type { PointLayer, SceneCamera } from "../result/widget_data";
 import { Button, ImageStepper, Slider } from "../widgets/controls";
 import { fixed, short } from "../widgets/numbers";
-import { hexColour, themeColour, useDark, useStill } from "../widgets/theme";
+import { hexColour, themeColour, useDark, useReducedMotion } from "../widgets/theme";
 import { sourceWords } from "../widgets/words";
 import { CameraTable } from "./camera_table";
 import { colourOf } from "./colours";
@@ -12,10 +12,10 @@ import type { Look } from "./geometry";
 import { capOf, FIRST_CHOICE, layerOf, Legend, SceneControls } from "./scene_controls";
 import { useScene } from "./use_scene";
 
-export interface SceneViewProps {
+interface SceneViewProps {
   readonly cameras: readonly SceneCamera[];
   readonly points?: readonly PointLayer[];
-  /** Index of the chosen image; null: none. */
+  /** Index of the selected image. */
   readonly selected: number | null;
   readonly onSelect: (image: number | null) => void;
 }
@@ -23,7 +23,7 @@ export interface SceneViewProps {
 const NO_POINTS: readonly PointLayer[] = [];
 
 export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: SceneViewProps) {
-  const [dark, still] = [useDark(), useStill()];
+  const [dark, still] = [useDark(), useReducedMotion()];
   const [share, setShare] = useState(1);
   const [choice, setChoice] = useState(FIRST_CHOICE);
   const [through, setThrough] = useState(false);
@@ -71,10 +71,10 @@ export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: S
         ref={host}
         role="application"
         tabIndex={0}
-        aria-label={`Picture of ${cameras.length} cameras. Left and right arrow keys choose a camera, Enter looks through it, Escape goes back.`}
-        onPointerDown={(event) => press.set(event)}
+        aria-label={`Picture of ${cameras.length} cameras. Left and right arrow keys select a camera, Enter looks through it, Escape goes back.`}
+        onPointerDown={(event) => pressed.set(event)}
         onClick={(event) => {
-          const found = press.moved(event) ? null : drawing.current?.pick(event.clientX, event.clientY);
+          const found = pressed.moved(event) ? null : drawing.current?.pick(event.clientX, event.clientY);
           if (found !== undefined && found !== null) onSelect(found);
         }}
         onKeyDown={(event) => {
@@ -110,8 +110,8 @@ export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: S
   );
 }
 
-/** A press that ends elsewhere turned the scene, and chooses nothing. */
-const press = {
+/** A press that ends elsewhere has rotated the scene and selects nothing. */
+const pressed = {
   x: 0,
   y: 0,
   set(event: PointerEvent) {

@@ -1,12 +1,12 @@
-// The three-dimensional picture's life within a page: made, resized, shown anew, taken down.
+// Creates, resizes, updates and disposes of the three-dimensional view within a page.
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { SceneCamera } from "../result/widget_data";
 import { SceneDrawing } from "./drawing";
 import type { Look, Viewpoint } from "./geometry";
 
 /**
- * The drawing in `host`, made anew for other cameras and seen from where the last one was; and why there is none.
- * `onLeave` is called when the reader turns away from what a camera saw.
+ * The view in `host`, or why it failed. Other cameras make a new view with the same viewpoint.
+ * `onLeave` is called when the user leaves the view through a camera.
  */
 export function useScene(
   host: { readonly current: HTMLDivElement | null },
@@ -15,7 +15,7 @@ export function useScene(
   onLeave: () => void,
 ): { drawing: { readonly current: SceneDrawing | null }; failed: string | null } {
   const drawing = useRef<SceneDrawing | null>(null);
-  const seenFrom = useRef<Viewpoint | null>(null); // kept while a run's cameras move on
+  const viewpoint = useRef<Viewpoint | null>(null); // kept while the cameras of a run move
   const [failed, setFailed] = useState<string | null>(null);
 
   useEffect(() => {
@@ -28,14 +28,14 @@ export function useScene(
       return;
     }
     drawing.current = made;
-    if (seenFrom.current) made.seeFrom(seenFrom.current);
+    if (viewpoint.current) made.setViewpoint(viewpoint.current);
     const observer = new ResizeObserver(([entry]) => {
       if (entry) made.resize(entry.contentRect.width, entry.contentRect.height);
     });
     observer.observe(host.current);
     return () => {
       observer.disconnect();
-      seenFrom.current = made.viewpoint();
+      viewpoint.current = made.viewpoint();
       made.dispose();
       drawing.current = null;
     };
@@ -44,14 +44,14 @@ export function useScene(
   useEffect(() => {
     if (!drawing.current) return;
     drawing.current.show(look);
-    tellTruth(host.current, drawing.current, look.selected, look.share);
+    exposeState(host.current, drawing.current, look.selected, look.share);
   }, [cameras, look]);
 
   return { drawing, failed };
 }
 
-/** What is really drawn of the chosen camera, for whoever checks the picture. */
-function tellTruth(stage: HTMLElement | null, now: SceneDrawing, selected: number | null, share: number) {
+/** Exposes what is drawn of the selected camera, for tests. */
+function exposeState(stage: HTMLElement | null, now: SceneDrawing, selected: number | null, share: number) {
   if (!stage) return;
   stage.dataset.share = String(share);
   stage.dataset.selected = selected === null ? "" : String(selected);

@@ -4,11 +4,11 @@ import { useId } from "preact/hooks";
 import type { Verdict } from "schemas";
 import { VERDICTS } from "./words";
 
-/** One of a few: radio buttons that look like one bar. */
+/** Radio buttons that look like one bar. */
 export function Choice<T extends string | number>(props: {
   label: string;
   value: T;
-  options: readonly { value: T; text: string; disabled?: boolean }[];
+  options: readonly { value: T; text: string }[];
   onChange: (value: T) => void;
 }) {
   const name = useId();
@@ -17,12 +17,11 @@ export function Choice<T extends string | number>(props: {
       <legend>{props.label}</legend>
       <div class="choice-bar">
         {props.options.map((option) => (
-          <label key={option.value} class={option.disabled ? "choice-off" : ""}>
+          <label key={option.value}>
             <input
               type="radio"
               name={name}
               checked={option.value === props.value}
-              disabled={option.disabled}
               onChange={() => props.onChange(option.value)}
             />
             <span>{option.text}</span>
@@ -105,7 +104,7 @@ export function Button(props: {
   );
 }
 
-/** The image's name, with the ones before and after it. */
+/** The name of the selected image, with buttons for the previous and next one. */
 export function ImageStepper(props: {
   names: readonly string[];
   selected: number | null;
@@ -120,7 +119,7 @@ export function ImageStepper(props: {
       </Button>
       <span class="stepper-name" aria-live="polite">
         {selected === null ? (
-          <span class="soft">no image chosen</span>
+          <span class="soft">no image selected</span>
         ) : (
           <>
             <bdi title={names[selected]}>{names[selected]}</bdi>{" "}

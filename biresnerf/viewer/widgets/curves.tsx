@@ -1,20 +1,20 @@
-// (3) Curves of the run: how well the field fits, how much the cameras still move, when the detector calls it stable.
+// Curves of the run: fit to the photos, motion of the cameras, and the signal of the stability detector.
 import { useEffect, useMemo, useRef } from "preact/hooks";
 import uPlot from "uplot";
 import type { CurvePoint } from "../result/widget_data";
 import { fixed, short } from "./numbers";
 import { themeColour, useDark } from "./theme";
 
-export interface CurvesProps {
+interface CurvesProps {
   readonly lines: readonly CurvePoint[];
   /** First step of stage 2, once known. */
   readonly switchStep?: number | null;
   readonly switchReason?: "stable" | "cap" | null;
-  /** All steps of the run, where known: the axis then shows what is still to come. */
+  /** Total steps of the run, if known: the axis then includes the steps to come. */
   readonly steps?: number | null;
 }
 
-const HIGH_PX = 170;
+const HEIGHT_PX = 170;
 
 interface Curve {
   readonly label: string;
@@ -31,7 +31,7 @@ interface Chart {
   readonly second?: string;
   readonly curves: readonly Curve[];
   readonly summary: (lines: readonly CurvePoint[]) => string;
-  /** Whether there is, or will be, something to show of it; and what is said until then. */
+  /** Whether a line belongs to this chart, and the note until its curve begins. */
   readonly of?: (line: CurvePoint) => boolean;
   readonly later?: string;
 }
@@ -52,7 +52,7 @@ const CHARTS: readonly Chart[] = [
     axis: "degrees",
     logarithmic: true,
     curves: [
-      { label: "turned, ° (90 % of cameras turn less)", colour: "--curve-1", value: (line) => positive(line.moved_deg) },
+      { label: "rotation, ° (90 % quantile)", colour: "--curve-1", value: (line) => positive(line.moved_deg) },
       { label: "settled below", colour: "--curve-3", value: (line) => line.still_deg, dashed: true },
     ],
     summary: (lines) => ends(lines, "Turning between checks", (line) => `${short(line.moved_deg)} degrees`),
@@ -61,7 +61,7 @@ const CHARTS: readonly Chart[] = [
     title: "Stability signal",
     axis: "dB over the window",
     of: (line) => line.still_deg != null,
-    later: "begins with the detector's 10th look",
+    later: "begins at the detector's 10th check",
     curves: [
       { label: "trend of the error, dB", colour: "--curve-1", value: (line) => line.trend_db },
       { label: "level within ±", colour: "--curve-3", value: (line) => line.level_db, dashed: true },
@@ -76,7 +76,7 @@ const CHARTS: readonly Chart[] = [
   },
 ];
 
-const positive = (value: number): number | undefined => (value > 0 ? value : undefined); // a logarithm has no zero
+const positive = (value: number): number | undefined => (value > 0 ? value : undefined); // zero has no place on a logarithmic axis
 const negative = (value: number | null | undefined) => (value == null ? value : -value);
 
 function ends(lines: readonly CurvePoint[], what: string, say: (line: CurvePoint) => string): string {
@@ -89,7 +89,7 @@ export function Curves({ lines, switchStep = null, switchReason = null, steps = 
   if (lines.length === 0) {
     return (
       <section class="curves" aria-label="Curves of the run">
-        <p class="notice">No check has been made yet; the first line comes with the first look of the detector.</p>
+        <p class="notice">The curves begin at the first check of the stability detector.</p>
       </section>
     );
   }
@@ -108,7 +108,7 @@ export function Curves({ lines, switchStep = null, switchReason = null, steps = 
           <>
             <i class="stage-2" /> stage 2, high resolution: detail, from step {began}
             {switchReason === "stable" && " (the error was stable)"}
-            {switchReason === "cap" && " (its last step, stable or not)"}
+            {switchReason === "cap" && " (at the step limit)"}
           </>
         ) : (
           "(stage 2 has not begun)"
@@ -118,7 +118,7 @@ export function Curves({ lines, switchStep = null, switchReason = null, steps = 
   );
 }
 
-/** The last step of stage 1, where lines of stage 2 are there. */
+/** The last step of stage 1, once stage 2 has begun. */
 function switchOf(lines: readonly CurvePoint[]): number | null {
   const first = lines.findIndex((line) => line.stage === "fine");
   return first < 0 ? null : first === 0 ? 0 : (lines[first - 1]?.step ?? null);
@@ -141,7 +141,7 @@ function Plot(props: { chart: Chart; lines: readonly CurvePoint[]; switchStep: n
     if (!element) return;
     const made = new uPlot(optionsOf(chart, element.clientWidth, latest), latest.current.data, element);
     plot.current = made;
-    const observer = new ResizeObserver(() => made.setSize({ width: element.clientWidth, height: HIGH_PX }));
+    const observer = new ResizeObserver(() => made.setSize({ width: element.clientWidth, height: HEIGHT_PX }));
     observer.observe(element);
     return () => {
       observer.disconnect();
@@ -188,7 +188,7 @@ function optionsOf(
   });
   return {
     width,
-    height: HIGH_PX,
+    height: HEIGHT_PX,
     legend: { show: false },
     cursor: { sync: { key: "biresnerf-curves" }, drag: { x: false, y: false }, points: { size: 6 } },
     scales: {
@@ -217,7 +217,7 @@ function optionsOf(
   };
 }
 
-/** The two stages as bands behind the curves. */
+/** Draws the two stages as bands behind the curves. */
 function drawStages(plot: uPlot, switchStep: number | null): void {
   const { ctx, bbox } = plot;
   const at = (step: number) => Math.min(bbox.left + bbox.width, Math.max(bbox.left, plot.valToPos(step, "x", true)));

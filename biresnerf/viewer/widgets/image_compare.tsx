@@ -1,4 +1,4 @@
-// (2) What the field shows at a camera, against the photo that was taken there.
+// A camera's photo against the field's render, difference and depth.
 import { useMemo, useState } from "preact/hooks";
 import type { ShownPictures, ShownView } from "schemas";
 import { length, minus, type Triple } from "../result/poses";
@@ -6,10 +6,10 @@ import type { UrlOf } from "../result/widget_data";
 import { Choice, ImageStepper, Slider } from "./controls";
 import { fixed } from "./numbers";
 
-export interface ImageCompareProps {
+interface ImageCompareProps {
   readonly names: readonly string[];
   readonly views: readonly ShownView[];
-  /** Centres of the cameras, to say which views are near one that has none. */
+  /** Centres of the cameras, to find the nearest rendered views. */
   readonly centres: readonly Triple[];
   readonly urlOf: UrlOf;
   readonly selected: number | null;
@@ -17,7 +17,12 @@ export interface ImageCompareProps {
 }
 
 type PictureKind = keyof ShownPictures;
-type Mode = "swipe" | "difference" | "depth";
+const MODES = [
+  { value: "swipe", text: "photo | render" },
+  { value: "difference", text: "difference" },
+  { value: "depth", text: "depth" },
+] as const;
+type Mode = (typeof MODES)[number]["value"];
 const NEAR = 3;
 
 export function ImageCompare({ names, views, centres, urlOf, selected, onSelect }: ImageCompareProps) {
@@ -27,7 +32,7 @@ export function ImageCompare({ names, views, centres, urlOf, selected, onSelect 
   if (views.length === 0) {
     return (
       <section class="compare" aria-label="Render against photo">
-        <p class="notice">No view of this result has been rendered.</p>
+        <p class="notice">No view of this result was rendered.</p>
       </section>
     );
   }
@@ -38,11 +43,7 @@ export function ImageCompare({ names, views, centres, urlOf, selected, onSelect 
           label="Show"
           value={mode}
           onChange={setMode}
-          options={[
-            { value: "swipe", text: "photo | render" },
-            { value: "difference", text: "difference", disabled: view !== undefined && !view.pictures.difference },
-            { value: "depth", text: "depth", disabled: view !== undefined && !view.pictures.depth },
-          ]}
+          options={MODES}
         />
       </div>
       {view ? (
@@ -66,15 +67,11 @@ function Picture(props: { view: ShownView; name: string; mode: Mode; urlOf: Imag
   const { view, name, mode, urlOf } = props;
   const [at, setAt] = useState(0.5);
   const [missing, setMissing] = useState<string | null>(null);
-  const url = (kind: PictureKind) => {
-    const file = view.pictures[kind];
-    return file === undefined ? null : urlOf(file);
-  };
   const frame = { aspectRatio: `${view.width} / ${view.height}`, maxWidth: `calc(62vh * ${view.width / view.height})` };
   const picture = (kind: PictureKind, alt: string, style?: Record<string, string>) => {
-    const source = url(kind);
+    const source = urlOf(view.pictures[kind]);
     return source === null ? (
-      <p class="notice compare-missing">The {kind} is not in this file; it lies beside the result.</p>
+      <p class="notice compare-missing">The {kind} is not in this file; it is in the folder of the result.</p>
     ) : (
       <img key={kind} src={source} alt={alt} style={style} draggable={false} onError={() => setMissing(kind)} />
     );
@@ -83,7 +80,7 @@ function Picture(props: { view: ShownView; name: string; mode: Mode; urlOf: Imag
     <figure class="compare-figure">
       {mode === "swipe" ? (
         <div class="compare-frame" style={frame}>
-          {picture("render", `What the field shows at ${name}`)}
+          {picture("render", `Render of ${name}`)}
           {picture("photo", `Photo ${name}`, { clipPath: `inset(0 ${100 * (1 - at)}% 0 0)` })}
           <span class="compare-tag compare-left" aria-hidden="true">
             photo
@@ -106,11 +103,11 @@ function Picture(props: { view: ShownView; name: string; mode: Mode; urlOf: Imag
       )}
       {missing && <p class="notice">The {missing} could not be loaded.</p>}
       <figcaption>
-        {mode === "difference" && <Key left="equal" right="a quarter of the full range, and more" />}
+        {mode === "difference" && <Key left="equal" right="a quarter of the full range or more" />}
         {mode === "depth" && <Key left="far" right="near" />}
         <span>
           PSNR <b>{fixed(view.psnr, 2)} dB</b> at {view.width} × {view.height} px,{" "}
-          {view.held_out ? "a view that the field never learnt from" : "a view that the field learnt from"}
+          {view.held_out ? "a held-out view" : "a training view"}
         </span>
       </figcaption>
     </figure>
@@ -143,7 +140,7 @@ function NotRendered(props: {
     <div class="notice">
       <p>
         {selected === null ? (
-          "Choose an image to see what the field shows there."
+          "Select an image to see its render."
         ) : (
           <>
             <bdi>{names[selected]}</bdi> was not rendered: {shown.length} of {names.length} views were.
@@ -151,7 +148,7 @@ function NotRendered(props: {
         )}
       </p>
       <p>
-        {selected === null ? "Rendered: " : "Nearest that were: "}
+        {selected === null ? "Rendered views: " : "Nearest rendered views: "}
         {near.map((image, position) => (
           <>
             {position > 0 && ", "}

@@ -1,4 +1,4 @@
-// (4) One row an image.
+// The table of images: one row each, sorted by a click on a heading, filtered by name and flag.
 import { useMemo, useState } from "preact/hooks";
 import type { ImageRow, SheetCell } from "../result/widget_data";
 import { Pick } from "./controls";
@@ -9,9 +9,9 @@ export interface ImageTableProps {
   readonly rows: readonly ImageRow[];
   readonly selected: number | null;
   readonly onSelect: (image: number | null) => void;
-  /** The image's place in the contact sheet. */
+  /** The image's cell in the contact sheet. */
   readonly cellOf?: (image: number) => SheetCell | null;
-  /** Images that are ticked, where they can be. */
+  /** The ticked images, if images can be ticked. */
   readonly ticked?: ReadonlySet<number>;
   readonly onTick?: (image: number, on: boolean) => void;
 }
@@ -41,7 +41,7 @@ const COLUMNS: readonly Column[] = [
   { key: "psnr", title: "PSNR end", hint: "Render against photo at the end, dB; held-out views only", value: (r) => r.psnr, text: (r) => fixed(r.psnr, 2) },
 ];
 const NAME: Column = { key: "name", title: "image", hint: "", value: (r) => r.name, text: (r) => r.name };
-const SOURCE: Column = { key: "source", title: "pose from", hint: "Who found the pose that it started from", value: (r) => r.source, text: (r) => sourceWords(r.source) };
+const SOURCE: Column = { key: "source", title: "pose from", hint: "Where its initial pose comes from", value: (r) => r.source, text: (r) => sourceWords(r.source) };
 
 const natural = new Intl.Collator("en", { numeric: true });
 
@@ -116,13 +116,13 @@ export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }:
             <tr>
               {onTick && (
                 <th scope="col">
-                  <span class="unseen">chosen</span>
+                  <span class="unseen">selected</span>
                 </th>
               )}
               {heading(NAME, "up", "")}
               {columns.map((column) => heading(column, "down", "number"))}
               {heading(SOURCE, "up", "")}
-              <th scope="col">notes</th>
+              <th scope="col">flags</th>
             </tr>
           </thead>
           <tbody>
@@ -137,7 +137,7 @@ export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }:
                   <td class="tick" onClick={(event) => event.stopPropagation()}>
                     <input
                       type="checkbox"
-                      aria-label={`Choose ${row.name}`}
+                      aria-label={`Select ${row.name}`}
                       checked={ticked?.has(row.image) ?? false}
                       onChange={(event) => onTick(row.image, event.currentTarget.checked)}
                     />
@@ -171,7 +171,7 @@ export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }:
             ))}
           </tbody>
         </table>
-        {found.length === 0 && <p class="notice">No image is called so.</p>}
+        {found.length === 0 && <p class="notice">No image matches.</p>}
       </div>
       {found.length > shown.length && (
         <button type="button" class="button" onClick={() => setAll(true)}>

@@ -1,6 +1,6 @@
-// Numbers as people read them.
+// Numbers for display.
 
-/** Three digits that count, without exponents where they can be had. */
+/** Significant digits, without an exponent unless the value is tiny or huge. */
 export function short(value: number | null | undefined, digits = 3): string {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value === 0) return "0";
@@ -13,7 +13,7 @@ export function short(value: number | null | undefined, digits = 3): string {
 export const fixed = (value: number | null | undefined, decimals: number): string =>
   value === null || value === undefined || !Number.isFinite(value) ? "–" : value.toFixed(decimals);
 
-/** With its sign; the minus is as wide as the plus. */
+/** With its sign, and a true minus. */
 export const signed = (value: number | null | undefined, decimals: number): string =>
   value === null || value === undefined || !Number.isFinite(value)
     ? "–"

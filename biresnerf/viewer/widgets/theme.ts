@@ -1,4 +1,4 @@
-// What the reader's system asks for, and what it changes to while the page is open.
+// Colour scheme and motion preferences of the reader's system, and colours of the theme.
 import { useEffect, useState } from "preact/hooks";
 
 function useMedia(query: string): boolean {
@@ -13,9 +13,9 @@ function useMedia(query: string): boolean {
 }
 
 export const useDark = (): boolean => useMedia("(prefers-color-scheme: dark)");
-export const useStill = (): boolean => useMedia("(prefers-reduced-motion: reduce)");
+export const useReducedMotion = (): boolean => useMedia("(prefers-reduced-motion: reduce)");
 
-/** A colour of theme.css as the browser has it. */
+/** The current value of a colour in theme.css. */
 export const themeColour = (name: string): string =>
   getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 

@@ -1,12 +1,12 @@
-// (5) Whether refinement helped, in one sentence, and what proves it.
+// The verdict in one sentence, with its evidence.
 import type { PairedDifference, Verdict } from "schemas";
 import { VerdictChip } from "./controls";
 import { count, fixed, short, signed } from "./numbers";
 
-export interface VerdictSentenceProps {
+interface VerdictSentenceProps {
   readonly verdict: Verdict | null;
   readonly state: "complete" | "partial";
-  /** Whether a verdict was asked for. */
+  /** Whether the options asked for a verdict. */
   readonly asked?: boolean;
 }
 
@@ -17,10 +17,10 @@ export function VerdictSentence({ verdict, state, asked = true }: VerdictSentenc
         <p class="verdict-sentence">
           <span class="chip chip-plain">{state === "partial" ? "partial" : "no verdict"}</span>
           {state === "partial"
-            ? "The run was stopped before its end: these are the best poses until then, and nobody has compared them with the input's."
+            ? "The run was stopped early: these are the best poses so far. They were not compared with the input's."
             : asked
-              ? "No verdict was passed."
-              : "No verdict was asked for: the refined poses are given back as they are."}
+              ? "No verdict was reached."
+              : "No verdict was requested: the result holds the refined poses."}
         </p>
       </section>
     );
@@ -33,18 +33,18 @@ export function VerdictSentence({ verdict, state, asked = true }: VerdictSentenc
       </p>
       <div class="proofs">
         {verdict.heldout && (
-          <Proof
+          <Evidence
             title={`${count(verdict.heldout.psnr.count, "unseen view")}, PSNR`}
             difference={verdict.heldout.psnr}
             unit="dB"
             before={fixed(verdict.heldout.psnr.before, 2)}
             after={fixed(verdict.heldout.psnr.after, 2)}
             least={0.5}
-            note={`Two equal trainings of ${count(verdict.heldout.steps, "step")}, poses held still.`}
+            note={`Two equal trainings of ${count(verdict.heldout.steps, "step")} with fixed poses.`}
           />
         )}
         {verdict.epipolar && (
-          <Proof
+          <Evidence
             title={`${count(verdict.epipolar.matches, "feature match", "feature matches")}, epipolar error`}
             difference={verdict.epipolar.error_px}
             unit="octaves"
@@ -53,8 +53,8 @@ export function VerdictSentence({ verdict, state, asked = true }: VerdictSentenc
             least={0.1}
             note={
               verdict.epipolar.independent
-                ? "Matches that the start had nothing to do with; an octave is half the error."
-                : "The start came from these matches: they can speak against the refined poses only."
+                ? "These matches had no part in the initial poses; one octave halves the error."
+                : "The initial poses came from these matches, so they count only against the refined poses."
             }
           />
         )}
@@ -78,7 +78,7 @@ const FINDING: Readonly<Record<PairedDifference["finding"], string>> = {
   open: "not certain",
 };
 
-function Proof(props: {
+function Evidence(props: {
   title: string;
   difference: PairedDifference;
   unit: string;
@@ -106,24 +106,24 @@ function Proof(props: {
   );
 }
 
-const WIDE = 260;
-const HIGH = 26;
+const WIDTH = 260;
+const HEIGHT = 26;
 
-/** The difference and its interval on a line; what is within the grey band would not matter. */
+/** The difference with its interval on an axis; differences within the grey band are negligible. */
 function Interval({ difference: d, least, unit }: { difference: PairedDifference; least: number; unit: string }) {
   const ends = [d.difference, d.low ?? d.difference, d.high ?? d.difference];
   const reach = 1.15 * Math.max(2 * least, ...ends.map(Math.abs));
-  const x = (value: number) => WIDE / 2 + (value / reach) * (WIDE / 2 - 6);
-  const said = `Gain ${signed(d.difference, 2)} ${unit}${d.low !== null && d.high !== null ? `, 95 % interval ${signed(d.low, 2)} to ${signed(d.high, 2)}` : ""}`;
+  const x = (value: number) => WIDTH / 2 + (value / reach) * (WIDTH / 2 - 6);
+  const text = `Gain ${signed(d.difference, 2)} ${unit}${d.low !== null && d.high !== null ? `, 95 % interval ${signed(d.low, 2)} to ${signed(d.high, 2)}` : ""}`;
   return (
-    <svg class="interval" viewBox={`0 0 ${WIDE} ${HIGH}`} preserveAspectRatio="xMinYMid" role="img" aria-label={said}>
-      <rect class="interval-band" x={x(-least)} width={x(least) - x(-least)} y={3} height={HIGH - 6} rx={2} />
-      <line class="interval-axis" x1={0} x2={WIDE} y1={HIGH / 2} y2={HIGH / 2} />
-      <line class="interval-zero" x1={x(0)} x2={x(0)} y1={2} y2={HIGH - 2} />
+    <svg class="interval" viewBox={`0 0 ${WIDTH} ${HEIGHT}`} preserveAspectRatio="xMinYMid" role="img" aria-label={text}>
+      <rect class="interval-band" x={x(-least)} width={x(least) - x(-least)} y={3} height={HEIGHT - 6} rx={2} />
+      <line class="interval-axis" x1={0} x2={WIDTH} y1={HEIGHT / 2} y2={HEIGHT / 2} />
+      <line class="interval-zero" x1={x(0)} x2={x(0)} y1={2} y2={HEIGHT - 2} />
       {d.low !== null && d.high !== null && (
-        <line class={`interval-range interval-${d.finding}`} x1={x(d.low)} x2={x(d.high)} y1={HIGH / 2} y2={HIGH / 2} />
+        <line class={`interval-range interval-${d.finding}`} x1={x(d.low)} x2={x(d.high)} y1={HEIGHT / 2} y2={HEIGHT / 2} />
       )}
-      <circle class={`interval-dot interval-${d.finding}`} cx={x(d.difference)} cy={HIGH / 2} r={4.5} />
+      <circle class={`interval-dot interval-${d.finding}`} cx={x(d.difference)} cy={HEIGHT / 2} r={4.5} />
     </svg>
   );
 }

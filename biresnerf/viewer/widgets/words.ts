@@ -1,4 +1,4 @@
-// Words for what the result's files name.
+// Words for the names in a result's files.
 import type { ImageReport, Verdict } from "schemas";
 
 export const FLAGS = {
@@ -9,11 +9,11 @@ export const FLAGS = {
   moved_far: "moved far",
   blurred: "blurred",
   exposure_off: "exposure off",
-  unsure_deg: "place unsure",
+  unsure_deg: "pose uncertain",
 } as const satisfies Partial<Record<keyof ImageReport, string>>;
 export type Flag = keyof typeof FLAGS;
 
-/** Flags that ask for a look. */
+/** Flags that deserve attention. */
 export const ALARMING: ReadonlySet<Flag> = new Set(["lost", "moved_far", "blurred", "exposure_off", "unsure_deg"]);
 
 export const VERDICTS = {

@@ -1,6 +1,6 @@
-// A job's server-sent events. Read by fetch: EventSource sends no API key.
+// A job's server-sent events, read with fetch: EventSource cannot send an API key.
 import type { JobView } from "schemas";
-import { address, asProblem, noteRefusal, pause, Problem, withKey } from "./http";
+import { address, asProblem, checkKey, pause, Problem, withKey } from "./http";
 
 export interface JobEvent {
   seq: number;
@@ -10,53 +10,53 @@ export interface JobEvent {
   data: Record<string, unknown>;
 }
 
-export interface Follower {
-  /** How far the job is; once a second at most. */
+interface JobEventHandlers {
+  /** The job as it is now; at most once a second. */
   onProgress: (job: JobView) => void;
-  /** An entry of its history, each once and in order. */
+  /** An event, each once and in order. */
   onEvent: (event: JobEvent) => void;
-  /** The connection is there, or not (and is tried again). */
-  onLink: (up: boolean) => void;
+  /** The connection was made or lost; it is retried. */
+  onConnection: (up: boolean) => void;
 }
 
 const RETRY_MS = 1500;
 
-/** Follows a job from its first event until it is over; throws `Problem` where asking again is of no use. */
-export async function follow(jobId: string, follower: Follower, signal: AbortSignal): Promise<void> {
+/** Reads a job's events from the first one until it is over. Throws `Problem` if retrying cannot help. */
+export async function followJob(jobId: string, handlers: JobEventHandlers, signal: AbortSignal): Promise<void> {
   let last = 0;
   let over = false;
-  const take = (kind: string, data: string) => {
-    const said = JSON.parse(data);
+  const handle = (kind: string, data: string) => {
+    const message = JSON.parse(data);
     if (kind === "progress") {
-      follower.onProgress(said as JobView);
+      handlers.onProgress(message as JobView);
       return;
     }
-    const event = said as JobEvent;
+    const event = message as JobEvent;
     last = event.seq;
     over ||= ["succeeded", "failed", "cancelled", "expired"].includes(event.type);
-    follower.onEvent(event);
+    handlers.onEvent(event);
   };
   while (!over && !signal.aborted) {
     try {
       const headers = withKey({ Accept: "text/event-stream", "Last-Event-ID": String(last) });
-      const answer = await fetch(address(`v1/jobs/${jobId}/events`), { headers, signal });
-      if (!answer.ok) throw noteRefusal(Problem.of(answer.status, await answer.text(), null));
-      follower.onLink(true);
-      await read(answer, take);
+      const response = await fetch(address(`v1/jobs/${jobId}/events`), { headers, signal });
+      if (!response.ok) throw checkKey(Problem.of(response.status, await response.text(), null));
+      handlers.onConnection(true);
+      await read(response, handle);
     } catch (error) {
       if (signal.aborted) return;
       const problem = asProblem(error);
-      if (problem.status && !problem.passing) throw problem;
+      if (problem.status && !problem.transient) throw problem;
     }
     if (!over && !signal.aborted) {
-      follower.onLink(false);
+      handlers.onConnection(false);
       await pause(RETRY_MS);
     }
   }
 }
 
-async function read(answer: Response, take: (kind: string, data: string) => void): Promise<void> {
-  const reader = answer.body!.pipeThrough(new TextDecoderStream()).getReader();
+async function read(response: Response, handle: (kind: string, data: string) => void): Promise<void> {
+  const reader = response.body!.pipeThrough(new TextDecoderStream()).getReader();
   let rest = "";
   for (;;) {
     const { done, value } = await reader.read();
@@ -70,7 +70,7 @@ async function read(answer: Response, take: (kind: string, data: string) => void
         if (line.startsWith("event: ")) kind = line.slice(7);
         else if (line.startsWith("data: ")) data.push(line.slice(6));
       }
-      if (data.length) take(kind, data.join("\n"));
+      if (data.length) handle(kind, data.join("\n"));
     }
   }
 }

@@ -1,30 +1,26 @@
-// Requests to the service: addresses, the API key, and errors as the problems that it tells.
+// Requests to the service: URLs, the API key, and errors as `Problem`.
+import type { FieldProblem } from "schemas";
 import { Store } from "./store";
 
-const KEY_PLACE = "biresnerf-api-key";
+const KEY_ITEM = "biresnerf-api-key";
 
-/** The API key; kept for as long as the tab is open. */
-export const apiKey = new Store<string | null>(sessionStorage.getItem(KEY_PLACE));
-/** Why the service wants a key, once it has said so. */
-export const keyWanted = new Store<string | null>(null);
+/** The API key, kept while the tab is open. */
+export const apiKey = new Store<string | null>(sessionStorage.getItem(KEY_ITEM));
+/** Why the service rejected the request without (or with) this key; null while no key is needed. */
+export const keyRequired = new Store<string | null>(null);
 
 export function useKey(key: string): void {
-  sessionStorage.setItem(KEY_PLACE, key);
+  sessionStorage.setItem(KEY_ITEM, key);
   apiKey.set(key);
-  keyWanted.set(null);
+  keyRequired.set(null);
 }
 
 export function forgetKey(): void {
-  sessionStorage.removeItem(KEY_PLACE);
+  sessionStorage.removeItem(KEY_ITEM);
   apiKey.set(null);
 }
 
-export interface FieldProblem {
-  pointer: string;
-  detail: string;
-}
-
-/** What the service (or the way to it) says went wrong. */
+/** An error of the service or of the connection to it. */
 export class Problem extends Error {
   constructor(
     readonly status: number,
@@ -40,11 +36,11 @@ export class Problem extends Error {
   }
 
   /** Whether the same request may succeed later. */
-  get passing(): boolean {
+  get transient(): boolean {
     return this.status === 0 || this.status === 429 || this.status >= 500;
   }
 
-  /** The same of a place, unless it names one. */
+  /** The same problem at a place, unless it already names one. */
   at(place: string): Problem {
     const { status, code, title, detail, hint, where, errors, waitS } = this;
     return new Problem(status, code, title, detail, hint, where || place, errors, waitS);
@@ -54,27 +50,27 @@ export class Problem extends Error {
     return new Problem(
       0,
       "unreachable",
-      "The service does not answer",
-      "The connection was refused or broke off.",
-      "The page tries again by itself.",
+      "The service does not respond",
+      "The connection was refused or lost.",
+      "The page retries by itself.",
     );
   }
 
   static of(status: number, text: string, retryAfter: string | null): Problem {
     const waitS = Number(retryAfter) || 0;
     try {
-      const said = JSON.parse(text);
+      const body = JSON.parse(text);
       return new Problem(
-        ...([status, String(said.code), String(said.title), String(said.detail)] as const),
-        ...([said.hint ?? "", said.where ?? "", said.errors ?? [], waitS] as const),
+        ...([status, String(body.code), String(body.title), String(body.detail)] as const),
+        ...([body.hint ?? "", body.where ?? "", body.errors ?? [], waitS] as const),
       );
     } catch {
-      return new Problem(status, "unknown", `The service answered ${status}`, text.slice(0, 300), "", "", [], waitS);
+      return new Problem(status, "unknown", `The service responded with status ${status}`, text.slice(0, 300), "", "", [], waitS);
     }
   }
 }
 
-/** A path of the interface as an address, also where a proxy serves the page below a folder. */
+/** The URL of an API path, relative to the page: a proxy may serve both below a prefix. */
 export function address(path: string): string {
   return new URL(path.replace(/^\//, ""), document.baseURI.split("#")[0]).href;
 }
@@ -83,45 +79,45 @@ export function withKey(headers: Record<string, string> = {}): Record<string, st
   return apiKey.value ? { ...headers, Authorization: `Bearer ${apiKey.value}` } : headers;
 }
 
-/** Takes note of a wish for a key; the page then asks for one. */
-export function noteRefusal(problem: Problem): Problem {
-  if (problem.status === 401) keyWanted.set(problem.code === "invalid_api_key" ? problem.detail : "");
+/** Has the page ask for a key if the problem is that one is missing or wrong. */
+export function checkKey(problem: Problem): Problem {
+  if (problem.status === 401) keyRequired.set(problem.code === "invalid_api_key" ? problem.detail : "");
   return problem;
 }
 
-export interface Asked {
+interface RequestOptions {
   json?: unknown;
   headers?: Record<string, string>;
   signal?: AbortSignal;
 }
 
-/** The answer itself; throws `Problem`. */
-export async function ask(method: string, path: string, asked: Asked = {}): Promise<Response> {
-  const headers = withKey(asked.headers);
-  if (asked.json !== undefined) headers["Content-Type"] = "application/json";
-  let answer: Response;
+/** Sends a request. Throws `Problem`. */
+export async function request(method: string, path: string, options: RequestOptions = {}): Promise<Response> {
+  const headers = withKey(options.headers);
+  if (options.json !== undefined) headers["Content-Type"] = "application/json";
+  let response: Response;
   try {
-    answer = await fetch(address(path), {
+    response = await fetch(address(path), {
       method,
       headers,
-      body: asked.json === undefined ? null : JSON.stringify(asked.json),
-      signal: asked.signal ?? null,
+      body: options.json === undefined ? null : JSON.stringify(options.json),
+      signal: options.signal ?? null,
     });
   } catch (error) {
-    if (asked.signal?.aborted) throw error;
+    if (options.signal?.aborted) throw error;
     throw Problem.unreachable();
   }
-  if (answer.ok) return answer;
-  throw noteRefusal(Problem.of(answer.status, await answer.text(), answer.headers.get("Retry-After")));
+  if (response.ok) return response;
+  throw checkKey(Problem.of(response.status, await response.text(), response.headers.get("Retry-After")));
 }
 
-/** The answer's JSON; throws `Problem`. */
-export async function call<T>(method: string, path: string, asked: Asked = {}): Promise<T> {
-  const answer = await ask(method, path, asked);
-  return (answer.status === 204 ? undefined : await answer.json()) as T;
+/** Sends a request and parses the JSON of the response. Throws `Problem`. */
+export async function requestJson<T>(method: string, path: string, options: RequestOptions = {}): Promise<T> {
+  const response = await request(method, path, options);
+  return (response.status === 204 ? undefined : await response.json()) as T;
 }
 
-/** As a problem, whatever was thrown. */
+/** Whatever was thrown, as a problem. */
 export function asProblem(error: unknown): Problem {
   if (error instanceof Problem) return error;
   return new Problem(0, "page_error", "The page failed", error instanceof Error ? error.message : String(error));

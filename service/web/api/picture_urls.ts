@@ -1,52 +1,52 @@
-// Addresses that an <img> can load. Where the service wants a key, an <img> cannot send it: the bytes are fetched
-// then, and shown from memory.
+// URLs that an <img> can load. An <img> sends no API key: where one is needed, the bytes are fetched with it and shown
+// from memory.
 import { useEffect, useState } from "preact/hooks";
-import { address, apiKey, ask } from "./http";
+import { address, apiKey, request } from "./http";
 
-/** Fetched pictures by address; a tab holds so many, the oldest go. */
-const HELD_MAX = 400;
-const held = new Map<string, string>();
-const underWay = new Map<string, Promise<string | null>>();
+/** Most fetched pictures that are kept; the oldest go first. */
+const CACHE_MAX = 400;
+const cached = new Map<string, string>();
+const pending = new Map<string, Promise<string | null>>();
 
-/** Never to the bucket: the page loads nothing from other hosts. */
-export function direct(href: string, version = ""): string {
+/** The URL of an artifact on the service itself, not in its bucket: the page loads nothing from other hosts. */
+export function artifactUrl(href: string, version = ""): string {
   return address(`${href}?redirect=false${version && `&v=${version.slice(0, 12)}`}`);
 }
 
-/** The picture's address now, or null while it is fetched; `changed` is called when it is there. */
+/** The picture's URL, or null while it is fetched; `changed` is called when it has arrived. */
 export function pictureUrl(href: string, version: string, changed: () => void): string | null {
-  const url = direct(href, version);
+  const url = artifactUrl(href, version);
   if (!apiKey.value) return url;
-  const found = held.get(url);
+  const found = cached.get(url);
   if (found) return found;
-  const coming = underWay.get(url) ?? fetched(href, url);
-  underWay.set(url, coming);
+  const coming = pending.get(url) ?? fetched(href, url);
+  pending.set(url, coming);
   void coming.then((done) => done && changed());
   return null;
 }
 
 async function fetched(href: string, url: string): Promise<string | null> {
   try {
-    const answer = await ask("GET", `${href}?redirect=false`);
-    const local = URL.createObjectURL(await answer.blob());
-    held.set(url, local);
-    for (const [oldest, gone] of held) {
-      if (held.size <= HELD_MAX) break;
-      held.delete(oldest);
+    const response = await request("GET", `${href}?redirect=false`);
+    const local = URL.createObjectURL(await response.blob());
+    cached.set(url, local);
+    for (const [oldest, gone] of cached) {
+      if (cached.size <= CACHE_MAX) break;
+      cached.delete(oldest);
       URL.revokeObjectURL(gone);
     }
     return local;
   } catch {
-    return null; // shown as missing; another draw tries again
+    return null; // shown as missing; the next render tries again
   } finally {
-    underWay.delete(url);
+    pending.delete(url);
   }
 }
 
-/** The address of one picture, once it can be shown. */
+/** The URL of one picture, once it can be shown. */
 export function usePicture(href: string | null, version: string): string | null {
-  const [, redraw] = useState(0);
+  const [, rerender] = useState(0);
   const [wanted, setWanted] = useState<string | null>(null);
   useEffect(() => setWanted(href), [href]);
-  return wanted ? pictureUrl(wanted, version, () => redraw((n) => n + 1)) : null;
+  return wanted ? pictureUrl(wanted, version, () => rerender((n) => n + 1)) : null;
 }

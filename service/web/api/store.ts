@@ -1,23 +1,23 @@
-// A value that several parts of the page look at.
+// A value that several components share.
 import { useEffect, useState } from "preact/hooks";
 
 export class Store<T> {
   private readonly watchers = new Set<() => void>();
 
-  constructor(private held: T) {}
+  constructor(private current: T) {}
 
   get value(): T {
-    return this.held;
+    return this.current;
   }
 
   set(value: T): void {
-    this.held = value;
+    this.current = value;
     for (const watcher of [...this.watchers]) watcher();
   }
 
   /** The value with some of its fields changed. */
   change(part: Partial<T>): void {
-    this.set({ ...this.held, ...part });
+    this.set({ ...this.current, ...part });
   }
 
   watch(watcher: () => void): () => void {
@@ -26,12 +26,12 @@ export class Store<T> {
   }
 }
 
-/** The store's value; the component is drawn again whenever it changes. */
+/** The store's value; the component renders again when it changes. */
 export function useStore<T>(store: Store<T>): T {
-  const [, redraw] = useState(0);
+  const [, rerender] = useState(0);
   useEffect(() => {
-    redraw((n) => n + 1); // it may have changed before anybody watched
-    return store.watch(() => redraw((n) => n + 1));
+    rerender((n) => n + 1); // it may have changed since it was rendered
+    return store.watch(() => rerender((n) => n + 1));
   }, [store]);
   return store.value;
 }

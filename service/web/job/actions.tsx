@@ -1,8 +1,8 @@
-// What can be done with a job: end it, run it again with other options, delete it, pass it on.
+// What can be done with a job: cancel it, run it again with other options, delete it, copy its link.
 import type { ComponentChildren } from "preact";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { JobView } from "schemas";
-import { asProblem, call, type Problem } from "../api/http";
+import { asProblem, type Problem, requestJson } from "../api/http";
 import { Store, useStore } from "../api/store";
 import { isOver } from "../jobs/state";
 import { OptionsForm } from "../options/form";
@@ -10,28 +10,28 @@ import type { Values } from "../options/schema";
 import { CopyButton } from "../parts/copy_button";
 import { ProblemBox } from "../parts/problem_box";
 
-/** Options to run a job again with, where another part of the page asks for that. */
-export const wishedAgain = new Store<{ job: string; values: Values } | null>(null);
+/** Set by other parts of the page to open the dialog for another run with these options. */
+export const runAgainRequest = new Store<{ job: string; values: Values } | null>(null);
 
 export function Actions({ job }: { job: JobView }) {
   return (
     <div class="actions">
       <CopyButton text={location.href} what="the address of this page" label="Copy link" />
       {!isOver(job) && <Cancel job={job} />}
-      {job.kind === "refine" && <Again job={job} />}
+      {job.kind === "refine" && <RunAgain job={job} />}
       {isOver(job) && <Delete job={job} />}
     </div>
   );
 }
 
-/** A button that opens a dialog, and the dialog. */
-function Asking(props: {
+/** A button and the dialog that it opens. */
+function DialogButton(props: {
   button: string;
   title: string;
   tone?: string;
   wide?: boolean;
   /** Opens the dialog too, whenever it changes. */
-  wish?: object | null;
+  request?: object | null;
   children: (close: () => void) => ComponentChildren;
 }) {
   const dialog = useRef<HTMLDialogElement>(null);
@@ -42,8 +42,8 @@ function Asking(props: {
     if (!dialog.current?.open) dialog.current?.showModal();
   };
   useEffect(() => {
-    if (props.wish) show();
-  }, [props.wish]);
+    if (props.request) show();
+  }, [props.request]);
   return (
     <>
       <button type="button" class={`act small ${props.tone ?? ""}`} onClick={show}>
@@ -67,14 +67,14 @@ function Asking(props: {
   );
 }
 
-function useAttempt(): [Problem | null, boolean, (doing: () => Promise<void>) => Promise<void>] {
+function useAttempt(): [Problem | null, boolean, (action: () => Promise<void>) => Promise<void>] {
   const [problem, setProblem] = useState<Problem | null>(null);
   const [busy, setBusy] = useState(false);
-  const attempt = async (doing: () => Promise<void>) => {
+  const attempt = async (action: () => Promise<void>) => {
     setBusy(true);
     setProblem(null);
     try {
-      await doing();
+      await action();
     } catch (error) {
       setProblem(asProblem(error));
     }
@@ -85,23 +85,23 @@ function useAttempt(): [Problem | null, boolean, (doing: () => Promise<void>) =>
 
 function Cancel({ job }: { job: JobView }) {
   const [problem, busy, attempt] = useAttempt();
-  const end = (keep_partial: boolean, close: () => void) =>
+  const cancel = (keep_partial: boolean, close: () => void) =>
     attempt(async () => {
-      await call("POST", `v1/jobs/${job.id}/cancel`, { json: { keep_partial } });
+      await requestJson("POST", `v1/jobs/${job.id}/cancel`, { json: { keep_partial } });
       close();
     });
   return (
-    <Asking button={job.cancel_requested ? "Ending …" : "Cancel"} title="End this job?">
+    <DialogButton button={job.cancel_requested ? "Cancelling …" : "Cancel"} title="Cancel this job?">
       {(close) => (
         <>
-          <p>It ends within 10 seconds. The best poses until then can be kept as a partial result.</p>
+          <p>It stops within 10 seconds. The best poses so far can be kept as a partial result.</p>
           {problem && <ProblemBox problem={problem} />}
           <p class="dialog-acts">
-            <button class="act primary" disabled={busy} onClick={() => end(true, close)}>
-              End it, keep the poses so far
+            <button class="act primary" disabled={busy} onClick={() => cancel(true, close)}>
+              Cancel and keep the poses so far
             </button>
-            <button class="act" disabled={busy} onClick={() => end(false, close)}>
-              End it, keep nothing
+            <button class="act" disabled={busy} onClick={() => cancel(false, close)}>
+              Cancel and keep nothing
             </button>
             <button class="act" onClick={close}>
               Let it run
@@ -109,7 +109,7 @@ function Cancel({ job }: { job: JobView }) {
           </p>
         </>
       )}
-    </Asking>
+    </DialogButton>
   );
 }
 
@@ -117,14 +117,14 @@ function Delete({ job }: { job: JobView }) {
   const [problem, busy, attempt] = useAttempt();
   const remove = () =>
     attempt(async () => {
-      await call("DELETE", `v1/jobs/${job.id}`);
+      await requestJson("DELETE", `v1/jobs/${job.id}`);
       location.hash = "#/";
     });
   return (
-    <Asking button="Delete" title="Delete this job?" tone="danger">
+    <DialogButton button="Delete" title="Delete this job?" tone="danger">
       {(close) => (
         <>
-          <p>Its files and exports go for good. The images that it was made from stay.</p>
+          <p>Its files and exports are deleted for good. The images that it was made from stay.</p>
           {problem && <ProblemBox problem={problem} />}
           <p class="dialog-acts">
             <button class="act danger" disabled={busy} onClick={remove}>
@@ -136,21 +136,21 @@ function Delete({ job }: { job: JobView }) {
           </p>
         </>
       )}
-    </Asking>
+    </DialogButton>
   );
 }
 
-function Again({ job }: { job: JobView }) {
+function RunAgain({ job }: { job: JobView }) {
   const [values, setValues] = useState<Values>({});
   const [problem, busy, attempt] = useAttempt();
   const labels = job.labels;
-  const wished = useStore(wishedAgain);
-  const wish = wished?.job === job.id ? wished : null;
+  const pending = useStore(runAgainRequest);
+  const request = pending?.job === job.id ? pending : null;
   useEffect(() => {
-    if (!wish) return;
-    setValues((chosen) => ({ ...chosen, ...wish.values }));
-    wishedAgain.set(null);
-  }, [wish]);
+    if (!request) return;
+    setValues((chosen) => ({ ...chosen, ...request.values }));
+    runAgainRequest.set(null);
+  }, [request]);
   const show = (made: JobView, close: () => void) => {
     close();
     location.hash = `#/jobs/${made.id}`;
@@ -158,30 +158,30 @@ function Again({ job }: { job: JobView }) {
   const fork = (close: () => void) =>
     attempt(async () => {
       const json = { options: values, labels };
-      show(await call<JobView>("POST", `v1/jobs/${job.id}/fork`, { json }), close);
+      show(await requestJson<JobView>("POST", `v1/jobs/${job.id}/fork`, { json }), close);
     });
-  const anew = (close: () => void) =>
+  const restart = (close: () => void) =>
     attempt(async () => {
-      // Another preset fills all options anew; otherwise those of this job hold.
+      // Another preset replaces all options; otherwise this job's options apply.
       const options = values.preset ? values : { ...job.options, ...values };
-      show(await call<JobView>("POST", "v1/jobs", { json: { dataset_id: job.dataset_id, options, labels } }), close);
+      show(await requestJson<JobView>("POST", "v1/jobs", { json: { dataset_id: job.dataset_id, options, labels } }), close);
     });
   return (
-    <Asking button="Run again …" title="Run again with other options" wide wish={wish}>
+    <DialogButton button="Run again …" title="Run again with other options" wide request={request}>
       {(close) => (
         <>
           <OptionsForm values={values} onChange={setValues} base={job.resolved_options ?? job.options} problems={problem?.errors ?? []} />
           <p class="soft">
-            A fork takes over COLMAP's answer or the whole of stage 1, whichever the changed options allow; where they allow
-            neither, the service says why.
+            A fork reuses COLMAP's result or all of stage 1, as far as the changed options allow; if they allow neither, the
+            service says why.
           </p>
           {problem && <ProblemBox problem={problem} />}
           <p class="dialog-acts">
-            <button class="act primary" disabled={busy} onClick={() => anew(close)}>
+            <button class="act primary" disabled={busy} onClick={() => restart(close)}>
               Run from the start
             </button>
             <button class="act" disabled={busy} onClick={() => fork(close)}>
-              Fork: go on from this job's work
+              Fork: continue from this job's work
             </button>
             <button class="act" onClick={close}>
               Close
@@ -189,6 +189,6 @@ function Again({ job }: { job: JobView }) {
           </p>
         </>
       )}
-    </Asking>
+    </DialogButton>
   );
 }

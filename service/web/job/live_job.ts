@@ -1,42 +1,42 @@
-// All that is known of one job, kept up to date for as long as somebody looks.
+// The state of one job and its files, kept up to date while its page is open.
 import type { ArtifactList, ArtifactView, JobView, PosesDocument, Report, SeedingPreview, ViewFile } from "schemas";
 import { type CurvePoint, historyOf, type PointLayer, pointsOf } from "../../../biresnerf/viewer/result/widget_data";
-import { follow, type JobEvent } from "../api/events";
-import { ask, asProblem, call, pause, type Problem } from "../api/http";
+import { followJob, type JobEvent } from "../api/events";
+import { asProblem, pause, type Problem, request, requestJson } from "../api/http";
 import { Store } from "../api/store";
 import { isOver } from "../jobs/state";
 
-export interface Seen {
+export interface LiveState {
   job: JobView | null;
   events: JobEvent[];
   artifacts: readonly ArtifactView[];
-  /** The run's curve so far. */
+  /** The curves so far. */
   history: CurvePoint[];
   poses: PosesDocument | null;
   report: Report | null;
   view: ViewFile | null;
   points: PointLayer[];
-  /** What COLMAP has found, while it works. */
+  /** Feature matches, while COLMAP runs. */
   seeding: SeedingPreview | null;
-  /** Whether progress comes as it happens. */
-  linked: boolean;
+  /** Whether events arrive. */
+  connected: boolean;
   problem: Problem | null;
 }
 
-const NOTHING: Seen = {
+const NOTHING: LiveState = {
   ...{ job: null, events: [], artifacts: [], history: [], poses: null, report: null, view: null, points: [] },
-  ...{ seeding: null, linked: true, problem: null },
+  ...{ seeding: null, connected: true, problem: null },
 };
 
-export class LiveJob extends Store<Seen> {
+export class LiveJob extends Store<LiveState> {
   private readonly stop = new AbortController();
-  /** What was read of each file, by its digest: a preview of another digest is read anew. */
-  private readonly read = new Map<string, string>();
+  /** The digest of each file when it was last read; a preview with another digest is read again. */
+  private readonly digests = new Map<string, string>();
   private recorded: CurvePoint[] = [];
-  /** Between two previews the progress events tell how it goes. */
-  private told: CurvePoint[] = [];
-  private looking: Promise<void> | null = null;
-  private lookAgain = false;
+  /** From progress events since the last preview. */
+  private live: CurvePoint[] = [];
+  private loading: Promise<void> | null = null;
+  private loadAgain = false;
 
   constructor(readonly id: string) {
     super(NOTHING);
@@ -50,77 +50,77 @@ export class LiveJob extends Store<Seen> {
     this.stop.abort();
   }
 
-  /** Looks for new files: a preview, the result, an export. */
+  /** Loads new files: a preview, the result, an export. */
   refresh(): Promise<void> {
-    if (this.looking) {
-      this.lookAgain = true;
-      return this.looking;
+    if (this.loading) {
+      this.loadAgain = true;
+      return this.loading;
     }
-    this.looking = this.look().finally(() => {
-      this.looking = null;
-      if (this.lookAgain && !this.stop.signal.aborted) {
-        this.lookAgain = false;
+    this.loading = this.load().finally(() => {
+      this.loading = null;
+      if (this.loadAgain && !this.stop.signal.aborted) {
+        this.loadAgain = false;
         void this.refresh();
       }
     });
-    return this.looking;
+    return this.loading;
   }
 
   private async run(): Promise<void> {
     try {
-      await this.reach();
+      await this.waitForJob();
       await this.refresh();
-      const takers = { onProgress: this.progress, onEvent: this.event, onLink: this.link };
-      await follow(this.id, takers, this.stop.signal);
+      const handlers = { onProgress: this.progress, onEvent: this.event, onConnection: this.connection };
+      await followJob(this.id, handlers, this.stop.signal);
     } catch (error) {
       if (!this.stop.signal.aborted) this.change({ problem: asProblem(error) });
     }
   }
 
-  /** The job, once the service answers. */
-  private async reach(): Promise<void> {
+  /** Asks for the job until the service responds. */
+  private async waitForJob(): Promise<void> {
     for (;;) {
       try {
-        this.change({ job: await call<JobView>("GET", `v1/jobs/${this.id}`), problem: null });
+        this.change({ job: await requestJson<JobView>("GET", `v1/jobs/${this.id}`), problem: null });
         return;
       } catch (error) {
         const problem = asProblem(error);
         this.change({ problem });
-        if (!problem.passing) throw error;
+        if (!problem.transient) throw error;
         await pause(2000);
         if (this.stop.signal.aborted) throw error;
       }
     }
   }
 
-  private readonly link = (linked: boolean) => this.change({ linked });
+  private readonly connection = (connected: boolean) => this.change({ connected });
 
   private readonly progress = (job: JobView) => {
-    // An attempt that begins at a checkpoint takes back what the one before told.
-    if (stepping(job)) this.told = this.told.filter((line) => line.step <= job.progress.step);
-    const last = this.told.at(-1) ?? this.recorded.at(-1);
+    // An attempt that resumes from a checkpoint repeats steps of the one before.
+    if (stepping(job)) this.live = this.live.filter((line) => line.step <= job.progress.step);
+    const last = this.live.at(-1) ?? this.recorded.at(-1);
     const line = lineOf(job, last);
-    if (line) this.told.push(line);
+    if (line) this.live.push(line);
     const ended = isOver(job) && this.value.job !== null && !isOver(this.value.job);
-    this.change({ job, history: [...this.recorded, ...this.told] });
+    this.change({ job, history: [...this.recorded, ...this.live] });
     if (ended) void this.refresh();
   };
 
   private readonly event = (event: JobEvent) => {
     this.change({ events: [...this.value.events, event] });
-    // Where the story is replayed, one look at its end does.
+    // Old events are replayed on connecting; the files were loaded once already.
     const fresh = Date.now() - Date.parse(event.at) < 60_000;
     if (fresh && ["preview", "succeeded", "cancelled", "failed"].includes(event.type)) void this.refresh();
   };
 
-  private async look(): Promise<void> {
+  private async load(): Promise<void> {
     try {
-      const { items } = await call<ArtifactList>("GET", `v1/jobs/${this.id}/artifacts`, { signal: this.stop.signal });
+      const { items } = await requestJson<ArtifactList>("GET", `v1/jobs/${this.id}/artifacts`, { signal: this.stop.signal });
       this.change({ artifacts: items });
       await this.readFiles();
     } catch (error) {
       const problem = asProblem(error);
-      if (!this.stop.signal.aborted && problem.code !== "expired" && !problem.passing) this.change({ problem });
+      if (!this.stop.signal.aborted && problem.code !== "expired" && !problem.transient) this.change({ problem });
     }
   }
 
@@ -135,11 +135,11 @@ export class LiveJob extends Store<Seen> {
     if (history !== null) {
       this.recorded = historyOf(history);
       const end = this.recorded.at(-1)?.step ?? 0;
-      this.told = this.told.filter((line) => line.step > end);
+      this.live = this.live.filter((line) => line.step > end);
     }
     this.change({
       view,
-      history: [...this.recorded, ...this.told],
+      history: [...this.recorded, ...this.live],
       report: report ?? this.value.report,
       poses: poses ?? this.value.poses,
       seeding: seeding ?? this.value.seeding,
@@ -149,13 +149,13 @@ export class LiveJob extends Store<Seen> {
 
   private async points(view: ViewFile): Promise<PointLayer[]> {
     const layers = view.points.map(async (entry) => {
-      const answer = await this.file(entry.file);
-      return answer && entry.count > 0 ? pointsOf(entry, await answer.arrayBuffer()) : null;
+      const response = await this.file(entry.file);
+      return response && entry.count > 0 ? pointsOf(entry, await response.arrayBuffer()) : null;
     });
     return (await Promise.all(layers)).filter((layer) => layer !== null);
   }
 
-  /** The file's text where it is there and was not read yet; while the job runs, the preview's. */
+  /** The file's text if it has changed since it was last read; the preview's while the job runs. */
   private async text(name: string): Promise<string | null> {
     return (await (await this.file(name))?.text()) ?? null;
   }
@@ -167,13 +167,13 @@ export class LiveJob extends Store<Seen> {
 
   private async file(name: string): Promise<Response | null> {
     const found = [name, `preview/${name}`].flatMap((n) => this.value.artifacts.filter((a) => a.name === n))[0];
-    if (!found || this.read.get(name) === found.sha256) return null;
+    if (!found || this.digests.get(name) === found.sha256) return null;
     try {
-      const answer = await ask("GET", `${found.href}?redirect=false`, { signal: this.stop.signal });
-      this.read.set(name, found.sha256);
-      return answer;
+      const response = await request("GET", `${found.href}?redirect=false`, { signal: this.stop.signal });
+      this.digests.set(name, found.sha256);
+      return response;
     } catch (error) {
-      if (asProblem(error).status === 404) return null; // another preview took its place
+      if (asProblem(error).status === 404) return null; // replaced by the next preview
       throw error;
     }
   }
@@ -183,14 +183,14 @@ const SIGNAL = ["still_deg", "trend_db", "level_db"] as const;
 
 const stepping = ({ stage }: JobView) => (stage === "coarse" || stage === "fine" ? stage : null);
 
-/** A line of the curve from a progress event, where it is of a later step than the last one. */
+/** A point of the curves from a progress event, if its step is later than the last one. */
 function lineOf(job: JobView, last: CurvePoint | undefined): CurvePoint | null {
   const { loss, psnr, moved_deg } = job.metrics;
   const { step } = job.progress;
   const stage = stepping(job);
   if (!stage || loss === undefined || psnr === undefined || !last || step <= last.step) return null;
   const line = { step, stage, loss, psnr, moved_deg: moved_deg ?? 0 };
-  // The detector looks at stage 1 alone; what it saw last stays in the job.
+  // The stability detector runs in stage 1 only; the job keeps its last values.
   const signal = stage === "coarse" ? SIGNAL.filter((name) => job.metrics[name] !== undefined) : [];
   return { ...line, ...Object.fromEntries(signal.map((name) => [name, job.metrics[name]])) };
 }

@@ -1,7 +1,7 @@
-// What the job's process has written, while it runs too.
+// The log of the job's process, live while it runs.
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { JobView } from "schemas";
-import { ask, pause } from "../api/http";
+import { pause, request } from "../api/http";
 import { isOver } from "../jobs/state";
 
 const EVERY_MS = 1500;
@@ -23,16 +23,16 @@ export function LogView({ job }: { job: JobView }) {
     void (async () => {
       let last = 0;
       while (!stop.signal.aborted) {
-        const done = over.current; // before the look: what was written between the two is not missed
+        const done = over.current; // read before the request, so that no line written in between is missed
         try {
           const path = `v1/jobs/${job.id}/logs?format=ndjson&after=${last}`;
-          const text = await (await ask("GET", path, { signal: stop.signal })).text();
+          const text = await (await request("GET", path, { signal: stop.signal })).text();
           const fresh = text.split("\n").filter(Boolean).map((line) => JSON.parse(line) as LogLine);
           last = fresh.at(-1)?.n ?? last;
           if (fresh.length) setLines((seen) => [...seen, ...fresh].slice(-LINES_MAX));
           else if (done) return;
         } catch {
-          if (stop.signal.aborted) return; // else the next look tries again
+          if (stop.signal.aborted) return; // else the next request tries again
         }
         await pause(EVERY_MS);
       }

@@ -1,4 +1,4 @@
-// One job: how far it is, what came out, what can be done with it.
+// One job: its progress, its result and what can be done with it.
 import { useEffect, useMemo, useState } from "preact/hooks";
 import type { JobView } from "schemas";
 import { duration } from "../../../biresnerf/viewer/widgets/numbers";
@@ -11,7 +11,7 @@ import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 import { Actions } from "./actions";
 import { Failure } from "./failure";
-import { LiveJob, type Seen } from "./live_job";
+import { LiveJob, type LiveState } from "./live_job";
 import { LogView } from "./log";
 import { JobViews } from "./views";
 
@@ -31,7 +31,7 @@ export function JobPage({ id }: { id: string }) {
       {problem && <ProblemBox problem={problem} />}
       <Failure job={job} images={seen.poses?.images.map(({ name }) => name) ?? []} />
       <Announced job={job} />
-      <Shown seen={seen} />
+      <Views seen={seen} />
       <Files live={live} seen={seen} />
       <Facts job={job} seen={seen} />
       <LogView job={job} />
@@ -39,7 +39,7 @@ export function JobPage({ id }: { id: string }) {
   );
 }
 
-function Head({ job, seen }: { job: JobView; seen: Seen }) {
+function Head({ job, seen }: { job: JobView; seen: LiveState }) {
   return (
     <header class="job-header">
       <div class="page-head">
@@ -49,17 +49,17 @@ function Head({ job, seen }: { job: JobView; seen: Seen }) {
         <Actions job={job} />
       </div>
       <StageBar job={job} named />
-      {!isOver(job) && <LiveNumbers job={job} linked={seen.linked} />}
+      {!isOver(job) && <LiveNumbers job={job} connected={seen.connected} />}
     </header>
   );
 }
 
-function LiveNumbers({ job, linked }: { job: JobView; linked: boolean }) {
+function LiveNumbers({ job, connected }: { job: JobView; connected: boolean }) {
   const { loss, psnr, moved_deg } = job.metrics;
   const numbers = [
     ["Loss", loss?.toExponential(2), ""],
     ["PSNR", psnr?.toFixed(2), "dB"],
-    ["Cameras turn", moved_deg?.toPrecision(2), "° a check"],
+    ["Cameras turn", moved_deg?.toPrecision(2), "° per check"],
     ["Attempt", job.attempt > 1 ? String(job.attempt) : undefined, ""],
   ].filter(([, value]) => value !== undefined);
   return (
@@ -72,12 +72,12 @@ function LiveNumbers({ job, linked }: { job: JobView; linked: boolean }) {
           </dd>
         </div>
       ))}
-      {!linked && <div class="soft">The connection broke off; trying again …</div>}
+      {!connected && <div class="soft">The connection was lost; reconnecting …</div>}
     </dl>
   );
 }
 
-/** For screen readers: stages and the end, not each step. */
+/** For screen readers: stages and the end, but not each step. */
 function Announced({ job }: { job: JobView }) {
   const text = isOver(job) ? `The job is over: ${job.verdict ?? job.state}` : job.stage ? `Now: ${job.stage}` : "Waiting";
   return (
@@ -87,20 +87,20 @@ function Announced({ job }: { job: JobView }) {
   );
 }
 
-function Shown({ seen }: { seen: Seen }) {
-  const [drawn, redraw] = useState(0);
+function Views({ seen }: { seen: LiveState }) {
+  const [version, rerender] = useState(0);
   const { artifacts } = seen;
   const urlOf = useMemo(() => {
     const byName = new Map(artifacts.map((artifact) => [artifact.name, artifact]));
     return (file: string) => {
       const found = byName.get(file);
-      return found ? pictureUrl(found.href, found.sha256, () => redraw((n) => n + 1)) : null;
+      return found ? pictureUrl(found.href, found.sha256, () => rerender((n) => n + 1)) : null;
     };
-  }, [artifacts, drawn]);
+  }, [artifacts, version]);
   return <JobViews seen={seen} urlOf={urlOf} />;
 }
 
-function Files({ live, seen }: { live: LiveJob; seen: Seen }) {
+function Files({ live, seen }: { live: LiveJob; seen: LiveState }) {
   const { job, artifacts } = seen;
   if (!job || !artifacts.some(({ preview, name }) => !preview && name !== "log.txt")) return null;
   return (
@@ -111,7 +111,7 @@ function Files({ live, seen }: { live: LiveJob; seen: Seen }) {
   );
 }
 
-function Facts({ job, seen }: { job: JobView; seen: Seen }) {
+function Facts({ job, seen }: { job: JobView; seen: LiveState }) {
   const seconds = Object.entries(seen.report?.seconds ?? {});
   const warnings = seen.report?.warnings ?? [];
   const options = Object.entries(job.resolved_options ?? job.options).sort(([a], [b]) => (a < b ? -1 : 1));
@@ -129,7 +129,7 @@ function Facts({ job, seen }: { job: JobView; seen: Seen }) {
       )}
       <dl class="facts">
         <Fact name="Job" value={job.id} />
-        <Fact name="Images" value={job.dataset_id} link={`#/datasets/${job.dataset_id}`} />
+        <Fact name="Image set" value={job.dataset_id} link={`#/datasets/${job.dataset_id}`} />
         {job.forked_from && <Fact name="Forked from" value={job.forked_from} link={`#/jobs/${job.forked_from}`} />}
         <Fact name="Submitted" value={moment(job.created_at)} />
         {job.expires_at && <Fact name="Kept until" value={moment(job.expires_at)} />}

@@ -1,4 +1,4 @@
-// What there is to see of a job, with one image chosen in all of it; while it runs, its previews.
+// The views of a job's result or, while it runs, of its previews; one image is selected in all of them.
 import type { ComponentChildren } from "preact";
 import { useEffect, useState } from "preact/hooks";
 import type { ArtifactView, JobView, PosesDocument, ViewFile } from "schemas";
@@ -7,7 +7,7 @@ import { asProblem, type Problem } from "../api/http";
 import { isOver } from "../jobs/state";
 import { ProblemBox } from "../parts/problem_box";
 import { Images } from "./images";
-import type { Seen } from "./live_job";
+import type { LiveState } from "./live_job";
 import { Seeding } from "./seeding";
 
 type Widgets = typeof import("./widgets");
@@ -21,12 +21,11 @@ function useWidgets(): { widgets: Widgets | null; problem: Problem | null } {
   return { widgets, problem };
 }
 
-export function JobViews({ seen, urlOf }: { seen: Seen; urlOf: UrlOf }) {
+export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
   const { widgets, problem } = useWidgets();
   const job = seen.job!;
   if (problem) return <ProblemBox problem={problem} />;
-  const nothing = isOver(job) && !seen.poses && !seen.history.length;
-  if (nothing) return null;
+  if (isOver(job) && !seen.poses && !seen.history.length) return null;
   return (
     <>
       {widgets && seen.report && isOver(job) && (
@@ -41,7 +40,7 @@ export function JobViews({ seen, urlOf }: { seen: Seen; urlOf: UrlOf }) {
   );
 }
 
-function Views({ seen, urlOf, widgets }: { seen: Seen; urlOf: UrlOf; widgets: Widgets | null }) {
+function Views({ seen, urlOf, widgets }: { seen: LiveState; urlOf: UrlOf; widgets: Widgets | null }) {
   const { poses, report, view, points } = seen;
   const job = seen.job!;
   const [chosen, setChosen] = useState<number | null | undefined>(undefined);
@@ -56,7 +55,7 @@ function Views({ seen, urlOf, widgets }: { seen: Seen; urlOf: UrlOf; widgets: Wi
           {widgets && poses ? (
             <widgets.SceneView cameras={cameras} points={points} {...choice} />
           ) : (
-            <Waiting job={job} for="cameras" />
+            <Placeholder job={job} for="cameras" />
           )}
         </Panel>
         <Panel name={view ? "Photo and render" : seen.job!.stage === "seeding" ? "Feature matches" : "Preview"} kind="panel-compare">
@@ -67,7 +66,7 @@ function Views({ seen, urlOf, widgets }: { seen: Seen; urlOf: UrlOf; widgets: Wi
           )}
         </Panel>
       </div>
-      <Panel name="The run" kind="panel-curves">
+      <Panel name="Progress of the run" kind="panel-curves">
         {widgets && seen.history.length > 1 ? (
           <widgets.Curves
             lines={seen.history}
@@ -76,7 +75,7 @@ function Views({ seen, urlOf, widgets }: { seen: Seen; urlOf: UrlOf; widgets: Wi
             steps={isOver(job) ? (report?.steps_done ?? null) : job.progress.steps_total || null}
           />
         ) : (
-          <Waiting job={job} for="curves" />
+          <Placeholder job={job} for="curves" />
         )}
       </Panel>
       {widgets && rows.length > 0 && (
@@ -89,7 +88,7 @@ function Views({ seen, urlOf, widgets }: { seen: Seen; urlOf: UrlOf; widgets: Wi
   );
 }
 
-/** Fetched when it is opened. */
+/** The video, fetched when it is opened. */
 function Orbit({ view, urlOf }: { view: ViewFile; urlOf: UrlOf }) {
   const [open, setOpen] = useState(false);
   if (!view.orbit) return null;
@@ -120,23 +119,23 @@ function Panel({ name, kind, children }: { name: string; kind: string; children:
   );
 }
 
-/** Holds the place of what is still to come. */
-function Waiting({ job, for: what }: { job: JobView; for: string }) {
+/** Stands in for what is not there yet. */
+function Placeholder({ job, for: what }: { job: JobView; for: string }) {
   const words = isOver(job)
-    ? `There are no ${what} of this job.`
+    ? `This job has no ${what}.`
     : job.state === "queued"
       ? `The ${what} appear soon after the job starts.`
-      : `The ${what} appear as soon as the poses begin to move.`;
+      : `The ${what} appear once the optimisation starts.`;
   return <p class="waiting soft">{words}</p>;
 }
 
 const KINDS = ["render", "photo", "difference", "depth"] as const;
 
-/** One view as the field has it now. */
-function Preview({ seen, poses, urlOf }: { seen: Seen; poses: PosesDocument | null; urlOf: UrlOf }) {
+/** One view as the field renders it now. */
+function Preview({ seen, poses, urlOf }: { seen: LiveState; poses: PosesDocument | null; urlOf: UrlOf }) {
   const pictures = previewPictures(seen.artifacts);
   if (!pictures.size && seen.seeding && !isOver(seen.job!)) return <Seeding seeding={seen.seeding} urlOf={urlOf} />;
-  if (!pictures.size) return <Waiting job={seen.job!} for="pictures" />;
+  if (!pictures.size) return <Placeholder job={seen.job!} for="pictures" />;
   const lens = poses?.cameras[0];
   const frame = lens && { aspectRatio: `${lens.width} / ${lens.height}` };
   return (
@@ -147,7 +146,7 @@ function Preview({ seen, poses, urlOf }: { seen: Seen; poses: PosesDocument | nu
           <li key={kind}>
             <figure>
               <div class="preview-frame" style={frame}>
-                {url && <img src={url} alt={`${kind} of one view, as the field has it now`} />}
+                {url && <img src={url} alt={`${kind} of one view, as the field renders it now`} />}
               </div>
               <figcaption>{kind}</figcaption>
             </figure>

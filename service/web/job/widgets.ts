@@ -1,4 +1,4 @@
-// What draws with WebGL and canvases: in a file of its own, so that lists and uploads do not wait for it.
+// The widgets that need WebGL or a canvas: a bundle of its own, so that lists and uploads load without it.
 export { Curves } from "../../../biresnerf/viewer/widgets/curves";
 export { ImageCompare } from "../../../biresnerf/viewer/widgets/image_compare";
 export { ImageTable } from "../../../biresnerf/viewer/widgets/image_table";

@@ -1,9 +1,9 @@
-// All jobs, newest first, as they are now.
+// The list of jobs, newest first, kept up to date.
 import { useEffect, useState } from "preact/hooks";
 import type { JobList, JobView } from "schemas";
 import { Pick } from "../../../biresnerf/viewer/widgets/controls";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
-import { asProblem, call, type Problem } from "../api/http";
+import { asProblem, type Problem, requestJson } from "../api/http";
 import { usePicture } from "../api/picture_urls";
 import { moment } from "../parts/format";
 import { ProblemBox } from "../parts/problem_box";
@@ -11,27 +11,27 @@ import { useTitle } from "../parts/title";
 import { DropZone } from "../upload/drop";
 import { Chip, isOver, type JobState, StageBar, STATE_WORDS, titleOf } from "./state";
 
-/** How many more are shown at a time, and how many the service gives at once. */
+/** Jobs per page of the list, and at most per request. */
 const PAGE = 24;
-const GIVEN_MAX = 200;
-/** While something runs, and while nothing does. */
+const REQUEST_MAX = 200;
+/** Between two requests while jobs run, and while none does. */
 const BUSY_MS = 1500;
 const IDLE_MS = 8000;
 
-/** What of the list was looked at, for who comes back to it from a job. */
-const looked = { state: "" as JobState | "", wanted: PAGE, scroll: 0 };
+/** Filter, length and scroll position, kept for the way back from a job. */
+const listView = { state: "" as JobState | "", wanted: PAGE, scroll: 0 };
 
 export function JobsPage() {
-  const [state, setState] = useState(looked.state);
-  const [wanted, setWanted] = useState(looked.wanted);
+  const [state, setState] = useState(listView.state);
+  const [wanted, setWanted] = useState(listView.wanted);
   const { found, problem } = useJobs(state, wanted);
   useTitle("Jobs");
   useEffect(() => {
-    Object.assign(looked, { state, wanted });
+    Object.assign(listView, { state, wanted });
   }, [state, wanted]);
   useEffect(() => {
-    if (found) scrollTo(0, looked.scroll);
-    looked.scroll = 0;
+    if (found) scrollTo(0, listView.scroll);
+    listView.scroll = 0;
   }, [found !== null]);
   const choose = (chosen: JobState | "") => {
     setState(chosen);
@@ -49,7 +49,7 @@ export function JobsPage() {
             <h2 id="jobs-heading">Jobs</h2>
             <Pick label="Show" value={state} onChange={choose} options={CHOICES} />
             <span class="soft" role="status">
-              {found.more ? `the newest ${found.jobs.length}` : count(found.jobs.length, "job")}
+              {found.more ? `newest ${found.jobs.length}` : count(found.jobs.length, "job")}
             </span>
           </div>
           <Cards {...found} onOlder={() => setWanted(found.jobs.length + PAGE)} />
@@ -57,14 +57,14 @@ export function JobsPage() {
       )}
       {found && found.jobs.length === 0 && (
         <p class="soft empty">
-          {found.state ? `No job is ${STATE_WORDS[found.state]}.` : "No jobs yet. Drop a set of images above to begin."}
+          {found.state ? `No job is ${STATE_WORDS[found.state]}.` : "No jobs yet. Drop an image set above to start."}
         </p>
       )}
     </>
   );
 }
 
-function Cards({ jobs, more, onOlder }: Found & { onOlder: () => void }) {
+function Cards({ jobs, more, onOlder }: Jobs & { onOlder: () => void }) {
   return (
     <>
       <ul class="cards">
@@ -93,7 +93,7 @@ const CHOICES: readonly { value: JobState | ""; text: string }[] = [
 function JobCard({ job }: { job: JobView }) {
   const picture = usePicture(job.thumbnail && `v1/jobs/${job.id}/artifacts/${job.thumbnail}`, job.stage ?? "");
   return (
-    <a class="card job-card" href={`#/jobs/${job.id}`} onClick={() => (looked.scroll = scrollY)}>
+    <a class="card job-card" href={`#/jobs/${job.id}`} onClick={() => (listView.scroll = scrollY)}>
       <span class="thumbnail">{picture && <img src={picture} alt="" width={96} height={72} loading="lazy" />}</span>
       <span class="job-lines">
         <span class="job-head">
@@ -109,49 +109,49 @@ function JobCard({ job }: { job: JobView }) {
   );
 }
 
-interface Found {
+interface Jobs {
   state: JobState | "";
   jobs: JobView[];
-  /** Whether there are older ones. */
+  /** Whether there are older jobs. */
   more: boolean;
 }
 
-/** So many of the newest jobs in a state (all: ""). */
-async function newest(state: JobState | "", wanted: number): Promise<Found> {
+/** The newest jobs in a state; "" stands for all states. */
+async function newest(state: JobState | "", wanted: number): Promise<Jobs> {
   const jobs: JobView[] = [];
   let cursor: string | null = null;
   do {
-    const limit = String(Math.min(GIVEN_MAX, wanted - jobs.length));
+    const limit = String(Math.min(REQUEST_MAX, wanted - jobs.length));
     const asked = new URLSearchParams({ limit, ...(state && { state }), ...(cursor && { cursor }) });
-    const page: JobList = await call<JobList>("GET", `v1/jobs?${asked}`);
+    const page: JobList = await requestJson<JobList>("GET", `v1/jobs?${asked}`);
     jobs.push(...page.items);
     cursor = page.next_cursor;
   } while (cursor && jobs.length < wanted);
   return { state, jobs, more: cursor !== null };
 }
 
-/** All that are shown are looked at again and again: the one that runs may be older than many that wait. */
+/** Polls all jobs that are shown: the running one may be older than many that wait. */
 function useJobs(state: JobState | "", wanted: number) {
-  const [found, setFound] = useState<Found | null>(null);
+  const [found, setFound] = useState<Jobs | null>(null);
   const [problem, setProblem] = useState<Problem | null>(null);
   useEffect(() => {
     let timer = 0;
-    let gone = false;
+    let stopped = false;
     const look = async () => {
       let wait = IDLE_MS;
       try {
         if (!document.hidden) {
           const now = await newest(state, wanted);
-          if (gone) return;
+          if (stopped) return;
           setFound(now);
           setProblem(null);
-          // A long list is looked at as much less often.
+          // The longer the list, the less often.
           if (now.jobs.some((job) => !isOver(job))) wait = BUSY_MS * Math.ceil(now.jobs.length / PAGE);
         }
       } catch (error) {
-        if (!gone) setProblem(asProblem(error));
+        if (!stopped) setProblem(asProblem(error));
       }
-      if (!gone) timer = window.setTimeout(look, wait);
+      if (!stopped) timer = window.setTimeout(look, wait);
     };
     const shown = () => {
       if (document.hidden) return;
@@ -161,7 +161,7 @@ function useJobs(state: JobState | "", wanted: number) {
     void look();
     document.addEventListener("visibilitychange", shown);
     return () => {
-      gone = true;
+      stopped = true;
       window.clearTimeout(timer);
       document.removeEventListener("visibilitychange", shown);
     };

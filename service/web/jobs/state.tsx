@@ -1,4 +1,4 @@
-// A job's state in words, as a chip, and as a bar of its stages.
+// A job's state in words, as a chip and as a bar of stages.
 import type { JobView } from "schemas";
 import { VerdictChip } from "../../../biresnerf/viewer/widgets/controls";
 import { duration } from "../../../biresnerf/viewer/widgets/numbers";
@@ -27,7 +27,7 @@ export const STATE_WORDS = {
 
 export const isOver = (job: JobView) => !["queued", "running"].includes(job.state);
 
-/** What a job is called after its set; labels are no longer than this. */
+/** The label that names a job after its image set, within the length allowed for labels. */
 export function nameLabel(name: string): { name: string } {
   return { name: [...name].slice(0, 100).join("") };
 }
@@ -39,13 +39,13 @@ export function titleOf(job: JobView): string {
 export function Chip({ job }: { job: JobView }) {
   if (job.state === "succeeded" && job.verdict) return <VerdictChip verdict={job.verdict} />;
   const tone = job.state === "failed" ? "bad" : job.state === "running" ? "accent" : "plain";
-  const ending = job.cancel_requested && !isOver(job);
-  const words = ending ? "ending" : STATE_WORDS[job.state];
+  const cancelling = job.cancel_requested && !isOver(job);
+  const words = cancelling ? "cancelling" : STATE_WORDS[job.state];
   return <span class={`chip chip-${tone}`}>{job.partial ? "partial result" : words}</span>;
 }
 
-/** One line of where the job is: stage, step, time left. */
-export function progressWords(job: JobView): string {
+/** Stage, step and time left in one line. */
+function progressWords(job: JobView): string {
   if (job.state === "queued") return job.queue_position ? `Number ${job.queue_position} in the queue` : "Waiting";
   if (job.state !== "running") {
     const took = job.started_at && job.finished_at && Date.parse(job.finished_at) - Date.parse(job.started_at);

@@ -1,13 +1,13 @@
-// Preset and options, made from what the service says of them.
+// Preset and options, from the service's description of them.
 import { useEffect, useMemo, useState } from "preact/hooks";
-import type { OptionsView } from "schemas";
-import { asProblem, call, type FieldProblem, type Problem } from "../api/http";
+import type { FieldProblem, OptionsView } from "schemas";
+import { asProblem, type Problem, requestJson } from "../api/http";
 import { ProblemBox } from "../parts/problem_box";
 import { type Field, fieldsOf, parsed, presetValue, type Values, words } from "./schema";
 
 const PRESET_WORDS: Record<string, string> = {
-  fast: "A look within minutes",
-  balanced: "For most sets",
+  fast: "A first result within minutes",
+  balanced: "For most image sets",
   quality: "Larger images, more steps",
   paper: "The published configuration",
 };
@@ -15,21 +15,21 @@ const PRESET_WORDS: Record<string, string> = {
 interface Props {
   values: Values;
   onChange: (change: (values: Values) => Values) => void;
-  /** What holds where nothing is changed; without it, what the preset says. */
+  /** Values of the fields that are left empty; without it, those of the preset. */
   base?: Values;
   problems?: readonly FieldProblem[];
 }
 
-let known: Promise<OptionsView> | null = null;
+let loaded: Promise<OptionsView> | null = null;
 
-/** What may be asked for; asked of the service once. */
-export function useOptions(): { view: OptionsView | null; problem: Problem | null } {
+/** The description of the options, requested once. */
+function useOptions(): { view: OptionsView | null; problem: Problem | null } {
   const [view, setView] = useState<OptionsView | null>(null);
   const [problem, setProblem] = useState<Problem | null>(null);
   useEffect(() => {
-    known ??= call<OptionsView>("GET", "v1/options");
-    known.then(setView, (error) => {
-      known = null;
+    loaded ??= requestJson<OptionsView>("GET", "v1/options");
+    loaded.then(setView, (error) => {
+      loaded = null;
       setProblem(asProblem(error));
     });
   }, []);
@@ -76,7 +76,7 @@ export function OptionsForm({ values, onChange, base, problems = [] }: Props) {
       <div class="fields">{fields.usual.map(row)}</div>
       <details>
         <summary>
-          Schedule, sizes and output <span class="soft">{changed ? `${changed} changed` : "as the preset says"}</span>
+          Schedule, sizes and output <span class="soft">{changed ? `${changed} changed` : "from the preset"}</span>
         </summary>
         <div class="fields">{fields.expert.map(row)}</div>
       </details>

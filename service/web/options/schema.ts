@@ -1,4 +1,4 @@
-// The options' JSON Schema as fields of a form.
+// Form fields from the JSON Schema of the options.
 import type { OptionsView } from "schemas";
 
 /** The part of JSON Schema that pydantic uses for the options. */
@@ -23,27 +23,26 @@ export interface Field {
   name: string;
   help: string;
   kind: "choice" | "yes-no" | "number" | "several" | "words";
-  /** Of a choice, or of several. */
   choices: string[];
   whole: boolean;
   least: number | null;
   most: number | null;
 }
 
-/** The usual fields, and those for experts; the ones for research are left out. */
+/** The usual fields and those for experts, without those for research. */
 export function fieldsOf(schema: Schema): { usual: Field[]; expert: Field[] } {
   const properties = Object.entries(schema.properties ?? {}).filter(([name]) => name !== "preset");
   const fields = (level: string) =>
-    properties.filter(([, said]) => said.level === level).map(([name, said]) => fieldOf(name, said));
+    properties.filter(([, property]) => property.level === level).map(([name, property]) => fieldOf(name, property));
   return { usual: fields("usual"), expert: fields("expert") };
 }
 
-function fieldOf(name: string, said: Schema): Field {
-  // `T | null`: null is "as the preset says".
-  const type = said.anyOf?.find((one) => one.type !== "null") ?? said;
+function fieldOf(name: string, property: Schema): Field {
+  // `T | null`: null stands for the value of the preset.
+  const type = property.anyOf?.find((one) => one.type !== "null") ?? property;
   const items = type.items?.enum?.map(String);
   const field: Field = {
-    ...{ name, help: said.description ?? "", kind: "words", choices: [] },
+    ...{ name, help: property.description ?? "", kind: "words", choices: [] },
     whole: type.type === "integer",
     least: type.minimum ?? type.exclusiveMinimum ?? null,
     most: type.maximum ?? type.exclusiveMaximum ?? null,
@@ -55,7 +54,7 @@ function fieldOf(name: string, said: Schema): Field {
   return field;
 }
 
-/** What holds where a field is left empty. */
+/** The value of a field that is left empty. */
 export function presetValue(view: OptionsView, preset: string, name: string): string {
   const filled: Values = { ...view.presets[preset as keyof OptionsView["presets"]] };
   return words(filled[name] ?? (view.json_schema as Schema).properties?.[name]?.default);
@@ -67,7 +66,7 @@ export function words(value: unknown): string {
   return typeof value === "boolean" ? (value ? "yes" : "no") : String(value);
 }
 
-/** What the form's text means; undefined: left to the preset. */
+/** The value of the text in a field; undefined if it is empty. */
 export function parsed(field: Field, text: string): unknown {
   const trimmed = text.trim();
   if (!trimmed) return undefined;

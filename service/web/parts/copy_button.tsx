@@ -1,16 +1,16 @@
 import { useState } from "preact/hooks";
 
-/** Copies a text, and says so for a moment. */
+/** Copies a text and confirms it for a moment. */
 export function CopyButton({ text, what, label = "Copy" }: { text: string; what: string; label?: string }) {
-  const [said, setSaid] = useState("");
+  const [status, setStatus] = useState("");
   const copy = async () => {
     try {
       await navigator.clipboard.writeText(text);
-      setSaid("Copied");
+      setStatus("Copied");
     } catch {
-      setSaid("Not allowed here: select and copy it"); // pages over plain HTTP from another machine
+      setStatus("Copying is blocked: select the text instead"); // browsers allow it on HTTPS and localhost only
     }
-    setTimeout(() => setSaid(""), 2500);
+    setTimeout(() => setStatus(""), 2500);
   };
   return (
     <>
@@ -18,7 +18,7 @@ export function CopyButton({ text, what, label = "Copy" }: { text: string; what:
         {label}
       </button>
       <span class="copied soft" role="status">
-        {said}
+        {status}
       </span>
     </>
   );

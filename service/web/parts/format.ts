@@ -1,4 +1,4 @@
-// Numbers for people; units are always named.
+// Sizes, times and shares for display.
 
 export function bytes(n: number): string {
   if (n < 1000) return `${n} B`;

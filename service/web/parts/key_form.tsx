@@ -1,9 +1,9 @@
-// Asks for an API key where the service wants one.
+// Asks for an API key where the service requires one.
 import { useState } from "preact/hooks";
 import { useKey } from "../api/http";
 import { useTitle } from "./title";
 
-export function KeyForm({ said }: { said: string }) {
+export function KeyForm({ error }: { error: string }) {
   const [text, setText] = useState("");
   useTitle("API key");
   return (
@@ -14,15 +14,15 @@ export function KeyForm({ said }: { said: string }) {
         if (text.trim()) useKey(text.trim());
       }}
     >
-      <h1>This service wants an API key</h1>
-      {said && (
+      <h1>This service requires an API key</h1>
+      {error && (
         <p class="bad" role="alert">
-          {said}
+          {error}
         </p>
       )}
       <p>
-        Whoever runs it makes one with <code>biresnerf keys create NAME</code>. It is kept in this tab alone, until the tab
-        is closed.
+        Its operator creates one with <code>biresnerf keys create NAME</code>. The key is kept in this tab only, until the
+        tab is closed.
       </p>
       <label for="api-key">API key</label>
       <input
@@ -35,7 +35,7 @@ export function KeyForm({ said }: { said: string }) {
         onInput={(event) => setText(event.currentTarget.value)}
       />
       <p>
-        <button class="act primary">Use it</button>
+        <button class="act primary">Use this key</button>
       </p>
     </form>
   );

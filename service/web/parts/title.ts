@@ -1,4 +1,4 @@
-// The document's title: what one tab among many is known by.
+// The document's title, which names the browser tab.
 import { useEffect } from "preact/hooks";
 
 export function useTitle(text: string): void {

@@ -1,4 +1,4 @@
-// What the service's check of a set says, line by line, as it comes to know it.
+// The result of the service's check of an image set, as far as it is known.
 import type { ComponentChildren } from "preact";
 import type { DatasetView } from "schemas";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
@@ -15,7 +15,7 @@ const INTRINSICS: Record<string, string> = {
   given: "given",
   exif: "from EXIF",
   colmap: "from COLMAP",
-  guessed: "guessed; refined with the poses",
+  guessed: "guessed, and refined with the poses",
 };
 
 export function CheckTable({ dataset }: { dataset: DatasetView }) {
@@ -23,11 +23,11 @@ export function CheckTable({ dataset }: { dataset: DatasetView }) {
   const checking = dataset.state === "finalizing";
   const rejected = dataset.state === "rejected";
   return (
-    <section class="card" aria-label="Check of the set">
+    <section class="card" aria-label="Check of the image set">
       <h2>
         Check{" "}
         <span class={`chip chip-${rejected ? "bad" : report ? "good" : "plain"}`} role="status">
-          {rejected ? "not accepted" : report ? "ready" : checking ? "checking every image …" : "waiting for files"}
+          {rejected ? "rejected" : report ? "ready" : checking ? "checking every image …" : "waiting for files"}
         </span>
       </h2>
       <table class="checks">
@@ -37,7 +37,7 @@ export function CheckTable({ dataset }: { dataset: DatasetView }) {
             {dataset.missing.length > 0 && `; ${dataset.missing.length} to come`}
           </Line>
           {rejected && dataset.error && (
-            <Line mark="bad" name={dataset.error.where || "The set"}>
+            <Line mark="bad" name={dataset.error.where || "Image set"}>
               {dataset.error.detail}
             </Line>
           )}
@@ -58,8 +58,8 @@ function Found({ dataset }: { dataset: DatasetView }) {
       </Line>
       <Line mark={report.without_pose ? "note" : "good"} name="Poses">
         {posed} of {report.images} given
-        {posed === 0 && "; COLMAP looks for them first"}
-        {posed > 0 && report.without_pose > 0 && "; the others are looked for"}
+        {posed === 0 && "; COLMAP will find them first"}
+        {posed > 0 && report.without_pose > 0 && "; the others will be found"}
       </Line>
       <Line mark="good" name="Cameras">
         {count(report.cameras, "camera")}: {report.camera_models.join(", ")}; intrinsics{" "}
@@ -67,7 +67,7 @@ function Found({ dataset }: { dataset: DatasetView }) {
       </Line>
       <Line mark="good" name="Masks">
         {report.masks ? count(report.masks, "mask") : "none"}
-        {report.transparency && "; transparent images, taken on white"}
+        {report.transparency && "; transparent images, on a white background"}
       </Line>
       {report.warnings.map((warning) => (
         <Line key={warning} mark="note" name="Warning">

@@ -1,8 +1,8 @@
-// A set of images: on its way, checked, and what to do with it.
+// An image set: its upload, its check, and the form that submits a job.
 import { useCallback, useEffect, useState } from "preact/hooks";
 import type { DatasetView, JobView } from "schemas";
 import { count, duration } from "../../../biresnerf/viewer/widgets/numbers";
-import { asProblem, call, pause, type Problem } from "../api/http";
+import { asProblem, pause, type Problem, requestJson } from "../api/http";
 import { Store, useStore } from "../api/store";
 import { nameLabel } from "../jobs/state";
 import { OptionsForm } from "../options/form";
@@ -12,34 +12,34 @@ import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 import { CheckTable } from "./check_table";
 import { DropZone } from "./drop";
+import { ResumeUpload } from "./resume_upload";
 import { transfers } from "./send";
-import { StillToCome } from "./still_to_come";
 import type { Transfer } from "./transfer";
 
-const LOOK_EVERY_MS = 700;
-const NOBODY = new Store<Transfer | null>(null);
+const POLL_MS = 700;
+const NO_TRANSFER = new Store<Transfer | null>(null);
 
 export function DatasetPage({ id }: { id: string }) {
-  const { dataset, problem, look } = useDataset(id);
-  const [, redraw] = useState(0);
-  const sending = useStore<Transfer | null>((transfers.get(id) as Store<Transfer | null> | undefined) ?? NOBODY);
+  const { dataset, problem, refresh } = useDataset(id);
+  const [, rerender] = useState(0);
+  const transfer = useStore<Transfer | null>((transfers.get(id) as Store<Transfer | null> | undefined) ?? NO_TRANSFER);
   useTitle(dataset ? `${dataset.name} · new job` : "New job");
-  useEffect(look, [sending?.phase]);
+  useEffect(refresh, [transfer?.phase]);
   if (problem) return <ProblemBox problem={problem} />;
   if (!dataset) return <p class="soft">Loading …</p>;
-  const interrupted = dataset.state === "open" && (!sending || sending.phase === "stopped");
+  const interrupted = dataset.state === "open" && (!transfer || transfer.phase === "stopped");
   return (
     <div class="dataset">
       <header class="page-head">
         <p class="soft">New job</p>
         <h1>{dataset.name}</h1>
       </header>
-      {sending && dataset.state === "open" && <Progress sending={sending} />}
-      {sending?.problem && <ProblemBox problem={sending.problem} />}
-      {interrupted && <StillToCome dataset={dataset} onBegun={() => redraw((n) => n + 1)} />}
+      {transfer && dataset.state === "open" && <Progress transfer={transfer} />}
+      {transfer?.problem && <ProblemBox problem={transfer.problem} />}
+      {interrupted && <ResumeUpload dataset={dataset} onStarted={() => rerender((n) => n + 1)} />}
       <CheckTable dataset={dataset} />
       {dataset.state === "rejected" && dataset.error && (
-        <ProblemBox problem={dataset.error} heading="The set was not accepted" />
+        <ProblemBox problem={dataset.error} heading="The image set was rejected" />
       )}
       {dataset.state === "rejected" && <DropZone compact />}
       {dataset.state === "ready" && <Submit dataset={dataset} />}
@@ -50,45 +50,45 @@ export function DatasetPage({ id }: { id: string }) {
 function useDataset(id: string) {
   const [dataset, setDataset] = useState<DatasetView | null>(null);
   const [problem, setProblem] = useState<Problem | null>(null);
-  const [asked, setAsked] = useState(0);
+  const [reload, setReload] = useState(0);
   useEffect(() => {
-    let gone = false;
+    let stopped = false;
     void (async () => {
-      while (!gone) {
+      while (!stopped) {
         try {
-          const seen = await call<DatasetView>("GET", `v1/datasets/${id}`);
-          if (gone) return;
+          const seen = await requestJson<DatasetView>("GET", `v1/datasets/${id}`);
+          if (stopped) return;
           setDataset(seen);
           setProblem(null);
           if (seen.state !== "finalizing" && seen.state !== "open") return;
         } catch (error) {
-          const told = asProblem(error);
-          if (gone) return;
-          setProblem(told);
-          if (!told.passing) return;
+          const failure = asProblem(error);
+          if (stopped) return;
+          setProblem(failure);
+          if (!failure.transient) return;
         }
-        await pause(LOOK_EVERY_MS);
+        await pause(POLL_MS);
       }
     })();
     return () => {
-      gone = true;
+      stopped = true;
     };
-  }, [id, asked]);
-  return { dataset, problem, look: useCallback(() => setAsked((n) => n + 1), []) };
+  }, [id, reload]);
+  return { dataset, problem, refresh: useCallback(() => setReload((n) => n + 1), []) };
 }
 
-function Progress({ sending }: { sending: Transfer }) {
-  const share = sending.bytes ? Math.min(1, sending.bytesDone / sending.bytes) : 1;
-  const seconds = (Date.now() - sending.startedAt) / 1000;
-  const rate = seconds > 1 ? sending.bytesDone / seconds : 0;
-  const left = rate && sending.phase === "sending" ? (sending.bytes - sending.bytesDone) / rate : null;
+function Progress({ transfer }: { transfer: Transfer }) {
+  const share = transfer.bytes ? Math.min(1, transfer.bytesDone / transfer.bytes) : 1;
+  const seconds = (Date.now() - transfer.startedAt) / 1000;
+  const rate = seconds > 1 ? transfer.bytesDone / seconds : 0;
+  const left = rate && transfer.phase === "sending" ? (transfer.bytes - transfer.bytesDone) / rate : null;
   return (
     <section class="card" aria-label="Upload">
       <div class="meter-head">
-        <strong>{sending.phase === "stopped" ? "Stopped" : sending.phase === "sending" ? "Sending" : "Sent"}</strong>
+        <strong>{transfer.phase === "stopped" ? "Stopped" : transfer.phase === "sending" ? "Sending" : "Sent"}</strong>
         <span>
-          {bytes(Math.min(sending.bytesDone, sending.bytes))} of {bytes(sending.bytes)} · {sending.filesDone} of{" "}
-          {count(sending.files, "file")}
+          {bytes(Math.min(transfer.bytesDone, transfer.bytes))} of {bytes(transfer.bytes)} · {transfer.filesDone} of{" "}
+          {count(transfer.files, "file")}
           {left !== null && ` · ${duration(left)} left`}
         </span>
       </div>
@@ -96,8 +96,8 @@ function Progress({ sending }: { sending: Transfer }) {
         {percent(share)}
       </progress>
       <p class="soft" role="status">
-        {sending.waiting && `${sending.waiting}; trying again`}
-        {!sending.waiting && sending.known > 0 && `${count(sending.known, "file")} the service had already`}
+        {transfer.waiting && `${transfer.waiting}; retrying`}
+        {!transfer.waiting && transfer.known > 0 && `${count(transfer.known, "file")} already on the service`}
       </p>
     </section>
   );
@@ -113,7 +113,7 @@ function Submit({ dataset }: { dataset: DatasetView }) {
     setProblem(null);
     try {
       const json = { dataset_id: dataset.id, options: values, labels: nameLabel(dataset.name) };
-      location.hash = `#/jobs/${(await call<JobView>("POST", "v1/jobs", { json })).id}`;
+      location.hash = `#/jobs/${(await requestJson<JobView>("POST", "v1/jobs", { json })).id}`;
     } catch (error) {
       setProblem(asProblem(error));
       setBusy(false);
@@ -121,7 +121,7 @@ function Submit({ dataset }: { dataset: DatasetView }) {
   };
   return (
     <form class="card" onSubmit={submit} aria-label="Options">
-      <h2>What to do</h2>
+      <h2>Options</h2>
       <OptionsForm values={values} onChange={setValues} problems={problem?.errors ?? []} />
       {problem && <ProblemBox problem={problem} />}
       <p class="submit">

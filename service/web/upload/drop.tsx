@@ -1,4 +1,4 @@
-// Where sets are dropped or chosen.
+// Where image sets are dropped or chosen.
 import { useEffect, useRef, useState } from "preact/hooks";
 import { asProblem, type Problem } from "../api/http";
 import { percent } from "../parts/format";
@@ -7,33 +7,33 @@ import { type Chosen, fromDrop, fromInput, type Gathered } from "./gather";
 import { begin } from "./send";
 
 interface Props {
-  /** What becomes of the files; tells how far it is while it takes time. */
+  /** What to do with the files; by default a new dataset is made of them. */
   onChosen?: (chosen: Chosen[]) => Promise<void>;
   compact?: boolean;
 }
 
 export function DropZone({ onChosen, compact = false }: Props) {
   const [over, setOver] = useState(false);
-  const [said, setSaid] = useState("");
+  const [status, setStatus] = useState("");
   const [problem, setProblem] = useState<Problem | null>(null);
   const take = async (gathered: Promise<Gathered>) => {
     setOver(false);
     setProblem(null);
-    setSaid("Reading …");
+    setStatus("Reading …");
     try {
       const chosen = await gathered;
-      if (!chosen.files.length) setSaid("There are no files in it.");
+      if (!chosen.files.length) setStatus("It holds no files.");
       else if (onChosen) await onChosen(chosen.files);
-      else location.hash = `#/datasets/${await begin(chosen, (share) => setSaid(`Reading … ${percent(share)}`))}`;
+      else location.hash = `#/datasets/${await begin(chosen, (share) => setStatus(`Reading … ${percent(share)}`))}`;
     } catch (error) {
-      setSaid("");
+      setStatus("");
       setProblem(asProblem(error));
     }
   };
   return (
     <section
       class={`drop ${over ? "over" : ""} ${compact ? "compact" : ""}`}
-      aria-label="New set of images"
+      aria-label="New image set"
       onDragOver={(event) => {
         event.preventDefault();
         setOver(true);
@@ -48,15 +48,15 @@ export function DropZone({ onChosen, compact = false }: Props) {
         <p class="drop-lead">Drop a folder of images, a COLMAP model with its images, or an archive</p>
         <p class="soft">
           transforms.json (nerfstudio, instant-ngp, Blender), COLMAP, LLFF, TUM, KITTI, Bundler, Metashape; zip, tar,
-          tar.gz. Without poses, COLMAP looks for them.
+          tar.gz. Without poses, COLMAP finds them.
         </p>
       </div>
       <div class="drop-buttons">
         <FileButton label="Choose a folder" folder onFiles={(files) => void take(Promise.resolve(fromInput(files)))} />
         <FileButton label="Choose files" onFiles={(files) => void take(Promise.resolve(fromInput(files)))} />
       </div>
-      <p class="drop-said" role="status">
-        {said}
+      <p class="drop-status" role="status">
+        {status}
       </p>
       {problem && <ProblemBox problem={problem} />}
     </section>

@@ -1,13 +1,13 @@
-// What was dropped or chosen, as files with paths.
+// Dropped or chosen files with their paths.
 
 export interface Chosen {
   path: string;
   file: File;
 }
 
-/** What was chosen at once. */
+/** The files of one choice. */
 export interface Gathered {
-  /** Of the folder or archive; what the set is called. */
+  /** Of the folder or archive: names the image set. */
   name: string;
   files: Chosen[];
 }
@@ -19,13 +19,13 @@ export function isArchive(chosen: readonly Chosen[]): boolean {
   return chosen.length === 1 && ARCHIVE.test(chosen[0]!.file.name);
 }
 
-/** All files below what was dropped. The entries must be taken before the handler of the event returns. */
+/** All files in what was dropped. Must be called in the event handler: entries are gone afterwards. */
 export async function fromDrop(data: DataTransfer): Promise<Gathered> {
   const found: Chosen[] = [];
   const entries: FileSystemEntry[] = [];
   for (const item of data.items) {
     const entry = item.webkitGetAsEntry();
-    const file = entry ? null : item.getAsFile(); // what comes from another program may be of no file system
+    const file = entry ? null : item.getAsFile(); // files from another program may have no entry
     if (entry) entries.push(entry);
     else if (file) found.push({ path: file.name, file });
   }
@@ -46,21 +46,21 @@ async function walk(entry: FileSystemEntry, below: string, found: Chosen[]): Pro
   }
   const reader = (entry as FileSystemDirectoryEntry).createReader();
   for (;;) {
-    // A reader gives some at a time, and none at the end.
+    // A reader returns some entries per call, and none at the end.
     const some = await new Promise<FileSystemEntry[]>((done, failed) => reader.readEntries(done, failed));
     if (!some.length) return;
     for (const inner of some) await walk(inner, `${path}/`, found);
   }
 }
 
-/** Without what systems leave lying about, and without a folder that merely wraps everything. */
-export function tidy(chosen: Chosen[]): Gathered {
+/** Without files of the operating system, and without a folder around everything. */
+function tidy(chosen: Chosen[]): Gathered {
   const kept = chosen.filter(({ path }) => !LEFT_OUT.test(path));
   kept.sort((a, b) => (a.path < b.path ? -1 : 1));
   if (isArchive(kept)) return { name: kept[0]!.file.name.replace(ARCHIVE, ""), files: kept };
   const top = kept[0]?.path.split("/")[0];
   const wraps = kept.every(({ path }) => path.includes("/") && path.split("/")[0] === top);
-  // A lone images/ or sparse/ has a meaning.
+  // These names have a meaning to the readers.
   if (!wraps || !top || ["images", "sparse", "colmap"].includes(top)) return { name: "dataset", files: kept };
   return { name: top, files: kept.map(({ path, file }) => ({ path: path.slice(top.length + 1), file })) };
 }

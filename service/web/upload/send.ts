@@ -1,42 +1,42 @@
-// Brings files to the service: only those it has not, several at a time, each again where the connection breaks.
+// Sends files to the service: only those that it lacks, several at a time, with retries.
 import type { DatasetView, Info, SizeLimits } from "schemas";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
-import { asProblem, call, Problem } from "../api/http";
+import { asProblem, Problem, requestJson } from "../api/http";
 import type { Store } from "../api/store";
 import { bytes as inBytes } from "../parts/format";
 import { type Chosen, type Gathered, isArchive } from "./gather";
-import { giveUpRejected, sendArchive } from "./resumable";
+import { deleteRejected, sendArchive } from "./resumable";
 import { newTransfer, put, retrying, type Transfer } from "./transfer";
 
 const AT_ONCE = 4;
-/** Beyond this a file is not held in memory to be hashed; it is sent without its digest. */
+/** Larger files are sent without their digest: hashing holds the whole file in memory. */
 const HASHED_MAX_BYTES = 256 * 2 ** 20;
 
-/** What is on its way from this tab, by dataset. */
+/** Uploads of this tab, by dataset. */
 export const transfers = new Map<string, Store<Transfer>>();
 
-/** What the service would refuse anyway is said before anything is sent, file by file. */
-function refuseTooMuch(chosen: readonly Chosen[], bytes: number, limits: SizeLimits): void {
+/** Throws `Problem` before anything is sent if the service would refuse it. */
+function checkLimits(chosen: readonly Chosen[], bytes: number, limits: SizeLimits): void {
   const refuse = (detail: string, errors: { pointer: string; detail: string }[] = []) => {
-    const hint = "Send fewer or smaller files, or ask who runs the service for more.";
-    throw new Problem(0, "too_much", "It is more than this service takes", detail, hint, "", errors);
+    const hint = "Send fewer or smaller files, or ask the operator for a higher limit.";
+    throw new Problem(0, "too_much", "The upload exceeds the limits of this service", detail, hint, "", errors);
   };
   if (isArchive(chosen)) {
     if (bytes > limits.max_archive_bytes) {
-      refuse(`The archive has ${inBytes(bytes)}; ${inBytes(limits.max_archive_bytes)} are taken.`);
+      refuse(`The archive has ${inBytes(bytes)}; the limit is ${inBytes(limits.max_archive_bytes)}.`);
     }
     return;
   }
   const large = chosen.filter(({ file }) => file.size > limits.max_file_bytes);
   if (large.length) {
-    const told = large.slice(0, 20).map(({ path, file }) => ({ pointer: path, detail: inBytes(file.size) }));
-    refuse(`${count(large.length, "file")} of more than ${inBytes(limits.max_file_bytes)}.`, told);
+    const errors = large.slice(0, 20).map(({ path, file }) => ({ pointer: path, detail: inBytes(file.size) }));
+    refuse(`${count(large.length, "file")} of more than ${inBytes(limits.max_file_bytes)}.`, errors);
   }
   if (chosen.length > limits.max_files) {
-    refuse(`There are ${count(chosen.length, "file")}; ${limits.max_files} are taken.`);
+    refuse(`There are ${count(chosen.length, "file")}; the limit is ${limits.max_files}.`);
   }
   if (bytes > limits.max_dataset_bytes) {
-    refuse(`The set has ${inBytes(bytes)}; ${inBytes(limits.max_dataset_bytes)} are taken.`);
+    refuse(`The image set has ${inBytes(bytes)}; the limit is ${inBytes(limits.max_dataset_bytes)}.`);
   }
 }
 
@@ -44,74 +44,74 @@ interface Entry extends Chosen {
   sha256: string | null;
 }
 
-/** Makes a dataset and sends the files in the background; returns its id once it is there. Throws `Problem`. */
+/** Creates a dataset and sends the files in the background; returns its id. Throws `Problem`. */
 export async function begin(gathered: Gathered, onHashing: (share: number) => void): Promise<string> {
   const chosen = gathered.files;
   const name = gathered.name.slice(0, 200) || "dataset";
   const bytes = chosen.reduce((sum, { file }) => sum + file.size, 0);
   const state = newTransfer(chosen.length, bytes);
-  refuseTooMuch(chosen, bytes, (await call<Info>("GET", "v1/info")).limits);
+  checkLimits(chosen, bytes, (await requestJson<Info>("GET", "v1/info")).limits);
   if (isArchive(chosen)) {
     const file = chosen[0]!.file;
-    return keep(await sendArchive(file, name, state), state);
+    return track(await sendArchive(file, name, state), state);
   }
   const entries = await hashed(chosen, bytes, onHashing);
   const manifest = entries.map(({ path, file, sha256 }) => ({ path, size: file.size, ...(sha256 && { sha256 }) }));
-  const dataset = await call<DatasetView>("POST", "v1/datasets", { json: { name, manifest } });
-  return keep({ dataset: dataset.id, sent: sendMissing(dataset, entries, state) }, state);
+  const dataset = await requestJson<DatasetView>("POST", "v1/datasets", { json: { name, manifest } });
+  return track({ dataset: dataset.id, sent: sendMissing(dataset, entries, state) }, state);
 }
 
-/** Goes on with a dataset of which not all arrived. Throws `Problem` where these are other files. */
-export async function goOn(dataset: DatasetView, chosen: Chosen[]): Promise<void> {
+/** Resumes the upload of a dataset. Throws `Problem` if files are missing among those chosen. */
+export async function resume(dataset: DatasetView, chosen: Chosen[]): Promise<void> {
   const bytes = chosen.reduce((sum, { file }) => sum + file.size, 0);
   const state = newTransfer(chosen.length, bytes);
-  const unlisted = dataset.missing.length === 0; // an archive, or a folder in the place of one
+  const unlisted = dataset.missing.length === 0; // an archive, or a folder instead of one
   if (unlisted && isArchive(chosen)) {
-    keep(await sendArchive(chosen[0]!.file, dataset.name, state, dataset.id), state);
+    track(await sendArchive(chosen[0]!.file, dataset.name, state, dataset.id), state);
     return;
   }
   const have = new Set(chosen.map(({ path }) => path));
   const lacking = dataset.missing.filter((path) => !have.has(path));
   if (lacking.length) {
-    const detail = `${lacking.length} of the missing files are not among these, for example ${lacking[0]}.`;
-    throw new Problem(0, "other_files", "These are other files", detail, "Choose the folder that was sent before.");
+    const detail = `${lacking.length} of the missing files are not among those chosen, for example ${lacking[0]}.`;
+    throw new Problem(0, "other_files", "Different files", detail, "Choose the folder that was sent before.");
   }
   const entries = chosen.map((item) => ({ ...item, sha256: null }));
   const wanted = unlisted ? { ...dataset, missing: [...have] } : dataset;
-  keep({ dataset: dataset.id, sent: sendMissing(wanted, entries, state) }, state);
+  track({ dataset: dataset.id, sent: sendMissing(wanted, entries, state) }, state);
 }
 
-/** Has a dataset checked of which everything arrived, but nobody was there to say so. */
+/** Has a dataset checked whose files have all arrived. */
 export function checkArrived(dataset: DatasetView): void {
   const { files, bytes } = dataset;
   const state = newTransfer(files, bytes);
   state.change({ filesDone: files, bytesDone: bytes });
-  keep({ dataset: dataset.id, sent: Promise.resolve() }, state);
+  track({ dataset: dataset.id, sent: Promise.resolve() }, state);
 }
 
-function keep(begun: { dataset: string; upload?: string; sent: Promise<void> }, state: Store<Transfer>): string {
-  transfers.set(begun.dataset, state);
-  begun.sent
-    .then(() => finalize(begun.dataset, begun.upload, state))
+function track(started: { dataset: string; upload?: string; sent: Promise<void> }, state: Store<Transfer>): string {
+  transfers.set(started.dataset, state);
+  started.sent
+    .then(() => finalize(started.dataset, started.upload, state))
     .catch((error) => state.change({ phase: "stopped", problem: asProblem(error) }));
-  return begun.dataset;
+  return started.dataset;
 }
 
 async function finalize(dataset: string, upload: string | undefined, state: Store<Transfer>): Promise<void> {
   state.change({ phase: "checking", waiting: "" });
   try {
-    await call("POST", `v1/datasets/${dataset}/finalize`, { headers: { Prefer: "respond-async" } });
+    await requestJson("POST", `v1/datasets/${dataset}/finalize`, { headers: { Prefer: "respond-async" } });
   } catch (error) {
     if (asProblem(error).status !== 422) throw error;
-    // What is wrong with a set that was checked stands in it; the page shows it from there.
-    const seen = await call<DatasetView>("GET", `v1/datasets/${dataset}`);
-    if (seen.state === "open") throw (upload && (await giveUpRejected(upload))) || error;
+    // What the check found wrong is part of the dataset; the page shows it from there.
+    const seen = await requestJson<DatasetView>("GET", `v1/datasets/${dataset}`);
+    if (seen.state === "open") throw (upload && (await deleteRejected(upload))) || error;
   }
   state.change({ phase: "done" });
 }
 
 async function hashed(chosen: Chosen[], bytes: number, onHashing: (share: number) => void): Promise<Entry[]> {
-  // Browsers have no digests on pages that came over plain HTTP from another machine.
+  // Browsers offer digests on HTTPS and localhost only.
   const subtle = globalThis.crypto?.subtle;
   const entries: Entry[] = [];
   let done = 0;
@@ -128,14 +128,14 @@ async function sendMissing(dataset: DatasetView, entries: Entry[], state: Store<
   const missing = new Set(dataset.missing);
   const queue = entries.filter(({ path }) => missing.has(path));
   const known = entries.length - queue.length;
-  const atHand = entries.filter(({ path }) => !missing.has(path)).reduce((sum, { file }) => sum + file.size, 0);
-  state.change({ phase: "sending", filesDone: known, known, bytesDone: atHand });
+  const knownBytes = entries.filter(({ path }) => !missing.has(path)).reduce((sum, { file }) => sum + file.size, 0);
+  state.change({ phase: "sending", filesDone: known, known, bytesDone: knownBytes });
   const lane = async () => {
     for (let entry = queue.shift(); entry; entry = queue.shift()) {
       try {
         await sendFile(dataset.id, entry, state);
       } catch (error) {
-        queue.length = 0; // the other lanes end with what they are at
+        queue.length = 0; // the other lanes finish their current file
         throw error;
       }
     }
@@ -146,10 +146,10 @@ async function sendMissing(dataset: DatasetView, entries: Entry[], state: Store<
 async function sendFile(dataset: string, entry: Entry, state: Store<Transfer>): Promise<void> {
   const path = entry.path.split("/").map(encodeURIComponent).join("/");
   const headers: Record<string, string> = entry.sha256 ? { "Repr-Digest": `sha-256=:${base64(entry.sha256)}:` } : {};
-  let told = 0;
+  let reported = 0;
   const onSent = (sent: number) => {
-    state.change({ bytesDone: state.value.bytesDone + sent - told });
-    told = sent;
+    state.change({ bytesDone: state.value.bytesDone + sent - reported });
+    reported = sent;
   };
   try {
     await retrying(state, async () => {

@@ -1,5 +1,5 @@
-// What is on its way to the service: its progress, retries, and requests that report how much they have sent.
-import { address, asProblem, noteRefusal, pause, Problem, withKey } from "../api/http";
+// An upload on its way: its progress, retries, and requests that report how much they have sent.
+import { address, asProblem, checkKey, pause, Problem, withKey } from "../api/http";
 import { Store } from "../api/store";
 
 const TRIES = 6;
@@ -8,12 +8,12 @@ export interface Transfer {
   phase: "hashing" | "sending" | "checking" | "done" | "stopped";
   files: number;
   filesDone: number;
-  /** Files that the service had already. */
+  /** Files that the service already had. */
   known: number;
   bytes: number;
   bytesDone: number;
   startedAt: number;
-  /** A passing fault: the page tries again. */
+  /** The transient problem after which the page is retrying. */
   waiting: string;
   problem: Problem | null;
 }
@@ -25,7 +25,7 @@ export function newTransfer(files: number, bytes: number): Store<Transfer> {
   });
 }
 
-/** Tries again while the fault is one that passes. */
+/** Retries after problems that may pass. */
 export async function retrying(state: Store<Transfer>, attempt: () => Promise<void>): Promise<void> {
   for (let tried = 1; ; tried += 1) {
     try {
@@ -34,14 +34,14 @@ export async function retrying(state: Store<Transfer>, attempt: () => Promise<vo
       return;
     } catch (error) {
       const problem = asProblem(error);
-      if (!problem.passing || tried === TRIES) throw problem;
+      if (!problem.transient || tried === TRIES) throw problem;
       state.change({ waiting: problem.title });
       await pause(Math.max(1000 * problem.waitS, Math.min(15000, 500 * 2 ** tried)));
     }
   }
 }
 
-/** Sends a body and tells how much of it is on its way, which fetch cannot. */
+/** Sends a body and reports how much has been sent, which fetch cannot. */
 export function put(
   method: string,
   path: string,
@@ -59,7 +59,7 @@ export function put(
     request.onload = () => {
       if (request.status < 300) return done(request);
       const problem = Problem.of(request.status, request.responseText, request.getResponseHeader("Retry-After"));
-      failed(noteRefusal(problem));
+      failed(checkKey(problem));
     };
     request.send(body);
   });

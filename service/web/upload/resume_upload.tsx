@@ -1,25 +1,25 @@
-// What to do about a set of which not all arrived: the page was loaded anew, or the sending was given up.
+// How to complete an upload that was interrupted: the page was reloaded, or sending failed.
 import type { DatasetView } from "schemas";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
 import { DropZone } from "./drop";
-import { checkArrived, goOn } from "./send";
+import { checkArrived, resume } from "./send";
 
-export function StillToCome({ dataset, onBegun }: { dataset: DatasetView; onBegun: () => void }) {
+export function ResumeUpload({ dataset, onStarted }: { dataset: DatasetView; onStarted: () => void }) {
   const { files, missing } = dataset;
   if (files > 0 && missing.length === 0) {
     return (
       <section class="card">
         <h2>{count(files, "file")} arrived, and none is known to be missing</h2>
-        <p>Nobody has said yet that this is all.</p>
+        <p>The upload has not been marked as complete.</p>
         <p class="submit">
           <button
             class="act primary"
             onClick={() => {
               checkArrived(dataset);
-              onBegun();
+              onStarted();
             }}
           >
-            That is all: check it
+            That is all: check them
           </button>
         </p>
       </section>
@@ -27,17 +27,17 @@ export function StillToCome({ dataset, onBegun }: { dataset: DatasetView; onBegu
   }
   return (
     <section class="card">
-      <h2>{missing.length ? `${count(missing.length, "file")} still to come` : "Nothing has arrived in whole"}</h2>
+      <h2>{missing.length ? `${count(missing.length, "file")} still to come` : "Nothing has arrived completely"}</h2>
       <p>
         {missing.length
-          ? `${count(files, "file")} arrived. Choose the same folder again: only what is missing is sent.`
-          : "Choose the folder or archive again: an archive goes on from its last byte that arrived."}
+          ? `${count(files, "file")} arrived. Choose the same folder again: only the missing files are sent.`
+          : "Choose the folder or archive again: an archive continues after the last byte that arrived."}
       </p>
       <DropZone
         compact
         onChosen={async (chosen) => {
-          await goOn(dataset, chosen);
-          onBegun();
+          await resume(dataset, chosen);
+          onStarted();
         }}
       />
     </section>
