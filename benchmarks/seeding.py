@@ -25,7 +25,8 @@ from biresnerf.data.model.dataset import Camera, Dataset
 from biresnerf.data.photos.guessed_lens import guess_lens
 from biresnerf.data.photos.image_files import read_header
 from biresnerf.data.photos.images import load_images
-from biresnerf.data.seeding.seed_poses import PoseCandidate, seed_poses
+from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
@@ -80,7 +81,7 @@ def with_focal(camera: Camera, times: float) -> Camera:
     )
 
 
-def errors_of(candidate: PoseCandidate, truth: Dataset, which: np.ndarray) -> str:
+def errors_of(candidate: InitialPoses, truth: Dataset, which: np.ndarray) -> str:
     if not which.any():
         return "none"
     poses = candidate.world_from_cam
@@ -119,7 +120,7 @@ def main() -> None:
     for candidate in found.candidates:
         sources = Counter(source for source, gone in zip(candidate.sources, missing, strict=True) if gone)
         print(
-            f"{asked.set.name}, {candidate.name}: {errors_of(candidate, truth, all_of_them)}; "
+            f"{asked.set.name}, {candidate.source}: {errors_of(candidate, truth, all_of_them)}; "
             f"missing ones {errors_of(candidate, truth, missing)}, from {dict(sources)}"
         )
     for warning in found.dataset.warnings:

@@ -1,13 +1,19 @@
-"""Progress as data: what the pipeline tells whoever runs it. No torch, no text formatting."""
+"""Progress as data: what the pipeline reports to its caller. No torch, no text formatting."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from biresnerf.errors import Interrupted
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.stages import ReusableStage, Stage
+
+# Where the parts of a run begin, as fractions of the whole.
+KERNELS_FROM, SEEDING_FROM, TRYING_FROM, START_KNOWN = 0.005, 0.01, 0.016, 0.02
+STAGES_FROM, EVALUATING_FROM, JUDGING_FROM, EXPORTING_FROM = 0.03, 0.88, 0.95, 0.99
 
 
 class Progress(BaseModel):
@@ -39,3 +45,21 @@ class Progress(BaseModel):
 
 
 OnProgress = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class Monitor:
+    """Whoever follows a run.
+
+    Attributes:
+        report: called with each `Progress`.
+        should_stop: asked after every step, view, frame and photo; once true, the run ends with `Interrupted`.
+    """
+
+    report: OnProgress = lambda _progress: None
+    should_stop: Callable[[], bool] = lambda: False
+
+    def raise_if_stopped(self, message: str) -> None:
+        """Raise `Interrupted` with ``message`` if the run is to stop."""
+        if self.should_stop():
+            raise Interrupted(message)

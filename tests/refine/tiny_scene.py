@@ -10,10 +10,14 @@ import torch
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet, load_images
+from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.synthetic.scene import write_synthetic_scene
+from biresnerf.errors import Interrupted
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.scene.scene_frame import scene_frame
+from biresnerf.refine.stages.two_stages import TwoStages
 
 CPU = torch.device("cpu")
 
@@ -54,6 +58,25 @@ def tiny_optimiser(
     frame = scene_frame(dataset.world_from_cam, images)
     start = frame.unit_from_world.apply_to_poses(dataset.world_from_cam)
     return JointOptimiser(images, frame, start, options, held_out or [], CPU, threads=2)
+
+
+def given_scene(
+    dataset: Dataset, images: ImageSet, held_out: list[int] | None = None, given: np.ndarray | None = None
+) -> Scene:
+    """The set as a run has it that starts from its own poses, or from others."""
+    poses = dataset.world_from_cam if given is None else given
+    start = InitialPoses(poses, "given", ("given",) * len(dataset))
+    return Scene(dataset, images, start, held_out or [])
+
+
+def finished(stages: TwoStages) -> bool:
+    """Run both stages; false if they were stopped."""
+    try:
+        stages.run_stage_1()
+        stages.run_stage_2()
+    except Interrupted:
+        return False
+    return True
 
 
 def photos_set(photos: list[np.ndarray]) -> ImageSet:

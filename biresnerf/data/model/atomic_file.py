@@ -28,6 +28,12 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text and a line feed, UTF-8, whole or not at all."""
+    with whole_file(path) as temporary:
+        temporary.write_text(text + "\n", "utf-8")
+
+
 def _umask() -> int:
     """The process's umask, read without changing it (Linux), else the usual one."""
     try:

@@ -15,6 +15,7 @@ from biresnerf.data.photos.image_likeness import likeness
 from biresnerf.data.photos.named_images import MIN_IMAGES, few_names
 from biresnerf.data.seeding.cached_mapping import remembered_mapping
 from biresnerf.data.seeding.compare_models import adds_to, model_lens_problem, with_found_lenses
+from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.seeding.map_images import MappedModel, Mapping
 from biresnerf.data.seeding.match_poses import MatchedPoses, can_match, carry_model
 from biresnerf.data.seeding.missing_poses import guess_missing
@@ -35,21 +36,6 @@ OVERLAP_MEND = (
 
 
 @dataclass(frozen=True, eq=False)
-class PoseCandidate:
-    """A complete set of poses to start from.
-
-    Attributes:
-        name: whose they are, as a whole.
-        world_from_cam: float64 [n, 4, 4].
-        sources: who found each of them.
-    """
-
-    name: PoseSource
-    world_from_cam: NDArray[np.float64]
-    sources: tuple[PoseSource, ...]
-
-
-@dataclass(frozen=True, eq=False)
 class Seeding:
     """A set of which every image has a pose, and what to start from.
 
@@ -59,7 +45,7 @@ class Seeding:
     """
 
     dataset: Dataset
-    candidates: tuple[PoseCandidate, ...]
+    candidates: tuple[InitialPoses, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +63,7 @@ class _Given:
 
     def candidate(
         self, name: PoseSource, matched: MatchedPoses | None, source: PoseSource, matches: NDArray[np.int64]
-    ) -> PoseCandidate:
+    ) -> InitialPoses:
         """``matched`` where it placed an image, else the given pose, else a guess."""
         poses = self.poses.copy() if matched is None else matched.world_from_cam.copy()
         placed = np.zeros(len(poses), dtype=np.bool_) if matched is None else matched.placed
@@ -88,7 +74,7 @@ class _Given:
         for i, guess in enumerate(guessed):
             if guess is not None or placed[i]:
                 sources[i] = guess or source
-        return PoseCandidate(name, poses, tuple(sources))
+        return InitialPoses(poses, name, tuple(sources))
 
 
 def seed_poses(
@@ -156,12 +142,12 @@ def _refuse_missing(dataset: Dataset) -> None:
         )
 
 
-def _without_features(given: _Given, nothing: NDArray[np.int64]) -> PoseCandidate:
+def _without_features(given: _Given, nothing: NDArray[np.int64]) -> InitialPoses:
     if given.posed.any():
         return given.candidate("given", None, "given", nothing)
     name: PoseSource = "forward-facing"
     count = len(given.dataset)
-    return PoseCandidate(name, np.tile(np.eye(4), (count, 1, 1)), (name,) * count)
+    return InitialPoses(np.tile(np.eye(4), (count, 1, 1)), name, (name,) * count)
 
 
 def _without_colmap(given: _Given, start: StartPoses, nothing: NDArray[np.int64]) -> Seeding:
@@ -279,7 +265,7 @@ def _facing_forward(given: _Given, what: str) -> Seeding:
     return _seeding(noted, _without_features(given, np.zeros((0, 0), dtype=np.int64)))
 
 
-def _seeding(dataset: Dataset, *candidates: PoseCandidate) -> Seeding:
+def _seeding(dataset: Dataset, *candidates: InitialPoses) -> Seeding:
     first = candidates[0]
     frames = tuple(
         replace(frame, world_from_cam=pose, pose_source=source) if frame.world_from_cam is None else frame

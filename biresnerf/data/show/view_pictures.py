@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,7 @@ def write_contact_sheet(images: ImageSet, folder: Path) -> ContactSheet | None:
 
 
 def write_points(
-    layers: list[tuple[str, NDArray[np.floating], NDArray[np.uint8]]], folder: Path
+    layers: Sequence[tuple[str, NDArray[np.floating], NDArray[np.uint8]]], folder: Path
 ) -> tuple[ShownPoints, ...]:
     """Writes a file for each layer: its source, positions [n, 3] in the input's world and colours [n, 3].
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from typing import Any
 
 import numpy as np
 import torch
+from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
@@ -43,6 +43,16 @@ SETTLED_SHARE = 1 / 3  # of stage 2, at the least before that
 RUN_SHARE, EVENT_SHARE = 0.1, 0.04  # of the run's samples: what all repairs may cost, and those of one time
 GUESSED_TIMES = 2  # that much where poses are guesses: more cameras need it
 FORWARD_COST = 0.4  # of a sample without its backward pass
+
+
+class RepairState(BaseModel):
+    """What a checkpoint keeps: images repaired, fixed points passed, samples spent."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    repaired: tuple[int, ...] = ()
+    times: int = 0
+    spent: float = 0.0
 
 
 class LostCameraRepair:
@@ -255,11 +265,11 @@ class LostCameraRepair:
         )
         return dataclasses.replace(marching, occupied=occupied[0, 0].to(torch.uint8).contiguous())
 
-    def notes(self) -> dict[str, Any]:
-        return {"repaired": self.repaired, "times": self._times, "spent": self._spent}
+    def state(self) -> RepairState:
+        return RepairState(repaired=tuple(self.repaired), times=self._times, spent=self._spent)
 
-    def load_notes(self, notes: dict[str, Any]) -> None:
-        self.repaired, self._times, self._spent = notes["repaired"], notes["times"], notes["spent"]
+    def load_state(self, state: RepairState) -> None:
+        self.repaired, self._times, self._spent = list(state.repaired), state.times, state.spent
         for camera in self.repaired:
             self.optimiser.mobility[:, self.optimiser.poses.members(camera)] = 1.0
 

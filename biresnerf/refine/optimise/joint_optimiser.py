@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.optimise.async_metrics import LateFigures, StepResult
 from biresnerf.refine.optimise.camera_errors import CameraErrors
 from biresnerf.refine.optimise.methods import METHODS, build_field, occupancy_side
-from biresnerf.refine.optimise.parts_state import Part, load_state_of, state_of
+from biresnerf.refine.optimise.optimiser_state import Part, StepState, load_state_of, state_of
 from biresnerf.refine.optimise.photo_sampler import PhotoSampler, PixelBatch
 from biresnerf.refine.optimise.pose_hypotheses import photo_distances
 from biresnerf.refine.parameters.camp_preconditioner import camp_preconditioner
@@ -64,7 +63,7 @@ class JointOptimiser:
         lenses: IntrinsicsParameters | None = None,
         sampler: PhotoSampler | None = None,
     ) -> None:
-        self.frame, self.options, self.device = frame, options, device
+        self.frame, self.options, self.device, self.threads = frame, options, device, threads
         self.bodies = bodies or RigidBodies.free(len(images))
         self.method = METHODS[options.method]
         self.field = build_field(self.method, options, frame, device, threads)
@@ -275,20 +274,17 @@ class JointOptimiser:
             "exposure": self.exposure,
         }
 
-    def notes(self) -> dict[str, float | int | None]:
-        """The numbers of the run that are not tensors."""
-        return {
-            "step_index": self.step_index,
-            "switch": self.switch,
-            "rays": self.rays,
-            "pose_scale": self.pose_scale,
-        }
+    def step_state(self) -> StepState:
+        """The state that is not in tensors."""
+        return StepState(
+            step_index=self.step_index, switch=self.switch, rays=self.rays, pose_scale=self.pose_scale
+        )
 
-    def load_state(self, tensors: dict[str, Tensor], notes: dict[str, Any]) -> None:
-        """Restore what `state` and `notes` gave; the next step is then the one that would have come."""
+    def load_state(self, tensors: dict[str, Tensor], numbers: StepState) -> None:
+        """Restore what `state` and `step_state` returned; the next step is then the one that would have come."""
         self._load_tensors(tensors)
-        self.step_index, self.switch = notes["step_index"], notes["switch"]
-        self.rays, self.pose_scale = notes["rays"], notes["pose_scale"]
+        self.step_index, self.switch = numbers.step_index, numbers.switch
+        self.rays, self.pose_scale = numbers.rays, numbers.pose_scale
         if self.draws is not self.generator:
             self.draws.manual_seed(self.options.seed + self.step_index)  # its state is not kept
         self.field.reach(self.step_index / self.schedule.steps)

@@ -1,41 +1,134 @@
-"""Checkpoints: all state of a run in one safetensors file, written whole or not at all."""
+"""Checkpoints: all state of a run in one safetensors file, written whole or not at all.
+
+The tensors are the file's tensors; all else is the JSON of `Checkpoint` in its metadata.
+"""
 
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
 from biresnerf.data.model.atomic_file import whole_file
-from biresnerf.data.points.feature_matches import KEPT
+from biresnerf.data.points.feature_matches import KEPT, FeatureMatches
+from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import InputError
+from biresnerf.refine.lost.lost_cameras import RepairState
+from biresnerf.refine.optimise.optimiser_state import StepState
+from biresnerf.refine.stages.stability import DetectorState
+from biresnerf.report import SwitchReason
 
 CHECKPOINT = Path("checkpoint") / "latest.safetensors"
-SEEDING = CHECKPOINT.with_name("seeding.json")  # what COLMAP answered; every checkpoint carries a copy
+SEEDING = CHECKPOINT.with_name("seeding.json")  # COLMAP's answer; every checkpoint carries a copy
 MATCHES = CHECKPOINT.with_name(KEPT)  # feature matches; every checkpoint carries them, too
-COARSE = CHECKPOINT.with_name("coarse.safetensors")  # the state as stage 1 ended, for runs that share it
-FORMAT = "3"
+COARSE = CHECKPOINT.with_name("coarse.safetensors")  # the state at the end of stage 1, for runs that share it
+FORMAT = "4"
+MATCHED_IMAGES, MATCHED_XY = "matches.images", "matches.xy"  # names of tensors
+OTHER_FOLDER = "Choose another output folder, or remove this one."
+
+_FROZEN = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
 
-def save_checkpoint(
-    folder: Path, tensors: dict[str, Tensor], notes: dict[str, Any], name: Path = CHECKPOINT
-) -> Path:
-    """Write `folder`/checkpoint/latest.safetensors; `notes` is JSON data kept beside the tensors."""
-    path = folder / name
+class RunOrigin(BaseModel):
+    """What a run was started with: only a run of the same origin continues it.
+
+    Attributes:
+        fingerprint: of photos, given poses and options.
+        stage_1_fingerprint: the same without the options that do not affect stage 1.
+        seeding: COLMAP's answer where it was asked: it would not answer quite the same again.
+    """
+
+    model_config = _FROZEN
+
+    fingerprint: str = ""
+    stage_1_fingerprint: str = ""
+    seeding: str | None = None
+
+
+class RunRecord(BaseModel):
+    """What has happened in a run so far.
+
+    Attributes:
+        resumed, rollbacks: how often.
+        switch_reason: why stage 2 began.
+        seconds: spent in each part of the run.
+    """
+
+    model_config = _FROZEN
+
+    resumed: int = 0
+    rollbacks: int = 0
+    switch_reason: SwitchReason | None = None
+    seconds: dict[str, float] = Field(default_factory=lambda: {"coarse": 0.0, "fine": 0.0})
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Record the seconds of a block, if it ends without an error."""
+        started = time.monotonic()
+        yield
+        self.seconds[part] = time.monotonic() - started
+
+
+class Checkpoint(BaseModel):
+    """All that a run needs to continue, in this process or another.
+
+    Attributes:
+        ends_stage_1: whether this is the state at the end of stage 1, kept for other runs.
+        block_errors: mean squared errors of the steps since the detector's last check.
+        snapshot_error: of the state that a rollback would restore, if there is one.
+        tensors: of the optimisation, the snapshot and the feature matches, on the CPU.
+    """
+
+    model_config = _FROZEN
+
+    ends_stage_1: bool = False
+    origin: RunOrigin
+    start: InitialPoses
+    record: RunRecord
+    optimiser: StepState
+    detector: DetectorState
+    repair: RepairState
+    block_errors: tuple[float, ...] = ()
+    snapshot_error: float | None = None
+    tensors: dict[str, Tensor] = Field(exclude=True, repr=False)
+
+    @property
+    def matches(self) -> FeatureMatches | None:
+        """The feature matches that it carries."""
+        if MATCHED_IMAGES not in self.tensors:
+            return None
+        return FeatureMatches.of(self.tensors[MATCHED_IMAGES].numpy(), self.tensors[MATCHED_XY].numpy())
+
+
+def match_tensors(matches: FeatureMatches | None) -> dict[str, Tensor]:
+    """Feature matches as tensors of a checkpoint."""
+    if matches is None:
+        return {}
+    images, xy = matches.kept()
+    return {MATCHED_IMAGES: torch.from_numpy(images), MATCHED_XY: torch.from_numpy(xy)}
+
+
+def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
+    """Write `folder`/checkpoint/latest.safetensors, or coarse.safetensors at the end of stage 1."""
+    path = folder / (COARSE if checkpoint.ends_stage_1 else CHECKPOINT)
     path.parent.mkdir(parents=True, exist_ok=True)
-    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.tensors.items()}
+    state = json.dumps(checkpoint.model_dump())
     with whole_file(path) as temporary:
-        save_file(contiguous, temporary, metadata={"format": FORMAT, "notes": json.dumps(notes)})
+        save_file(contiguous, temporary, metadata={"format": FORMAT, "state": state})
     return path
 
 
-def load_checkpoint(folder: Path, name: Path = CHECKPOINT) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-    """Tensors and notes of the checkpoint in `folder`, None where there is none.
+def load_checkpoint(folder: Path, name: Path = CHECKPOINT) -> Checkpoint | None:
+    """The checkpoint in `folder`, None where there is none.
 
     Raises:
         InputError: ``checkpoint_invalid`` if the file is damaged or of another version.
@@ -46,15 +139,16 @@ def load_checkpoint(folder: Path, name: Path = CHECKPOINT) -> tuple[dict[str, Te
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors: dict[str, torch.Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise _invalid(path, f"cannot be read ({error}).") from error
     if metadata.get("format") != FORMAT:
         raise _invalid(path, "was written by another version.")
-    return tensors, json.loads(metadata["notes"])
+    try:
+        return Checkpoint.model_validate({**json.loads(metadata["state"]), "tensors": tensors})
+    except (ValidationError, KeyError, ValueError) as error:
+        raise _invalid(path, "was written by another version.") from error
 
 
 def _invalid(path: Path, what: str) -> InputError:
-    return InputError(
-        "checkpoint_invalid", what, where=str(path), hint="Choose another output folder, or remove this one."
-    )
+    return InputError("checkpoint_invalid", what, where=str(path), hint=OTHER_FOLDER)

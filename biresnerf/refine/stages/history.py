@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.data.model.atomic_file import whole_file
-
-if TYPE_CHECKING:
-    from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 
 HISTORY = "history.jsonl"
 
@@ -47,19 +43,6 @@ class HistoryLine(BaseModel):
     confirmed: int | None = Field(None, description="Checks in a row that found the error stable.")
 
 
-@dataclass(frozen=True)
-class Observer:
-    """Lets a comparison look into a run that it has the true poses of; the run itself never does.
-
-    Attributes:
-        at_check: what it returns at each check joins that check's line of the history.
-        at_end: called once, when all steps are taken and the run's own views are scored.
-    """
-
-    at_check: Callable[[JointOptimiser], dict[str, float]] = lambda _optimiser: {}
-    at_end: Callable[[JointOptimiser], None] = lambda _optimiser: None
-
-
 class History:
     """Appends lines to ``folder``/history.jsonl; a continued run drops those after its checkpoint first."""
 
@@ -67,7 +50,7 @@ class History:
         self.path = folder / HISTORY
 
     def cut(self, step: int) -> None:
-        """Keep the lines up to `step` alone: what came later will come again."""
+        """Keep only the lines up to `step`: a continued run writes the later ones again."""
         if not self.path.is_file():
             return
         kept = [line for line in read_history(self.path) if float(line["step"]) <= step]
@@ -81,7 +64,7 @@ class History:
 
 
 def read_history(path: Path) -> list[dict[str, float | str]]:
-    """The lines of a history; one that a kill tore off in the middle is left out."""
+    """The lines of a history, without one that a kill cut off."""
     lines = []
     for text in path.read_text("utf-8").splitlines():
         try:

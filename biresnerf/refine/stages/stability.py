@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict
 
 from biresnerf.options.refine_options import DetectorName
 
@@ -42,6 +43,16 @@ STILL_DEG = 0.05  # 90 % quantile of rotation change per block below which camer
 # Adam's steps have the size of the learning rate whatever the gradient: settled cameras still stagger by about
 # rate * sqrt(steps) in a block. Measured on settled rigs: 1.2 to 1.5 times that; while they move, 3 and more.
 STAGGER = 1.7
+
+
+class DetectorState(BaseModel):
+    """What a checkpoint keeps of the detector."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    decibels: tuple[float, ...] = ()
+    confirmed: int = 0
+    rising: int = 0
 
 
 @dataclass
@@ -122,6 +133,12 @@ class StabilityDetector:
         slope, intercept = np.polyfit(x, values, 1)
         fluctuation = float(np.std(values - (slope * x + intercept)))
         return float(slope * (WINDOW - 1)), fluctuation
+
+    def state(self) -> DetectorState:
+        return DetectorState(decibels=tuple(self.decibels), confirmed=self.confirmed, rising=self.rising)
+
+    def load_state(self, state: DetectorState) -> None:
+        self.decibels, self.confirmed, self.rising = list(state.decibels), state.confirmed, state.rising
 
     def clear(self) -> None:
         """Forget the window, after a rollback."""

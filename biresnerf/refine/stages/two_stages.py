@@ -6,23 +6,31 @@ import logging
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 from torch import Tensor
 
-from biresnerf.errors import RefinementError
+from biresnerf.errors import Interrupted, RefinementError
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.progress import OnProgress, Progress
+from biresnerf.progress import Monitor, Progress
 from biresnerf.refine.lost.lost_cameras import LostCameraRepair
 from biresnerf.refine.optimise.async_metrics import StepResult
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refine.stages.checkpoint import CHECKPOINT, COARSE, save_checkpoint
-from biresnerf.refine.stages.history import History, HistoryLine, Observer
-from biresnerf.refine.stages.previews import Previews
-from biresnerf.refine.stages.run_record import RunRecord
+from biresnerf.refine.scene.scene import Scene
+from biresnerf.refine.stages.checkpoint import (
+    CHECKPOINT,
+    COARSE,
+    Checkpoint,
+    RunOrigin,
+    RunRecord,
+    match_tensors,
+    save_checkpoint,
+)
+from biresnerf.refine.stages.history import History, HistoryLine
 from biresnerf.refine.stages.stability import StabilityDetector
+from biresnerf.refine.stages.timing import Estimate, PreviewTimer, StageName
 from biresnerf.stages import ReusableStage
 
 logger = logging.getLogger(__name__)
@@ -30,44 +38,43 @@ logger = logging.getLogger(__name__)
 ROLLBACKS = 3
 SNAPSHOT = "snapshot."  # before the names of its tensors in a checkpoint
 REPORT_PERIOD_S = 0.5
-FIRST_FRACTION, LAST_FRACTION = 0.03, 0.88  # of the whole run's progress: reading before, evaluation after
-FINE_COST = 2.0  # a fine step against a coarse one, until measured
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Looks into a run on its way; the run does not depend on what it sees.
+
+    Attributes:
+        at_check: what it returns at each check joins that check's line of the history.
+        at_end: called once, when all steps are taken and the run's own views are scored.
+        write_preview: shows the state of the run in files, and returns these relative to the output folder.
+    """
+
+    at_check: Callable[[JointOptimiser], dict[str, float]] = lambda _optimiser: {}
+    at_end: Callable[[JointOptimiser], None] = lambda _optimiser: None
+    write_preview: Callable[[TwoStages], tuple[str, ...]] = lambda _stages: ()
 
 
 class TwoStages:
-    """Runs a `JointOptimiser` to its last step; can stop after any step and go on from a checkpoint.
+    """Runs a `JointOptimiser` to its last step; can stop after any step and continue from a checkpoint.
 
     Args:
-        folder: where checkpoints go.
-        fingerprint: of input and options; a checkpoint with another one is not resumed.
-        seeding: COLMAP's answer, where poses come from it; goes into every checkpoint.
-        start: the poses started from; goes into every checkpoint.
-        observer: looks in at every check.
-        show: writes a preview and returns its files, relative to `folder`; called on the way and at the end.
-        carried: tensors that go into every checkpoint as they are.
-        stage_1_fingerprint: the fingerprint without the options that have no say in stage 1.
+        folder: where checkpoints and the history go.
+        origin: what the run was started with; goes into every checkpoint.
     """
 
     def __init__(
         self,
         optimiser: JointOptimiser,
+        scene: Scene,
         folder: Path,
-        fingerprint: str,
-        on_progress: OnProgress,
-        should_stop: Callable[[], bool],
-        seeding: str | None = None,
-        start: dict[str, Any] | None = None,
-        observer: Observer | None = None,
-        show: Callable[[], tuple[str, ...]] = lambda: (),
-        carried: dict[str, Tensor] | None = None,
-        stage_1_fingerprint: str = "",
+        origin: RunOrigin = RunOrigin(),  # noqa: B008 - frozen
+        monitor: Monitor = Monitor(),  # noqa: B008
+        observer: Observer = Observer(),
     ) -> None:
-        self.optimiser, self.folder = optimiser, folder
-        self.history, self.observer = History(folder), observer or Observer()
-        self.on_progress, self.should_stop = on_progress, should_stop
-        self.previews, self.carried = Previews(show, optimiser.options.checkpoint_every_s), carried or {}
-        self.record = RunRecord(fingerprint, stage_1_fingerprint, seeding=seeding, start=start or {})
-        self.repair = LostCameraRepair(optimiser)
+        self.optimiser, self.scene, self.folder, self.origin = optimiser, scene, folder, origin
+        self.monitor, self.observer = monitor, observer
+        self.record, self.history, self.repair = RunRecord(), History(folder), LostCameraRepair(optimiser)
         options = optimiser.options
         self.detector = StabilityDetector(
             options.coarse_steps_min,
@@ -75,6 +82,8 @@ class TwoStages:
             options.detector,
             guarded=optimiser.method.additions,
         )
+        self.estimate, self._previews = Estimate(), PreviewTimer(options.checkpoint_every_s)
+        self._reported = self._saved = 0.0
         self._errors: list[float] = []
         self._losses: list[float] = []
         self._moved_deg = 0.0
@@ -82,60 +91,68 @@ class TwoStages:
         self._poses_at_check = optimiser.poses.poses()
         self._snapshot: tuple[float, dict[str, Tensor]] | None = None
         self._reusable: dict[ReusableStage, tuple[str, ...]] = {}
-        self._step_seconds = {"coarse": 0.0, "fine": 0.0}
-        self._fraction = FIRST_FRACTION
 
     @property
-    def stage(self) -> Literal["coarse", "fine"]:
+    def stage(self) -> StageName:
         return "coarse" if self.optimiser.switch is None else "fine"
 
-    def run(self) -> bool:
-        """Step to the end; False if stopped before on request. A checkpoint is written either way.
+    def run_stage_1(self) -> None:
+        """Step until stage 2 begins; takes no step where it has begun, or the method has one stage only.
 
         Raises:
-            RefinementError: ``diverged`` when the error is not a number or keeps rising after all rollbacks.
+            Interrupted: stopped; a checkpoint is written.
+            RefinementError: ``diverged``: the error is not a number, or keeps rising after all rollbacks.
         """
-        optimiser, options = self.optimiser, self.optimiser.options
-        reported = saved = time.monotonic()
-        self.previews.begin()
-        self.history.cut(optimiser.step_index)
-        while optimiser.step_index < self.optimiser.schedule.steps:
-            if self.should_stop():
-                self._save()
-                self.on_progress(self._progress(CHECKPOINT.as_posix()))
-                return False
-            started = time.monotonic()
-            result = optimiser.step()
-            # Without the check: a repair within it says nothing of the steps to come.
-            stepped = time.monotonic() - started
-            if not math.isfinite(result.loss):
-                raise RefinementError("diverged", f"The loss is not a number at step {optimiser.step_index}.")
-            self._errors.append(result.mean_squared_error)
-            self._losses.append(result.loss)
-            stage = self.stage
-            # Also where the period does not divide the cap: stage 2 must not wait, or never come.
-            due = optimiser.step_index == self.detector.cap and optimiser.switch is None
-            if due or optimiser.step_index % options.check_every == 0:
-                self._check(result)
-            now = time.monotonic()
-            self.record.seconds[stage] += now - started
-            slow = self._step_seconds[stage]
-            self._step_seconds[stage] = stepped if slow == 0 else 0.98 * slow + 0.02 * stepped
-            checkpoint = None
-            if now - saved >= options.checkpoint_every_s:
-                self._save()
-                saved, checkpoint = time.monotonic(), CHECKPOINT.as_posix()
-            preview = self.previews.if_due()
-            if checkpoint or preview or now - reported >= REPORT_PERIOD_S:
-                reported = now
-                self.on_progress(self._progress(checkpoint, preview))
+        self._reported = self._saved = time.monotonic()
+        self._previews.begin()
+        self.history.cut(self.optimiser.step_index)
+        while self.optimiser.switch is None and self.optimiser.step_index < self.optimiser.schedule.steps:
+            self._step()
+
+    def run_stage_2(self) -> None:
+        """Step to the end and write a checkpoint. Raises as `run_stage_1`."""
+        while self.optimiser.step_index < self.optimiser.schedule.steps:
+            self._step()
         self._save()
-        # Evaluation may take long; whoever looks, or stops it, finds the final poses.
-        self.on_progress(self._progress(CHECKPOINT.as_posix(), self.previews.take()))
-        return True
+        # Evaluation may take long: meanwhile a preview shows the final poses, and a stop loses nothing.
+        self.monitor.report(self._progress(CHECKPOINT.as_posix(), self._preview()))
+
+    def _step(self) -> None:
+        """One step, and what is due after it: a check, a checkpoint, a preview, a report."""
+        optimiser, options = self.optimiser, self.optimiser.options
+        if self.monitor.should_stop():
+            self._save()
+            self.monitor.report(self._progress(CHECKPOINT.as_posix()))
+            raise Interrupted(f"stopped at step {optimiser.step_index}; run again to continue")
+        started, stage = time.monotonic(), self.stage
+        result = optimiser.step()
+        # Without the check: the time of a repair within it says nothing about the steps to come.
+        self.estimate.stepped(stage, time.monotonic() - started)
+        if not math.isfinite(result.loss):
+            raise RefinementError("diverged", f"The loss is not a number at step {optimiser.step_index}.")
+        self._errors.append(result.mean_squared_error)
+        self._losses.append(result.loss)
+        # At the cap, too, where the period does not divide it: stage 2 must not wait for the next check.
+        at_cap = optimiser.step_index == self.detector.cap and optimiser.switch is None
+        if at_cap or optimiser.step_index % options.check_every == 0:
+            self._check(result)
+        now = time.monotonic()
+        self.record.seconds[stage] += now - started
+        checkpoint = None
+        if now - self._saved >= options.checkpoint_every_s:
+            self._save()
+            self._saved, checkpoint = time.monotonic(), CHECKPOINT.as_posix()
+        preview = self._preview() if self._previews.due else ()
+        if checkpoint or preview or now - self._reported >= REPORT_PERIOD_S:
+            self._reported = now
+            self.monitor.report(self._progress(checkpoint, preview))
+
+    def _preview(self) -> tuple[str, ...]:
+        with self._previews.showing():
+            return self.observer.write_preview(self)
 
     def _check(self, last: StepResult) -> None:
-        """The detector's turn, at the end of each block."""
+        """The end of a block of steps: the detector decides how to continue."""
         optimiser = self.optimiser
         error = float(np.mean(self._errors))
         self._errors = []
@@ -159,10 +176,11 @@ class TwoStages:
             self._snapshot = (error, {k: v.clone() for k, v in optimiser.coarse_state().items()})
         if verdict in ("stable", "cap"):
             self._repair(switching=True)
-            self.record.switch_reason = "stable" if verdict == "stable" else "cap"
+            reason = "stable" if verdict == "stable" else "cap"
+            self.record = self.record.model_copy(update={"switch_reason": reason})
             logger.info("stage 2 begins at step %d (%s)", optimiser.step_index, verdict)
             self._snapshot, self._signal = None, {}
-            self._save(COARSE)
+            self._save(ends_stage_1=True)
             self._reusable = {"coarse": (COARSE.as_posix(),)}
             optimiser.start_reconstruction()
         else:
@@ -173,7 +191,7 @@ class TwoStages:
             self._repair()
 
     def _repair(self, *, switching: bool = False) -> None:
-        """Lost cameras brought home; what that moves is no motion of the block."""
+        """Give lost cameras other poses; that does not count as motion within the block."""
         self.repair.run(switching=switching)
         self._poses_at_check = self.optimiser.poses.poses()
 
@@ -201,7 +219,7 @@ class TwoStages:
 
     def _roll_back(self) -> None:
         """Back to the best state so far with half the pose rate (method 4.3, DIVERGE)."""
-        self.record.rollbacks += 1
+        self.record = self.record.model_copy(update={"rollbacks": self.record.rollbacks + 1})
         if self.record.rollbacks > ROLLBACKS or self._snapshot is None:
             raise RefinementError("diverged", f"The error keeps rising at step {self.optimiser.step_index}.")
         logger.warning("error rises at step %d: rolling back", self.optimiser.step_index)
@@ -211,16 +229,10 @@ class TwoStages:
         self._poses_at_check = self.optimiser.poses.poses()
 
     def _progress(self, checkpoint: str | None, preview: tuple[str, ...] = ()) -> Progress:
-        optimiser, options = self.optimiser, self.optimiser.options
-        done, total = optimiser.step_index, optimiser.schedule.steps
-        coarse = self._step_seconds["coarse"] or self._step_seconds["fine"] / FINE_COST
-        fine = self._step_seconds["fine"] or coarse * FINE_COST
-        switch = options.coarse_steps_max if optimiser.switch is None else optimiser.switch
-        left = max(0, switch - done) * coarse + (total - max(done, switch)) * fine
-        spent = sum(self.record.seconds.values())
-        share = spent / max(spent + left, 1e-9)
-        # An early switch makes what is left dearer; the fraction told never falls all the same.
-        self._fraction = max(self._fraction, FIRST_FRACTION + (LAST_FRACTION - FIRST_FRACTION) * share)
+        optimiser = self.optimiser
+        step, steps = optimiser.step_index, optimiser.schedule.steps
+        switch = self.detector.cap if optimiser.switch is None else optimiser.switch
+        fraction, eta_s = self.estimate.at(step, switch, steps, sum(self.record.seconds.values()))
         losses, self._losses = self._losses, []
         reusable, self._reusable = self._reusable, {}
         metrics = {"moved_deg": self._moved_deg, **self._signal}
@@ -229,58 +241,51 @@ class TwoStages:
         if self._errors:
             metrics["psnr"] = -10 * math.log10(max(float(np.mean(self._errors)), 1e-12))
         return Progress(
-            stage="coarse" if optimiser.switch is None else "fine",
-            step=done,
-            steps_total=total,
-            fraction=self._fraction,
-            eta_s=left * (1 - FIRST_FRACTION) / (LAST_FRACTION - FIRST_FRACTION),
+            stage=self.stage,
+            step=step,
+            steps_total=steps,
+            fraction=fraction,
+            eta_s=eta_s,
             metrics=metrics,
             checkpoint=checkpoint,
             preview=preview,
             reusable=reusable,
         )
 
-    def _save(self, name: Path = CHECKPOINT) -> None:
-        record, detector = self.record, self.detector
-        notes: dict[str, Any] = {
-            **record.notes(),
-            "detector": {
-                "decibels": detector.decibels,
-                "confirmed": detector.confirmed,
-                "rising": detector.rising,
-            },
-            "errors": self._errors,
-            "repair": self.repair.notes(),
-            "optimiser": self.optimiser.notes(),
-        }
-        state = self.optimiser.state() if name == CHECKPOINT else self.optimiser.coarse_state()
-        tensors = {**self.carried, **state, "poses_at_check": self._poses_at_check}
+    def _save(self, *, ends_stage_1: bool = False) -> None:
+        state = self.optimiser.coarse_state() if ends_stage_1 else self.optimiser.state()
+        tensors = {**match_tensors(self.scene.matches), **state, "poses_at_check": self._poses_at_check}
         if self._snapshot is not None:
-            notes["snapshot_error"] = self._snapshot[0]
             tensors.update({SNAPSHOT + name: tensor for name, tensor in self._snapshot[1].items()})
-        save_checkpoint(self.folder, tensors, notes, name)
-
-    def resume(self, tensors: dict[str, Tensor], notes: dict[str, Any]) -> None:
-        """Go on where a checkpoint left off."""
-        snapshot = {k.removeprefix(SNAPSHOT): v for k, v in tensors.items() if k.startswith(SNAPSHOT)}
-        if snapshot:
-            self._snapshot = (notes["snapshot_error"], snapshot)
-        self.optimiser.load_state(
-            {k: v for k, v in tensors.items() if not k.startswith(SNAPSHOT)}, notes["optimiser"]
+        checkpoint = Checkpoint(
+            ends_stage_1=ends_stage_1,
+            origin=self.origin,
+            start=self.scene.start,
+            record=self.record,
+            optimiser=self.optimiser.step_state(),
+            detector=self.detector.state(),
+            repair=self.repair.state(),
+            block_errors=tuple(self._errors),
+            snapshot_error=None if self._snapshot is None else self._snapshot[0],
+            tensors=tensors,
         )
-        self._take_up(tensors, notes)
-        self.record.resumed += 1
-        for key, value in notes["detector"].items():
-            setattr(self.detector, key, value)
+        save_checkpoint(self.folder, checkpoint)
 
-    def begin_stage_2(self, tensors: dict[str, Tensor], notes: dict[str, Any]) -> None:
-        """Begin where stage 1 of another run ended, which differs in options of stage 2 alone."""
-        self.optimiser.load_state({**self.optimiser.state(), **tensors}, notes["optimiser"])
-        self._take_up(tensors, notes)
-        self.optimiser.start_reconstruction()
-
-    def _take_up(self, tensors: dict[str, Tensor], notes: dict[str, Any]) -> None:
-        self._poses_at_check = tensors["poses_at_check"]
-        self._errors = notes["errors"]
-        self.repair.load_notes(notes["repair"])
-        self.record.take(notes)
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Continue where a checkpoint was written; from the end of stage 1 of another run, begin stage 2."""
+        saved, optimiser = checkpoint.tensors, self.optimiser
+        tensors = {name: tensor for name, tensor in saved.items() if not name.startswith(SNAPSHOT)}
+        if checkpoint.ends_stage_1:  # it holds nothing of the reconstruction module
+            tensors = {**optimiser.state(), **tensors}
+        optimiser.load_state(tensors, checkpoint.optimiser)
+        self._poses_at_check, self._errors = tensors["poses_at_check"], list(checkpoint.block_errors)
+        self.repair.load_state(checkpoint.repair)
+        self.record = checkpoint.record
+        if checkpoint.ends_stage_1:
+            optimiser.start_reconstruction()
+            return
+        if checkpoint.snapshot_error is not None:
+            snapshot = {k.removeprefix(SNAPSHOT): v for k, v in saved.items() if k.startswith(SNAPSHOT)}
+            self._snapshot = (checkpoint.snapshot_error, snapshot)
+        self.detector.load_state(checkpoint.detector)
+        self.record = self.record.model_copy(update={"resumed": self.record.resumed + 1})

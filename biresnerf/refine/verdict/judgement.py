@@ -1,8 +1,8 @@
-"""The verdict on a finished optimisation: evidence gathered, decision taken, photos looked over."""
+"""The verdict on a finished optimisation: gather the evidence, decide, and check each photo."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,9 +13,12 @@ from biresnerf.data.model.dataset import GUESSES, Dataset
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.progress import EXPORTING_FROM, JUDGING_FROM, Monitor, Progress
 from biresnerf.refine.lost.pose_certainty import unsure_deg
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refine.start.input_frame import poses_in_input_frame
+from biresnerf.refine.scene.scene import Scene
+from biresnerf.refine.stages.two_stages import TwoStages
+from biresnerf.refine.start.first_step import poses_in_input_frame
 from biresnerf.refine.verdict import image_flags
 from biresnerf.refine.verdict.pose_evidence import (
     EpipolarComparison,
@@ -25,9 +28,10 @@ from biresnerf.refine.verdict.pose_evidence import (
     compare_on_unseen_views,
     moved_px,
 )
-from biresnerf.refine.verdict.run_input import RunInput
 from biresnerf.refine.verdict.verdict import MEASURABLE_PX, Findings, decide, failed_checks
 from biresnerf.report import Verdict
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -36,7 +40,7 @@ GUESSED = GUESSES | {"forward-facing"}
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """The verdict, and what it has to say of each image [n].
+    """The verdict, and what was found about each image [n].
 
     Attributes:
         trial_psnr: of the unseen views, before and after [2, n]; NaN for the others.
@@ -57,26 +61,34 @@ class Judgement:
     exposure_off: NDArray[np.bool_]
 
 
-def judge(
-    given: RunInput,
-    optimiser: JointOptimiser,
-    threads: int,
-    should_stop: Callable[[], bool],
-    tell: Callable[[float], None] = lambda _share: None,
-) -> Judgement:
-    """Compare the optimised poses with the dataset's own.
-
-    Args:
-        tell: called with the share of the work that is done.
+def judge(stages: TwoStages) -> Judgement | None:
+    """The verdict on the refined poses; None where the options ask for none.
 
     Raises:
-        Interrupted: ``should_stop`` said so.
+        Interrupted: stopped; a continued run judges again.
     """
-    dataset, images = given.dataset, given.images
+    if not stages.optimiser.options.verdict:
+        return None
+    with stages.record.timed("judging"):
+        judgement = judge_poses(stages.scene, stages.optimiser, stages.monitor)
+    logger.info("verdict: %s", judgement.verdict.verdict)
+    return judgement
+
+
+def judge_poses(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Judgement:
+    """Compare the optimised poses with the dataset's own. Raises `Interrupted` where `monitor` stops it."""
+
+    def report(share: float) -> None:
+        fraction = JUDGING_FROM + (EXPORTING_FROM - JUDGING_FROM) * share
+        message = "comparing the refined poses with the input's"
+        monitor.report(Progress(stage="evaluating", fraction=fraction, message=message))
+
+    report(0.0)
+    dataset, images = scene.dataset, scene.images
     refined = optimiser.lenses.refined(dataset)
-    everyone = range(len(dataset))
-    before = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in everyone))
-    after = Rig(poses_in_input_frame(dataset, optimiser)[0], tuple(refined.camera_of(i) for i in everyone))
+    rows = range(len(dataset))
+    before = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in rows))
+    after = Rig(poses_in_input_frame(dataset, optimiser)[0], tuple(refined.camera_of(i) for i in rows))
     turned, shifted = motion(before.world_from_cam, after.world_from_cam)
     spread = rms_spread(before.world_from_cam[:, :3, 3])
     grounded = sum(frame.pose_source not in GUESSED for frame in dataset.frames) > len(dataset) / 2
@@ -87,14 +99,13 @@ def judge(
     moved = 0.0
     if np.isfinite(after.world_from_cam).all():
         moved = moved_px(before, after, images)
-        if given.matches is not None:
-            epipolar = compare_on_matches(
-                before, after, given.matches, independent=not given.start.placed.any()
-            )
+        if scene.matches is not None:
+            independent = not scene.start.matched.any()
+            epipolar = compare_on_matches(before, after, scene.matches, independent=independent)
         if moved >= MEASURABLE_PX:
             heldout = compare_on_unseen_views(
-                before, after, images, given.held_out, optimiser.options, optimiser.device, threads, should_stop,
-                lambda share: tell(0.9 * share),
+                before, after, images, scene.held_out, optimiser.options, optimiser.device, optimiser.threads,
+                monitor.should_stop, lambda share: report(0.9 * share),
             )  # fmt: skip
     verdict = decide(
         Findings(
@@ -102,7 +113,7 @@ def judge(
             moved_px=moved,
             heldout=heldout.evidence if heldout else None,
             epipolar=epipolar.evidence if epipolar else None,
-            compared_with=_whose(dataset),
+            compared_with=_source_of_poses(dataset),
             grounded=grounded,
         )
     )
@@ -115,7 +126,7 @@ def motion(before: Array, after: Array) -> tuple[Array, Array]:
     return turned, np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
 
 
-def _whose(dataset: Dataset) -> Literal["given", "seeded", "mixed"]:
+def _source_of_poses(dataset: Dataset) -> Literal["given", "seeded", "mixed"]:
     given = sum(frame.pose_source == "given" for frame in dataset.frames)
     if given == len(dataset):
         return "given"

@@ -1,4 +1,4 @@
-"""The account of a run: everything that report.json says."""
+"""The report of a run: all that report.json holds."""
 
 from __future__ import annotations
 
@@ -8,42 +8,39 @@ import numpy as np
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.named_images import few_names
-from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.parameters.intrinsics_parameters import IntrinsicsParameters
+from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
+from biresnerf.refine.start.first_step import poses_in_input_frame
 from biresnerf.refine.verdict.judgement import Judgement, motion
-from biresnerf.refine.verdict.run_input import RunInput
 from biresnerf.refine.views.evaluation import ViewScore
 from biresnerf.report import CameraReport, HeldOut, ImageReport, Report, SimilarityReport
 
 
 def run_report(
-    given: RunInput,
     stages: TwoStages,
     scores: list[ViewScore],
     judgement: Judgement | None,
-    refined: np.ndarray,
-    similarity: Similarity,
-    *,
-    threads: int,
     state: Literal["complete", "partial"],
 ) -> Report:
-    """The report of a run whose refined poses, in the input's frame, are `refined` [n, 4, 4].
+    """The report of a run as it is now.
 
     Args:
-        similarity: carries optimised poses to the input's frame.
-        judgement: None where no verdict has been passed.
+        scores: of held-out views, as far as they are scored.
+        judgement: None where there is no verdict.
     """
     from biresnerf import __version__
 
-    dataset, optimiser, record = given.dataset, stages.optimiser, stages.record
+    scene, optimiser, record = stages.scene, stages.optimiser, stages.record
+    dataset = scene.dataset
+    refined, similarity = poses_in_input_frame(dataset, optimiser)
     lost = [i for i, flag in enumerate(optimiser.camera_errors.lost.tolist()) if flag]
     return Report(
         version=__version__,
         state=state,
         options=optimiser.options,
         verdict=judgement.verdict if judgement is not None else None,
-        images=_image_reports(given, stages, scores, judgement, refined),
+        images=_image_reports(stages, scores, judgement, refined),
         cameras=camera_reports(dataset, optimiser.lenses),
         heldout=HeldOut(
             count=len(scores),
@@ -52,7 +49,7 @@ def run_report(
         )
         if scores
         else None,
-        start_trials=given.start.trials,
+        start_trials=scene.start.trials,
         steps_done=optimiser.step_index,
         switch_step=optimiser.switch if optimiser.method.two_stages else None,
         switch_reason=record.switch_reason,
@@ -60,15 +57,15 @@ def run_report(
         seconds={stage: round(seconds, 3) for stage, seconds in record.seconds.items()},
         backend=optimiser.field.backend,
         device=str(optimiser.device),
-        threads=threads,
-        working_size=(int(given.images.widths.max()), int(given.images.heights.max())),
+        threads=optimiser.threads,
+        working_size=(int(scene.images.widths.max()), int(scene.images.heights.max())),
         input_from_optimised=SimilarityReport(
             scale=similarity.scale,
             rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
             translation=tuple(float(v) for v in similarity.translation),
         ),
         warnings=dataset.warnings
-        + _stray_warnings(given)
+        + _unmatched_warnings(scene)
         + _lost_warnings(dataset, lost)
         + (unsure_warnings(dataset, judgement.unsure_deg) if judgement is not None else ()),
     )
@@ -92,13 +89,13 @@ def camera_reports(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[Came
     )
 
 
-def _stray_warnings(given: RunInput) -> tuple[str, ...]:
-    strays = np.flatnonzero(given.start.stray).tolist()
-    if not strays:
+def _unmatched_warnings(scene: Scene) -> tuple[str, ...]:
+    unmatched = np.flatnonzero(scene.start.unmatched).tolist()
+    if not unmatched:
         return ()
-    names = ", ".join(given.dataset.names[i] for i in strays)
+    names = ", ".join(scene.dataset.names[i] for i in unmatched)
     return (
-        f"Feature matches placed all but {len(strays)} of {len(given.dataset)} images: of {names} only the photo "
+        f"Feature matches placed all but {len(unmatched)} of {len(scene.dataset)} images: of {names} only the photo "
         "tells where it was taken from. Look at these poses before you rely on them.",
     )
 
@@ -123,21 +120,17 @@ def unsure_warnings(dataset: Dataset, unsure_deg: np.ndarray) -> tuple[str, ...]
 
 
 def _image_reports(
-    given: RunInput,
-    stages: TwoStages,
-    scores: list[ViewScore],
-    judgement: Judgement | None,
-    refined: np.ndarray,
+    stages: TwoStages, scores: list[ViewScore], judgement: Judgement | None, refined: np.ndarray
 ) -> tuple[ImageReport, ...]:
-    optimiser, repaired = stages.optimiser, stages.repair.repaired
+    scene, optimiser, repaired = stages.scene, stages.optimiser, stages.repair.repaired
     lost, exposures = optimiser.camera_errors.lost, optimiser.exposure.gains()
-    turn, shift = motion(given.dataset.world_from_cam, refined)
+    turn, shift = motion(scene.dataset.world_from_cam, refined)
     scored = {score.image: score for score in scores}
     return tuple(
         ImageReport(
             name=frame.name,
-            pose_source=given.start.sources[i],
-            held_out=i in given.held_out,
+            pose_source=scene.start.sources[i],
+            held_out=i in scene.held_out,
             fixed=bool(optimiser.bodies.fixed[i]),
             moved_deg=float(turn[i]),
             moved_units=float(shift[i]),
@@ -148,12 +141,12 @@ def _image_reports(
             ssim=scored[i].ssim if i in scored else None,
             **_judged(judgement, i),
         )
-        for i, frame in enumerate(given.dataset.frames)
+        for i, frame in enumerate(scene.dataset.frames)
     )
 
 
 def _judged(judgement: Judgement | None, image: int) -> dict[str, float | bool | None]:
-    """What a judgement says of one image, by the names of `ImageReport`."""
+    """What a judgement holds for one image, by the names of `ImageReport`."""
     if judgement is None:
         return {}
     figures = {

@@ -1,17 +1,14 @@
-"""Views rendered at the end to be looked at: which ones, and where in space their rays end."""
+"""Views rendered at the end for people to look at: which ones, and where in space their rays end."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from biresnerf.data.show.view_file import ShownView
 from biresnerf.geometry.focus import rms_spread
-from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.views.evaluation import ViewScore
 
@@ -19,13 +16,12 @@ Points = tuple[NDArray[np.float64], NDArray[np.uint8]]  # positions [n, 3] and c
 
 POINTS_A_VIEW = 2500
 OPAQUE = 0.8  # rays that end in something
-REACH = (
-    3.0  # distances of the cameras from the scene's middle; what lies beyond is surroundings, seen vaguely
-)
+# In distances of the cameras from the scene's centre; the surroundings beyond are too vague to show.
+REACH = 3.0
 
 
-def spread_views(world_from_cam: NDArray[np.float64], taken: list[int], count: int) -> list[int]:
-    """Up to ``count`` views beside those ``taken``, each the farthest from all before it in place and direction.
+def spread_views(world_from_cam: NDArray[np.float64], chosen: list[int], count: int) -> list[int]:
+    """Up to ``count`` views beside the ``chosen``, each the farthest from all before it in place and direction.
 
     Args:
         world_from_cam: all poses [n, 4, 4].
@@ -33,16 +29,16 @@ def spread_views(world_from_cam: NDArray[np.float64], taken: list[int], count: i
     centres = world_from_cam[:, :3, 3]
     place = centres / max(rms_spread(centres), 1e-300)
     where = np.concatenate([place, world_from_cam[:, :3, 2]], axis=1)
-    chosen = list(taken)
+    views = list(chosen)
     apart = np.full(len(where), np.inf)
-    for view in chosen:
+    for view in views:
         apart = np.minimum(apart, np.linalg.norm(where - where[view], axis=1))
-    while len(chosen) < min(len(taken) + count, len(where)):
-        apart[chosen] = -1.0
+    while len(views) < min(len(chosen) + count, len(where)):
+        apart[views] = -1.0
         view = int(np.argmax(apart))
-        chosen.append(view)
+        views.append(view)
         apart = np.minimum(apart, np.linalg.norm(where - where[view], axis=1))
-    return chosen[len(taken) :]
+    return views[len(chosen) :]
 
 
 @torch.no_grad()
@@ -62,25 +58,3 @@ def surface_of(optimiser: JointOptimiser, score: ViewScore) -> Points:
     near = np.linalg.norm(points, axis=1) <= REACH * optimiser.frame.distance
     colours = np.rint(255 * score.view.colour[rows, columns]).astype(np.uint8)
     return points[near], colours[near]
-
-
-@dataclass
-class Shown:
-    """Views that were rendered, and the surface they see, in the unit frame."""
-
-    views: list[ShownView] = field(default_factory=list)
-    _positions: list[NDArray[np.float64]] = field(default_factory=list)
-    _colours: list[NDArray[np.uint8]] = field(default_factory=list)
-
-    def add(self, view: ShownView, positions: NDArray[np.float64], colours: NDArray[np.uint8]) -> None:
-        """Take note of one."""
-        self.views.append(view)
-        self._positions.append(positions)
-        self._colours.append(colours)
-
-    def surface(self, unit_from_world: Similarity, input_from_optimised: Similarity) -> Points:
-        """All points in the input's frame."""
-        if not self.views:
-            return np.empty((0, 3)), np.empty((0, 3), np.uint8)
-        in_world = unit_from_world.inverse().apply(np.concatenate(self._positions))
-        return input_from_optimised.apply(in_world), np.concatenate(self._colours)

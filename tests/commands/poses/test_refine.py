@@ -152,7 +152,7 @@ def test_sigterm_writes_checkpoint_and_partial_result_and_ends_with_143(terminat
     report = report_of(output)
     assert report.state == "partial"
     assert 0 < report.steps_done < STEPS
-    assert load_checkpoint(output)[1]["optimiser"]["step_index"] == report.steps_done
+    assert load_checkpoint(output).optimiser.step_index == report.steps_done
     frames = json.loads((output / "transforms.json").read_text())["frames"]
     assert len(frames) == 6
     assert (output / "colmap/sparse/0/images.bin").is_file()
@@ -190,7 +190,7 @@ def test_a_damaged_checkpoint_is_named(scene, terminated, tmp_path):
 def test_a_killed_run_goes_on_from_its_last_checkpoint(scene, tmp_path):
     status, _ = stop_after_checkpoint(scene, tmp_path / "out", signal.SIGKILL)
     assert status == -signal.SIGKILL
-    kept = load_checkpoint(tmp_path / "out")[1]["optimiser"]["step_index"]
+    kept = load_checkpoint(tmp_path / "out").optimiser.step_index
     assert kept > 0
     # What changes neither result nor effort may differ when going on.
     again = command(scene, tmp_path / "out", checkpoint_every_s=100, orbit_frames=1)
@@ -222,4 +222,4 @@ def test_a_second_signal_ends_at_once_and_harms_no_checkpoint(scene, tmp_path):
     finally:
         process.kill()
         process.communicate()
-    assert load_checkpoint(output)[1]["optimiser"]["step_index"] > 0
+    assert load_checkpoint(output).optimiser.step_index > 0

@@ -13,9 +13,10 @@ from biresnerf.data.model.dataset import Camera, Dataset, Frame, SourceFormat
 from biresnerf.data.model.image_order import pose_distances
 from biresnerf.data.seeding import cached_mapping as remembered_mapping
 from biresnerf.data.seeding import map_images
+from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.seeding.map_images import MappedModel
 from biresnerf.data.seeding.match_poses import carry_model
-from biresnerf.data.seeding.seed_poses import PoseCandidate, Seeding, seed_poses
+from biresnerf.data.seeding.seed_poses import Seeding, seed_poses
 from biresnerf.data.synthetic.scene import synthetic_focal
 from biresnerf.errors import Interrupted, RefinementError
 from biresnerf.geometry.perturb import perturb_poses
@@ -78,7 +79,7 @@ def completed(noisy) -> Seeding:
     return seed_poses(replace(noisy, frames=tuple(frames)))
 
 
-def placed(candidate: PoseCandidate) -> np.ndarray:
+def placed(candidate: InitialPoses) -> np.ndarray:
     return np.array([source.startswith("matches") for source in candidate.sources])
 
 
@@ -102,7 +103,7 @@ def test_the_result_lies_in_the_frame_of_the_given_poses(found, noisy):
 
 def test_the_same_request_gives_the_same_poses(found, noisy):
     again = seed_poses(noisy)
-    assert [c.name for c in again.candidates] == [c.name for c in found.candidates]
+    assert [c.source for c in again.candidates] == [c.source for c in found.candidates]
     for one, other in zip(found.candidates, again.candidates, strict=True):
         np.testing.assert_array_equal(one.world_from_cam, other.world_from_cam)
 
@@ -270,5 +271,5 @@ def test_a_given_focal_length_that_matches_contradict_is_told(noisy, tmp_path):
         model["images"] = model["images"][: VIEWS // 2]
     kept.write_text(json.dumps(remembered))
     few = seed_poses(with_focal(noisy, 1.5), remember=kept)
-    assert [candidate.name for candidate in few.candidates] == ["given"]
+    assert [candidate.source for candidate in few.candidates] == ["given"]
     assert focal_warnings(few) == []

@@ -130,7 +130,7 @@ def test_photos_too_smooth_for_features_but_alike_face_forward(tmp_path):
         grey = np.repeat(np.uint8(127 + 90 * wave)[..., None], 3, axis=2)
         Image.fromarray(grey).save(tmp_path / f"{index}.png")
     found = seed_poses(read_dataset(tmp_path))
-    assert [c.name for c in found.candidates] == ["forward-facing"]
+    assert [c.source for c in found.candidates] == ["forward-facing"]
     assert any("without features" in text for text in found.dataset.warnings)
 
 

@@ -14,16 +14,18 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_robust
+from biresnerf.progress import Monitor
 from biresnerf.refine.lost import lost_cameras
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from biresnerf.refine.scene.scene_frame import scene_frame
 from biresnerf.refine.stages.checkpoint import load_checkpoint
 from biresnerf.refine.stages.two_stages import TwoStages
-from biresnerf.refine.start.choose_start import Start
-from biresnerf.refine.verdict.run_input import RunInput
+from biresnerf.refine.verdict.evaluate import Evaluation
+from biresnerf.refine.verdict.run_report import run_report
 from biresnerf.write.output_folder import OutputFolder
-from tests.refine.tiny_scene import CPU, tiny_optimiser, tiny_options, tiny_set
+from biresnerf.write.result import write_result
+from tests.refine.tiny_scene import CPU, finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 SIZE, STEPS, PERIOD = 32, 160, 8
 TURNED, ORBITED, HELD_OUT = 5, 3, [3, 8]
@@ -57,10 +59,9 @@ def start(
     )
     return TwoStages(
         optimiser,
+        given_scene(*scene, held_out=HELD_OUT),
         folder,
-        "fingerprint",
-        lambda _: None,
-        lambda: stop_at is not None and optimiser.step_index >= stop_at,
+        monitor=Monitor(should_stop=lambda: stop_at is not None and optimiser.step_index >= stop_at),
     )
 
 
@@ -91,7 +92,7 @@ def repaired(scene, tmp_path_factory) -> TwoStages:
         patch.setattr(lost_cameras, "RUN_SHARE", 10.0)
         patch.setattr(lost_cameras, "EVENT_SHARE", 10.0)
         stages = start(scene, tmp_path_factory.mktemp("repaired"), spoiled(true_poses(scene)))
-        assert stages.run()
+        assert finished(stages)
     return stages
 
 
@@ -114,19 +115,19 @@ def test_cameras_that_begin_at_a_guess_are_in_doubt_until_they_stand_right(scene
     stages = start(scene, tmp_path, given)
     stages.optimiser.camera_errors.doubt(guessed)
     assert errors_deg(stages, truth)[guessed].min() > 20
-    assert stages.run()
+    assert finished(stages)
     assert errors_deg(stages, truth)[guessed].max() < 15
     assert not stages.optimiser.camera_errors.lost.any()
 
 
 def test_a_run_stopped_between_repairs_ends_as_an_uninterrupted_one(scene, tmp_path, repaired):
     stopped = start(scene, tmp_path, spoiled(true_poses(scene)), stop_at=70)
-    assert not stopped.run()
+    assert not finished(stopped)
     assert stopped.repair.repaired == [TURNED]
     resumed = start(scene, tmp_path, spoiled(true_poses(scene)))
-    resumed.resume(*load_checkpoint(tmp_path))
-    assert resumed.run()
-    assert resumed.repair.notes() == repaired.repair.notes()
+    resumed.restore(load_checkpoint(tmp_path))
+    assert finished(resumed)
+    assert resumed.repair.state() == repaired.repair.state()
     for name, tensor in repaired.optimiser.state().items():
         assert torch.equal(resumed.optimiser.state()[name], tensor), name
 
@@ -141,7 +142,7 @@ def test_nothing_is_touched_on_a_healthy_run(scene, tmp_path, monkeypatch):
         flagged.append(bool(stages.optimiser.camera_errors.lost.any()))
 
     monkeypatch.setattr(stages.optimiser.camera_errors, "close_block", closed)
-    assert stages.run()
+    assert finished(stages)
     assert len(flagged) == STEPS // PERIOD
     assert not any(flagged)
     assert stages.repair.repaired == []
@@ -151,7 +152,7 @@ def test_nothing_is_touched_on_a_healthy_run(scene, tmp_path, monkeypatch):
 def test_a_run_spends_no_more_than_its_share(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(lost_cameras, "RUN_SHARE", 0.2)
     stages = start(scene, tmp_path, spoiled(true_poses(scene)))
-    stages.run()
+    finished(stages)
     assert stages.repair.repaired == [TURNED]  # the first one found takes all there is
     assert bool(stages.optimiser.camera_errors.suspects[ORBITED])
 
@@ -164,7 +165,7 @@ def test_in_an_open_scene_a_camera_that_looks_where_nobody_does_is_brought_home(
     given = truth.copy()
     given[TURNED] = given[TURNED] @ np.diag([-1.0, 1, -1, 1])
     stages = start(open_scene, tmp_path, given, stop_at=90)
-    stages.run()
+    finished(stages)
     errors = stages.optimiser.camera_errors
     errors._stood_out.zero_()
     errors.errors.fill_(1e-3)  # whatever the errors say
@@ -177,13 +178,12 @@ def test_in_an_open_scene_a_camera_that_looks_where_nobody_does_is_brought_home(
 
 def test_the_report_names_those_that_stay_lost(scene, tmp_path):
     stages = start(scene, tmp_path, true_poses(scene), stop_at=1)
-    stages.run()
+    finished(stages)
     stages.optimiser.camera_errors._stood_out[TURNED] = 2
     stages.repair.repaired = [ORBITED]
-    dataset, images = scene
-    begun = Start(dataset.world_from_cam, "given", ("given",) * len(dataset))
-    given = RunInput(dataset, images, begun, HELD_OUT)
-    report = OutputFolder(tmp_path).write_result(given, stages, [], None, threads=1, state="partial")
+    dataset = scene[0]
+    partial = run_report(stages, [], None, "partial")
+    report = write_result(OutputFolder(tmp_path), stages, Evaluation(), partial)
     assert [image.name for image in report.images if image.lost] == [dataset.names[TURNED]]
     assert [image.name for image in report.images if image.repaired] == [dataset.names[ORBITED]]
     assert [dataset.names[TURNED] in warning for warning in report.warnings] == [True]

@@ -16,13 +16,13 @@ from biresnerf.geometry.similarity import align_robust
 from biresnerf.options.presets import METHOD_VALUES, PRESETS
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
-from biresnerf.progress import Progress
+from biresnerf.progress import Monitor, Progress
 from biresnerf.refine.optimise import methods
 from biresnerf.refine.optimise.methods import METHODS
 from biresnerf.refine.stages.checkpoint import load_checkpoint
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.report import Report
-from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set
+from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 SMALL_GRID = {
     "reconstruction_levels": 8,
@@ -105,14 +105,16 @@ def test_a_stopped_and_resumed_run_ends_bit_for_bit_as_an_uninterrupted_one(tmp_
     def stages(stop_at: int | None) -> TwoStages:
         optimiser = tiny_optimiser(dataset, images, options, held_out=[1])
         stop = lambda: optimiser.step_index == stop_at  # noqa: E731
-        return TwoStages(optimiser, tmp_path, "fingerprint", lambda _progress: None, stop)
+        return TwoStages(
+            optimiser, given_scene(dataset, images, [1]), tmp_path, monitor=Monitor(should_stop=stop)
+        )
 
     whole = stages(None)
-    assert whole.run()
-    assert not stages(13).run()
+    assert finished(whole)
+    assert not finished(stages(13))
     resumed = stages(None)
-    resumed.resume(*load_checkpoint(tmp_path))
-    assert resumed.run()
+    resumed.restore(load_checkpoint(tmp_path))
+    assert finished(resumed)
     state = resumed.optimiser.state()
     for name, tensor in whole.optimiser.state().items():
         assert torch.equal(state[name], tensor), name

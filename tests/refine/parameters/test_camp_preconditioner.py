@@ -125,10 +125,10 @@ def test_a_run_with_it_steps_and_restores_its_state(tmp_path):
     first = tiny_optimiser(dataset, images, tiny_options(pose_parametrisation="so3xr3_camp"))
     for _ in range(4):
         first.step()
-    saved, notes = {k: v.clone() for k, v in first.state().items()}, first.notes()
+    saved, numbers = {k: v.clone() for k, v in first.state().items()}, first.step_state()
     first.step()
     second = tiny_optimiser(dataset, images, tiny_options(pose_parametrisation="so3xr3_camp"))
-    second.load_state(saved, notes)
+    second.load_state(saved, numbers)
     second.step()
     assert torch.equal(first.poses.matrices(), second.poses.matrices())
     assert not torch.equal(second.poses.matrices(), second.poses.start)

@@ -267,11 +267,11 @@ def test_a_run_goes_on_from_its_state_to_the_bit(scene):
     first = with_lenses(scene, options, 1.05, "all")
     for _ in range(8):
         first.step()
-    saved, notes = {k: v.clone() for k, v in first.state().items()}, first.notes()
+    saved, numbers = {k: v.clone() for k, v in first.state().items()}, first.step_state()
     for _ in range(3):
         first.step()
     second = with_lenses(scene, options, 1.05, "all")
-    second.load_state(saved, notes)
+    second.load_state(saved, numbers)
     for _ in range(3):
         second.step()
     assert bool((first.lenses.increments != 0).any())

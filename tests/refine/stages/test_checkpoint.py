@@ -2,17 +2,55 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
+from biresnerf.data.points.feature_matches import FeatureMatches
+from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import InputError
-from biresnerf.refine.stages.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
+from biresnerf.refine.lost.lost_cameras import RepairState
+from biresnerf.refine.optimise.optimiser_state import StepState
+from biresnerf.refine.stages.checkpoint import (
+    CHECKPOINT,
+    COARSE,
+    FORMAT,
+    Checkpoint,
+    RunOrigin,
+    RunRecord,
+    load_checkpoint,
+    match_tensors,
+    save_checkpoint,
+)
+from biresnerf.refine.stages.stability import DetectorState
+from biresnerf.report import TrialReport
 from tests.data.scenes import assert_complete
 
-NOTES = {"step": 3, "seconds": {"coarse": 0.1 + 0.2}, "nothing": None, "text": "ä\n"}
+POSES = np.random.default_rng(0).normal(0, 1e3, (3, 4, 4)) / 3
+
+
+def checkpoint(tensors: dict[str, torch.Tensor], step: int = 3) -> Checkpoint:
+    return Checkpoint(
+        origin=RunOrigin(fingerprint="a", stage_1_fingerprint="b", seeding="ä\n"),
+        start=InitialPoses(
+            POSES,
+            "given",
+            ("given", "given", "neighbours"),
+            (TrialReport(source="given", placed=0, psnr=0.1),),
+        ),
+        record=RunRecord(seconds={"coarse": 0.1 + 0.2}),
+        optimiser=StepState(step_index=step, switch=None, rays=7, pose_scale=0.5),
+        detector=DetectorState(decibels=(1 / 3, float("inf")), confirmed=1),
+        repair=RepairState(repaired=(1, 2), times=1, spent=1e9 / 7),
+        block_errors=(2 / 3, float("nan")),
+        snapshot_error=0.1,
+        tensors=tensors,
+    )
 
 
 def tensors() -> dict[str, torch.Tensor]:
@@ -26,13 +64,36 @@ def tensors() -> dict[str, torch.Tensor]:
 
 
 def test_tensors_and_notes_come_back_as_they_were(tmp_path):
-    assert save_checkpoint(tmp_path / "new folder", tensors(), NOTES) == tmp_path / "new folder" / CHECKPOINT
-    loaded, notes = load_checkpoint(tmp_path / "new folder")
-    assert notes == NOTES
-    assert loaded.keys() == tensors().keys()
+    saved = checkpoint(tensors())
+    assert save_checkpoint(tmp_path / "new folder", saved) == tmp_path / "new folder" / CHECKPOINT
+    loaded = load_checkpoint(tmp_path / "new folder")
+    for part in ("ends_stage_1", "origin", "record", "optimiser", "detector", "repair", "snapshot_error"):
+        assert getattr(loaded, part) == getattr(saved, part), part
+    np.testing.assert_array_equal(loaded.block_errors, saved.block_errors)
+    np.testing.assert_array_equal(loaded.start.world_from_cam, POSES)
+    assert (loaded.start.sources, loaded.start.trials) == (saved.start.sources, saved.start.trials)
+    assert loaded.tensors.keys() == tensors().keys()
     for name, tensor in tensors().items():
-        assert loaded[name].dtype == tensor.dtype
-        assert torch.equal(loaded[name], tensor)
+        assert loaded.tensors[name].dtype == tensor.dtype
+        assert torch.equal(loaded.tensors[name], tensor)
+
+
+def test_the_end_of_stage_1_has_a_file_of_its_own(tmp_path):
+    ending = checkpoint({"table": torch.zeros(5)}).model_copy(update={"ends_stage_1": True})
+    assert save_checkpoint(tmp_path, ending) == tmp_path / COARSE
+    assert load_checkpoint(tmp_path) is None
+    assert load_checkpoint(tmp_path, COARSE).ends_stage_1
+
+
+def test_feature_matches_come_back_as_a_run_has_them(tmp_path):
+    images, xy = np.array([[0, 1], [1, 2]]), np.random.default_rng(0).uniform(0, 640, (2, 2, 2))
+    matches = FeatureMatches.of(images, xy)
+    save_checkpoint(tmp_path, checkpoint(match_tensors(matches)))
+    back = load_checkpoint(tmp_path).matches
+    np.testing.assert_array_equal(back.images, matches.images)
+    np.testing.assert_array_equal(back.xy, matches.xy)
+    save_checkpoint(tmp_path, checkpoint(match_tensors(None)))
+    assert load_checkpoint(tmp_path).matches is None
 
 
 def test_a_folder_without_one_gives_none(tmp_path):
@@ -42,7 +103,7 @@ def test_a_folder_without_one_gives_none(tmp_path):
 
 @pytest.mark.parametrize("keep", [0.0, 0.001, 0.5, 0.99])
 def test_a_truncated_file_is_refused_with_its_name_and_the_mend(tmp_path, keep):
-    path = save_checkpoint(tmp_path, {"table": torch.rand(5000)}, NOTES)
+    path = save_checkpoint(tmp_path, checkpoint({"table": torch.rand(5000)}))
     content = path.read_bytes()
     path.write_bytes(content[: int(keep * len(content))])
     with pytest.raises(InputError) as caught:
@@ -50,18 +111,19 @@ def test_a_truncated_file_is_refused_with_its_name_and_the_mend(tmp_path, keep):
     assert_complete(caught.value, "checkpoint_invalid", str(path))
 
 
-def test_a_file_of_another_version_is_refused(tmp_path):
-    from safetensors.torch import save_file
-
+@pytest.mark.parametrize(
+    "metadata", [{"format": "0", "state": "{}"}, {"format": FORMAT, "state": json.dumps({"unknown": 1})}]
+)
+def test_a_file_of_another_version_is_refused(tmp_path, metadata):
     (tmp_path / CHECKPOINT).parent.mkdir()
-    save_file({"table": torch.rand(5)}, tmp_path / CHECKPOINT, metadata={"format": "0", "notes": "{}"})
+    save_file({"table": torch.rand(5)}, tmp_path / CHECKPOINT, metadata=metadata)
     with pytest.raises(InputError) as caught:
         load_checkpoint(tmp_path)
     assert_complete(caught.value, "checkpoint_invalid")
 
 
 def test_a_kill_in_the_middle_of_writing_leaves_the_old_checkpoint(tmp_path):
-    save_checkpoint(tmp_path, {"table": torch.zeros(5)}, {"step": 1})
+    save_checkpoint(tmp_path, checkpoint({"table": torch.zeros(5)}, step=1))
     killed = subprocess.run(
         [
             sys.executable,
@@ -74,12 +136,13 @@ def half(tensors, path, metadata):
     os.kill(os.getpid(), signal.SIGKILL)
 checkpoint.save_file = half
 from pathlib import Path
-checkpoint.save_checkpoint(Path({str(tmp_path)!r}), {{"table": torch.ones(5)}}, {{"step": 2}})
+from tests.refine.stages import test_checkpoint
+checkpoint.save_checkpoint(Path({str(tmp_path)!r}), test_checkpoint.checkpoint({{"table": torch.ones(5)}}, step=2))
 """,
         ],
         check=False,
     )
     assert killed.returncode == -9
-    loaded, notes = load_checkpoint(tmp_path)
-    assert notes == {"step": 1}
-    assert torch.equal(loaded["table"], torch.zeros(5))
+    loaded = load_checkpoint(tmp_path)
+    assert loaded.optimiser.step_index == 1
+    assert torch.equal(loaded.tensors["table"], torch.zeros(5))

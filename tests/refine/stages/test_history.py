@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 
+from biresnerf.progress import Monitor
 from biresnerf.refine.stages.checkpoint import load_checkpoint
-from biresnerf.refine.stages.history import HISTORY, History, Observer, read_history
-from biresnerf.refine.stages.two_stages import TwoStages
-from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set
+from biresnerf.refine.stages.history import HISTORY, History, read_history
+from biresnerf.refine.stages.two_stages import Observer, TwoStages
+from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 
 def test_each_check_leaves_a_line_and_a_continued_run_has_them_once(tmp_path):
@@ -18,16 +19,15 @@ def test_each_check_leaves_a_line_and_a_continued_run_has_them_once(tmp_path):
         observer = Observer(at_check=lambda now: {"observed": float(now.step_index)})
         stages = TwoStages(
             optimiser,
+            given_scene(*scene),
             tmp_path,
-            "fingerprint",
-            lambda _: None,
-            lambda: optimiser.step_index >= stop_at,
+            monitor=Monitor(should_stop=lambda: optimiser.step_index >= stop_at),
             observer=observer,
         )
         checkpoint = load_checkpoint(tmp_path)
         if checkpoint is not None:
-            stages.resume(*checkpoint)
-        stages.run()
+            stages.restore(checkpoint)
+        finished(stages)
         return stages
 
     run(13)

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from biresnerf.errors import RefinementError
-from biresnerf.progress import Progress
+from biresnerf.progress import Monitor, Progress
 from biresnerf.refine.stages.checkpoint import CHECKPOINT, load_checkpoint
 from biresnerf.refine.stages.history import HISTORY, read_history
 from biresnerf.refine.stages.two_stages import TwoStages
-from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set
+from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 
 @pytest.fixture(scope="module")
@@ -24,10 +24,12 @@ def start(
     optimiser = tiny_optimiser(*scene, options, held_out=[3])
     return TwoStages(
         optimiser,
+        given_scene(*scene, held_out=[3]),
         folder,
-        "fingerprint",
-        (told if told is not None else []).append,
-        lambda: stop_at is not None and optimiser.step_index >= stop_at,
+        monitor=Monitor(
+            (told if told is not None else []).append,
+            lambda: stop_at is not None and optimiser.step_index >= stop_at,
+        ),
     )
 
 
@@ -35,7 +37,7 @@ def start(
 def whole(scene, tmp_path_factory):
     """A run without interruption."""
     stages = start(scene, tmp_path_factory.mktemp("whole"), tiny_options())
-    assert stages.run()
+    assert finished(stages)
     return stages
 
 
@@ -49,11 +51,11 @@ def test_a_run_stopped_anywhere_and_resumed_ends_bit_for_bit_as_an_uninterrupted
     scene, tmp_path, whole, stop_at
 ):
     stopped = start(scene, tmp_path, tiny_options(), stop_at)
-    assert not stopped.run()
+    assert not finished(stopped)
     assert stopped.optimiser.step_index == stop_at
     resumed = start(scene, tmp_path, tiny_options())
-    resumed.resume(*load_checkpoint(tmp_path))
-    assert resumed.run()
+    resumed.restore(load_checkpoint(tmp_path))
+    assert finished(resumed)
     assert resumed.record.resumed == 1
     assert resumed.optimiser.switch == whole.optimiser.switch
     assert torch.equal(resumed.optimiser.poses.poses(), whole.optimiser.poses.poses())
@@ -70,21 +72,21 @@ def test_stage_2_begins_at_the_cap_at_the_latest(whole):
 
 def test_stage_2_begins_at_the_cap_though_no_check_falls_on_it(scene, tmp_path):
     stages = start(scene, tmp_path, tiny_options(check_every=50, coarse_steps_max=17, steps=20))
-    assert stages.run()
+    assert finished(stages)
     assert stages.optimiser.switch == 17
 
 
 def test_progress_carries_what_the_detector_saw_last_and_in_stage_2_nothing_of_it(scene, tmp_path):
     told: list[Progress] = []
-    assert not start(scene, tmp_path, tiny_options(), 13, told).run()
+    assert not finished(start(scene, tmp_path, tiny_options(), 13, told))
     line = read_history(tmp_path / HISTORY)[-1]
     assert line["step"] == 10
     assert {name: told[-1].metrics[name] for name in ("still_deg", "confirmed")} == {
         name: line[name] for name in ("still_deg", "confirmed")
     }
     resumed = start(scene, tmp_path, tiny_options(), told=told)
-    resumed.resume(*load_checkpoint(tmp_path))
-    assert resumed.run()
+    resumed.restore(load_checkpoint(tmp_path))
+    assert finished(resumed)
     assert told[-1].stage == "fine"
     assert "still_deg" not in told[-1].metrics
 
@@ -99,7 +101,7 @@ def test_a_stable_error_begins_stage_2_before_the_cap(scene, tmp_path):
         return check(step, 0.01, 0.0)
 
     stages.detector.check = flat
-    stages.run()
+    finished(stages)
     assert stages.record.switch_reason == "stable"
     assert stages.optimiser.switch == 15  # the first check at or after the floor
 
@@ -107,7 +109,7 @@ def test_a_stable_error_begins_stage_2_before_the_cap(scene, tmp_path):
 def test_fractions_never_fall_and_checkpoints_are_told_when_they_exist(scene, tmp_path):
     told: list[Progress] = []
     stages = start(scene, tmp_path, tiny_options(checkpoint_every_s=0.01), told=told)
-    assert stages.run()
+    assert finished(stages)
     fractions = [progress.fraction for progress in told]
     assert fractions == sorted(fractions)
     assert fractions[-1] < 0.9
@@ -120,11 +122,11 @@ def test_fractions_never_fall_and_checkpoints_are_told_when_they_exist(scene, tm
 def test_the_fraction_waits_where_an_early_switch_makes_the_rest_dearer_than_thought(scene, tmp_path):
     stages = start(scene, tmp_path, tiny_options())
     stages.optimiser.step_index = 12
-    stages.record.seconds["coarse"], stages._step_seconds["coarse"] = 12.0, 1.0
+    stages.record.seconds["coarse"], stages.estimate.step_seconds["coarse"] = 12.0, 1.0
     early = stages._progress(None)
     assert 0.1 < early.fraction < 0.9
     stages.optimiser.start_reconstruction()
-    stages._step_seconds["fine"] = 10.0
+    stages.estimate.step_seconds["fine"] = 10.0
     later = stages._progress(None)
     assert later.eta_s > early.eta_s
     assert later.fraction == early.fraction
@@ -134,11 +136,11 @@ def test_rising_errors_roll_back_to_the_best_state_with_half_the_pose_rate(scene
     stages = start(scene, tmp_path, tiny_options(coarse_steps_max=40, coarse_steps_min=40))
     verdicts = iter(["running"] * 4 + ["diverging"] * 1)
     stages.detector.check = lambda *_: next(verdicts)
-    stages.should_stop = lambda: stages.optimiser.step_index == 20
-    stages.run()
+    stages.monitor = Monitor(should_stop=lambda: stages.optimiser.step_index == 20)
+    finished(stages)
     best = {k: v.clone() for k, v in stages._snapshot[1].items()}
-    stages.should_stop = lambda: stages.optimiser.step_index == 25
-    stages.run()
+    stages.monitor = Monitor(should_stop=lambda: stages.optimiser.step_index == 25)
+    finished(stages)
     assert stages.record.rollbacks == 1
     assert stages.optimiser.pose_scale == 0.5
     assert torch.equal(stages.optimiser.state()["poses.rotation"], best["poses.rotation"])
@@ -147,11 +149,11 @@ def test_rising_errors_roll_back_to_the_best_state_with_half_the_pose_rate(scene
 
 def test_a_resumed_run_can_still_roll_back(scene, tmp_path):
     first = start(scene, tmp_path, tiny_options(), stop_at=7)
-    first.run()
+    finished(first)
     second = start(scene, tmp_path, tiny_options(), stop_at=11)
-    second.resume(*load_checkpoint(tmp_path))
+    second.restore(load_checkpoint(tmp_path))
     second.detector.check = lambda *_: "diverging"
-    assert not second.run()
+    assert not finished(second)
     assert second.record.rollbacks == 1
 
 
@@ -160,7 +162,7 @@ def test_an_error_that_keeps_rising_ends_the_run_with_a_reason(scene, tmp_path):
     verdicts = iter(["running", *["diverging"] * 4])
     stages.detector.check = lambda *_: next(verdicts)
     with pytest.raises(RefinementError) as caught:
-        stages.run()
+        finished(stages)
     assert caught.value.code == "diverged"
 
 
@@ -169,6 +171,6 @@ def test_a_loss_that_is_no_number_ends_the_run_with_a_reason(scene, tmp_path):
     with torch.no_grad():
         stages.optimiser.field.networks[4][:] = float("nan")
     with pytest.raises(RefinementError) as caught:
-        stages.run()
+        finished(stages)
     assert caught.value.code == "diverged"
     assert "step 1" in str(caught.value)

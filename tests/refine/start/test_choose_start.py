@@ -6,13 +6,16 @@ import json
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
+from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refine.start import choose_start as start_module
 from biresnerf.refine.start import frozen_trials
-from biresnerf.refine.start.choose_start import MATCHED_MOBILITY, Start, choose_start
+from biresnerf.refine.start.choose_start import choose_start
+from biresnerf.refine.start.first_step import MATCHED_MOBILITY, pose_mobility, stage_lengths
 from tests.refine.tiny_scene import CPU, tiny_options, tiny_set
 
 VIEWS = 9
@@ -29,14 +32,14 @@ def short(monkeypatch):
     monkeypatch.setattr(frozen_trials, "SAMPLES", 8192)
 
 
-def candidates(dataset, first: np.ndarray, second: np.ndarray) -> list[Start]:
+def candidates(dataset, first: np.ndarray, second: np.ndarray) -> list[InitialPoses]:
     return [
-        Start(first, "given", ("given",) * VIEWS),
-        Start(second, "matches-incremental", ("matches-incremental",) * VIEWS),
+        InitialPoses(first, "given", ("given",) * VIEWS),
+        InitialPoses(second, "matches-incremental", ("matches-incremental",) * VIEWS),
     ]
 
 
-def choose(images, tried: list[Start]) -> Start:
+def choose(images, tried: list[InitialPoses]) -> InitialPoses:
     return choose_start(tried, images, tiny_options(), CPU, 2, lambda: False)
 
 
@@ -47,7 +50,7 @@ def test_good_matches_win_over_noisy_given_poses(scene):
     assert chosen.source == "matches-incremental"
     np.testing.assert_array_equal(chosen.world_from_cam, dataset.world_from_cam)
     assert chosen.trials[1].psnr > chosen.trials[0].psnr + 1
-    np.testing.assert_array_equal(chosen.mobility, np.repeat(MATCHED_MOBILITY, VIEWS).reshape(2, VIEWS))
+    np.testing.assert_array_equal(pose_mobility(chosen), np.repeat(MATCHED_MOBILITY, VIEWS).reshape(2, VIEWS))
 
 
 def test_good_given_poses_win_over_wrong_matches(scene):
@@ -55,7 +58,7 @@ def test_good_given_poses_win_over_wrong_matches(scene):
     wrong = perturb_poses(dataset.world_from_cam, 0.15, seed=2)
     chosen = choose(images, candidates(dataset, dataset.world_from_cam, wrong))
     assert chosen.source == "given"
-    np.testing.assert_array_equal(chosen.mobility, 1.0)
+    np.testing.assert_array_equal(pose_mobility(chosen), 1.0)
     assert [trial.source for trial in chosen.trials] == ["given", "matches-incremental"]
 
 
@@ -77,27 +80,27 @@ def test_stage_1_is_shorter_where_matches_placed_the_cameras_and_its_length_was_
     given, matched = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
     open_options = RefineOptions(preset="fast")
     resolved = open_options.resolved("cpu")
-    assert given.stage_lengths(open_options, resolved) == resolved
-    shorter = matched.stage_lengths(open_options, resolved)
+    assert stage_lengths(given, open_options, resolved) == resolved
+    shorter = stage_lengths(matched, open_options, resolved)
     assert (shorter.coarse_steps_min, shorter.coarse_steps_max) == (400, 800)
     fixed = RefineOptions(preset="fast", coarse_steps_min=500, coarse_steps_max=900)
-    assert matched.stage_lengths(fixed, fixed.resolved("cpu")) == fixed.resolved("cpu")
+    assert stage_lengths(matched, fixed, fixed.resolved("cpu")) == fixed.resolved("cpu")
 
 
-def test_cameras_that_matches_left_out_where_they_placed_most_are_not_sound(scene):
+def test_cameras_that_matches_left_out_where_they_placed_most_are_not_reliable(scene):
     dataset, _ = scene
     matched, guess = "matches-incremental", "neighbours"
     everyone = [False] * 9
-    for sources, doubted, stray in (
+    for sources, guessed, unmatched in (
         ((matched,) * 8 + ("given",), everyone, [*everyone[1:], True]),
         ((matched,) * 2 + ("given",) * 7, everyone, everyone),
         (("given",) * 8 + (guess,), [*everyone[1:], True], everyone),
         ((guess,) * 9, everyone, everyone),
     ):
-        start = Start(dataset.world_from_cam, sources[0], sources)
-        assert start.doubted.tolist() == doubted
-        assert start.stray.tolist() == stray
-        assert start.sound.tolist() == [not (a or b) for a, b in zip(doubted, stray, strict=True)]
+        start = InitialPoses(dataset.world_from_cam, sources[0], sources)
+        assert start.guessed.tolist() == guessed
+        assert start.unmatched.tolist() == unmatched
+        assert start.reliable.tolist() == [not (a or b) for a, b in zip(guessed, unmatched, strict=True)]
 
 
 def test_a_stop_ends_the_trial(scene):
@@ -111,6 +114,7 @@ def test_a_start_survives_its_checkpoint(scene):
     dataset, images = scene
     noisy = perturb_poses(dataset.world_from_cam, 0.15, seed=1)
     chosen = choose(images, candidates(dataset, noisy, dataset.world_from_cam))
-    back = Start.from_json(json.loads(json.dumps(chosen.as_json())))
+    start = TypeAdapter(InitialPoses)
+    back = start.validate_python(json.loads(json.dumps(start.dump_python(chosen))))
     np.testing.assert_array_equal(back.world_from_cam, chosen.world_from_cam)
     assert (back.source, back.sources, back.trials) == (chosen.source, chosen.sources, chosen.trials)

@@ -11,14 +11,13 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.feature_matches import FeatureMatches
 from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.progress import Monitor
 from biresnerf.refine.start import frozen_trials
-from biresnerf.refine.start.choose_start import Start
 from biresnerf.refine.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
-from biresnerf.refine.verdict.judgement import Judgement, judge
+from biresnerf.refine.verdict.judgement import Judgement, judge_poses
 from biresnerf.refine.verdict.pose_evidence import Rig, moved_px
-from biresnerf.refine.verdict.run_input import RunInput
 from biresnerf.refine.views.held_out_views import held_out_views, unseen_rounds, unseen_views
-from tests.refine.tiny_scene import CPU, tiny_optimiser, tiny_options, tiny_set
+from tests.refine.tiny_scene import CPU, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 VIEWS = 14
 OPTIONS = tiny_options(trial_steps=60, samples_per_step=8192)
@@ -63,9 +62,8 @@ def judged(
     """The verdict on a run that was given one set of poses and ended with the other."""
     dataset, images = scene
     optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3])
-    start = Start(given, "given", ("given",) * VIEWS)
-    run = RunInput(with_poses(dataset, given), images, start, [3], matches)
-    return judge(run, optimiser, 2, lambda: False)
+    run = replace(given_scene(with_poses(dataset, given), images, [3]), matches=matches)
+    return judge_poses(run, optimiser, Monitor())
 
 
 def test_true_poses_in_place_of_noisy_ones_are_an_improvement(scene, noisy):
@@ -88,7 +86,7 @@ def test_poses_that_stayed_are_unchanged(scene):
 
 
 def test_matches_alone_tell_good_poses_from_bad_ones(scene, noisy, monkeypatch):
-    monkeypatch.setattr(f"{judge.__module__}.compare_on_unseen_views", lambda *_: None)
+    monkeypatch.setattr(f"{judge_poses.__module__}.compare_on_unseen_views", lambda *_: None)
     truth, matches = scene[0].world_from_cam, true_matches(scene[0])
     better, worse = judged(scene, noisy, truth, matches), judged(scene, truth, noisy, matches)
     assert (better.verdict.verdict, worse.verdict.verdict) == ("improved", "kept_input")

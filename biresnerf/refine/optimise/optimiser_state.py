@@ -1,14 +1,32 @@
-"""The tensors of an optimisation's parts as one flat dictionary, for checkpoints and rollbacks."""
+"""The state of a joint optimisation, as rollbacks and checkpoints keep it: tensors of its parts, and a few numbers."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
+from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 
+class StepState(BaseModel):
+    """The numbers of an optimisation that are not tensors.
+
+    Attributes:
+        switch: the step that stage 2 began at, None before.
+        rays: of the next step.
+        pose_scale: factor of the pose rate, halved by each rollback.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    step_index: int
+    switch: int | None
+    rays: int
+    pose_scale: float
+
+
 class Part(Protocol):
-    """What keeps tensors from step to step."""
+    """A part of the optimisation with tensors of its own."""
 
     def state(self) -> dict[str, Tensor]: ...
     def load_state(self, state: dict[str, Tensor]) -> None: ...
@@ -20,7 +38,7 @@ def state_of(parts: dict[str, Part]) -> dict[str, Tensor]:
 
 
 def load_state_of(parts: dict[str, Part], tensors: dict[str, Tensor]) -> None:
-    """Restore what `state_of` gave; other keys are left alone."""
+    """Restore what `state_of` returned; other keys are ignored."""
     for name, part in parts.items():
         head = f"{name}."
         part.load_state({k.removeprefix(head): v for k, v in tensors.items() if k.startswith(head)})

@@ -1,4 +1,4 @@
-"""What a run works on, once it is known where it starts."""
+"""What a run works on once its initial poses are known."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ import numpy as np
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.feature_matches import FeatureMatches
-from biresnerf.refine.start.choose_start import Start
+from biresnerf.data.seeding.initial_poses import InitialPoses
 
 
 @dataclass(frozen=True, eq=False)
-class RunInput:
-    """The set, its photos, where it starts, which views are kept from the field, and what else is known.
+class Scene:
+    """A set of photos with initial poses.
 
     Attributes:
         dataset: the set, with the poses that the result is compared with.
         images: its photos at the working size.
         start: the poses that the optimisation starts from.
-        held_out: indices of the views that are kept from the field to be scored.
+        held_out: indices of the views that the field is not trained on, to be scored.
         matches: feature matches of the photos, where any were looked for and found.
     """
 
     dataset: Dataset
     images: ImageSet
-    start: Start
+    start: InitialPoses
     held_out: list[int]
     matches: FeatureMatches | None = None
 
     @property
-    def untaught(self) -> list[int]:
-        """Indices of all views that teach the field nothing: those held out, and strays, whose poses are doubtful."""
-        return sorted({*self.held_out, *np.flatnonzero(self.start.stray).tolist()})
+    def excluded_from_training(self) -> list[int]:
+        """Indices of all views that the field is not trained on: held out, or unmatched, so of doubtful pose."""
+        return sorted({*self.held_out, *np.flatnonzero(self.start.unmatched).tolist()})

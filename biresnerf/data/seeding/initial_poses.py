@@ -1,0 +1,72 @@
+"""A complete set of poses that a run could start from, with what found each of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PlainSerializer, PlainValidator
+
+from biresnerf.data.model.dataset import GUESSES
+from biresnerf.report import PoseSource, TrialReport
+
+MATCHED_SOURCES: frozenset[PoseSource] = frozenset({"colmap", "matches-incremental", "matches-global"})
+MOSTLY_MATCHED = 0.8  # share of the cameras from which on feature matches placed most
+GUESSED_MOST = 0.5  # of the cameras: with more guesses there is no field of others to agree with
+
+# Float64 [n, 4, 4]; in JSON a list of lists.
+PoseArray = Annotated[
+    NDArray[np.float64],
+    PlainValidator(lambda value: np.array(value, dtype=np.float64)),
+    PlainSerializer(lambda poses: poses.tolist()),
+]
+
+
+@dataclass(frozen=True, eq=False)
+class InitialPoses:
+    """Poses to start from.
+
+    Attributes:
+        world_from_cam: float64 [n, 4, 4], in the frame of the given poses.
+        source: of the set as a whole.
+        sources: of each pose.
+        trials: how every candidate did in the choice between several; empty if there was only one.
+    """
+
+    world_from_cam: PoseArray
+    source: PoseSource
+    sources: tuple[PoseSource, ...]
+    trials: tuple[TrialReport, ...] = ()
+
+    @property
+    def matched(self) -> NDArray[np.bool_]:
+        """Which poses [n] come from feature matches."""
+        return np.array([source in MATCHED_SOURCES for source in self.sources])
+
+    @property
+    def mostly_matched(self) -> bool:
+        """Whether feature matches placed most cameras."""
+        return bool(self.matched.mean() >= MOSTLY_MATCHED)
+
+    @property
+    def guessed(self) -> NDArray[np.bool_]:
+        """Which poses [n] are guesses from other images; none where most are, as all are equally doubtful then."""
+        guessed = np.array([source in GUESSES for source in self.sources])
+        return guessed if guessed.mean() <= GUESSED_MOST else np.zeros_like(guessed)
+
+    @property
+    def unmatched(self) -> NDArray[np.bool_]:
+        """Which cameras [n] matches left out where they placed most.
+
+        Such a camera must not train the field: one of few photos finds room for itself from any pose, however small
+        its weight (fountain-P11's sixth, 20 degrees off, went unnoticed).
+        """
+        matched = self.matched
+        return ~matched if self.mostly_matched else np.zeros_like(matched)
+
+    @property
+    def reliable(self) -> NDArray[np.bool_]:
+        """Which poses [n] are as good as any of the set."""
+        return ~(self.guessed | self.unmatched)

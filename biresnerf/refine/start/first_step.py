@@ -1,0 +1,76 @@
+"""From initial poses to the optimisation at its first step, and from optimised poses back to the input's frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
+from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
+from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.optimise.methods import METHODS
+from biresnerf.refine.parameters.intrinsics_parameters import lenses_of
+from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
+from biresnerf.refine.scene.scene import Scene
+from biresnerf.refine.scene.scene_depth import matched_depth
+from biresnerf.refine.scene.scene_frame import scene_frame
+
+# Factors of the pose rate, in stage 1 and 2, for cameras placed by matches. They are off by tenths of a degree, and at
+# the full rate the steps alone carry them further before the field can tell: fox, from 0.29 deg, ended 1,500 steps
+# later at 1.03 with the full rate, 0.64 with a fifth of it, 0.28 with these.
+MATCHED_MOBILITY = (0.0, 0.3)
+# Where matches placed most cameras, stage 1 has only to form the field: its lengths shrink to this share.
+MATCHED_COARSE_SHARE = 2 / 3
+
+
+def first_step(scene: Scene, options: ResolvedOptions, device: torch.device, threads: int) -> JointOptimiser:
+    """The optimisation at its first step, in the unit frame of the initial poses."""
+    dataset, images, start = scene.dataset, scene.images, scene.start
+    bodies = rigid_bodies(dataset, options)
+    world_from_cam = bodies.held(start.world_from_cam, dataset.world_from_cam)
+    frame = scene_frame(world_from_cam, images, matched_depth(dataset, world_from_cam, scene.matches))
+    poses = frame.unit_from_world.apply_to_poses(world_from_cam)
+    excluded = scene.excluded_from_training
+    lenses = lenses_of(dataset, images, options.refine_intrinsics, excluded, device, dollies=not bodies.tied)
+    optimiser = JointOptimiser(
+        images, frame, poses, options, excluded, device, threads, pose_mobility(start), bodies, lenses
+    )
+    optimiser.camera_errors.doubt(start.guessed)
+    return optimiser
+
+
+def pose_mobility(start: InitialPoses) -> NDArray[np.float64]:
+    """Each camera's factor of the pose rate [2, n] in stage 1 and stage 2."""
+    return np.where(start.matched[None], np.array(MATCHED_MOBILITY)[:, None], 1.0)
+
+
+def stage_lengths(start: InitialPoses, asked: RefineOptions, resolved: ResolvedOptions) -> ResolvedOptions:
+    """`resolved` with a shorter stage 1 where matches placed most cameras, unless its length was `asked` for."""
+    if not (start.mostly_matched and METHODS[resolved.method].additions):
+        return resolved
+    names = [n for n in ("coarse_steps_min", "coarse_steps_max") if getattr(asked, n) is None]
+    shorter = {name: round(MATCHED_COARSE_SHARE * getattr(resolved, name)) for name in names}
+    return resolved.model_copy(update=shorter)
+
+
+def poses_in_input_frame(
+    dataset: Dataset, optimiser: JointOptimiser
+) -> tuple[NDArray[np.float64], Similarity]:
+    """Refined world_from_cam [n, 4, 4] in the input's frame, and the similarity `input_from_optimised`.
+
+    The optimisation leaves frame and scale free. The similarity that fits the optimised poses to the given ones best
+    fixes them; it is robust to lost cameras unless the method says otherwise. Fixed cameras and rigs leave less free.
+    """
+    world_from_unit = optimiser.frame.unit_from_world.inverse()
+    optimised = world_from_unit.apply_to_poses(optimiser.poses.poses().numpy())
+    given, tied = dataset.world_from_cam, dataset.anchors
+    input_from_optimised = optimiser.bodies.input_from_optimised(optimised, given)
+    if input_from_optimised is None and optimiser.method.robust_frame:
+        input_from_optimised = align_robust(optimised[tied], given[tied], with_rotations=True)
+    elif input_from_optimised is None:
+        input_from_optimised = align_by_spread(optimised[tied], given[tied])
+    carried = input_from_optimised.apply_to_poses(optimised)
+    return optimiser.bodies.restored(carried, given), input_from_optimised

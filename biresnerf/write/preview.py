@@ -1,0 +1,112 @@
+"""Previews of a running refinement: photos, poses and matches while COLMAP works, then poses and a rendered view."""
+
+from __future__ import annotations
+
+from biresnerf.data.formats.simple.poses_json import POSES, write_poses_json
+from biresnerf.data.formats.transforms.write_transforms import write_transforms
+from biresnerf.data.model.atomic_file import write_text
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.refined_set import RefinedSet, refined_set
+from biresnerf.data.photos.area_resize import area_resize
+from biresnerf.data.seeding.seed_poses import Seeding
+from biresnerf.data.seeding.seeding_preview import write_seeding_preview
+from biresnerf.data.seeding.seeding_progress import SeedingProgress
+from biresnerf.data.show.renders import picture_stems
+from biresnerf.data.show.view_file import THUMBNAIL
+from biresnerf.data.show.view_pictures import write_thumbnail
+from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.progress import SEEDING_FROM, Monitor, Progress
+from biresnerf.refine.stages.history import HISTORY
+from biresnerf.refine.stages.two_stages import TwoStages
+from biresnerf.refine.start.first_step import poses_in_input_frame
+from biresnerf.refine.verdict.run_report import run_report
+from biresnerf.refine.views.evaluation import render_view
+from biresnerf.write.output_folder import PREVIEW, REPORT, OutputFolder
+from biresnerf.write.result import described, write_rendered
+
+TRANSFORMS = "transforms.json"
+
+
+def write_preview(folder: OutputFolder, stages: TwoStages) -> tuple[str, ...]:
+    """Write the poses so far, the report on them, and one view at half the working size.
+
+    Returns the files, relative to the output folder.
+    """
+    dataset, optimiser, path = stages.scene.dataset, stages.optimiser, folder.preview
+    world_from_cam, _ = poses_in_input_frame(dataset, optimiser)
+    report = run_report(stages, [], None, "partial")
+    refined = optimiser.lenses.refined(dataset)
+    write_transforms(refined, world_from_cam, path / TRANSFORMS)
+    write_poses_json(described(refined, world_from_cam, report), path / POSES)
+    write_text(path / REPORT, report.model_dump_json(indent=2))
+    names = [POSES, REPORT, TRANSFORMS]
+    if stages.history.path.is_file():
+        write_text(path / HISTORY, stages.history.path.read_text("utf-8").rstrip("\n"))
+        names.append(HISTORY)
+    return tuple(f"{PREVIEW}/{name}" for name in (*names, *_write_pictures(folder, stages)))
+
+
+def _write_pictures(folder: OutputFolder, stages: TwoStages) -> list[str]:
+    """Names of the pictures of one view, held out where there is one, and of its thumbnail."""
+    scene, optimiser = stages.scene, stages.optimiser
+    view = (scene.held_out or [0])[0]
+    halves = [
+        camera.resized(max(1, camera.width // 2), max(1, camera.height // 2))
+        for camera in optimiser.lenses.refined_working(scene.images.cameras)
+    ]
+    intrinsics = Intrinsics.from_cameras(halves).to(optimiser.device)
+    pose = optimiser.poses.matrices()[view].detach()
+    rendered = render_view(optimiser, pose, view, intrinsics, as_photo=True)
+    photo = scene.images.image(view)
+    small = area_resize(photo, halves[view].width, halves[view].height) / 255
+    pictures = write_rendered(folder.preview, picture_stems(scene.dataset.names)[view], rendered, small)
+    return [path.name for path in (*pictures, write_thumbnail(photo, folder.preview / THUMBNAIL))]
+
+
+class SeedingPreview:
+    """Shows and reports what `seed_poses` finds; in a `with` block, which removes the files after an error.
+
+    Args:
+        dataset: as it was given.
+    """
+
+    def __init__(self, dataset: Dataset, folder: OutputFolder, monitor: Monitor) -> None:
+        self._dataset, self._folder, self._monitor = dataset, folder, monitor
+        self._found: SeedingProgress | None = None  # as long as COLMAP is not asked
+
+    def __enter__(self) -> SeedingPreview:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:
+            self._folder.remove_preview()
+
+    def __call__(self, found: SeedingProgress) -> None:
+        """More is known."""
+        self._found = found
+        given = self._dataset.posed.all()
+        message = "comparing the poses with feature matches" if given else "COLMAP looks for poses"
+        if found.matches:
+            message += f": {len(found.matches)} pairs of photos match"
+        elif found.features:
+            message += f": features of {len(found.features)} of {len(self._dataset)} photos found"
+        poses = refined_set(self._dataset, self._dataset.world_from_cam) if given else None
+        self._show(found, poses, message)
+
+    def show_candidate(self, seeding: Seeding) -> None:
+        """The first poses to start from, where COLMAP was asked: others may be tried before they move."""
+        if self._found is None:
+            return
+        first = seeding.candidates[0]
+        poses = refined_set(
+            seeding.dataset,
+            first.world_from_cam,
+            given=[frame.world_from_cam for frame in self._dataset.frames],
+            pose_sources=first.sources,
+        )
+        self._show(self._found, poses, f"{len(poses)} poses to start from")
+
+    def _show(self, found: SeedingProgress, poses: RefinedSet | None, message: str) -> None:
+        paths = write_seeding_preview(self._dataset, found, self._folder.preview, poses)
+        shown = tuple(f"{PREVIEW}/{path.name}" for path in paths)
+        self._monitor.report(Progress(stage="seeding", fraction=SEEDING_FROM, message=message, preview=shown))

@@ -1,0 +1,171 @@
+"""The result of a run: poses in all forms asked for, pictures, view.json, and the report."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.formats.codec import WriteContext
+from biresnerf.data.formats.result_formats import write_result_formats
+from biresnerf.data.formats.simple.poses_json import POSES
+from biresnerf.data.formats.transforms.write_transforms import transforms_notes
+from biresnerf.data.model.atomic_file import write_text
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.refined_set import RefinedSet, refined_set
+from biresnerf.data.points.refined_points import with_points_of
+from biresnerf.data.show.renders import picture_stems, write_orbit, write_view
+from biresnerf.data.show.view_file import THUMBNAIL, ShownPictures, ShownView, ViewFile, write_view_file
+from biresnerf.data.show.view_pictures import write_contact_sheet, write_points, write_thumbnail
+from biresnerf.geometry.similarity import Similarity
+from biresnerf.progress import EXPORTING_FROM, Progress
+from biresnerf.refine.scene.scene import Scene
+from biresnerf.refine.stages.two_stages import TwoStages
+from biresnerf.refine.start.first_step import poses_in_input_frame
+from biresnerf.refine.verdict.evaluate import Evaluation
+from biresnerf.refine.views.evaluation import RenderedView, ViewScore
+from biresnerf.refine.views.shown_views import Points
+from biresnerf.report import PointsReport, Report
+from biresnerf.viewer.report_html import write_report_html
+from biresnerf.write.output_folder import REPORT, OutputFolder
+
+logger = logging.getLogger(__name__)
+
+CONFIG = "config.json"
+RENDERS, ORBIT = "renders", "renders/orbit.mp4"
+REFINED = "refined"
+SOLID = 0.5  # opacity from which a depth means something
+
+
+def write_result(folder: OutputFolder, stages: TwoStages, evaluation: Evaluation, report: Report) -> Report:
+    """Write poses in the input's frame, in the input's form and in others, the options, and last the report.
+
+    Where the verdict keeps the input's poses, those are written, and the refined ones beside them in refined/. Once the
+    result is complete, what only an unfinished run needs is removed.
+
+    Returns the report with notes on what was written.
+
+    Raises:
+        Interrupted: stopped before the last export of a complete result was written.
+    """
+    complete = report.state == "complete"
+    if complete:
+        stages.monitor.report(Progress(stage="exporting", fraction=EXPORTING_FROM))
+    scene, optimiser, path = stages.scene, stages.optimiser, folder.path
+    write_text(path / CONFIG, optimiser.options.model_dump_json(indent=2))
+    refined, input_from_optimised = poses_in_input_frame(scene.dataset, optimiser)
+    refined_dataset = optimiser.lenses.refined(scene.dataset)
+    returned, returned_dataset, poses, moved = refined, refined_dataset, POSES, None
+    if report.verdict is not None and report.verdict.returned == "input":
+        returned, returned_dataset = scene.dataset.world_from_cam, scene.dataset
+        if np.isfinite(refined).all():
+            _, moved = _write_poses(path / REFINED, scene, refined_dataset, refined, report)
+            poses = f"{REFINED}/{POSES}"
+    # A run that is stopped must end soon: it leaves large exports out.
+    exports, should_stop = (
+        (optimiser.options.exports, stages.monitor.should_stop) if complete else ((), _never)
+    )
+    report, result = _write_poses(path, scene, returned_dataset, returned, report, exports, should_stop)
+    surface = evaluation.surface(optimiser.frame.unit_from_world, input_from_optimised)
+    _write_view_file(path, scene, evaluation, moved or result, surface, poses)
+    notes = write_report_html(path, report)
+    for note in notes:
+        logger.warning("%s", note)
+    report = report.model_copy(update={"warnings": report.warnings + notes})
+    write_text(path / REPORT, report.model_dump_json(indent=2))
+    if complete:
+        folder.clean_up()
+        stages.monitor.report(Progress(stage="exporting", fraction=1.0, eta_s=0.0))
+    return report
+
+
+def _never() -> bool:
+    return False
+
+
+class ResultPictures:
+    """Writes what is rendered at the end to renders/."""
+
+    def __init__(self, folder: OutputFolder, scene: Scene) -> None:
+        self._folder, self._scene = folder.path, scene
+
+    def write_view(self, score: ViewScore) -> ShownView:
+        """Render, photo, difference and depth of one view."""
+        photo = self._scene.images.image(score.image)
+        stem = picture_stems(self._scene.dataset.names)[score.image]
+        files = write_rendered(self._folder / RENDERS, stem, score.view, photo)
+        names = {path.stem.rpartition("_")[2]: path.relative_to(self._folder).as_posix() for path in files}
+        return ShownView(
+            image=score.image,
+            held_out=score.image in self._scene.held_out,
+            width=photo.shape[1],
+            height=photo.shape[0],
+            psnr=score.psnr,
+            pictures=ShownPictures.model_validate(names),
+        )
+
+    def write_orbit(self, frames: Iterator[NDArray[np.generic]]) -> None:
+        """Film the frames."""
+        write_orbit(self._folder / ORBIT, frames)
+
+
+def write_rendered(folder: Path, stem: str, view: RenderedView, photo: NDArray[np.generic]) -> list[Path]:
+    """The pictures of a rendered view beside its photo [h, w, 3]; depth is left out where nothing solid is seen."""
+    depth = np.where(view.opacity > SOLID, view.depth, np.nan)
+    return write_view(folder, stem, render=view.colour, photo=photo, depth=depth)
+
+
+def described(dataset: Dataset, world_from_cam: NDArray[np.float64], report: Report) -> RefinedSet:
+    """The set at poses [n, 4, 4], with what the report says of each image."""
+    tie = report.input_from_optimised
+    return refined_set(
+        dataset,
+        world_from_cam,
+        similarity=Similarity(tie.scale, np.array(tie.rotation), np.array(tie.translation)),
+        pose_sources=[image.pose_source for image in report.images],
+        flags=[image.flags for image in report.images],
+    )
+
+
+def _write_poses(
+    folder: Path,
+    scene: Scene,
+    dataset: Dataset,
+    world_from_cam: NDArray[np.float64],
+    report: Report,
+    exports: Sequence[str] = (),
+    should_stop: Callable[[], bool] = _never,
+) -> tuple[Report, RefinedSet]:
+    """Write poses [n, 4, 4] in the formats of every result, in the input's own and in the exports.
+
+    ``dataset`` is the input, with the refined lenses where those are returned.
+
+    Returns the report with notes on them, and the set as written.
+    """
+    refined = described(dataset, world_from_cam, report)
+    refined = with_points_of(refined, dataset.source.colmap, scene.matches, scene.images)
+    notes = write_result_formats(refined, folder, exports, WriteContext(dataset, should_stop=should_stop))
+    notes += transforms_notes(dataset, world_from_cam)
+    points = PointsReport(source=refined.points_source, count=len(refined.model.points))
+    return report.model_copy(update={"points": points, "warnings": report.warnings + notes}), refined
+
+
+def _write_view_file(
+    folder: Path, scene: Scene, evaluation: Evaluation, refined: RefinedSet, surface: Points, poses: str
+) -> None:
+    """view.json and what it lists beside the renders; ``poses`` is the file that holds the poses of ``refined``."""
+    images, sparse = scene.images, refined.model.points
+    write_thumbnail(images.image((scene.held_out or [0])[0]), folder / THUMBNAIL)
+    layers = [(refined.points_source, sparse.xyz, sparse.rgb), ("field", *surface)]
+    view = ViewFile(
+        poses=poses,
+        thumbnail=THUMBNAIL,
+        contact_sheet=write_contact_sheet(images, folder),
+        views=tuple(evaluation.views),
+        points=write_points(layers, folder),
+        orbit=ORBIT if (folder / ORBIT).is_file() else None,
+    )
+    write_view_file(view, folder)
