@@ -16,7 +16,7 @@ from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.pipeline import refine_poses
 from tests.data.points.test_refined_points import seen_model
-from tests.refine.tiny_scene import tiny_options
+from tests.refine.tiny_scene import tiny_run
 
 
 def test_a_text_model_comes_back_in_both_forms_with_its_ids_and_points_of_the_refined_cameras(tmp_path):
@@ -42,7 +42,7 @@ def test_a_text_model_comes_back_in_both_forms_with_its_ids_and_points_of_the_re
     points = replace(exact.points, track_image_ids=10 * exact.points.track_image_ids, xyz=xyz)
     write_colmap_text(replace(exact, images=images, points=points), scene / "sparse/0")
 
-    options = tiny_options(start="given", verdict=False, exports=("kitti", "pinhole"))
+    options = tiny_run(start="given", verdict=False, exports=("kitti", "pinhole"))
     report = refine_poses(scene, tmp_path / "out", options)
     model = read_colmap_model(tmp_path / "out/colmap/sparse/0")
     text = read_colmap_model(tmp_path / "out/colmap/sparse_txt/0")

@@ -20,7 +20,7 @@ from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.pipeline import refine_poses
-from tests.refine.tiny_scene import tiny_options
+from tests.refine.tiny_scene import tiny_run
 
 FIXED = ("./train/r_1", "train/r_4.png")
 
@@ -35,7 +35,7 @@ def noisy(tmp_path_factory):
 
 
 def test_fixed_cameras_keep_every_bit_in_every_file_and_the_others_move(noisy, tmp_path):
-    refine_poses(noisy, tmp_path, tiny_options(start="given", fixed=FIXED, verdict=False))
+    refine_poses(noisy, tmp_path, tiny_run(start="given", fixed=FIXED, verdict=False))
     given = json.loads((noisy.root / "transforms.json").read_text())["frames"]
     after = json.loads((tmp_path / "transforms.json").read_text())["frames"]
     same = [i for i, (a, b) in enumerate(zip(given, after, strict=True)) if a == b]
@@ -82,7 +82,7 @@ def as_rig(dataset):
 
 def test_a_rig_stays_as_it_is_bolted_and_moves_as_one(noisy, tmp_path):
     dataset, before = as_rig(noisy)
-    refine_poses(dataset, tmp_path, tiny_options(start="given", verdict=False))
+    refine_poses(dataset, tmp_path, tiny_run(start="given", verdict=False))
     after = read_colmap_model(tmp_path / "colmap/sparse/0")
     assert list(after.frames) == list(before.frames)
     assert np.array_equal(

@@ -14,10 +14,10 @@ from biresnerf.errors import Interrupted
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
 from biresnerf.report import Report
-from tests.refine.tiny_scene import tiny_options
+from tests.refine.tiny_scene import tiny_run
 
 # So few steps at so high a rate can only spoil true poses.
-OPTIONS = tiny_options(start="given", trial_steps=40, pose_rate=0.02, pose_rate_final=0.02)
+OPTIONS = tiny_run(start="given", trial_steps=40, pose_rate=0.02, pose_rate_final=0.02)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from biresnerf.data.photos.images import ImageSet, load_images
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import Interrupted
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.scene.scene_frame import scene_frame
@@ -22,7 +22,7 @@ from biresnerf.refine.stages.two_stages import TwoStages
 CPU = torch.device("cpu")
 
 
-def tiny_options(**changed) -> RefineOptions:
+def tiny_run(**changed) -> RefineOptions:
     """Options of a run of 40 steps: stage 2 from step 20."""
     values = {
         "preset": "fast",
@@ -43,7 +43,12 @@ def tiny_options(**changed) -> RefineOptions:
         "holdout": 1,
         "orbit_frames": 0,
     }
-    return RefineOptions(**{**values, **changed}).resolved("cpu")
+    return RefineOptions(**{**values, **changed})
+
+
+def tiny_options(**changed) -> ResolvedOptions:
+    """The same, resolved."""
+    return tiny_run(**changed).resolved("cpu")
 
 
 def tiny_set(folder: Path, views: int = 7, size: int = 24) -> tuple[Dataset, ImageSet]:

@@ -22,7 +22,7 @@ from biresnerf.refine.optimise.methods import METHODS
 from biresnerf.refine.stages.checkpoint import load_checkpoint
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.report import Report
-from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
+from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_run, tiny_set
 
 SMALL_GRID = {
     "reconstruction_levels": 8,
@@ -42,9 +42,9 @@ EACH = pytest.mark.parametrize("method", list(METHODS))
 
 
 def small_options(method: str, **changed) -> RefineOptions:
-    """As `tiny_options`, 20 steps with the switch after 10, for a method."""
+    """As `tiny_run`, 20 steps with the switch after 10, for a method."""
     steps = {"steps": 20, "coarse_steps_min": 10, "coarse_steps_max": 10, "max_image_size": 16}
-    return tiny_options(method=method, **{**steps, **SMALL[method], **changed})
+    return tiny_run(method=method, **{**steps, **SMALL[method], **changed})
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -100,7 +100,7 @@ def test_progress_tells_the_stages_a_method_has_and_never_falls(run):
 @EACH
 def test_a_stopped_and_resumed_run_ends_bit_for_bit_as_an_uninterrupted_one(tmp_path, method):
     dataset, images = tiny_set(tmp_path / "scene", views=4, size=16)
-    options = small_options(method)
+    options = small_options(method).resolved("cpu")
 
     def stages(stop_at: int | None) -> TwoStages:
         optimiser = tiny_optimiser(dataset, images, options, held_out=[1])
@@ -129,7 +129,9 @@ def test_held_out_photos_never_reach_the_field(tmp_path, method):
     for shade in (0, 255):
         photos = images.pixels.copy()
         photos[images.offsets[2] : images.offsets[3]] = shade
-        optimiser = tiny_optimiser(dataset, replace(images, pixels=photos), small_options(method), [2])
+        optimiser = tiny_optimiser(
+            dataset, replace(images, pixels=photos), small_options(method).resolved("cpu"), [2]
+        )
         for _ in range(
             2
         ):  # the third has as many rays as the second's samples allow, also those of held-out photos
@@ -143,7 +145,7 @@ def test_held_out_photos_never_reach_the_field(tmp_path, method):
 def test_a_camera_that_strays_from_a_formed_field_comes_back(tmp_path, method):
     dataset, images = tiny_set(tmp_path, views=10)
     steps = {"steps": 400, "coarse_steps_min": 400, "coarse_steps_max": 400, "max_image_size": 24}
-    optimiser = tiny_optimiser(dataset, images, small_options(method, holdout=0, **steps))
+    optimiser = tiny_optimiser(dataset, images, small_options(method, holdout=0, **steps).resolved("cpu"))
     optimiser.pose_scale = 0.0
     for _ in range(150):
         optimiser.step()
