@@ -12,10 +12,18 @@ class Fault(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    code: str = Field(description="Stable machine-readable name in snake_case, such as `pose_file_invalid`.")
-    detail: str = Field(description="What is wrong, in one sentence.")
-    where: str = Field("", description="The file or entry at fault, and the field in it where there is one.")
-    hint: str = Field("", description="What to do about it.")
+    code: str = Field(description="Stable machine-readable name in snake_case.", examples=["unsafe_path"])
+    detail: str = Field(description="What is wrong, in one sentence.", examples=["The name has a part `..`."])
+    where: str = Field(
+        "",
+        description="The file or entry at fault, and the field in it where there is one.",
+        examples=["../evil.png"],
+    )
+    hint: str = Field(
+        "",
+        description="What to do about it.",
+        examples=["Pack the archive with relative names inside one folder."],
+    )
 
     def __str__(self) -> str:
         return " ".join(part for part in (self.where and f"{self.where}:", self.detail, self.hint) if part)

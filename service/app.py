@@ -18,7 +18,7 @@ from biresnerf import __version__
 from biresnerf.errors import FaultError
 from service import web_page
 from service.docs import docs_page
-from service.docs.openapi import describe
+from service.docs.api_description import describe
 from service.http.access import Access, say_who_is_let_in
 from service.http.dependencies import Service
 from service.http.metrics import WebMetrics
@@ -110,7 +110,7 @@ def create_app(settings: Settings) -> FastAPI:
     _answer_with_problems(app)
     for router in _ROUTERS:
         app.include_router(router)
-    describe(app)
+    describe(app, _ROUTERS)
     return app
 
 

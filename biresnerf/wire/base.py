@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 class Record(BaseModel):
     """Base of everything that crosses a process border."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    # A message holds every field, those with a default too: the schemas of answers call them required.
+    model_config = ConfigDict(frozen=True, extra="forbid", json_schema_serialization_defaults_required=True)
 
 
 LABELS_MOST, LABEL_LENGTH = 20, 100

@@ -28,17 +28,19 @@ class ManifestEntry(Record):
 class CheckReport(Record):
     """What the check of a dataset found."""
 
-    images: int
-    with_pose: int
-    without_pose: int
-    poses: Literal["missing", "partial", "given"]
-    cameras: int
-    camera_models: tuple[str, ...] = Field(description="COLMAP's names.")
-    intrinsics: tuple[IntrinsicsSource, ...] = Field(description="Where those of the cameras come from.")
-    format: str
-    masks: int
+    images: int = Field(examples=[60])
+    with_pose: int = Field(examples=[60])
+    without_pose: int = Field(examples=[0])
+    poses: Literal["missing", "partial", "given"] = Field(examples=["given"])
+    cameras: int = Field(examples=[1])
+    camera_models: tuple[str, ...] = Field(examples=[["OPENCV"]], description="COLMAP's names.")
+    intrinsics: tuple[IntrinsicsSource, ...] = Field(
+        examples=[["given"]], description="Where those of the cameras come from."
+    )
+    format: str = Field(examples=["nerfstudio"])
+    masks: int = Field(examples=[0])
     transparency: bool = Field(description="Whether images have an alpha channel.")
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = Field(examples=[[]])
 
 
 class DatasetLinks(Record):
@@ -60,20 +62,20 @@ class DatasetLinks(Record):
 class DatasetView(Record):
     """A set of uploaded files."""
 
-    id: str
+    id: str = Field(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
     tenant: str = Field("local", description="Whose it is.")
-    name: str
-    state: DatasetState
-    files: int = 0
-    bytes: int = 0
+    name: str = Field(examples=["kitchen"])
+    state: DatasetState = Field(examples=["ready"])
+    files: int = Field(0, examples=[61])
+    bytes: int = Field(0, examples=[48_211_034])
     missing: tuple[str, ...] = Field((), description="Manifest paths not received yet.")
     report: CheckReport | None = Field(None, description="What its check found; none unless it is ready.")
-    error: JobError | None = None
+    error: JobError | None = Field(None, examples=[None])
     created_at: datetime
     expires_at: datetime | None = Field(
         None, description="When its files go unless it is used; none while a job uses it, or never."
     )
-    revision: int = 0
+    revision: int = Field(0, examples=[63])
     links: DatasetLinks = Field(default_factory=DatasetLinks.of)
 
 
@@ -102,9 +104,9 @@ class NewDataset(Record):
 class FileView(Record):
     """One file of a dataset."""
 
-    path: str
-    size: int
-    sha256: str
+    path: str = Field(examples=["images/0001.jpg"])
+    size: int = Field(examples=[803_120])
+    sha256: str = Field(examples=["9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"])
     created_at: datetime
 
 
@@ -118,15 +120,17 @@ class FileList(Record):
 class UploadView(Record):
     """Bytes on their way into a dataset."""
 
-    id: str
-    dataset_id: str
+    id: str = Field(examples=["up_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
+    dataset_id: str = Field(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
     kind: UploadKind
     path: str | None = Field(None, description="The file's path; null for an archive.")
-    size: int
+    size: int = Field(examples=[48_211_034])
     sha256: str | None = None
     state: UploadState
-    received: int = Field(description="Bytes that are safe; the next byte to send has this number.")
-    error: JobError | None = Field(None, description="Why it was rejected.")
+    received: int = Field(
+        examples=[16_777_216], description="Bytes that are safe; the next byte to send has this number."
+    )
+    error: JobError | None = Field(None, examples=[None], description="Why it was rejected.")
     created_at: datetime
     expires_at: datetime = Field(description="It is given up then, unless it goes on.")
 
@@ -153,7 +157,7 @@ class SignedUpload(Record):
     """Where to send one file: the bytes as the body of a PUT, without a key."""
 
     upload: UploadView
-    url: str
+    url: str = Field(examples=["https://s3.example.org/bucket/datasets/…/content?X-Amz-Signature=…"])
 
 
 class SignedUploads(Record):

@@ -43,10 +43,10 @@ WantedStage = Literal["auto", "seeding", "coarse"]
 class JobProgress(Record):
     """How far the running attempt is. ``fraction`` never falls within one attempt."""
 
-    fraction: float = Field(0.0, ge=0.0, le=1.0)
-    step: int = 0
-    steps_total: int = 0
-    eta_s: float | None = None
+    fraction: float = Field(0.0, examples=[0.31], ge=0.0, le=1.0)
+    step: int = Field(0, examples=[620])
+    steps_total: int = Field(0, examples=[2000])
+    eta_s: float | None = Field(None, examples=[71.5])
 
 
 class JobLinks(Record):
@@ -76,19 +76,19 @@ class JobLinks(Record):
 class JobView(Record):
     """A job as clients see it. ``revision`` grows with every change (use it as a weak ETag)."""
 
-    id: str
+    id: str = Field(examples=["job_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
     tenant: str = Field("local", description="Whose it is.")
     kind: JobKind = Field("refine", description="`export` writes the result of `parent` in further forms.")
     parent: str | None = Field(None, description="Of an export: the job whose result it writes.")
     forked_from: str | None = Field(None, description="The job that this one started from.")
     forked_stage: ReusableStage | None = Field(None, description="Whose work of that job it took over.")
-    dataset_id: str
-    state: JobState
-    stage: Stage | None = None
+    dataset_id: str = Field(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
+    state: JobState = Field(examples=["running"])
+    stage: Stage | None = Field(None, examples=["coarse"])
     progress: JobProgress = JobProgress()
     priority: PriorityName = "normal"
     queue_position: int | None = Field(None, description="1 is next; none unless queued.")
-    attempt: int = 0
+    attempt: int = Field(0, examples=[1])
     cancel_requested: bool = False
     created_at: datetime
     started_at: datetime | None = None
@@ -96,9 +96,12 @@ class JobView(Record):
     expires_at: datetime | None = Field(
         None, description="When its files go, once it is over; none where they are kept for ever."
     )
-    options: dict[str, Any] = Field(description="RefineOptions as requested; of an export, its formats.")
+    options: dict[str, Any] = Field(
+        examples=[{"preset": "fast"}], description="RefineOptions as requested; of an export, its formats."
+    )
     resolved_options: dict[str, Any] | None = Field(
         None,
+        examples=[{"preset": "fast", "steps": 3000, "device": "cpu"}],
         description="ResolvedOptions: every option as the latest attempt used it, filled in from preset, method and "
         "the worker's device. Null until the job runs.",
     )
@@ -108,18 +111,18 @@ class JobView(Record):
     partial: bool = Field(
         False, description="The files are those of a job that was stopped: its best poses until then."
     )
-    metrics: dict[str, float] = Field({})
+    metrics: dict[str, float] = Field({}, examples=[{"loss": 0.012, "psnr": 19.2}])
     message: str = ""
     verdict: VerdictName | None = Field(
         None,
         description="Whether refinement helped, once the job has succeeded; the report has the evidence.",
     )
-    error: JobError | None = None
+    error: JobError | None = Field(None, examples=[None])
     thumbnail: str | None = Field(
         None, description="The artifact that is a small picture of it; while it runs, the latest preview's."
     )
-    labels: dict[str, str] = Field({})
-    revision: int = 0
+    labels: dict[str, str] = Field({}, examples=[{"run": "a"}])
+    revision: int = Field(0, examples=[17])
     links: JobLinks = Field(default_factory=JobLinks.of)
 
     @property

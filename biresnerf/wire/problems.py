@@ -21,31 +21,11 @@ class FieldProblem(BaseModel):
 class Problem(Fault):
     """An error as RFC 9457 has it, with a stable `code`."""
 
-    model_config = ConfigDict(
-        json_schema_extra={
-            "examples": [
-                {
-                    "type": "urn:biresnerf:problem:unsafe_path",
-                    "title": "A file name is not safe",
-                    "status": 422,
-                    "detail": "The name has a part `..`.",
-                    "instance": "/v1/datasets/ds_01/archive",
-                    "code": "unsafe_path",
-                    "request_id": "5f1c0d9e6a0b4a3c",
-                    "retryable": False,
-                    "where": "../evil.png",
-                    "hint": "Pack the archive with relative names inside one folder.",
-                    "errors": [],
-                }
-            ]
-        },
-    )
-
-    type: str
-    title: str
-    status: int
-    instance: str | None = None
-    request_id: str | None = None
+    type: str = Field(examples=["urn:biresnerf:problem:unsafe_path"])
+    title: str = Field(examples=["A file name is not safe"])
+    status: int = Field(examples=[422])
+    instance: str | None = Field(None, examples=["/v1/datasets/ds_01/archive"])
+    request_id: str | None = Field(None, examples=["5f1c0d9e6a0b4a3c"])
     retryable: bool = False
     errors: list[FieldProblem] = Field(default_factory=list)
 

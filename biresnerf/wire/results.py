@@ -13,10 +13,13 @@ from biresnerf.wire.base import Record
 class ResultFile(Record):
     """One file of a result, or the log of a failed job."""
 
-    name: str = Field(description="Path relative to the result, for example renders/orbit.mp4.")
-    size: int
-    sha256: str
-    media_type: str
+    name: str = Field(
+        examples=["transforms.json"],
+        description="Path relative to the result, for example renders/orbit.mp4.",
+    )
+    size: int = Field(examples=[41_305])
+    sha256: str = Field(examples=["9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"])
+    media_type: str = Field(examples=["application/json"])
 
 
 class ArtifactView(ResultFile):
@@ -25,7 +28,7 @@ class ArtifactView(ResultFile):
     preview: bool = Field(
         False, description="It shows a job that is not over; another one will take its place."
     )
-    href: str
+    href: str = Field(examples=["/v1/jobs/job_01JD8Y3V1QKZ5M0C7W2N4T6XAB/artifacts/transforms.json"])
 
 
 class ArtifactList(Record):
@@ -37,7 +40,9 @@ class ArtifactList(Record):
 class ImageRow(ImageReport):
     """One image, and how much better its photo was predicted from the refined poses."""
 
-    delta_psnr: float | None = Field(None, description="trial_psnr_after - trial_psnr_before.")
+    delta_psnr: float | None = Field(
+        None, examples=[3.5], description="trial_psnr_after - trial_psnr_before."
+    )
 
 
 class ImageList(Record):
@@ -62,6 +67,10 @@ class NewShare(Record):
 class ShareView(Record):
     """A link to one file that needs no key."""
 
-    name: str
-    href: str
+    name: str = Field(examples=["transforms.json"])
+    href: str = Field(
+        examples=[
+            "/v1/shared/job_01JD8Y3V1QKZ5M0C7W2N4T6XAB/transforms.json?expires=1795291200&signature=kq0h…"
+        ]
+    )
     expires_at: datetime

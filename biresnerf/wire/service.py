@@ -15,15 +15,21 @@ from biresnerf.wire.jobs import JobState, PriorityName
 class TenantShare(Record):
     """What a tenant may use and what it uses. A limit of 0 is none."""
 
-    id: str
-    weight: float = Field(description="Share of the slots where tenants wait for them; 1 is usual.")
-    top_priority: PriorityName = Field(description="The highest priority its jobs may ask for.")
-    max_running: int = Field(description="Jobs at the same time.")
-    max_queued: int = Field(description="Jobs that wait.")
-    max_stored_bytes: int = Field(description="Bytes of datasets, uploads and results together.")
-    running: int
-    queued: int
-    stored_bytes: int
+    id: str = Field(examples=["anna"])
+    weight: float = Field(
+        examples=[1.0], description="Share of the slots where tenants wait for them; 1 is usual."
+    )
+    top_priority: PriorityName = Field(
+        examples=["normal"], description="The highest priority its jobs may ask for."
+    )
+    max_running: int = Field(examples=[2], description="Jobs at the same time.")
+    max_queued: int = Field(examples=[100], description="Jobs that wait.")
+    max_stored_bytes: int = Field(
+        examples=[107_374_182_400], description="Bytes of datasets, uploads and results together."
+    )
+    running: int = Field(examples=[1])
+    queued: int = Field(examples=[2])
+    stored_bytes: int = Field(examples=[1_288_490_188])
 
 
 class OptionsView(Record):
@@ -33,34 +39,36 @@ class OptionsView(Record):
     `usual`, `expert` or `research`.
     """
 
-    json_schema: dict[str, Any]
+    json_schema: dict[str, Any] = Field(
+        examples=[{"type": "object", "properties": {"steps": {"type": "integer"}}}]
+    )
     presets: dict[PresetName, ResolvedOptions] = Field(description="As resolved by a worker without a GPU.")
     presets_on_gpu: dict[PresetName, ResolvedOptions] = Field(
-        description="As resolved by a worker with a GPU."
+        examples=[{}], description="As resolved by a worker with a GPU."
     )
 
 
 class SizeLimits(Record):
     """What the service takes."""
 
-    max_files: int
-    max_file_bytes: int
-    max_dataset_bytes: int
-    max_archive_bytes: int
-    max_unpacked_bytes: int
-    max_archive_ratio: float
-    job_timeout_s: float
-    check_timeout_s: float
+    max_files: int = Field(examples=[1000])
+    max_file_bytes: int = Field(examples=[67_108_864])
+    max_dataset_bytes: int = Field(examples=[8_589_934_592])
+    max_archive_bytes: int = Field(examples=[8_589_934_592])
+    max_unpacked_bytes: int = Field(examples=[21_474_836_480])
+    max_archive_ratio: float = Field(examples=[200.0])
+    job_timeout_s: float = Field(examples=[7200.0])
+    check_timeout_s: float = Field(examples=[900.0])
 
 
 class Info(Record):
     """What this service is."""
 
     name: Literal["biresnerf"] = "biresnerf"
-    version: str
+    version: str = Field(examples=["0.1.0"])
     limits: SizeLimits
-    archives: list[str]
-    job_counts: dict[JobState, int]
+    archives: list[str] = Field(examples=[["application/zip", "application/x-tar", "application/gzip"]])
+    job_counts: dict[JobState, int] = Field(examples=[{"queued": 2, "running": 1, "succeeded": 40}])
     share: TenantShare = Field(description="What you may use, and what you use. A limit of 0 is none.")
 
 

@@ -72,13 +72,13 @@ class WebhookLinks(Record):
 class WebhookView(Record):
     """Who hears of what. The secret is told once, when it is made."""
 
-    id: str
-    tenant: str
-    url: str
+    id: str = Field(examples=["wh_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
+    tenant: str = Field(examples=["local"])
+    url: str = Field(examples=["https://hooks.example.org/biresnerf"])
     description: str = ""
-    events: tuple[WebhookEvent, ...]
+    events: tuple[WebhookEvent, ...] = Field(examples=[["job.succeeded", "job.failed"]])
     job_id: str | None = Field(None, description="Hears of this job only, and goes with it.")
-    enabled: bool
+    enabled: bool = Field(examples=[True])
     disabled_why: str | None = Field(None, description="Why the service switched it off, where it did.")
     failing_since: datetime | None = Field(None, description="No delivery has succeeded since.")
     previous_secret_until: datetime | None = Field(
@@ -91,10 +91,10 @@ class WebhookView(Record):
 class WebhookAttempt(Record):
     """One try to deliver: when, how long it took, and the status that came back, or why none did."""
 
-    number: int
+    number: int = Field(examples=[1])
     at: datetime
-    seconds: float
-    status: int | None = None
+    seconds: float = Field(examples=[0.412])
+    status: int | None = Field(None, examples=[204])
     error: str | None = None
 
 
@@ -114,14 +114,17 @@ class DeliveryLinks(Record):
 class DeliveryView(Record):
     """One message to one webhook; ``id`` is what the receiver finds in the header `webhook-id`."""
 
-    id: str
-    webhook_id: str
-    event: str
-    state: DeliveryState
+    id: str = Field(examples=["msg_5f1c0d9e6a0b4a3c8d7e6f5a4b3c2d1e"])
+    webhook_id: str = Field(examples=["wh_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
+    event: str = Field(examples=["webhook.test"])
+    state: DeliveryState = Field(examples=["delivered"])
     next_attempt_at: datetime | None = Field(None, description="None unless pending.")
     created_at: datetime
     finished_at: datetime | None = None
-    body: str = Field(description="The message, byte for byte.")
+    body: str = Field(
+        examples=['{"type": "webhook.test", "timestamp": "2026-11-21T19:00:00Z", "data": {}}'],
+        description="The message, byte for byte.",
+    )
     attempts: tuple[WebhookAttempt, ...] = ()
     links: DeliveryLinks = Field(default_factory=DeliveryLinks.of)
 

@@ -15,7 +15,8 @@ from typing import Any
 
 from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import Progress
-from service.docs.examples import EXAMPLES
+from biresnerf.report import Report
+from service.docs.examples import example_of
 
 folder = Path(sys.argv[1])
 order = json.loads((folder / "job.json").read_text())
@@ -81,11 +82,12 @@ verdict = {
     "why": ["No better."],
     "moved_px": 1,
 }
-image = EXAMPLES["Report"]["images"][0]
+example = example_of(Report)
+image = example["images"][0]
 images = [
     {**image, "name": name, "moved_deg": moved, "trial_psnr_before": before, "trial_psnr_after": after}
     for name, moved, before, after in (("a", 1.0, None, None), ("b", 3.0, 20.0, 21.0), ("c", 2.0, 20.0, 24.0))
 ]
-report = {**EXAMPLES["Report"], "options": options, "verdict": verdict, "images": images}
+report = {**example, "options": options, "verdict": verdict, "images": images}
 (output / "report.json").write_text(json.dumps(report))
 tell("exporting", steps)
