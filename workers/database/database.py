@@ -12,13 +12,13 @@ from typing import Any, LiteralString
 
 import psycopg
 from psycopg.rows import DictRow, dict_row
+from psycopg.sql import SQL, Composed
 from psycopg_pool import AsyncConnectionPool, PoolClosed, PoolTimeout
 
 from workers.settings.errors import SetupError, Unavailable
 
 log = logging.getLogger(__name__)
 
-Connection = psycopg.AsyncConnection[DictRow]
 # What a database that is away, or just went away, raises.
 AWAY = (
     *(psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout, PoolClosed),
@@ -35,6 +35,26 @@ CONNECT: dict[str, Any] = {
 }
 LISTEN_CHANNEL = "biresnerf_jobs"
 RECONNECT_S = 1.0
+
+
+Statement = LiteralString | bytes | SQL | Composed
+
+
+class Connection(psycopg.AsyncConnection[DictRow]):
+    """A connection that gives rows as dicts."""
+
+    async def row(self, statement: Statement, *parameters: Any) -> DictRow | None:
+        """The first row of a statement, if there is one."""
+        return await (await self.execute(statement, parameters)).fetchone()
+
+    async def value(self, statement: Statement, *parameters: Any) -> Any:
+        """The first value of the first row; none where there is no row."""
+        row = await self.row(statement, *parameters)
+        return None if row is None else next(iter(row.values()))
+
+    async def rows(self, statement: Statement, *parameters: Any) -> list[DictRow]:
+        """All rows of a statement."""
+        return await (await self.execute(statement, parameters)).fetchall()
 
 
 class Database:
@@ -62,10 +82,10 @@ class Database:
                 "database_unavailable", f"The database does not answer: {first_line(error)}"
             ) from error
 
-    async def fetch(self, sql: LiteralString, *parameters: Any) -> list[DictRow]:
+    async def fetch(self, statement: Statement, *parameters: Any) -> list[DictRow]:
         """Rows of one statement in a transaction of its own."""
         async with self.transaction() as connection:
-            cursor = await connection.execute(sql, parameters)
+            cursor = await connection.execute(statement, parameters)
             return await cursor.fetchall() if cursor.description else []
 
 
@@ -108,7 +128,7 @@ async def open_database(
         reconnect_timeout=RECONNECT_S,
         reconnect_failed=_keep_trying,
         kwargs={"row_factory": dict_row, **CONNECT},
-        connection_class=psycopg.AsyncConnection[DictRow],
+        connection_class=Connection,
         configure=end_if_silent,
         check=AsyncConnectionPool.check_connection,  # connections killed with the server are replaced unseen
         open=False,

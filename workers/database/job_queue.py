@@ -106,8 +106,7 @@ async def take(connection: Connection, worker_id: int) -> Entry | None:
     An entry that the worker already has comes first: the answer was lost with the connection.
     """
     await connection.execute(HEARTBEAT, (worker_id,))
-    held = await _rows(
-        connection,
+    held = await connection.rows(
         "SELECT id, args ->> 'job_id' AS job_id FROM procrastinate_jobs"
         " WHERE worker_id = %s AND status = 'doing'",
         worker_id,
@@ -126,7 +125,7 @@ async def acknowledge(
     False, and nothing is changed, where the entry is another worker's by now.
     """
     own = "SELECT 1 FROM procrastinate_jobs WHERE id = %s AND worker_id = %s AND status = 'doing' FOR UPDATE"
-    if not await _rows(connection, own, entry_id, worker_id):
+    if not await connection.rows(own, entry_id, worker_id):
         return False
     if again_in_s is None:
         await _manager(connection).finish_job_by_id_async(entry_id, Status.SUCCEEDED, delete_job=False)
@@ -138,7 +137,7 @@ async def acknowledge(
 async def lock_taken(connection: Connection, entry_id: int) -> bool:
     """Whether some worker has the entry; it stays so until the end of the transaction."""
     taken = "SELECT 1 FROM procrastinate_jobs WHERE id = %s AND status = 'doing' FOR UPDATE"
-    return bool(await _rows(connection, taken, entry_id))
+    return bool(await connection.rows(taken, entry_id))
 
 
 async def put_back(connection: Connection, entry_id: int, in_s: float = 0) -> None:
@@ -177,8 +176,7 @@ async def unregister_worker(connection: Connection, worker_id: int | None) -> No
 
 async def entries_of_worker(connection: Connection, worker_id: int | None) -> list[int]:
     """Entries that the worker has, or any worker, in the order in which they are to be locked."""
-    rows = await _rows(
-        connection,
+    rows = await connection.rows(
         "SELECT id FROM procrastinate_jobs WHERE status = 'doing' AND queue_name = %s"
         " AND (%s::bigint IS NULL OR worker_id = %s) ORDER BY id",
         *(QUEUE, worker_id, worker_id),
@@ -238,7 +236,3 @@ def _adapted(value: Any) -> Any:
     if isinstance(value, list):
         return [_adapted(item) for item in value]
     return tuple(map(_adapted, value)) if isinstance(value, tuple) else value
-
-
-async def _rows(connection: Connection, sql: LiteralString, *parameters: Any) -> list[DictRow]:
-    return await (await connection.execute(sql, parameters)).fetchall()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from pydantic import BaseModel, ConfigDict
 
 from biresnerf.wire.datasets import DatasetState
@@ -74,26 +72,22 @@ async def read_statistics(database: Database, stall_s: float) -> Statistics:
     """Everything in one snapshot; raises `Unavailable`."""
     async with database.transaction() as connection:
         await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
-        jobs = await _rows(connection, _JOBS)
-        datasets = await _rows(connection, "SELECT state, count(*) AS n FROM datasets GROUP BY state")
-        (trash,) = await _rows(connection, "SELECT count(*) AS n FROM trash")
-        (webhooks,) = await _rows(connection, _WEBHOOKS)
-        (bounds,) = await _rows(connection, "SELECT tally_bounds() AS bounds_s")
+        jobs = await connection.rows(_JOBS)
+        datasets = await connection.rows("SELECT state, count(*) AS n FROM datasets GROUP BY state")
+        (trash,) = await connection.rows("SELECT count(*) AS n FROM trash")
+        (webhooks,) = await connection.rows(_WEBHOOKS)
+        (bounds,) = await connection.rows("SELECT tally_bounds() AS bounds_s")
         return Statistics(
             jobs={row["state"]: row["jobs"] for row in jobs},
             datasets={row["state"]: row["n"] for row in datasets},
             oldest_queued_s=next((row["oldest_s"] for row in jobs if row["state"] == "queued"), 0.0),
-            slots=tuple(SlotCount(**row) for row in await _rows(connection, _SLOTS, stall_s)),
+            slots=tuple(SlotCount(**row) for row in await connection.rows(_SLOTS, stall_s)),
             trash=trash["n"],
             webhooks_pending=webhooks["pending"],
             webhooks_late_s=webhooks["late_s"],
             bounds_s=tuple(bounds["bounds_s"]),
-            tallies=tuple(Tally(**row) for row in await _rows(connection, _TALLIES)),
+            tallies=tuple(Tally(**row) for row in await connection.rows(_TALLIES)),
         )
-
-
-async def _rows(connection: Connection, sql: Any, *parameters: Any) -> list[dict[str, Any]]:
-    return await (await connection.execute(sql, parameters)).fetchall()
 
 
 async def fold_tallies(connection: Connection) -> None:

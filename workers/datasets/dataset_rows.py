@@ -46,11 +46,9 @@ async def record_file(
         await connection.execute(
             "UPDATE uploads SET brought = least(size, brought + %s) WHERE id = %s", (stored.size, upload_id)
         )
-    before = await (
-        await connection.execute(
-            "DELETE FROM dataset_files WHERE dataset_id = %s AND path = %s RETURNING key", (dataset_id, path)
-        )
-    ).fetchone()
+    before = await connection.row(
+        "DELETE FROM dataset_files WHERE dataset_id = %s AND path = %s RETURNING key", dataset_id, path
+    )
     if before is not None:
         await connection.execute(
             "INSERT INTO trash (prefix) VALUES (%s)", (before["key"].removesuffix(f"/{path}"),)
@@ -78,13 +76,15 @@ async def require_place(
 
     Raises `Conflict` (``file_exists``), `LimitReached` (``too_many_files``, ``body_too_large``).
     """
-    cursor = await connection.execute(
+    row = await connection.row(
         "SELECT count(*) FILTER (WHERE path <> %s) AS files, count(*) FILTER (WHERE path = %s) AS same,"
         " coalesce(sum(size) FILTER (WHERE path <> %s), 0)::bigint AS bytes"
         " FROM dataset_files WHERE dataset_id = %s",
-        (path, path, path, dataset_id),
+        path,
+        path,
+        path,
+        dataset_id,
     )
-    row = await cursor.fetchone()
     assert row is not None, "an aggregate gives a row"
     if row["same"] and not overwrite:
         raise Conflict("file_exists", f"{path} is there already.")
@@ -98,7 +98,7 @@ async def require_place(
 async def locked(connection: Connection, dataset_id: str, tenant: str | None) -> DatasetState:
     """The state of the dataset, which stays as it is until the transaction ends; raises `NotFound`."""
     sql = f"SELECT state FROM datasets WHERE id = %s AND {MINE} FOR UPDATE"
-    row = await (await connection.execute(sql, (dataset_id, tenant))).fetchone()
+    row = await connection.row(sql, dataset_id, tenant)
     if row is None:
         raise NotFound(f"No dataset {dataset_id}.")
     state: DatasetState = row["state"]

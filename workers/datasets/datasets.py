@@ -232,11 +232,12 @@ class DatasetStore:
         async with self._database.transaction() as connection:
             if (await self._required(connection, dataset_id)).state == "expired":
                 raise Expired(f"The files of dataset {dataset_id} were not used for long and are gone.")
-            found = await connection.execute(
+            rows = await connection.rows(
                 FILE + " WHERE dataset_id = %s AND path > %s ORDER BY path LIMIT %s",
-                (dataset_id, after, limit + 1),
+                dataset_id,
+                after,
+                limit + 1,
             )
-            rows = await found.fetchall()
         items = tuple(DatasetFile.model_validate(row) for row in rows[:limit])
         return Page(items=items, next_cursor=cursor_after(items[-1].path) if len(rows) > limit else None)
 
@@ -288,7 +289,7 @@ class DatasetStore:
 
     async def _required(self, connection: Connection, dataset_id: str) -> DatasetView:
         sql = DATASET + f" WHERE datasets.id = %s AND {MINE}"
-        row = await (await connection.execute(sql, (dataset_id, self._tenant))).fetchone()
+        row = await connection.row(sql, dataset_id, self._tenant)
         if row is None:
             raise NotFound(f"No dataset {dataset_id}.")
         return record_from_row(DatasetView, row)

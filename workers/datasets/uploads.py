@@ -77,12 +77,9 @@ class UploadStore:
         async with self._database.transaction() as connection:
             await require_open(connection, dataset_id, self._tenant)
             await require_byte_quota(connection, dataset_id, size)
-            cursor = await connection.execute(
-                "SELECT count(*) AS n FROM uploads WHERE dataset_id = %s", (dataset_id,)
-            )
-            row = await cursor.fetchone()
-            if row is not None and row["n"] >= self._settings.max_files:
-                raise LimitReached("too_many_files", f"A dataset has at most {row['n']} uploads at a time.")
+            n = await connection.value("SELECT count(*) FROM uploads WHERE dataset_id = %s", dataset_id)
+            if n >= self._settings.max_files:
+                raise LimitReached("too_many_files", f"A dataset has at most {n} uploads at a time.")
             await connection.execute(
                 "INSERT INTO uploads (id, dataset_id, kind, path, size, sha256, folder, state, expires_at)"
                 " VALUES (%s, %s, %s, %s, %s, %s, %s, %s, clock_timestamp() + make_interval(secs => %s))",
@@ -196,15 +193,14 @@ class UploadStore:
     async def conclude(self, upload_id: str, token: uuid.UUID, error: JobError | None) -> None:
         """``received`` becomes ``stored``, or ``rejected`` with the error; the pieces go to the trash."""
         async with self._database.transaction() as connection:
-            cursor = await connection.execute(
+            row = await connection.row(
                 "UPDATE uploads SET state = %s, error = %s, take_token = NULL, take_until = NULL"
                 " WHERE id = %s AND state = 'received' AND take_token = %s RETURNING folder",
-                (
-                    *("stored" if error is None else "rejected",),
-                    *(None if error is None else Jsonb(error.model_dump()), upload_id, token),
-                ),
+                "stored" if error is None else "rejected",
+                None if error is None else Jsonb(error.model_dump()),
+                upload_id,
+                token,
             )
-            row = await cursor.fetchone()
             if row is not None:
                 await connection.execute("DELETE FROM upload_pieces WHERE upload_id = %s", (upload_id,))
                 await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (row["folder"],))
@@ -250,7 +246,7 @@ class UploadStore:
 
     async def _required(self, connection: Connection, upload_id: str) -> Upload:
         sql = _UPLOAD + f" WHERE uploads.id = %s AND {MINE}"
-        row = await (await connection.execute(sql, (upload_id, self._tenant))).fetchone()
+        row = await connection.row(sql, upload_id, self._tenant)
         if row is None:
             raise NotFound(f"No upload {upload_id}.")
         return record_from_row(Upload, row)

@@ -56,8 +56,7 @@ async def claim_job(database: Database, job_id: str, max_attempts: int) -> Claim
 
 async def _claim(database: Database, job_id: str, max_attempts: int, token: uuid.UUID) -> Claim | None:
     async with database.transaction() as connection:
-        cursor = await connection.execute("SELECT * FROM jobs WHERE id = %s FOR UPDATE", (job_id,))
-        row = await cursor.fetchone()
+        row = await connection.row("SELECT * FROM jobs WHERE id = %s FOR UPDATE", job_id)
         if row is not None and row["run_token"] == token:
             # An earlier try got through, though its acknowledgement was lost: the attempt counts once.
             return _claimed(row, token)

@@ -13,7 +13,7 @@ from biresnerf.wire.jobs import JobView, WantedStage
 from workers.database.database import Connection
 from workers.database.ids import new_id
 from workers.jobs.forks import LATEST_FIRST, plan_fork
-from workers.jobs.job_rows import JOB, asked_columns, fingerprint_of, job_from_row, known_job, one_row
+from workers.jobs.job_rows import JOB, asked_columns, fingerprint_of, job_from_row, known_job
 from workers.jobs.job_states import insert_job, queue_job
 from workers.jobs.jobs import JobStore
 from workers.jobs.quotas import require_room, submitting_for
@@ -127,11 +127,11 @@ class DerivedJobs(JobStore):
             parent = await self._required(connection, job_id)
             _require_result(parent)
             await submitting_for(connection, parent["dataset_id"], self._tenant)
-            same = await one_row(
-                connection,
+            same = await connection.row(
                 JOB + " WHERE parent = %s AND fingerprint = %s AND kind = 'export'"
                 " AND state IN ('queued', 'running', 'succeeded')",
-                *(job_id, fingerprint),
+                job_id,
+                fingerprint,
             )
             if same is not None:
                 return job_from_row(same), False
@@ -148,8 +148,8 @@ class DerivedJobs(JobStore):
         """All exports of a job, the oldest first."""
         async with self._database.transaction() as connection:
             await self._required(connection, job_id)
-            cursor = await connection.execute(JOB + " WHERE parent = %s ORDER BY created_at, id", (job_id,))
-            return Page(items=tuple(job_from_row(row) for row in await cursor.fetchall()))
+            rows = await connection.rows(JOB + " WHERE parent = %s ORDER BY created_at, id", job_id)
+            return Page(items=tuple(map(job_from_row, rows)))
 
     async def _insert_below(
         self, connection: Connection, parent: Mapping[str, Any], job_id: str, values: Mapping[str, Any]

@@ -25,16 +25,15 @@ async def date_jobs(connection: Connection, kept_s: float | None) -> None:
 
 async def expire_jobs(connection: Connection, limit: int) -> int:
     """Let the files of jobs go that are due, as many as ``limit``; returns how many."""
-    cursor = await connection.execute(
+    due = await connection.rows(
         "SELECT id, tenant, finished_at, artifacts FROM jobs WHERE expires_at <= clock_timestamp()"
         " AND state IN ('succeeded', 'failed', 'cancelled')"
         # An export or a fork that waits or runs still reads its files.
         " AND NOT EXISTS (SELECT 1 FROM jobs AS heir WHERE jobs.id IN (heir.parent, heir.forked_from)"
         " AND heir.state IN ('queued', 'running'))"
         " ORDER BY expires_at LIMIT %s FOR UPDATE SKIP LOCKED",
-        (limit,),
+        limit,
     )
-    due = await cursor.fetchall()
     for job in due:
         freed = {"files": len(job["artifacts"]), "bytes": sum(item["size"] for item in job["artifacts"])}
         await connection.execute(

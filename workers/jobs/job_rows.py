@@ -47,11 +47,6 @@ def _thumbnail(row: dict[str, Any]) -> str | None:
     )
 
 
-async def one_row(connection: Connection, sql: Any, *parameters: Any) -> dict[str, Any] | None:
-    """The first row of a statement, if there is one."""
-    return await (await connection.execute(sql, parameters)).fetchone()
-
-
 def asked_columns(options: RefineOptions) -> dict[str, Any]:
     """Columns of a new job that follow from its options.
 
@@ -63,8 +58,8 @@ def asked_columns(options: RefineOptions) -> dict[str, Any]:
 
 async def jobs_of_dataset(connection: Connection, dataset_id: str) -> list[str]:
     """Id and state of each job on the dataset, to show."""
-    cursor = await connection.execute("SELECT id, state FROM jobs WHERE dataset_id = %s", (dataset_id,))
-    return [f"{job['id']} ({job['state']})" for job in await cursor.fetchall()]
+    jobs = await connection.rows("SELECT id, state FROM jobs WHERE dataset_id = %s", dataset_id)
+    return [f"{job['id']} ({job['state']})" for job in jobs]
 
 
 def fingerprint_of(
@@ -83,9 +78,7 @@ async def known_job(
     connection: Connection, tenant: str, idempotency_key: str, fingerprint: str
 ) -> JobView | None:
     """The job of an earlier request with this key; raises `Conflict` where that was a different one."""
-    row = await one_row(
-        connection, JOB + " WHERE tenant = %s AND idempotency_key = %s", *(tenant, idempotency_key)
-    )
+    row = await connection.row(JOB + " WHERE tenant = %s AND idempotency_key = %s", tenant, idempotency_key)
     if row is not None and row["fingerprint"] != fingerprint:
         raise Conflict("idempotency_key_reused", f"The key was used for another request ({row['id']}).")
     return None if row is None else job_from_row(row)
@@ -93,9 +86,6 @@ async def known_job(
 
 async def events_of(connection: Connection, job_id: str, after: int, limit: int) -> tuple[JobEvent, ...]:
     """The job's history after ``seq == after``."""
-    cursor = await connection.execute(
-        "SELECT seq, at, attempt, type, data FROM job_events WHERE job_id = %s AND seq > %s"
-        " ORDER BY seq LIMIT %s",
-        (job_id, after, limit),
-    )
-    return tuple(JobEvent.model_validate(row) for row in await cursor.fetchall())
+    select = "SELECT seq, at, attempt, type, data FROM job_events WHERE job_id = %s AND seq > %s"
+    rows = await connection.rows(f"{select} ORDER BY seq LIMIT %s", job_id, after, limit)
+    return tuple(map(JobEvent.model_validate, rows))

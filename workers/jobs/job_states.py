@@ -39,7 +39,7 @@ async def insert_job(connection: Connection, values: Mapping[str, Any]) -> dict[
     statement = sql.SQL("INSERT INTO jobs ({}) VALUES ({}) RETURNING id, queue_order, held").format(
         sql.SQL(", ").join(map(sql.Identifier, row)), sql.SQL(", ").join([sql.Placeholder()] * len(row))
     )
-    added = await (await connection.execute(statement, list(row.values()))).fetchone()
+    added = await connection.row(statement, *row.values())
     assert added is not None, "RETURNING"
     return added
 
@@ -57,13 +57,13 @@ async def _enqueue(connection: Connection, job: Mapping[str, Any]) -> None:
 
 async def start_attempt(connection: Connection, job_id: str, token: uuid.UUID) -> dict[str, Any]:
     """Begin one more attempt, which owns the job from now on; returns the row."""
-    cursor = await connection.execute(
+    row = await connection.row(
         "UPDATE jobs SET state = 'running', attempt = attempt + 1, run_token = %s, fraction = 0,"
         " step = 0, stage = NULL, eta_s = NULL, message = '',"
         " started_at = coalesce(started_at, clock_timestamp()) WHERE id = %s RETURNING *",
-        (token, job_id),
+        token,
+        job_id,
     )
-    row = await cursor.fetchone()
     assert row is not None, "the row is locked"
     await add_event(connection, job_id, "started", {"resumed": row["checkpoint"] is not None})
     return row
@@ -102,12 +102,11 @@ async def take_back(connection: Connection, entry_id: int) -> None:
     The job goes back to the queue (its attempt stays counted); one that should be cancelled, or is final
     already, leaves the queue. The token is dropped, so a worker that was only asleep is fenced from here on.
     """
-    cursor = await connection.execute(
+    job = await connection.row(  # of unfinished jobs there is an index
         "SELECT id, cancel_requested FROM jobs"
-        " WHERE queue_id = %s AND state IN ('queued', 'running') FOR UPDATE",  # of these there is an index
-        (entry_id,),
+        " WHERE queue_id = %s AND state IN ('queued', 'running') FOR UPDATE",
+        entry_id,
     )
-    job = await cursor.fetchone()
     if not await job_queue.lock_taken(connection, entry_id):
         return  # it came to an end in the meantime
     if job is None:  # or final
@@ -125,15 +124,14 @@ async def take_back(connection: Connection, entry_id: int) -> None:
 
 async def requeue_lost(connection: Connection, silent_s: float) -> None:
     """Queue again unfinished jobs that the queue does not know (any more), unchanged for ``silent_s``."""
-    cursor = await connection.execute(
+    for job in await connection.rows(
         "SELECT jobs.id, jobs.queue_order, jobs.held"
         " FROM jobs LEFT JOIN queue_entries AS entry ON entry.id = jobs.queue_id"
         " WHERE jobs.state IN ('queued', 'running')"
         " AND jobs.updated_at < clock_timestamp() - make_interval(secs => %s)"
         " AND coalesce(entry.state NOT IN ('todo', 'doing'), true) FOR UPDATE OF jobs SKIP LOCKED",
-        (silent_s,),
-    )
-    for job in await cursor.fetchall():
+        silent_s,
+    ):
         log.warning("job %s was lost by the queue; queueing it again", job["id"])
         await _enqueue(connection, job)
         await requeue(connection, job["id"], "requeued", {"why": "lost"}, fence=True)
@@ -151,13 +149,14 @@ async def request_cancel(
     connection: Connection, job_id: str, tenant: str | None, keep_partial: bool, stall_s: float
 ) -> None:
     """Cancel a queued job, or ask its worker to. Nothing is changed where that was asked for, or the job is over."""
-    cursor = await connection.execute(
+    job = await connection.row(
         "UPDATE jobs SET cancel_requested = true, keep_partial = %s"
         " WHERE id = %s AND tenant = coalesce(%s, tenant) AND state IN ('queued', 'running')"
         " AND NOT cancel_requested RETURNING queue_id, state",
-        (keep_partial, job_id, tenant),
+        keep_partial,
+        job_id,
+        tenant,
     )
-    job = await cursor.fetchone()
     if job is None:
         return
     await job_queue.cancel(connection, job["queue_id"])
@@ -214,8 +213,7 @@ async def finish_cancelled(
         keep: the attempt's name.
         stall_s: how long a worker may be silent; nothing is deleted before twice that.
     """
-    cursor = await connection.execute("SELECT keep_partial, previews FROM jobs WHERE id = %s", (job_id,))
-    row = await cursor.fetchone()
+    row = await connection.row("SELECT keep_partial, previews FROM jobs WHERE id = %s", job_id)
     assert row is not None, "the row is locked"
     logs = [item for item in artifacts if item.name == LOG_NAME]
     kept, shown = list(artifacts), None

@@ -24,7 +24,6 @@ from workers.jobs.job_rows import (
     fingerprint_of,
     job_from_row,
     known_job,
-    one_row,
 )
 from workers.jobs.job_states import delete_job, insert_job, queue_job, request_cancel
 from workers.jobs.job_updates import JobListener, follow
@@ -169,19 +168,15 @@ class JobStore:
     async def delete(self, job_id: str) -> None:
         """Delete a final job with its files; raises `NotFound`, `Conflict` (``state_conflict``)."""
         async with self._database.transaction() as connection:
-            row = await one_row(
-                connection,
-                f"SELECT state FROM jobs WHERE id = %s AND {MINE} FOR UPDATE",
-                *(job_id, self._tenant),
+            row = await connection.row(
+                f"SELECT state FROM jobs WHERE id = %s AND {MINE} FOR UPDATE", job_id, self._tenant
             )
             if row is None:
                 raise NotFound(f"No job {job_id}.")
             if row["state"] in ("queued", "running"):
                 raise Conflict("state_conflict", f"Job {job_id} is {row['state']}; cancel it first.")
-            busy = await one_row(
-                connection,
-                "SELECT id FROM jobs WHERE parent = %s AND state IN ('queued', 'running')",
-                job_id,
+            busy = await connection.row(
+                "SELECT id FROM jobs WHERE parent = %s AND state IN ('queued', 'running')", job_id
             )
             if busy is not None:
                 raise Conflict("state_conflict", f"Its export {busy['id']} is not over; cancel that first.")
@@ -202,10 +197,9 @@ class JobStore:
             own = await self._required(connection, job_id)
             if own["state"] == "expired":
                 raise Expired(f"The files of job {job_id} were kept for their time and are gone.")
-            cursor = await connection.execute(
-                "SELECT artifacts FROM jobs WHERE parent = %s AND state = 'succeeded'", (job_id,)
+            exports = await connection.rows(
+                "SELECT artifacts FROM jobs WHERE parent = %s AND state = 'succeeded'", job_id
             )
-            exports = await cursor.fetchall()
         listed = [*own["artifacts"], *(own["previews"] or {}).get("artifacts", [])]
         listed += [item for row in exports for item in row["artifacts"] if item["name"] != LOG_NAME]
         # A form that the job wrote itself may have been exported as well: the files are the same.
@@ -216,11 +210,9 @@ class JobStore:
         """What the job's process wrote to standard error, after line ``after``; raises `NotFound`."""
         async with self._database.transaction() as connection:
             await self._required(connection, job_id)
-            cursor = await connection.execute(
-                "SELECT n, at, attempt, text FROM job_log WHERE job_id = %s AND n > %s ORDER BY n LIMIT %s",
-                (job_id, after, limit),
-            )
-            return tuple(LogLine.model_validate(row) for row in await cursor.fetchall())
+            select = "SELECT n, at, attempt, text FROM job_log WHERE job_id = %s AND n > %s"
+            rows = await connection.rows(f"{select} ORDER BY n LIMIT %s", job_id, after, limit)
+            return tuple(map(LogLine.model_validate, rows))
 
     async def update(self, job_id: str, after: int = 0) -> JobUpdate:
         """The job and the events after ``after``, seen in one snapshot; raises `NotFound`."""
@@ -262,7 +254,7 @@ class JobStore:
         return await self._listener.database_answers(2.0)
 
     async def _required(self, connection: Connection, job_id: str) -> dict[str, Any]:
-        row = await one_row(connection, JOB + f" WHERE id = %s AND {MINE}", *(job_id, self._tenant))
+        row = await connection.row(JOB + f" WHERE id = %s AND {MINE}", job_id, self._tenant)
         if row is None:
             raise NotFound(f"No job {job_id}.")
         return row

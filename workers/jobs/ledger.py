@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, TypeVar
 
+from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
 
 from biresnerf.progress import Progress
@@ -24,6 +25,8 @@ from workers.records import LOG_NAME, Artifact
 
 PREVIEW_KEPT_S = 60.0  # after another one took its place: it may be on its way to somebody
 LOG_LINES_MAX = 20_000  # of one job
+_LOCKED = """
+    SELECT run_token, state, cancel_requested, keep_partial, log_lines FROM jobs WHERE id = %s FOR UPDATE"""
 T = TypeVar("T")
 
 
@@ -40,7 +43,7 @@ class Ledger:
 
         resolved = None if now.options is None else Jsonb(now.options.model_dump(mode="json"))
 
-        async def write(connection: Connection) -> None:
+        async def write(connection: Connection, job: DictRow) -> None:
             await connection.execute(
                 "UPDATE jobs SET stage = %s, fraction = greatest(fraction, %s), step = %s, steps_total = %s,"
                 " eta_s = %s, metrics = metrics || %s, message = %s,"
@@ -62,7 +65,7 @@ class Ledger:
     async def checkpoint(self, prefix: str, files: Sequence[str], step: int) -> None:
         """Point the job at a new checkpoint and give the one before to the trash."""
 
-        async def write(connection: Connection) -> None:
+        async def write(connection: Connection, job: DictRow) -> None:
             await connection.execute(
                 "INSERT INTO trash (prefix) SELECT checkpoint ->> 'prefix' FROM jobs"
                 " WHERE id = %s AND checkpoint ->> 'prefix' <> %s",
@@ -79,7 +82,7 @@ class Ledger:
     async def reusable(self, stage: ReusableStage, prefix: str, files: Sequence[str]) -> None:
         """Keep the work of a stage for other jobs to start from, in the place of an earlier attempt's."""
 
-        async def write(connection: Connection) -> None:
+        async def write(connection: Connection, job: DictRow) -> None:
             await connection.execute(
                 "INSERT INTO trash (prefix) SELECT reusable -> %s ->> 'prefix' FROM jobs"
                 " WHERE id = %s AND reusable -> %s ->> 'prefix' <> %s",
@@ -95,7 +98,7 @@ class Ledger:
     async def preview(self, prefix: str, artifacts: Sequence[Artifact], now: Progress) -> None:
         """Let the job show these files, in the place of those before."""
 
-        async def write(connection: Connection) -> None:
+        async def write(connection: Connection, job: DictRow) -> None:
             await connection.execute(
                 "INSERT INTO trash (prefix, not_before)"
                 " SELECT previews ->> 'prefix', clock_timestamp() + make_interval(secs => %s) FROM jobs"
@@ -115,16 +118,11 @@ class Ledger:
         """Append lines to the job's log; what is more than `LOG_LINES_MAX` is in its log file alone."""
         before: int | None = None
 
-        async def write(connection: Connection) -> None:
+        async def write(connection: Connection, job: DictRow) -> None:
             nonlocal before
-            cursor = await connection.execute(
-                "SELECT log_lines FROM jobs WHERE id = %s", (self.claim.job_id,)
-            )
-            row = await cursor.fetchone()
-            assert row is not None, "the row is locked"
-            if before is not None and row["log_lines"] != before:
+            if before is not None and job["log_lines"] != before:
                 return  # an earlier try got through, though its acknowledgement was lost
-            before = row["log_lines"]
+            before = int(job["log_lines"])
             room = LOG_LINES_MAX - before
             kept = list(lines[: max(0, room)])
             if kept and len(kept) == room:
@@ -145,12 +143,8 @@ class Ledger:
     async def wants_partial(self) -> bool:
         """Whether who cancelled the job wants what there is of its result."""
 
-        async def read(connection: Connection) -> bool:
-            cursor = await connection.execute(
-                "SELECT keep_partial FROM jobs WHERE id = %s", (self.claim.job_id,)
-            )
-            row = await cursor.fetchone()
-            return bool(row and row["keep_partial"])
+        async def read(_: Connection, job: DictRow) -> bool:
+            return bool(job["keep_partial"])
 
         return await self._fenced(read, done=False)
 
@@ -162,8 +156,8 @@ class Ledger:
         Files of other attempts are deleted once no process can still be writing them.
         """
 
-        async def write(connection: Connection) -> bool:
-            if await _cancel_requested(connection, self.claim.job_id):
+        async def write(connection: Connection, job: DictRow) -> bool:
+            if job["cancel_requested"]:
                 return False
             await connection.execute(
                 "UPDATE jobs SET verdict = %s WHERE id = %s", (verdict, self.claim.job_id)
@@ -177,8 +171,8 @@ class Ledger:
     async def fail(self, error: JobError, artifacts: Sequence[Artifact], keep: str, stall_s: float) -> None:
         """End the job as failed (or cancelled, if that was asked for)."""
 
-        async def write(connection: Connection) -> None:
-            if await _cancel_requested(connection, self.claim.job_id):
+        async def write(connection: Connection, job: DictRow) -> None:
+            if job["cancel_requested"]:
                 await finish_cancelled(connection, self.claim.job_id, artifacts, keep, stall_s)
                 return
             await finish(connection, self.claim.job_id, "failed", error, artifacts)
@@ -189,7 +183,7 @@ class Ledger:
     async def cancelled(self, artifacts: Sequence[Artifact], keep: str, stall_s: float) -> None:
         """End the job as cancelled, with what is wanted of the files."""
 
-        async def write(connection: Connection) -> None:
+        async def write(connection: Connection, job: DictRow) -> None:
             await finish_cancelled(connection, self.claim.job_id, artifacts, keep, stall_s)
 
         await self._fenced(write, done=None)
@@ -208,8 +202,8 @@ class Ledger:
         ``smaller``: options that attempts to come use in the place of those asked for.
         """
 
-        async def write(connection: Connection) -> bool:
-            if await _cancel_requested(connection, self.claim.job_id):
+        async def write(connection: Connection, job: DictRow) -> bool:
+            if job["cancel_requested"]:
                 await finish_cancelled(connection, self.claim.job_id)
                 return False
             await requeue(
@@ -225,28 +219,21 @@ class Ledger:
 
         return await self._fenced(write, done=True)
 
-    async def _fenced(self, write: Callable[[Connection], Awaitable[T]], *, done: T | None = None) -> T:
-        """Run ``write`` under the job's row lock if the token still holds.
+    async def _fenced(
+        self, write: Callable[[Connection, DictRow], Awaitable[T]], *, done: T | None = None
+    ) -> T:
+        """Run ``write`` under the job's row lock, with the row, if the token still holds.
 
         ``done`` is the answer where an earlier try got through, though its acknowledgement was lost.
         """
 
         async def once() -> T:
             async with self._database.transaction() as connection:
-                cursor = await connection.execute(
-                    "SELECT run_token, state FROM jobs WHERE id = %s FOR UPDATE", (self.claim.job_id,)
-                )
-                row = await cursor.fetchone()
-                if row is None or row["run_token"] != self.claim.token:
+                job = await connection.row(_LOCKED, self.claim.job_id)
+                if job is None or job["run_token"] != self.claim.token:
                     raise Fenced(f"job {self.claim.job_id} has a new owner")
-                if row["state"] != "running":
+                if job["state"] != "running":
                     return done  # type: ignore[return-value]
-                return await write(connection)
+                return await write(connection, job)
 
         return await retry_while_unavailable(once)
-
-
-async def _cancel_requested(connection: Connection, job_id: str) -> bool:
-    cursor = await connection.execute("SELECT cancel_requested FROM jobs WHERE id = %s", (job_id,))
-    row = await cursor.fetchone()
-    return bool(row and row["cancel_requested"])

@@ -16,11 +16,11 @@ async def submitting_for(connection: Connection, dataset_id: str, seen_by: str |
     """
     # The dataset before the tenant, as uploads lock them.
     sql = "SELECT tenant FROM datasets WHERE id = %s AND tenant = coalesce(%s, tenant) FOR SHARE"
-    dataset = await (await connection.execute(sql, (dataset_id, seen_by))).fetchone()
-    if dataset is None:
+    tenant = await connection.value(sql, dataset_id, seen_by)
+    if tenant is None:
         raise NotFound(f"No dataset {dataset_id}.")
-    await _lock_tenant(connection, dataset["tenant"])
-    return str(dataset["tenant"])
+    await _lock_tenant(connection, tenant)
+    return str(tenant)
 
 
 async def require_room(connection: Connection, dataset_id: str, priority: int, max_queued: int) -> None:
@@ -30,16 +30,14 @@ async def require_room(connection: Connection, dataset_id: str, priority: int, m
     (``queue_full``: ``max_queued`` jobs wait already; ``quota_exhausted``).
     """
     sql = "SELECT state, tenant FROM datasets WHERE id = %s FOR SHARE"
-    dataset = await (await connection.execute(sql, (dataset_id,))).fetchone()
+    dataset = await connection.row(sql, dataset_id)
     if dataset is None:  # deleted a moment ago
         raise NotFound(f"No dataset {dataset_id}.")
     if dataset["state"] != "ready":
         raise Conflict("dataset_not_ready", f"Dataset {dataset_id} is {dataset['state']}, not ready.")
-    queued = await (
-        await connection.execute("SELECT count(*) AS n FROM jobs WHERE state = 'queued'")
-    ).fetchone()
-    if queued is not None and queued["n"] >= max_queued:
-        raise LimitReached("queue_full", f"{queued['n']} jobs wait already, which is the limit.")
+    queued = await connection.value("SELECT count(*) FROM jobs WHERE state = 'queued'")
+    if queued >= max_queued:
+        raise LimitReached("queue_full", f"{queued} jobs wait already, which is the limit.")
     await _require_job_quota(connection, dataset["tenant"], priority)
 
 
@@ -48,12 +46,10 @@ async def _require_job_quota(connection: Connection, tenant: str, priority: int)
     if priority > limits["top_priority"]:
         raise Conflict("priority_not_allowed", "Jobs of this tenant may not ask for so high a priority.")
     if limits["max_queued"]:
-        sql = "SELECT count(*) AS n FROM jobs WHERE tenant = %s AND state = 'queued'"
-        row = await (await connection.execute(sql, (tenant,))).fetchone()
-        if row is not None and row["n"] >= limits["max_queued"]:
-            raise LimitReached(
-                "quota_exhausted", f"{row['n']} of your jobs wait already, which is the limit."
-            )
+        waiting = "SELECT count(*) FROM jobs WHERE tenant = %s AND state = 'queued'"
+        queued = await connection.value(waiting, tenant)
+        if queued >= limits["max_queued"]:
+            raise LimitReached("quota_exhausted", f"{queued} of your jobs wait already, which is the limit.")
     await _require_bytes(connection, tenant, limits["max_stored_bytes"], 1)
 
 
@@ -62,17 +58,16 @@ async def require_byte_quota(connection: Connection, dataset_id: str, size: int)
 
     From here to the end of the transaction nothing else of the tenant is counted.
     """
-    sql = "SELECT tenant FROM datasets WHERE id = %s"
-    row = await (await connection.execute(sql, (dataset_id,))).fetchone()
-    if row is not None:
-        limits = await _limits(connection, row["tenant"])
-        await _require_bytes(connection, row["tenant"], limits["max_stored_bytes"], size)
+    tenant = await connection.value("SELECT tenant FROM datasets WHERE id = %s", dataset_id)
+    if tenant is not None:
+        limits = await _limits(connection, tenant)
+        await _require_bytes(connection, tenant, limits["max_stored_bytes"], size)
 
 
 async def _limits(connection: Connection, tenant: str) -> dict[str, int]:
     await _lock_tenant(connection, tenant)
     sql = "SELECT top_priority, max_queued, max_stored_bytes FROM tenant_limits WHERE id = %s"
-    row = await (await connection.execute(sql, (tenant,))).fetchone()
+    row = await connection.row(sql, tenant)
     assert row is not None, "referenced by what the tenant owns"
     return row
 
@@ -84,9 +79,7 @@ async def _lock_tenant(connection: Connection, tenant: str) -> None:
 async def _require_bytes(connection: Connection, tenant: str, limit: int, size: int) -> None:
     if not limit:
         return
-    sql = "SELECT stored_bytes_of(%s) AS stored"
-    row = await (await connection.execute(sql, (tenant,))).fetchone()
-    stored = row["stored"] if row is not None else 0
+    stored = await connection.value("SELECT stored_bytes_of(%s)", tenant)
     if stored + size > limit:
         raise LimitReached(
             "quota_exhausted", f"{stored} of your {limit} bytes are stored; delete datasets or jobs first."

@@ -23,7 +23,7 @@ async def require_same_store(database: Database, files: FileStore) -> None:
     try:
         async with database.transaction() as connection:
             await connection.execute("SELECT pg_advisory_xact_lock(%s)", (MARK_LOCK,))
-            row = await (await connection.execute("SELECT id FROM file_store")).fetchone()
+            row = await connection.row("SELECT id FROM file_store")
             known, found = None if row is None else row["id"], await _mark(files)
             if found is None and known is None:
                 found = known = uuid.uuid4().hex

@@ -74,12 +74,17 @@ class KeyStore:
         text = f"{prefix}_{secrets.token_urlsafe(32)}"
         async with self._database.transaction() as connection:
             await ensure_tenant(connection, tenant)
-            cursor = await connection.execute(
+            row = await connection.row(
                 "INSERT INTO api_keys (id, tenant, name, prefix, sha256, scopes, expires_at)"
                 " VALUES (%s, %s, %s, %s, %s, %s, clock_timestamp() + %s::interval) RETURNING *",
-                (new_id("key"), tenant, name, prefix, _digest(text), wanted, lives),
+                new_id("key"),
+                tenant,
+                name,
+                prefix,
+                _digest(text),
+                wanted,
+                lives,
             )
-            row = await cursor.fetchone()
             assert row is not None, "the inserted row"
             return _key(row), text
 

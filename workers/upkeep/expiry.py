@@ -88,7 +88,7 @@ class Expiry:
         async with self._database.transaction() as connection:
             # The lock first: a submit that came before it is seen by the next statement, one after it sees us.
             await connection.execute("SELECT 1 FROM datasets WHERE id = %s FOR UPDATE", (dataset_id,))
-            cursor = await connection.execute(
+            row = await connection.row(
                 "UPDATE datasets SET state = 'expired', revision = revision + 1 WHERE id = %s"
                 " AND state IN ('open', 'ready', 'rejected') AND expires_at <= clock_timestamp()"
                 " AND touched_at < clock_timestamp() - make_interval(secs => %s)"
@@ -97,18 +97,18 @@ class Expiry:
                 " AND NOT EXISTS (SELECT 1 FROM uploads WHERE dataset_id = datasets.id"
                 " AND expires_at > clock_timestamp() AND state IN ('receiving', 'received'))"
                 " RETURNING tenant",
-                (dataset_id, kept_s, kept_s),
+                dataset_id,
+                kept_s,
+                kept_s,
             )
-            row = await cursor.fetchone()
             if row is None:
                 await connection.execute("UPDATE datasets SET expires_at = NULL WHERE id = %s", (dataset_id,))
                 return
-            cursor = await connection.execute(
+            what = await connection.row(
                 "WITH gone AS (DELETE FROM dataset_files WHERE dataset_id = %s RETURNING size)"
                 " SELECT count(*) AS files, coalesce(sum(size), 0)::bigint AS bytes FROM gone",
-                (dataset_id,),
+                dataset_id,
             )
-            what = await cursor.fetchone()
             await connection.execute("DELETE FROM uploads WHERE dataset_id = %s", (dataset_id,))
             await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (f"datasets/{dataset_id}",))
         log.info("expired %s of %s, unused: %s", dataset_id, row["tenant"], what)
@@ -132,6 +132,4 @@ class Expiry:
 
 
 async def _mine(connection: Connection) -> bool:
-    cursor = await connection.execute("SELECT pg_try_advisory_xact_lock(%s) AS mine", (EXPIRY_LOCK,))
-    row = await cursor.fetchone()
-    return bool(row and row["mine"])
+    return bool(await connection.value("SELECT pg_try_advisory_xact_lock(%s)", EXPIRY_LOCK))

@@ -154,11 +154,10 @@ class WebhookSender:
         self, connection: Connection, row: dict[str, Any], result: Result, at: datetime, seconds: float
     ) -> None:
         """Record the outcome. The state of the message changes only while the lease is ours."""
-        cursor = await connection.execute(
+        written = await connection.row(
             "UPDATE webhook_deliveries SET attempts = attempts + 1 WHERE id = %s RETURNING attempts",
-            (row["id"],),
+            row["id"],
         )
-        written = await cursor.fetchone()
         if written is None:  # deleted meanwhile, with its webhook
             return
         await connection.execute(
@@ -189,13 +188,14 @@ class WebhookSender:
             )
             return
         gone = result.outcome == "gone"
-        cursor = await connection.execute(
+        row = await connection.row(
             "UPDATE webhooks SET failing_since = coalesce(failing_since, clock_timestamp()),"
             " enabled = enabled AND NOT (%s OR coalesce(failing_since < clock_timestamp()"
             " - make_interval(secs => %s), false)) WHERE id = %s AND enabled RETURNING enabled",
-            (gone, self._settings.webhook_give_up_days * 86_400, webhook_id),
+            gone,
+            self._settings.webhook_give_up_days * 86_400,
+            webhook_id,
         )
-        row = await cursor.fetchone()
         if row is None or row["enabled"]:
             return
         why = "410 Gone" if gone else f"no success in {self._settings.webhook_give_up_days:g} days"

@@ -58,20 +58,23 @@ class WebhookStore:
         secret = new_secret()
         async with self._database.transaction() as connection:
             await connection.execute("SELECT 1 FROM tenants WHERE id = %s FOR NO KEY UPDATE", (tenant,))
-            cursor = await connection.execute(
-                "SELECT count(*) AS n FROM webhooks WHERE tenant = %s AND job_id IS NULL", (tenant,)
-            )
-            have = await cursor.fetchone()
-            if have is None or have["n"] >= self._settings.max_webhooks:
+            have = "SELECT count(*) FROM webhooks WHERE tenant = %s AND job_id IS NULL"
+            if await connection.value(have, tenant) >= self._settings.max_webhooks:
                 raise LimitReached(
                     "too_many_webhooks", f"There are {self._settings.max_webhooks} webhooks already."
                 )
-            cursor = await connection.execute(
-                "INSERT INTO webhooks (id, tenant, url, events, description, secret)"
-                " VALUES (%s, %s, %s, %s, %s, %s) RETURNING *",
-                (new_id("wh"), tenant, target, list(dict.fromkeys(events)), description, secret),
-            )
-            return _webhook(await cursor.fetchone()), secret
+            return _webhook(
+                await connection.row(
+                    "INSERT INTO webhooks (id, tenant, url, events, description, secret)"
+                    " VALUES (%s, %s, %s, %s, %s, %s) RETURNING *",
+                    new_id("wh"),
+                    tenant,
+                    target,
+                    list(dict.fromkeys(events)),
+                    description,
+                    secret,
+                )
+            ), secret
 
     async def get(self, webhook_id: str) -> WebhookView:
         """The webhook; raises `NotFound`."""
@@ -113,17 +116,14 @@ class WebhookStore:
         target = None if url is None else str(checked_url(url, Policy.of(self._settings)))
         async with self._database.transaction() as connection:
             await self._required(connection, webhook_id, lock=True)
-            cursor = await connection.execute(
+            row = await connection.row(
                 "UPDATE webhooks SET url = coalesce(%s, url), events = coalesce(%s, events),"
                 " description = coalesce(%s, description), enabled = coalesce(%s, enabled),"
                 " disabled_why = CASE WHEN %s::boolean IS NULL THEN disabled_why END,"
                 " failing_since = CASE WHEN %s THEN NULL ELSE failing_since END WHERE id = %s RETURNING *",
-                (
-                    *(target, None if events is None else list(dict.fromkeys(events)), description),
-                    *(enabled, enabled, enabled is True, webhook_id),
-                ),
+                *(target, None if events is None else list(dict.fromkeys(events)), description),
+                *(enabled, enabled, enabled is True, webhook_id),
             )
-            row = await cursor.fetchone()
             if enabled is False:
                 await drop_pending(connection, webhook_id)
             return _webhook(row)
@@ -133,13 +133,16 @@ class WebhookStore:
         secret = new_secret()
         async with self._database.transaction() as connection:
             await self._required(connection, webhook_id, lock=True)
-            cursor = await connection.execute(
-                "UPDATE webhooks SET previous_secret = secret, secret = %s,"
-                " previous_until = clock_timestamp() + make_interval(hours => %s)"
-                " WHERE id = %s RETURNING *",
-                (secret, ROTATION_HOURS, webhook_id),
-            )
-            return _webhook(await cursor.fetchone()), secret
+            return _webhook(
+                await connection.row(
+                    "UPDATE webhooks SET previous_secret = secret, secret = %s,"
+                    " previous_until = clock_timestamp() + make_interval(hours => %s)"
+                    " WHERE id = %s RETURNING *",
+                    secret,
+                    ROTATION_HOURS,
+                    webhook_id,
+                )
+            ), secret
 
     async def delete(self, webhook_id: str) -> None:
         """Delete it with its deliveries; what waits is not sent. Raises `NotFound`."""
@@ -173,16 +176,13 @@ class WebhookStore:
         created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
         async with self._database.transaction() as connection:
             await self._required(connection, webhook_id)
-            found = await connection.execute(
+            rows = await connection.rows(
                 _DELIVERY + " WHERE webhook_id = %s"
                 " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
                 " ORDER BY created_at DESC, id DESC LIMIT %s",
-                (
-                    *(webhook_id, *((cursor_time(created),) * 2 if created else (None, None))),
-                    *(last_id, limit + 1),
-                ),
+                *(webhook_id, *((cursor_time(created),) * 2 if created else (None, None))),
+                *(last_id, limit + 1),
             )
-            rows = await found.fetchall()
         items = tuple(_delivery_record(row) for row in rows[:limit])
         more = len(rows) > limit
         return Page(
@@ -221,10 +221,9 @@ class WebhookStore:
         self, connection: Connection, webhook_id: str, *, lock: bool = False
     ) -> dict[str, Any]:
         end = " FOR NO KEY UPDATE" if lock else ""
-        cursor = await connection.execute(
-            f"SELECT * FROM webhooks WHERE id = %s AND {_MINE}{end}".encode(), (webhook_id, self._tenant)
+        row = await connection.row(
+            f"SELECT * FROM webhooks WHERE id = %s AND {_MINE}{end}".encode(), webhook_id, self._tenant
         )
-        row = await cursor.fetchone()
         if row is None:
             raise NotFound(f"No webhook {webhook_id}.")
         return row
@@ -254,10 +253,7 @@ async def drop_pending(connection: Connection, webhook_id: str) -> None:
 
 
 async def _delivery(connection: Connection, webhook_id: str, delivery_id: str) -> DeliveryView:
-    cursor = await connection.execute(
-        _DELIVERY + " WHERE id = %s AND webhook_id = %s", (delivery_id, webhook_id)
-    )
-    row = await cursor.fetchone()
+    row = await connection.row(_DELIVERY + " WHERE id = %s AND webhook_id = %s", delivery_id, webhook_id)
     if row is None:
         raise NotFound(f"Webhook {webhook_id} has no delivery {delivery_id}.")
     return _delivery_record(row)
