@@ -46,6 +46,12 @@ def test_the_build_is_of_these_sources() -> None:
     assert hatch_build.is_built(ROOT), "make web builds it anew"
 
 
+def test_the_page_reads_only_what_responses_and_result_files_hold() -> None:
+    if not (ROOT / "node_modules" / "typescript").is_dir():
+        pytest.skip("TypeScript is not installed; make web installs it.")
+    assert hatch_build.check_types(ROOT) == 0
+
+
 def test_the_lock_file_names_no_registry_and_a_digest_for_each_package() -> None:
     text = (ROOT / "package-lock.json").read_text()
     assert '"resolved"' not in text

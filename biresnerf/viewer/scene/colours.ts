@@ -4,32 +4,23 @@ import type { SceneCamera } from "../result/widget_data";
 export type ColourBy = "moved_deg" | "moved_units" | "delta_psnr" | "source";
 export type Colour = readonly [number, number, number]; // 0 to 255
 
+/** `#rrggbb` as numbers. */
+export function hexColour(hex: string): Colour {
+  const number = Number.parseInt(hex.slice(1), 16);
+  return [(number >> 16) & 255, (number >> 8) & 255, number & 255];
+}
+
 // Viridis, as in difference and depth images: perceptually uniform, also for colour-blind readers.
-const VIRIDIS: readonly Colour[] = [
-  [68, 1, 84],
-  [71, 44, 122],
-  [59, 81, 139],
-  [44, 113, 142],
-  [33, 144, 141],
-  [39, 173, 129],
-  [92, 200, 99],
-  [170, 220, 50],
-  [253, 231, 37],
-];
+const VIRIDIS = ["#440154", "#472c7a", "#3b518b", "#2c718e", "#21908d", "#27ad81", "#5cc863", "#aadc32", "#fde725"].map(
+  hexColour,
+);
 // Orange is worse, blue is better: colour-blind readers can tell them apart.
-const WORSE: Colour = [213, 94, 0];
-const BETTER: Colour = [0, 114, 178];
-const BETTER_ON_DARK: Colour = [86, 180, 233];
-export const UNKNOWN: Colour = [128, 134, 140];
+const WORSE = hexColour("#d55e00");
+const BETTER = hexColour("#0072b2");
+const BETTER_ON_DARK = hexColour("#56b4e9");
+export const UNKNOWN = hexColour("#80868c");
 // The palette of Okabe and Ito without black and yellow, which vanish on a dark or light background.
-const KINDS: readonly Colour[] = [
-  [0, 114, 178],
-  [230, 159, 0],
-  [0, 158, 115],
-  [204, 121, 167],
-  [213, 94, 0],
-  [86, 180, 233],
-];
+const KINDS = ["#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9"].map(hexColour);
 
 const blend = (a: Colour, b: Colour, share: number): Colour => [
   Math.round(a[0] + share * (b[0] - a[0])),

@@ -4,10 +4,10 @@ import { between, centreOf, medianOf, spreadOf, turnDeg } from "../result/poses"
 import type { PointLayer, SceneCamera } from "../result/widget_data";
 import { Button, ImageStepper, Slider } from "../widgets/controls";
 import { fixed, short } from "../widgets/numbers";
-import { hexColour, themeColour, useDark, useReducedMotion } from "../widgets/theme";
+import { themeColour, useDark, useReducedMotion } from "../widgets/theme";
 import { sourceWords } from "../widgets/words";
 import { CameraTable } from "./camera_table";
-import { colourOf } from "./colours";
+import { colourOf, hexColour } from "./colours";
 import type { Look } from "./geometry";
 import { capOf, FIRST_CHOICE, layerOf, Legend, SceneControls } from "./scene_controls";
 import { useScene } from "./use_scene";

@@ -18,9 +18,3 @@ export const useReducedMotion = (): boolean => useMedia("(prefers-reduced-motion
 /** The current value of a colour in theme.css. */
 export const themeColour = (name: string): string =>
   getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-
-/** `#rrggbb` as numbers. */
-export function hexColour(hex: string): [number, number, number] {
-  const number = Number.parseInt(hex.slice(1), 16);
-  return [(number >> 16) & 255, (number >> 8) & 255, number & 255];
-}
