@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from docs.generate.commands_page import commands_page
+from docs.generate.format_tables import format_page, page_formats
 from docs.generate.notebooks import notebook
 from docs.generate.options_page import options_page
 from docs.generate.result_schema import result_schema
@@ -19,6 +20,8 @@ def generated() -> dict[Path, str]:
         ROOT / "docs/options.md": options_page(),
         ROOT / "docs/settings.md": settings_page(),
         ROOT / "docs/commands.md": commands_page(),
+        ROOT / "docs/formats.md": format_page(ROOT / "docs/formats.md"),
+        ROOT / "service/web/formats.ts": page_formats(),
         ROOT / "docs/result.schema.json": result_schema(),
     }
     walks = [path for path in sorted((ROOT / "examples").glob("*.py")) if "# %%" in path.read_text("utf-8")]

@@ -1,5 +1,6 @@
 // The programs that read the files of a result, and how to get them.
 import type { ArtifactView } from "schemas";
+import { RESULT_FORMATS } from "../formats";
 
 export interface Consumer {
   name: string;
@@ -7,44 +8,11 @@ export interface Consumer {
   /** A file, or a folder (ending in a slash). */
   files: string;
   /** The format to request if it is not written by default. */
-  pack?: string;
+  exported?: string;
 }
 
 export const CONSUMERS: readonly Consumer[] = [
-  {
-    name: "For nerfstudio",
-    words: "Replaces the transforms.json of the photos; then: ns-train nerfacto --data FOLDER",
-    files: "transforms.json",
-  },
-  {
-    name: "For 3D Gaussian splatting, gsplat, OpenMVS",
-    words: "Photos without distortion, with PINHOLE cameras and points",
-    files: "pinhole/",
-    pack: "pinhole",
-  },
-  {
-    name: "For COLMAP",
-    words: "A binary model with the input's ids; gsplat and 3DGS read it too if the lenses have no distortion",
-    files: "colmap/sparse/",
-  },
-  { name: "For COLMAP, as text", words: "For programs that read no binary models", files: "colmap/sparse_txt/", pack: "colmap-text" },
-  {
-    name: "For instant-ngp",
-    words: "Put it into the folder of the photos and open it in instant-ngp",
-    files: "transforms_ngp.json",
-    pack: "instant-ngp",
-  },
-  { name: "For Blender", words: "Cameras before and after, and points: File › Import › glTF", files: "scene.glb" },
-  {
-    name: "For Metashape",
-    words: "Bundler format: File › Import › Import Cameras",
-    files: "bundler/",
-    pack: "bundler",
-  },
-  { name: "For evo and SLAM tools", words: "A trajectory in TUM format", files: "tum.txt" },
-  { name: "For odometry tools", words: "A trajectory in KITTI format", files: "kitti.txt", pack: "kitti" },
-  { name: "For LLFF", words: "In the format of the input", files: "poses_bounds.npy" },
-  { name: "For your own programs", words: "Each pose before and after, in full precision", files: "poses.json" },
+  ...RESULT_FORMATS,
   { name: "To share", words: "The views of this page in one file that needs no network", files: "report.html" },
   { name: "To share, as a video", words: "A flight around the scene", files: "renders/orbit.mp4" },
   { name: "Numbers and evidence", words: "The figures behind the verdict, and the outcome for each image", files: "report.json" },

@@ -24,7 +24,7 @@ export function Downloads({ job, artifacts, onNewFiles }: Props) {
   // Further formats are written from poses.json, which a preview does not have.
   const exportable = results.some(({ name }) => name === "poses.json");
   const rows = CONSUMERS.map((consumer) => ({ consumer, files: filesFor(consumer, results) }));
-  const shown = rows.filter(({ consumer, files }) => files.length || (consumer.pack && exportable));
+  const shown = rows.filter(({ consumer, files }) => files.length || (consumer.exported && exportable));
   return (
     <ul class="downloads">
       {shown.map(({ consumer, files }) => (
@@ -163,7 +163,7 @@ async function exported(
   onNewFiles: () => Promise<void>,
 ): Promise<void> {
   say("Writing …");
-  const json = { formats: [consumer.pack] };
+  const json = { formats: [consumer.exported] };
   let made = await requestJson<JobView>("POST", `v1/jobs/${job.id}/exports`, { json });
   while (!isOver(made)) {
     if (made.state === "queued" && made.queue_position) say(`Waiting, number ${made.queue_position}`);

@@ -1,6 +1,7 @@
 // Where image sets are dropped or chosen.
 import { useEffect, useRef, useState } from "preact/hooks";
 import { asProblem, type Problem } from "../api/http";
+import { READ_FORMATS } from "../formats";
 import { percent } from "../parts/format";
 import { ProblemBox } from "../parts/problem_box";
 import { type Chosen, fromDrop, fromInput, type Gathered } from "./gather";
@@ -47,8 +48,7 @@ export function DropZone({ onChosen, compact = false }: Props) {
       <div class="drop-words">
         <p class="drop-lead">Drop a folder of images, a COLMAP model with its images, or an archive</p>
         <p class="soft">
-          transforms.json (nerfstudio, instant-ngp, Blender), COLMAP, LLFF, TUM, KITTI, Bundler, Metashape; zip, tar,
-          tar.gz. Without poses, COLMAP finds them.
+          {READ_FORMATS}; zip, tar, tar.gz. Without poses, COLMAP finds them.
         </p>
       </div>
       <div class="drop-buttons">

@@ -15,7 +15,7 @@ from biresnerf.options.formats import Format
 
 COLMAP = Format(
     name="colmap",
-    title="COLMAP model",
+    title="COLMAP",
     rank=20,
     found_as=("sparse/0", "colmap/sparse/0", "sparse", "colmap/sparse", ".", "sparse_txt/0", "sparse_txt"),
     gives="poses, cameras, features, points, rigs, frames, all ids; binary or text, COLMAP 3.10 to 4.2",
@@ -28,7 +28,7 @@ COLMAP = Format(
     always=True,
     loses=("mask paths",),
     heading="For COLMAP",
-    hint="A binary model with the input's ids; gsplat and 3DGS read it too where lenses have no distortion",
+    hint="A binary model with the input's ids; gsplat and 3DGS read it too if the lenses have no distortion",
     downloads="colmap/sparse/",
 )
 COLMAP_TEXT = Format(
@@ -40,7 +40,7 @@ COLMAP_TEXT = Format(
     loses=("mask paths",),
     lacks="names with spaces",
     heading="For COLMAP, as text",
-    hint="For what reads no binary models",
+    hint="For programs that read no binary models",
     downloads="colmap/sparse_txt/",
 )
 

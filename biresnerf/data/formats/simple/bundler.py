@@ -38,7 +38,7 @@ BUNDLER = Format(
     in_result="bundler/bundle.out",
     loses=("some lenses", "rigs", "mask paths"),
     heading="For Metashape",
-    hint="Bundler's form: File › Import › Import Cameras",
+    hint="Bundler format: File › Import › Import Cameras",
     downloads="bundler/",
 )
 

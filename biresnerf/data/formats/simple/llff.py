@@ -32,7 +32,7 @@ LLFF = Format(
     needs=("bounds",),
     loses=("names", "some lenses", "distortion", "rigs", "points", "mask paths"),
     heading="For LLFF",
-    hint="In the form of the input",
+    hint="In the format of the input",
 )
 
 

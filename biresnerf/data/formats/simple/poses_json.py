@@ -28,7 +28,7 @@ POSES_JSON = Format(
     always=True,
     loses=("rigs", "points"),
     heading="For your own programs",
-    hint="Each pose before and after, with all digits",
+    hint="Each pose before and after, in full precision",
 )
 
 

@@ -51,7 +51,7 @@ TUM = Format(
     needs=("lens file",),
     loses=("lenses", "rigs", "points", "mask paths"),
     heading="For evo and SLAM tools",
-    hint="A trajectory in TUM's form",
+    hint="A trajectory in TUM format",
 )
 KITTI = Format(
     name="kitti",
@@ -62,7 +62,7 @@ KITTI = Format(
     needs=("lens file",),
     loses=("names", "lenses", "rigs", "points", "mask paths"),
     heading="For odometry tools",
-    hint="A trajectory in KITTI's form",
+    hint="A trajectory in KITTI format",
 )
 
 

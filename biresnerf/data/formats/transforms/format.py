@@ -21,7 +21,7 @@ TRANSFORMS = Format(
     needs=("input",),
     loses=("rigs", "points"),
     heading="For nerfstudio",
-    hint="Put it in the place of the photos' transforms.json, then: ns-train nerfacto --data FOLDER",
+    hint="Replaces the transforms.json of the photos; then: ns-train nerfacto --data FOLDER",
 )
 CODECS = (
     Codec(

@@ -36,7 +36,7 @@ INSTANT_NGP = Format(
     loses=("rigs", "points", "mask paths"),
     lacks="FULL_OPENCV; WebP and TIFF images",
     heading="For instant-ngp",
-    hint="Put it into the photos' folder, then open it in instant-ngp",
+    hint="Put it into the folder of the photos and open it in instant-ngp",
 )
 
 
