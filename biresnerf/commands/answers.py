@@ -1,4 +1,4 @@
-"""Answers of commands: one JSON document, or lines for people."""
+"""Output of commands: one JSON document, or lines of text."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ json_option = click.option(
 )
 
 
-def print_json(answer: BaseModel | dict[str, Any]) -> None:
-    """Print one JSON document on standard output; what is no number there is null."""
+def print_json(answer: BaseModel | dict[str, Any] | Sequence[BaseModel]) -> None:
+    """Print one JSON document on standard output; NaN and infinity become null."""
     if isinstance(answer, BaseModel):
         click.echo(answer.model_dump_json(indent=1))
     else:
@@ -34,13 +34,13 @@ def _plain(value: Any) -> Any:
 
 
 def with_code(error: Exception) -> str:
-    """What went wrong, with the code by which docs/troubleshooting.md has it."""
+    """The error's message and its code, under which docs/troubleshooting.md lists it."""
     code = getattr(error, "code", None)
     return f"{error} [{code}]" if code else str(error)
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:
-    """Rows in columns as wide as they need, the last one without filling."""
+    """Rows as aligned columns."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))] if rows else []
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows

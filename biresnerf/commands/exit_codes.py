@@ -1,4 +1,4 @@
-"""What the exit status says, in one place; docs/command-line.md has the table."""
+"""Exit statuses; docs/command-line.md lists them."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import IO, Any
 import click
 
 DONE = 0
-FAILED = 1  # nothing below: the optimisation diverged, a bug
+FAILED = 1  # none of the others: the optimisation diverged, a bug
 INPUT = 2  # the input, an option, or the usage has to change
 JOB = 3  # the job failed, was cancelled, or has expired
 NOT_FOUND = 4  # no such job, dataset or file
-KEY = 5  # the API key is missing, refused, or may not do that
-AWAY = 6  # the service cannot be reached, or asks to come back later
-NOT_OVER = 7  # the job goes on: it was not over after --timeout
+KEY = 5  # the API key is missing, refused, or lacks the permission
+AWAY = 6  # the service cannot be reached, or is busy
+NOT_OVER = 7  # the job was not over after --timeout; it continues
 SIGINT = 128 + signal.SIGINT
 SIGTERM = 128 + signal.SIGTERM
 
@@ -27,5 +27,5 @@ class CommandFailed(click.ClickException):
         self.exit_code = exit_code  # type: ignore[misc]
 
     def show(self, file: IO[Any] | None = None) -> None:
-        """The line."""
+        """Prints the line."""
         click.echo(f"error: {self.message}", file=file, err=file is None)

@@ -1,4 +1,4 @@
-"""`--set key=value`: any refinement option on any command that takes them."""
+"""`--set key=value`: any refinement option, for every command that takes them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from biresnerf.errors import InputError
 
 
 def parse_settings(texts: tuple[str, ...]) -> dict[str, Any]:
-    """Values by key; a value is JSON where it can be read as such, else text. Raises `InputError`."""
+    """Values by key; a value that is not valid JSON is text. Raises `InputError`."""
     settings: dict[str, Any] = {}
     for text in texts:
         key, separator, value = text.partition("=")

@@ -1,4 +1,4 @@
-"""`biresnerf demo`: the whole way, from images with bad poses to images with good ones, over HTTP.
+"""`biresnerf demo`: a whole job over HTTP, from images with wrong poses to images with refined ones.
 
 Starts a service of its own, sends a scene whose true poses are known (or the user's), shows the progress,
 fetches the results, measures them, and stops the service.
@@ -17,7 +17,6 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,45 +31,24 @@ from biresnerf.options.refine_options import RefineOptions
 from biresnerf.report import Report
 from workers.process.die_with_parent import tethered
 
-# By this file a later run knows that it may clear the folder.
+# Marks a folder that a later run may clear.
 _MARK = ".made-by-biresnerf-demo"
 _STOP_S = 40.0
 _READY = re.compile(r"ready at (\S+)")
 
 
-@dataclass(frozen=True)
-class Folders:
-    """Where everything of one run lies."""
-
-    output: Path
-
-    @property
-    def scene(self) -> Path:
-        """What is sent, where the demo makes the scene."""
-        return self.output / "scene"
-
-    @property
-    def truth(self) -> Path:
-        """The true poses of the made scene."""
-        return self.output / "scene.truth.json"
-
-    @property
-    def result(self) -> Path:
-        """What came back."""
-        return self.output / "result"
-
-
 def run_demo(scene: Path | None, output: Path, options: RefineOptions, views: int, size: int) -> None:
-    """Runs the demo; raises `BiresnerfError` where a part of it fails."""
-    folders = Folders(output.resolve())
+    """Runs the demo; all its files are in ``output`` afterwards. Raises `BiresnerfError`."""
+    output = output.resolve()
     if scene is not None:
-        look_at(scene)  # what is wrong with it is said before anything starts
-    _clear(folders.output)
-    given = scene or _made_scene(folders, views, size)
+        look_at(scene)  # raises before anything starts
+    _clear(output)
+    given = scene or _make_scene(output / "scene", views, size)
+    result = output / "result"
     with _service() as url:
         click.echo(f"service, while this runs: {url}  (its page; API docs: {url}/docs)")
-        _send_and_fetch(url, given, folders.result, options)
-    _tell(folders, None if scene else folders.truth, given)
+        _send_and_fetch(url, given, result, options)
+    _print_outcome(result, given, None if scene else output / "scene.truth.json")
 
 
 def _clear(output: Path) -> None:
@@ -86,14 +64,14 @@ def _clear(output: Path) -> None:
     (output / _MARK).touch()
 
 
-def _made_scene(folders: Folders, views: int, size: int) -> Path:
+def _make_scene(scene: Path, views: int, size: int) -> Path:
     click.echo(f"making a scene of {views} views with known poses, and turning each camera at random …")
-    _biresnerf("make-scene", folders.scene, "--views", views, "--size", size, "--noise", 0.15, "--seed", 1)
-    return folders.scene
+    _biresnerf("make-scene", scene, "--views", views, "--size", size, "--noise", 0.15, "--seed", 1)
+    return scene
 
 
 def _biresnerf(*arguments: object) -> str:
-    """Output of another command of ours, in a process of its own: it loads what the service must not."""
+    """Runs another command in a process of its own, as it loads torch; returns its output."""
     command = [sys.executable, "-m", "biresnerf.command_line", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode != 0:
@@ -103,7 +81,7 @@ def _biresnerf(*arguments: object) -> str:
 
 @contextmanager
 def _service() -> Iterator[str]:
-    """A whole service on a free port, with a database of its own; gone at the end."""
+    """Runs a service on a free port, with a private database; deletes both at the end."""
     home = Path(tempfile.mkdtemp(prefix="biresnerf-demo-"))
     home.chmod(0o711)  # the database runs as another user where root starts it
     environment = {name: value for name, value in os.environ.items() if not name.startswith("BIRESNERF_")}
@@ -111,7 +89,7 @@ def _service() -> Iterator[str]:
     log = home / "service.log"
     command = [sys.executable, "-m", "biresnerf.command_line", "up", "--port", "0", "--slots", "1"]
     with log.open("wb") as errors:
-        # Its own session: Ctrl-C reaches us alone, and we end it in order. Where we are killed it ends by itself.
+        # In a session of its own, Ctrl-C does not reach it. It ends by itself if this process is killed.
         process = subprocess.Popen(
             tethered(command, signal_number=signal.SIGINT),
             env=environment,
@@ -150,14 +128,14 @@ def _send_and_fetch(url: str, scene: Path, target: Path, options: RefineOptions)
         click.echo(f"fetched {len(fetch(client, job, target))} files")
 
 
-def _tell(folders: Folders, truth: Path | None, scene: Path) -> None:
-    """The outcome in numbers."""
-    report = Report.model_validate_json((folders.result / "report.json").read_bytes())
+def _print_outcome(result: Path, scene: Path, truth: Path | None) -> None:
+    """Prints the pose errors before and after, or how far the poses moved where the truth is not known."""
+    report = Report.model_validate_json((result / "report.json").read_bytes())
     click.echo()
     for line in report.verdict.in_words() if report.verdict is not None else []:
         click.echo(line)
     if truth is not None:
-        before, after = (_pose_error(path, truth) for path in (scene, folders.result))
+        before, after = (_pose_error(path, truth) for path in (scene, result))
         click.echo("pose error (mean over the cameras)   before      after")
         click.echo(f"  rotation                        {before[0]:8.3f}°  {after[0]:8.3f}°")
         click.echo(f"  position, of camera distance    {before[1]:8.3f}%  {after[1]:8.3f}%")
@@ -174,9 +152,9 @@ def _tell(folders: Folders, truth: Path | None, scene: Path) -> None:
         click.echo(
             f"held-out views ({held_out.count}): PSNR {held_out.psnr:.2f} dB, SSIM {held_out.ssim:.3f}"
         )
-    click.echo(f"\nfiles: {os.path.relpath(folders.result)}")
+    click.echo(f"\nfiles: {os.path.relpath(result)}")
     for name in ("report.html", "transforms.json", "colmap/sparse/0", "renders", "report.json"):
-        if (folders.result / name).exists():
+        if (result / name).exists():
             click.echo(f"  {name}")
     click.echo("the service's page, for sets of your own: run `biresnerf up` and open http://127.0.0.1:8000")
 

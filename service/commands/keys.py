@@ -1,25 +1,21 @@
-"""`biresnerf keys`: make, list and revoke API keys, on the machine that holds the database."""
+"""`biresnerf keys`: create, list and revoke API keys, on the machine that holds the database."""
 
 from __future__ import annotations
 
-import asyncio
-import json
 import re
-from collections.abc import Awaitable, Callable
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from biresnerf.commands.answers import json_option
-from service.commands.serve import settings_with, setup_problems
+from biresnerf.commands.answers import json_option, print_json
+from biresnerf.errors import InputError
+from service.commands.installation import data_dir_option, with_database
 
 if TYPE_CHECKING:
-    from workers.database.database import Database
     from workers.tenants.api_keys import ApiKey
 
-T = TypeVar("T")
 _UNITS = {"h": "hours", "d": "days", "w": "weeks"}
 
 
@@ -38,29 +34,24 @@ class Span(click.ParamType[timedelta]):
 
 @click.group("keys")
 def keys_command() -> None:
-    """Make, list and revoke API keys.
+    """Create, list and revoke API keys.
 
-    Works on BIRESNERF_DATABASE_URL, else on the private database of `biresnerf up` in the data folder,
-    whether it runs or not.
+    Works on the database at BIRESNERF_DATABASE_URL, or else on the private one of `biresnerf up`, which may be running
+    or not.
     """
-
-
-data_dir_option = click.option(
-    "--data-dir", type=click.Path(path_type=Path), help="Where the private database is."
-)
 
 
 @keys_command.command("create")
 @click.argument("name")
 @click.option(
-    "--tenant", default="local", show_default=True, help="Whose key it is; a new name is a new tenant."
+    "--tenant", default="local", show_default=True, help="The key's tenant; a new name creates a tenant."
 )
 @click.option(
     "--scope",
     "scopes",
     multiple=True,
     type=click.Choice(["read", "datasets:write", "jobs:write", "admin"]),
-    help="May be repeated. Default: read, datasets:write and jobs:write. admin may do everything.",
+    help="May be repeated. Default: read, datasets:write and jobs:write. admin includes all.",
 )
 @click.option("--expires", type=Span(), help="For example 90d. Default: never.")
 @json_option
@@ -73,7 +64,7 @@ def create_command(
     as_json: bool,
     data_dir: Path | None,
 ) -> None:
-    """Make a key called NAME. Its text is shown once; only a digest of it is kept."""
+    """Create a key called NAME. Its text is shown once; only a digest of it is stored."""
     from workers.tenants.api_keys import USUAL_SCOPES, KeyStore
 
     key, text = with_database(
@@ -81,23 +72,23 @@ def create_command(
         lambda database: KeyStore(database).create(tenant, name, scopes or USUAL_SCOPES, lives=expires),
     )
     if as_json:
-        click.echo(json.dumps({**key.model_dump(mode="json"), "key": text}))
+        print_json({**key.model_dump(mode="json"), "key": text})
         return
     click.echo(text)
     click.echo(f"{_line(key)}\nKeep it now: it is not shown again.", err=True)
 
 
 @keys_command.command("list")
-@click.option("--tenant", help="Of this tenant only.")
+@click.option("--tenant", help="Only keys of this tenant.")
 @json_option
 @data_dir_option
 def list_command(tenant: str | None, as_json: bool, data_dir: Path | None) -> None:
-    """List the keys, revoked ones too."""
+    """List all keys, including revoked ones."""
     from workers.tenants.api_keys import KeyStore
 
     found = with_database(data_dir, lambda database: KeyStore(database).list(tenant))
     if as_json:
-        click.echo(json.dumps([key.model_dump(mode="json") for key in found]))
+        print_json(found)
         return
     for key in found:
         click.echo(_line(key))
@@ -108,8 +99,7 @@ def list_command(tenant: str | None, as_json: bool, data_dir: Path | None) -> No
 @json_option
 @data_dir_option
 def revoke_command(key_id: str, as_json: bool, data_dir: Path | None) -> None:
-    """End the key KEY_ID for good, from its next request on."""
-    from biresnerf.errors import InputError
+    """Revoke the key KEY_ID for good, from its next request on."""
     from workers.settings.errors import NotFound
     from workers.tenants.api_keys import KeyStore
 
@@ -117,24 +107,14 @@ def revoke_command(key_id: str, as_json: bool, data_dir: Path | None) -> None:
         key = with_database(data_dir, lambda database: KeyStore(database).revoke(key_id))
     except NotFound as error:
         raise InputError.of(error.fault, hint="`biresnerf keys list` shows the ids.") from None
-    click.echo(json.dumps(key.model_dump(mode="json")) if as_json else _line(key))
-
-
-def with_database(data_dir: Path | None, work: Callable[[Database], Awaitable[T]]) -> T:
-    """What ``work`` makes of the database; raises `InputError` where the operator has to change something."""
-    from workers.database.database import open_database
-    from workers.database.reach_database import reached_database
-
-    async def run(url: str) -> T:
-        async with open_database(url, connections=1) as database:
-            return await work(database)
-
-    with setup_problems(), reached_database(settings_with(data_dir=data_dir)) as url:
-        return asyncio.run(run(url))
+    if as_json:
+        print_json(key)
+    else:
+        click.echo(_line(key))
 
 
 def _line(key: ApiKey) -> str:
-    ends = f"revoked {key.revoked_at:%Y-%m-%d}" if key.revoked_at else "living"
+    ends = f"revoked {key.revoked_at:%Y-%m-%d}" if key.revoked_at else "valid"
     if key.expires_at and not key.revoked_at:
         ends = f"until {key.expires_at:%Y-%m-%d}"
     used = f"used {key.last_used_at:%Y-%m-%d}" if key.last_used_at else "never used"

@@ -1,73 +1,44 @@
-"""The commands of the service, found by `biresnerf` through their entry points. Imports happen when one runs."""
+"""Commands that run the service's processes. Imports happen when one runs."""
 
 from __future__ import annotations
 
 import socket
 import sys
-from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from biresnerf.commands.answers import json_option, print_json
 from biresnerf.commands.settings_option import settings_option
-from biresnerf.errors import InputError
-
-if TYPE_CHECKING:
-    from workers.settings.settings import Settings
+from service.commands.installation import settings_with, setup_problems
 
 
 def free_port() -> int:
-    """A port that nobody listens on just now."""
+    """A port that nothing listens on at the moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
 
 
-def settings_with(**given: Any) -> Settings:
-    """The settings of the environment, with those given (not None) in their place."""
-    from workers.settings.settings import Settings
-
-    return Settings(**{name: value for name, value in given.items() if value is not None})
-
-
-@contextmanager
-def setup_problems() -> Iterator[None]:
-    """Turns what the operator has to change into an `InputError`."""
-    from pydantic import ValidationError
-
-    from workers.settings.errors import SetupError
-
-    try:
-        yield
-    except SetupError as error:
-        raise InputError.of(error.fault) from None
-    except ValidationError as error:
-        lines = [
-            f"BIRESNERF_{'_'.join(map(str, item['loc'])).upper()}: {item['msg']}." for item in error.errors()
-        ]
-        raise InputError(
-            "invalid_settings", " ".join(lines), hint="Change these environment variables."
-        ) from None
-
-
 @click.command("up")
 @click.option("--host", help="Address to listen on. Default: BIRESNERF_HOST, else 127.0.0.1.")
 @click.option(
-    "--port", type=click.IntRange(0, 65535), help="0 takes a free one. Default: BIRESNERF_PORT, else 8000."
+    "--port", type=click.IntRange(0, 65535), help="0: a free one. Default: BIRESNERF_PORT, else 8000."
 )
 @click.option(
     "--slots", type=click.IntRange(0, 64), help="Jobs at the same time. Default: BIRESNERF_SLOTS, else 1."
 )
-@click.option("--data-dir", type=click.Path(path_type=Path), help="Files and private database.")
+@click.option(
+    "--data-dir", type=click.Path(path_type=Path), help="Folder for files and the private database."
+)
 def up_command(host: str | None, port: int | None, slots: int | None, data_dir: Path | None) -> None:
-    """Run everything on this machine: database, API, dispatcher and workers.
+    """Run a whole service on this machine: database, API, dispatcher and workers.
 
     Without BIRESNERF_DATABASE_URL a private PostgreSQL is started from the installed package. Ctrl-C stops
-    everything; running jobs write a checkpoint and go on at the next start.
+    everything; running jobs write a checkpoint and continue at the next start.
     """
     import asyncio
 
@@ -108,9 +79,12 @@ def _answers(url: str) -> bool:
 
 @click.command("api")
 @click.option("--host", help="Address to listen on.")
-@click.option("--port", type=click.IntRange(0, 65535), help="0 takes a free one.")
+@click.option("--port", type=click.IntRange(0, 65535), help="0: a free one.")
 def api_command(host: str | None, port: int | None) -> None:
-    """Run the web process alone (needs BIRESNERF_DATABASE_URL and `biresnerf migrate`)."""
+    """Run only the web process.
+
+    Needs BIRESNERF_DATABASE_URL, and a database brought up to date by `biresnerf migrate`.
+    """
     from service.server import serve
     from workers.settings.logs import set_up_logging
 
@@ -121,9 +95,12 @@ def api_command(host: str | None, port: int | None) -> None:
 
 
 @click.command("worker")
-@click.option("--slot", default="cpu0", show_default=True, help="cpuN, or gpuN for the GPU of that number.")
+@click.option("--slot", default="cpu0", show_default=True, help="cpuN, or gpuN for GPU number N.")
 def worker_command(slot: str) -> None:
-    """Run one worker slot: one job at a time (needs BIRESNERF_DATABASE_URL and `biresnerf migrate`)."""
+    """Run one worker slot, which runs one job at a time.
+
+    Needs BIRESNERF_DATABASE_URL, and a database brought up to date by `biresnerf migrate`.
+    """
     from workers.queue.slot import main
 
     with setup_problems():
@@ -153,23 +130,27 @@ def migrate_command(as_json: bool) -> None:
     type=click.Path(path_type=Path),
     default=Path("demo-output"),
     show_default=True,
-    help="For all of its files.",
+    help="Folder for all files.",
 )
 @click.option("--preset", default="fast", show_default=True, help="fast, balanced, quality or paper.")
 @click.option(
-    "--views", type=click.IntRange(6, 400), default=60, show_default=True, help="Of the made scene."
+    "--views",
+    type=click.IntRange(6, 400),
+    default=60,
+    show_default=True,
+    help="Images of the synthetic scene.",
 )
 @click.option(
-    "--size", type=click.IntRange(32, 800), default=100, show_default=True, help="Of its images, px."
+    "--size", type=click.IntRange(32, 800), default=100, show_default=True, help="Width of its images, px."
 )
 @settings_option
 def demo_command(
     scene: Path | None, output: Path, preset: str, views: int, size: int, settings: dict[str, Any]
 ) -> None:
-    """Show a whole job: a service of its own, bad poses in, good poses out.
+    """Run a demonstration: a service of its own, wrong poses in, refined poses out.
 
-    Without --scene a synthetic scene is made, whose true poses are known; each camera is then turned and
-    shifted at random (14 degrees on average). Everything lies in OUTPUT afterwards.
+    Without --scene a synthetic scene with known poses is rendered and each camera is turned and shifted at random
+    (14 degrees on average). All files are in OUTPUT afterwards.
     """
     from biresnerf.options.refine_options import parse_options
     from service.commands.demo import run_demo

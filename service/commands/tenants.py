@@ -1,15 +1,14 @@
-"""`biresnerf tenants`: what share of the service each tenant gets, and how much at most."""
+"""`biresnerf tenants`: each tenant's share of the service and its limits."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from biresnerf.commands.answers import json_option
-from service.commands.keys import data_dir_option, with_database
+from biresnerf.commands.answers import json_option, print_json
+from service.commands.installation import data_dir_option, with_database
 
 if TYPE_CHECKING:
     from biresnerf.wire.service import TenantShare
@@ -21,7 +20,7 @@ _LIMIT = click.IntRange(min=-1)
 def tenants_command() -> None:
     """List tenants and set their shares and limits.
 
-    A limit of 0 is none, one of -1 is what BIRESNERF_TENANT_MAX_RUNNING, …_QUEUED and …_STORED_BYTES say.
+    A limit of 0 means no limit; -1 means the default in BIRESNERF_TENANT_MAX_RUNNING, …_QUEUED or …_STORED_BYTES.
     """
 
 
@@ -29,12 +28,12 @@ def tenants_command() -> None:
 @json_option
 @data_dir_option
 def list_command(as_json: bool, data_dir: Path | None) -> None:
-    """List the tenants with what they use."""
+    """List the tenants with their usage."""
     from workers.tenants.tenants import TenantStore
 
     found = with_database(data_dir, lambda database: TenantStore(database).shares())
     if as_json:
-        click.echo(json.dumps([share.model_dump(mode="json") for share in found]))
+        print_json(found)
         return
     for share in found:
         click.echo(_line(share))
@@ -42,21 +41,26 @@ def list_command(as_json: bool, data_dir: Path | None) -> None:
 
 @tenants_command.command("set")
 @click.argument("name")
-@click.option("--weight", type=click.FloatRange(0.1, 10), help="Share of the slots where tenants wait.")
 @click.option(
-    "--top-priority", type=click.Choice(["low", "normal", "high"]), help="The highest its jobs may have."
+    "--weight", type=click.FloatRange(0.1, 10), help="Share of the slots when several tenants wait."
 )
-@click.option("--max-running", type=_LIMIT, help="Jobs at the same time.")
-@click.option("--max-queued", type=_LIMIT, help="Jobs that wait.")
+@click.option(
+    "--top-priority", type=click.Choice(["low", "normal", "high"]), help="Highest priority its jobs may have."
+)
+@click.option("--max-running", type=_LIMIT, help="Jobs running at the same time.")
+@click.option("--max-queued", type=_LIMIT, help="Jobs waiting.")
 @click.option("--max-stored-bytes", type=_LIMIT, help="Bytes of datasets, uploads and results.")
 @json_option
 @data_dir_option
 def set_command(name: str, as_json: bool, data_dir: Path | None, **changes: Any) -> None:
-    """Change what is given of the tenant NAME; a new name is a new tenant."""
+    """Change the given values of the tenant NAME; a new name creates a tenant."""
     from workers.tenants.tenants import TenantStore
 
     share = with_database(data_dir, lambda database: TenantStore(database).set(name, **changes))
-    click.echo(json.dumps(share.model_dump(mode="json")) if as_json else _line(share))
+    if as_json:
+        print_json(share)
+    else:
+        click.echo(_line(share))
 
 
 def _line(share: TenantShare) -> str:

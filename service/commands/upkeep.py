@@ -1,4 +1,4 @@
-"""The commands for what has to be done beside requests and jobs. Imports happen when one runs."""
+"""Commands for webhooks and backups. Imports happen when one runs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from biresnerf.commands.answers import json_option, print_json
-from service.commands.serve import settings_with, setup_problems
+from service.commands.installation import data_dir_option, settings_with, setup_problems
 
 if TYPE_CHECKING:
     from workers.upkeep.backup_folder import BackupIndex
@@ -20,9 +20,10 @@ MIB = 2**20
 
 @click.command("dispatcher")
 def dispatcher_command() -> None:
-    """Run what sends webhooks (needs BIRESNERF_DATABASE_URL and `biresnerf migrate`).
+    """Run the process that sends webhooks.
 
-    Several may run. SIGTERM or Ctrl-C ends it once the messages under way are delivered.
+    Needs BIRESNERF_DATABASE_URL, and a database brought up to date by `biresnerf migrate`. Several may run. SIGTERM or
+    Ctrl-C ends it after the deliveries under way.
     """
     from workers.upkeep.dispatcher import main
 
@@ -33,12 +34,13 @@ def dispatcher_command() -> None:
 
 @click.command("backup")
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
-@click.option("--data-dir", type=click.Path(path_type=Path), help="Default: BIRESNERF_DATA_DIR.")
+@data_dir_option
 @json_option
 def backup_command(folder: Path, data_dir: Path | None, as_json: bool) -> None:
-    """Bring FOLDER up to date with the database and all files, while the service runs or not.
+    """Back up the database and all files to FOLDER.
 
-    The same folder again takes only what is new. It holds secrets: keep it as safe as the service.
+    The service may keep running. A further backup to FOLDER copies only new files. It holds secrets: protect it as
+    well as the service.
     """
     from workers.database.reach_database import reached_database
     from workers.upkeep.backup import make_backup
@@ -54,12 +56,13 @@ def backup_command(folder: Path, data_dir: Path | None, as_json: bool) -> None:
 
 @click.command("restore")
 @click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
-@click.option("--data-dir", type=click.Path(path_type=Path), help="Default: BIRESNERF_DATA_DIR.")
+@data_dir_option
 @json_option
 def restore_command(folder: Path, data_dir: Path | None, as_json: bool) -> None:
-    """Put the backup in FOLDER into an empty installation; nothing of the service may run yet.
+    """Restore the backup in FOLDER into an empty installation.
 
-    Every file is checked against its digest. Jobs that were running go on from their last checkpoints.
+    The service must not run yet. Every file is checked against its digest. Jobs that were running continue from their
+    last checkpoints.
     """
     from workers.database.reach_database import reached_database
     from workers.upkeep.backup_folder import read_index

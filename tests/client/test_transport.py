@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import anyio
 import httpx
 import pytest
@@ -12,7 +10,7 @@ from biresnerf.client import Client, ServiceError
 from biresnerf.client.job_calls import with_name
 from biresnerf.client.transport import parse, run_together
 from biresnerf.wire.jobs import ForkJob, JobView
-from tests.client.fake_service import URL, client_of
+from tests.client.fake_service import client_of
 
 pytestmark = pytest.mark.anyio
 
@@ -71,23 +69,6 @@ async def test_a_service_that_never_answered_is_not_waited_for() -> None:
         async with client_of(answer, answered=False) as client:
             with pytest.raises(ServiceError, match="refused"):
                 await client.job("job_1")
-
-
-async def test_the_key_goes_to_the_service_alone() -> None:
-    from biresnerf.client import AsyncClient
-
-    seen: dict[str, Any] = {}
-
-    def answer(request: httpx.Request) -> httpx.Response:
-        seen[request.url.host] = request.headers.get("authorization")
-        return httpx.Response(200, content=b"")
-
-    async with AsyncClient(URL, api_key="secret") as client:
-        client._http._transport = client._http._mounts = None  # type: ignore[assignment]
-        client._http._mounts, client._http._transport = {}, httpx.MockTransport(answer)
-        await client._http.get("/readyz")
-        await client._http.get("http://store.test/file")
-    assert seen == {"service.test": "Bearer secret", "store.test": None}
 
 
 async def test_the_first_failure_cancels_the_rest_and_is_raised_bare() -> None:

@@ -1,4 +1,4 @@
-"""`biresnerf download JOB --output OUT`: the files of a result."""
+"""`biresnerf download JOB --output OUT`: downloads the files of a result."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from biresnerf.commands.jobs.service_options import JOB, JobName, service_at, se
 @click.argument("job", type=JOB)
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option("--output", "-o", required=True, type=click.Path(path_type=Path), help="Folder for the files.")
-@click.option("--replace", is_flag=True, help="Overwrite files of other content.")
+@click.option("--replace", is_flag=True, help="Overwrite files that differ.")
 @service_options
 @json_option
 def download_command(
@@ -28,10 +28,10 @@ def download_command(
     api_key: str | None,
     as_json: bool,
 ) -> None:
-    """Download the result of JOB, or its files of these names (with * and ?; a folder stands for what is in it).
+    """Download the result of JOB, or some of its files.
 
-    What is there already is not sent again, and what was interrupted goes on where it broke off. Of a running job
-    these are its previews, of a cancelled or failed one what there is.
+    NAME may hold * and ?; a folder stands for all files in it. Files that are there already are skipped, interrupted
+    downloads are resumed. A running job has previews, a cancelled or failed one whatever it has written.
     """
     with service_at(url, api_key, job) as client:
         found = client.job(job.id)

@@ -1,4 +1,4 @@
-"""What comes after a job is queued, for every command that queues one: its address, waiting, its files."""
+"""After a command has queued a job: prints its address, waits for it, fetches its files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import click
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import print_json
 from biresnerf.commands.jobs.job_progress import BytesView, JobProgressView, watch
-from biresnerf.errors import InputError
 
 if TYPE_CHECKING:
     from biresnerf.client import Client
@@ -24,7 +23,7 @@ timeout_option = click.option(
     "timeout_s",
     type=click.FloatRange(0, min_open=True),
     metavar="SECONDS",
-    help="Wait no longer; the job goes on, and the exit status is 7.",
+    help="Stop waiting after this time; the job continues, and the exit status is 7.",
 )
 
 
@@ -37,21 +36,10 @@ def follow_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return wait(timeout_option(output(command)))
 
 
-def require_empty(folder: Path | None) -> None:
-    """Raises `InputError` where downloads would mix with other files."""
-    if folder is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(
-            "output_not_empty",
-            "is not an empty folder.",
-            where=str(folder),
-            hint="Name a new folder for the results.",
-        )
-
-
 def see_through(
     client: Client, job: JobView, *, wait: bool, timeout_s: float | None, output: Path | None, as_json: bool
 ) -> None:
-    """Print where the job is; wait for it and fetch its files where that is wanted. Raises `JobFailed`."""
+    """Print the job's address, then wait for it and fetch its files if asked to. Raises `JobFailed`."""
     if not as_json:
         click.echo(f"{client.url}{job.links.self}")
     if wait or timeout_s is not None or output is not None:
@@ -67,9 +55,9 @@ def see_through(
 
 
 def waited_for(client: Client, job: JobView, timeout_s: float | None, *, as_json: bool) -> JobView:
-    """The job once it is over, with its progress on standard error.
+    """The job once it is over; shows its progress on standard error.
 
-    Ctrl-C, ``timeout_s`` and a service that stays away end the waiting, not the job: it is said how to come back to it.
+    Ctrl-C, ``timeout_s`` and a service that cannot be reached end the waiting, not the job: it prints how to resume.
     """
     from biresnerf.client import JobNotOver, ServiceError
 
@@ -92,8 +80,8 @@ def waited_for(client: Client, job: JobView, timeout_s: float | None, *, as_json
 
 def _tell_how_to_come_back(client: Client, job: JobView) -> None:
     address = f"{client.url}{job.links.self}"
-    click.echo(f"The job goes on. To wait again: biresnerf wait {address}", err=True)
-    click.echo(f"To end it: biresnerf cancel {address}", err=True)
+    click.echo(f"The job continues. To wait again: biresnerf wait {address}", err=True)
+    click.echo(f"To stop it: biresnerf cancel {address}", err=True)
 
 
 def require_success(job: JobView) -> None:
@@ -105,6 +93,6 @@ def require_success(job: JobView) -> None:
 
 
 def fetch(client: Client, job: JobView, output: Path, **how: Any) -> list[Path]:
-    """The job's files below ``output``, with a bar; an interrupted one is taken up again by the same command."""
+    """Downloads the job's files to ``output``, with a progress bar; a later call resumes an interrupted one."""
     with BytesView("downloading") as view:
         return client.download_all(job.id, output, on_bytes=view.more, **how)

@@ -1,4 +1,4 @@
-"""`biresnerf fork JOB`: the same images with other options, without doing again what stays the same."""
+"""`biresnerf fork JOB`: the same images with other options, reusing what stays the same."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import click
 
 from biresnerf.client.job_calls import with_name
 from biresnerf.commands.answers import json_option
-from biresnerf.commands.jobs.follow_job import follow_options, require_empty, see_through
+from biresnerf.commands.empty_folder import require_empty
+from biresnerf.commands.jobs.follow_job import follow_options, see_through
 from biresnerf.commands.jobs.service_options import JOB, JobName, service_at, service_options
 from biresnerf.commands.jobs.submit import label_option
 from biresnerf.commands.settings_option import settings_option
@@ -21,7 +22,7 @@ from biresnerf.wire.jobs import WantedStage
 @settings_option
 @click.option(
     "--from-stage", type=click.Choice(get_args(WantedStage)), default="auto", show_default=True,
-    help="Whose work is taken over; auto: the latest that the options allow.",
+    help="The stage to reuse; auto: the latest that the options allow.",
 )  # fmt: skip
 @follow_options
 @label_option
@@ -39,10 +40,11 @@ def fork_command(
     api_key: str | None,
     as_json: bool,
 ) -> None:
-    """Queue a job on the images of JOB with some other options (`--set`), taking over the work of a stage."""
+    """Queue JOB again with other options, reusing the work that they do not change."""
     from biresnerf.options.refine_options import parse_options
 
-    require_empty(output)
+    if output is not None:
+        require_empty(output)
     options = parse_options(settings)
     with service_at(url, api_key, job) as client:
         if called := client.job(job.id).labels.get("name"):

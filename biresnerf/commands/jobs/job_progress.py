@@ -1,4 +1,4 @@
-"""Progress for people, on standard error: bars on a terminal, plain lines elsewhere."""
+"""Progress on standard error: bars on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LINE_EVERY_S = 10.0
 
 
 class _View:
-    """A bar on a terminal; elsewhere nothing is put up."""
+    """A bar on a terminal, nothing elsewhere."""
 
     def __init__(self, *columns: ProgressColumn) -> None:
         console = Console(stderr=True)
@@ -38,7 +38,7 @@ class _View:
             self._bar.stop()
 
     def note(self, text: str) -> None:
-        """Something worth a line."""
+        """Prints a line."""
         if self._bar is not None:
             self._bar.console.print(text, highlight=False, markup=False)
         else:
@@ -46,7 +46,7 @@ class _View:
 
 
 class JobProgressView(_View):
-    """Stage, step, loss and time left of a job; in a pipe a line at each stage and every few seconds."""
+    """Stage, step, loss and time left of a job; without a terminal a line at each stage and every 10 seconds."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -62,7 +62,7 @@ class JobProgressView(_View):
             self._task = self._bar.add_task("job", total=1.0, stage="waiting", numbers="", left="?")
 
     def job(self, job: JobView) -> None:
-        """How far the job is."""
+        """Shows the job's progress."""
         stage, numbers, left = stage_of(job), numbers_of(job), left_of(job)
         fraction = job.progress.fraction
         if self._bar is not None:
@@ -75,7 +75,7 @@ class JobProgressView(_View):
 
 
 class BytesView(_View):
-    """Bytes on their way, in either direction; in a pipe a line where nothing else would tell for long."""
+    """Bytes sent or received; without a terminal a line every 10 seconds."""
 
     def __init__(self, title: str) -> None:
         super().__init__(
@@ -89,7 +89,7 @@ class BytesView(_View):
             self._task = self._bar.add_task(title, total=None)
 
     def more(self, count: int, total: int) -> None:
-        """So many bytes more, of so many; may be called from several threads."""
+        """Counts ``count`` further bytes of ``total``."""
         with self._lock:
             self._done += count
             self._show(total)
@@ -105,21 +105,21 @@ class BytesView(_View):
 
 
 class SendingView(BytesView):
-    """A submission: what is sent, and what comes after."""
+    """The steps of a submission, and the bytes sent."""
 
     def __init__(self) -> None:
         super().__init__("reading")
 
     def sending(self, sending: Sending) -> None:
-        """How far the submission is."""
+        """Shows the submission's progress."""
         begins, self._title, self._done = sending.step != self._title, sending.step, sending.bytes_sent
         if begins and sending.step == "sending":
             there = sending.files - sending.files_missing
-            known = f", {there} are there already" if there else ""
+            known = f"; the service has {there} already" if there else ""
             size = f"{sending.bytes_missing / 1e6:.1f} MB"
             self.note(f"sending {sending.files_missing} of {sending.files} files, {size}{known}")
         elif begins and sending.step == "checking":
-            self.note("checking what was sent")
+            self.note("checking the files")
         self._show(sending.bytes_missing)
 
 
@@ -136,16 +136,16 @@ def watch(client: Client, job: JobView, view: JobProgressView, timeout_s: float 
 
 def _worth_a_line(event: StreamEvent) -> str | None:
     if event.kind == "attempt_crashed":
-        return f"Attempt {event.data.get('attempt')} broke off; the job goes on from its last checkpoint."
+        return f"Attempt {event.data.get('attempt')} crashed; the job continues from its last checkpoint."
     if event.kind == "retried_smaller":
-        return "It ran out of memory; the job begins again with less."
+        return "It ran out of memory; the job starts again with smaller settings."
     if event.kind == "cancel_requested":
-        return "The job was asked to end."
+        return "Cancellation was requested."
     return None
 
 
 def stage_of(job: JobView) -> str:
-    """Where the job is: its place in the queue, its stage, or how it ended."""
+    """Its place in the queue, its stage, or its final state."""
     if job.state == "queued":
         return f"waiting {job.queue_position or ''}".strip()
     return job.state if job.final else job.stage or job.state
@@ -159,7 +159,7 @@ def numbers_of(job: JobView) -> str:
 
 
 def left_of(job: JobView) -> str:
-    """Minutes and seconds to the end."""
+    """Minutes and seconds left."""
     left = job.progress.eta_s
     if left is None:
         return "?"

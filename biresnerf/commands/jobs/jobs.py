@@ -25,7 +25,10 @@ _LOG_EVERY_S = 1.0
 @service_options
 @json_option
 def status_command(job: JobName, url: str | None, api_key: str | None, as_json: bool) -> None:
-    """Show how far JOB is (its id, or its address as `submit` prints it)."""
+    """Show the state of JOB.
+
+    JOB is an id, or an address as `submit` prints it.
+    """
     with service_at(url, api_key, job) as client:
         found = client.job(job.id)
     if as_json:
@@ -35,16 +38,16 @@ def status_command(job: JobName, url: str | None, api_key: str | None, as_json: 
 
 
 def described(job: JobView) -> list[str]:
-    """A job in lines for people."""
+    """A job in lines of text."""
     lines = [f"{job.id}  {stage_of(job)}"]
     if job.state == "running":
         lines.append(f"  {100 * job.progress.fraction:.0f} %  {numbers_of(job)}  left {left_of(job)}")
     if job.cancel_requested and not job.final:
-        lines.append("  was asked to end")
+        lines.append("  cancellation requested")
     if job.attempt > 1:
         lines.append(f"  attempt {job.attempt}")
     if job.partial:
-        lines.append("  partial result: the best poses until it was stopped")
+        lines.append("  partial result: the best poses when it was stopped")
     if job.verdict is not None:
         lines.append(f"  verdict: {job.verdict}")
     if job.error is not None:
@@ -60,13 +63,13 @@ def described(job: JobView) -> list[str]:
 @click.command("list")
 @click.option("--state", type=click.Choice(get_args(JobState)), help="Only those in this state.")
 @click.option("--label", metavar="NAME=VALUE", help="Only those with this label.")
-@click.option("--limit", type=click.IntRange(1), default=20, show_default=True, help="The newest so many.")
+@click.option("--limit", type=click.IntRange(1), default=20, show_default=True, help="At most this many.")
 @service_options
 @json_option
 def list_command(
     state: JobState | None, label: str | None, limit: int, url: str | None, api_key: str | None, as_json: bool
 ) -> None:
-    """List jobs, the newest first."""
+    """List jobs, newest first."""
     wanted = None
     if label is not None:
         name, separator, value = label.partition("=")
@@ -100,9 +103,9 @@ def list_command(
 def wait_command(
     job: JobName, timeout_s: float | None, url: str | None, api_key: str | None, as_json: bool
 ) -> None:
-    """Show the progress of JOB until it is over. Exit status 0: it succeeded; 3: it did not.
+    """Show the progress of JOB until it is over.
 
-    Ctrl-C ends the waiting, not the job.
+    The exit status is 0 if it succeeded and 3 if not. Ctrl-C stops waiting; the job continues.
     """
     with service_at(url, api_key, job) as client:
         over = waited_for(client, client.job(job.id), timeout_s, as_json=as_json)
@@ -115,20 +118,20 @@ def wait_command(
 
 @click.command("logs")
 @click.argument("job", type=JOB)
-@click.option("--follow", "-f", is_flag=True, help="Go on until the job is over.")
+@click.option("--follow", "-f", is_flag=True, help="Continue until the job is over.")
 @click.option("--after", type=click.IntRange(0), default=0, help="Only lines after this number.")
 @service_options
 @json_option
 def logs_command(
     job: JobName, follow: bool, after: int, url: str | None, api_key: str | None, as_json: bool
 ) -> None:
-    """Print what the process of JOB has written so far."""
+    """Print the log of JOB."""
     if follow and as_json:
-        raise click.UsageError("--follow has no end that --json could wait for; `biresnerf wait --json` has.")
+        raise click.UsageError("--follow and --json exclude each other; see `biresnerf wait --json`.")
     lines = []
     with service_at(url, api_key, job) as client:
         while True:
-            # The state first: what is written between the two looks is not missed.
+            # The state first: lines written between the two requests are not missed.
             over = client.job(job.id).final
             while page := client.log(job.id, after=after):
                 after = page[-1].n
@@ -146,14 +149,14 @@ def _sleep_or_leave(client: Client, job: JobName) -> None:
     try:
         time.sleep(_LOG_EVERY_S)
     except KeyboardInterrupt:
-        click.echo(f"The job goes on: biresnerf wait {client.url}/v1/jobs/{job.id}", err=True)
+        click.echo(f"The job continues: biresnerf wait {client.url}/v1/jobs/{job.id}", err=True)
         raise click.exceptions.Exit(exit_codes.SIGINT) from None
 
 
 @click.command("cancel")
 @click.argument("job", type=JOB)
-@click.option("--keep-partial", is_flag=True, help="Keep the best poses so far as its result.")
-@click.option("--wait", is_flag=True, help="Until it has ended.")
+@click.option("--keep-partial", is_flag=True, help="Keep the best poses so far as the result.")
+@click.option("--wait", is_flag=True, help="Wait until it has ended.")
 @timeout_option
 @service_options
 @json_option
@@ -166,7 +169,7 @@ def cancel_command(
     api_key: str | None,
     as_json: bool,
 ) -> None:
-    """End JOB. One that is over already stays as it is."""
+    """Stop JOB. Does nothing if it is over already."""
     with service_at(url, api_key, job) as client:
         found = client.cancel(job.id, keep_partial=keep_partial)
         if (wait or timeout_s is not None) and not found.final:
@@ -174,7 +177,7 @@ def cancel_command(
     if as_json:
         print_json(found)
     else:
-        click.echo("\n".join(described(found)) if found.final else f"{found.id} was asked to end")
+        click.echo("\n".join(described(found)) if found.final else f"cancellation of {found.id} requested")
 
 
 @click.command("delete")

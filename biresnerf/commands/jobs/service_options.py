@@ -1,4 +1,4 @@
-"""What all commands share that speak to a service: its address and key, its errors, the jobs it is asked about."""
+"""Shared by all commands that talk to a service: address, API key, job arguments, exit codes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DEFAULT_URL = "http://127.0.0.1:8000"
 
 
 class JobName(NamedTuple):
-    """A job as it is named on a command line: by its id, or by its address, which says where its service is."""
+    """A job on a command line: its id, and its service's address if the job was named by its address."""
 
     id: str
     url: str | None = None
@@ -46,17 +46,19 @@ def service_options(command: Callable[..., Any]) -> Callable[..., Any]:
     url = click.option(
         "--url",
         envvar="BIRESNERF_URL",
-        help=f"Where the service is. Default: BIRESNERF_URL, else {DEFAULT_URL}.",
+        help=f"Address of the service. Default: BIRESNERF_URL, else {DEFAULT_URL}.",
     )
     key = click.option(
-        "--api-key", envvar="BIRESNERF_API_KEY", help="Better in BIRESNERF_API_KEY: others see command lines."
+        "--api-key",
+        envvar="BIRESNERF_API_KEY",
+        help="Prefer BIRESNERF_API_KEY: other users can see command lines.",
     )
     return url(key(command))
 
 
 @contextmanager
 def service_at(url: str | None, api_key: str | None, job: JobName | None = None) -> Iterator[Client]:
-    """The service: of the job's address, of `--url`, or of this machine. Its errors become exit codes."""
+    """A client of the service in the job's address, at `--url`, or on this machine. Errors become exit codes."""
     try:
         from biresnerf.client import Client, JobFailed, ServiceError
     except ModuleNotFoundError as error:
@@ -81,7 +83,7 @@ def _tell_pause(error: ServiceError, seconds: float) -> None:
 
 
 def exit_code_of(error: ServiceError) -> int:
-    """The exit status for what a service answered."""
+    """The exit status for an error of a service."""
     if error.code == "unexpected_answer" and error.status < 500 and not error.retryable:
         return exit_codes.INPUT  # another program answers there: the address is wrong
     if error.status in {404, 410}:

@@ -1,4 +1,4 @@
-"""`biresnerf submit PATH`: a scene of this machine to a service, and its result back."""
+"""`biresnerf submit PATH`: sends a local scene to a service and fetches the result."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import click
 
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option
-from biresnerf.commands.jobs.follow_job import follow_options, require_empty, see_through
+from biresnerf.commands.empty_folder import require_empty
+from biresnerf.commands.jobs.follow_job import follow_options, see_through
 from biresnerf.commands.jobs.job_progress import SendingView
 from biresnerf.commands.jobs.service_options import service_at, service_options
 from biresnerf.commands.settings_option import settings_option
@@ -33,7 +34,12 @@ def _labels(_context: click.Context, _parameter: click.Parameter, texts: tuple[s
 
 
 label_option = click.option(
-    "--label", "labels", multiple=True, metavar="NAME=VALUE", callback=_labels, help="To find the job by."
+    "--label",
+    "labels",
+    multiple=True,
+    metavar="NAME=VALUE",
+    callback=_labels,
+    help="A label to find the job by; may be repeated.",
 )
 
 
@@ -44,10 +50,10 @@ label_option = click.option(
 @follow_options
 @click.option(
     "--priority", type=click.Choice(["low", "normal", "high"]), default="normal", show_default=True,
-    help="Jobs of a higher one run first; your tenant may be allowed less.",
+    help="Jobs of higher priority run first; your tenant may have a lower limit.",
 )  # fmt: skip
 @label_option
-@click.option("--resume", metavar="DATASET", help="Go on with the dataset of an interrupted submission.")
+@click.option("--resume", metavar="DATASET", help="Resume an interrupted submission with its dataset.")
 @service_options
 @json_option
 def submit_command(
@@ -62,21 +68,23 @@ def submit_command(
     as_json: bool,
     **how: Any,
 ) -> None:
-    """Send PATH (a folder, or a file with poses in a folder of images) to a service as a job.
+    """Submit PATH to a service as a job.
 
-    Only what the service lacks is sent. Prints the job's address. Ctrl-C while waiting leaves the job running.
+    PATH is a folder of images, or a file with poses in one. Sends only files that the service lacks, and prints the
+    job's address. Ctrl-C while waiting leaves the job running.
     """
     from biresnerf.options.refine_options import parse_options
 
     options = parse_options({**settings, **({"preset": preset} if preset else {})})
-    require_empty(output)
+    if output is not None:
+        require_empty(output)
     with service_at(url, api_key) as client:
         job = submitted(client, path, options, **how)
         see_through(client, job, wait=wait, timeout_s=timeout_s, output=output, as_json=as_json)
 
 
 def submitted(client: Client, path: Path, options: RefineOptions, **how: Any) -> JobView:
-    """The job of a folder, with what is sent on standard error. Ctrl-C says how to go on."""
+    """Submits a folder with progress on standard error. After Ctrl-C it prints the command that resumes."""
     last: Sending | None = None
 
     def note(sending: Sending) -> None:
@@ -97,5 +105,5 @@ def _tell_how_to_resume(last: Sending | None, resumed: str | None) -> None:
         click.echo("Stopped before anything was sent.", err=True)
         return
     again = ["biresnerf", *sys.argv[1:], *(() if resumed else ("--resume", last.dataset_id))]
-    click.echo("Stopped; what has arrived stays there. To go on:", err=True)
+    click.echo("Stopped; the service keeps what it has received. To resume:", err=True)
     click.echo(f"  {shlex.join(again)}", err=True)

@@ -1,4 +1,4 @@
-"""`biresnerf bench`: how long a step takes on this machine."""
+"""`biresnerf bench`: the time per optimisation step on this machine."""
 
 from __future__ import annotations
 
@@ -15,28 +15,35 @@ from biresnerf.options.refine_options import RefineOptions
 
 @click.command("bench")
 @click.option(
-    "--preset", type=click.Choice(list(PRESETS)), default="fast", show_default=True, help="Whose steps."
+    "--preset",
+    type=click.Choice(list(PRESETS)),
+    default="fast",
+    show_default=True,
+    help="The preset to measure.",
 )
 @click.option(
     "--device",
     type=click.Choice(["auto", "cpu", "cuda"]),
     default="auto",
     show_default=True,
-    help="auto: the GPU where there is one.",
+    help="auto: the GPU if there is one.",
 )
-@click.option("--threads", type=click.IntRange(0, 256), default=0, help="0 takes all cores.")
-@click.option("--steps", type=click.IntRange(4, 10_000), default=60, show_default=True, help="Of each stage.")
+@click.option("--threads", type=click.IntRange(0, 256), default=0, help="0: all cores.")
 @click.option(
-    "--views", type=click.IntRange(6, 400), default=30, show_default=True, help="Of the made scene."
+    "--steps", type=click.IntRange(4, 10_000), default=60, show_default=True, help="Steps per stage."
 )
 @click.option(
-    "--size", type=click.IntRange(16, 800), default=100, show_default=True, help="Of its images, px."
+    "--views", type=click.IntRange(6, 400), default=30, show_default=True, help="Images of the scene."
+)
+@click.option(
+    "--size", type=click.IntRange(16, 800), default=100, show_default=True, help="Width of its images, px."
 )
 @json_option
 def bench_command(as_json: bool, steps: int, views: int, size: int, **given: Any) -> None:
-    """Measure steps of both stages on a small made scene: medians after a quarter of them, first steps of a run.
+    """Measure the time per step of both stages on this machine.
 
-    Later steps of a run have other numbers of samples. `make bench` measures the kernels one by one (docs/speed.md).
+    Runs the first steps on a small synthetic scene and prints medians without the first quarter. Later steps of a run
+    take other numbers of samples. `make bench` measures single kernels (docs/speed.md).
     """
     options = RefineOptions(**given, max_image_size=size)
     with tempfile.TemporaryDirectory(prefix="biresnerf-bench-") as folder:
@@ -62,7 +69,7 @@ def bench_command(as_json: bool, steps: int, views: int, size: int, **given: Any
 
 
 def measured(options: RefineOptions, folder: Path, steps: int, views: int, size: int) -> dict[str, Any]:
-    """The figures, as `--json` prints them."""
+    """The measurements, as `--json` prints them."""
     import time
 
     from biresnerf.commands.machine.this_machine import describe_machine

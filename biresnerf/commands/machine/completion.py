@@ -1,4 +1,4 @@
-"""`biresnerf completion SHELL`: what a shell needs to complete commands and options."""
+"""`biresnerf completion SHELL`: a script that completes commands and options."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ SHELLS = ("bash", "zsh", "fish")
 @click.argument("shell", type=click.Choice(SHELLS))
 @click.pass_context
 def completion_command(context: click.Context, shell: str) -> None:
-    """Print a script that completes commands and options in SHELL.
+    """Print a script for SHELL that completes commands and options.
 
-    bash: `eval "$(biresnerf completion bash)"` in ~/.bashrc; zsh the same in ~/.zshrc; fish:
+    bash: add `eval "$(biresnerf completion bash)"` to ~/.bashrc; zsh: the same in ~/.zshrc; fish:
     `biresnerf completion fish > ~/.config/fish/completions/biresnerf.fish`.
     """
     kind = get_completion_class(shell)

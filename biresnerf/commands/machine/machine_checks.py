@@ -72,7 +72,7 @@ def kernels() -> Found:
 
 
 def gpu() -> Found:
-    """Whether the CUDA kernels can run; none is needed."""
+    """Whether the CUDA kernels can run. A GPU is optional."""
     code = (
         "import json, torch; from biresnerf.field.backends import cuda_problem; p = cuda_problem();"
         "print(json.dumps([p, None if p else torch.cuda.get_device_name()]))"
@@ -83,7 +83,7 @@ def gpu() -> Found:
     problem, name = json.loads(done.stdout.splitlines()[-1])
     if problem is not None:
         return Found(
-            "GPU", "missing", f"none used: {problem}", "Not needed: the CPU kernels do the same. docs/cuda.md"
+            "GPU", "missing", f"not used: {problem}", "Optional: the CPU kernels do the same. docs/cuda.md"
         )
     return Found("GPU", "good", name)
 
@@ -92,7 +92,7 @@ def colmap() -> Found:
     """pycolmap, loaded in a process of its own as `refine` does."""
     if importlib.util.find_spec("pycolmap") is None:
         return Found(
-            "COLMAP", "missing", "is not installed: images without poses cannot find theirs by features",
+            "COLMAP", "missing", "is not installed: images without poses cannot be registered",
             "pip install 'biresnerf[colmap]'",
         )  # fmt: skip
     done = _in_child("import zlib, pycolmap; print(pycolmap.__version__)", _IMPORT_S)
@@ -102,7 +102,7 @@ def colmap() -> Found:
 
 
 def video() -> Found:
-    """The encoder of the orbit video."""
+    """The encoder for the orbit video."""
     import imageio_ffmpeg
 
     try:
@@ -112,7 +112,7 @@ def video() -> Found:
 
 
 def report_page() -> Found:
-    """What report.html is made of."""
+    """The built parts of report.html."""
     from biresnerf.viewer.report_html import BUNDLE
 
     if (BUNDLE / "report.js").is_file():
@@ -121,25 +121,25 @@ def report_page() -> Found:
 
 
 def scratch() -> Found:
-    """Room for work files."""
+    """Free space for temporary files."""
     folder = Path(tempfile.gettempdir())
     free = shutil.disk_usage(folder).free
     detail = f"{free / 2**30:.1f} GiB free in {folder}"
     if free > _WORK_BYTES:
         return Found("work files", "good", detail)
-    return Found("work files", "broken", detail, "Make room, or name another folder in TMPDIR.")
+    return Found("work files", "broken", detail, "Free some space, or set TMPDIR to another folder.")
 
 
 CHECKS: Sequence[Check] = (versions, processor, kernels, gpu, colmap, video, report_page, scratch)
 
 
 def _in_child(code: str, limit_s: float) -> subprocess.CompletedProcess[str] | str:
-    """What a piece of Python printed, or why it failed: a crash there is a finding here."""
+    """Runs Python code in a process of its own; returns the process, or why it failed."""
     try:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=limit_s)
     except subprocess.TimeoutExpired:
         return f"did not answer within {limit_s:.0f} s"
     if done.returncode != 0:
-        last = done.stderr.strip().splitlines()[-1:] or ["nothing was said"]
+        last = done.stderr.strip().splitlines()[-1:] or ["no message"]
         return f"failed ({done.returncode}): {last[0]}"
     return done

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from biresnerf.commands.answers import json_option, print_json
-from biresnerf.commands.jobs.follow_job import require_empty
+from biresnerf.commands.empty_folder import require_empty
 from biresnerf.options.formats import formats
 
 if TYPE_CHECKING:
@@ -40,10 +40,11 @@ def convert_command(
     bounds: tuple[float, float] | None,
     as_json: bool,
 ) -> None:
-    """Write the poses of INPUT, in any format that `refine` reads, into the new folder OUTPUT in other formats.
+    """Convert the poses of INPUT into other formats, without optimising anything.
 
-    World, scale and names stay as they are. Images without a pose are left out and listed. docs/formats.md says what
-    each format holds. For the result of `refine` there is `export`.
+    INPUT may have any format that `refine` reads; OUTPUT is a new folder. World, scale and names stay as they are.
+    Images without a pose are left out and listed. docs/formats.md describes the formats. `export` converts results of
+    `refine`.
     """
     require_empty(output)
     if bounds is not None and bounds[0] >= bounds[1]:

@@ -1,4 +1,4 @@
-"""`biresnerf inspect INPUT`: what is in a folder, and what `refine` would do with it."""
+"""`biresnerf inspect INPUT`: what a folder contains, and what `refine` would do with it."""
 
 from __future__ import annotations
 
@@ -20,17 +20,19 @@ if TYPE_CHECKING:
 @click.command("inspect")
 @click.argument("input_path", metavar="INPUT", type=click.Path(path_type=Path))
 @click.option(
-    "--preset", type=click.Choice(list(PRESETS)), help="What would be done with it. Default: balanced."
+    "--preset",
+    type=click.Choice(list(PRESETS)),
+    help="The preset that `refine` would use. Default: balanced.",
 )
 @settings_option
-@click.option("--pixels", is_flag=True, help="Decode every image too, to find damaged ones.")
+@click.option("--pixels", is_flag=True, help="Also decode every image, to find damaged ones.")
 @json_option
 def inspect_command(
     input_path: Path, preset: str | None, settings: dict[str, Any], pixels: bool, as_json: bool
 ) -> None:
-    """Show what INPUT holds and what `refine` would do with it, without doing it.
+    """Show what INPUT contains and what `refine` would do with it.
 
-    Everything is checked that `refine` checks before it starts, except pixels, unless --pixels asks for them.
+    Checks all that `refine` checks before it starts. Pixels are only checked with --pixels.
     """
     asked = parse_options({**settings, **({"preset": preset} if preset else {})})
     from biresnerf.data.formats.read_dataset import read_dataset
@@ -51,7 +53,7 @@ def inspect_command(
 
 
 def contents(dataset: Dataset) -> dict[str, Any]:
-    """What the set holds."""
+    """What the set contains, as JSON values."""
     taken = Counter(frame.camera for frame in dataset.frames)
     return {
         "folder": str(dataset.root),
@@ -90,13 +92,13 @@ def plan(dataset: Dataset, options: ResolvedOptions) -> dict[str, Any]:
         "steps": options.steps,
         "working_size": max(sizes),
         "photo_bytes": sum(3 * width * height for width, height in sizes),
-        # Steps take as long as their samples, which nobody knows before there is a field.
+        # Unknown: a step's time depends on its number of samples, which depends on the field.
         "seconds": None,
     }
 
 
 def start_in_words(dataset: Dataset, options: ResolvedOptions) -> str:
-    """Where the poses would come from that the optimisation starts from."""
+    """Where the initial poses would come from."""
     from biresnerf.data.seeding.match_poses import can_match
 
     start, missing = options.start, int((~dataset.posed).sum())
@@ -148,6 +150,6 @@ def _lines(found: dict[str, Any]) -> list[str]:
         f"  start from: {wanted['start']}",
         f"  take {wanted['steps']} steps on photos of up to {width} x {height} px"
         f" ({wanted['photo_bytes'] / 2**20:.0f} MiB of pixels)",
-        "  take a time that is not known before it begins; `biresnerf bench` measures steps on this machine",
+        "  take a time that cannot be predicted; `biresnerf bench` measures steps on this machine",
     ]
     return lines + [f"warning: {warning}" for warning in found["warnings"]]

@@ -1,4 +1,4 @@
-"""`biresnerf make-scene OUT`: a set whose true poses are known, with poses that are wrong, or missing."""
+"""`biresnerf make-scene OUT`: images with wrong or missing poses, and the true poses."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.empty_folder import require_empty
 from biresnerf.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ _FOCAL_TOO_LONG = 1.01
 
 @dataclass(frozen=True)
 class MadeScene:
-    """What was written: a set of so many images, of which so many have a pose, and the file of their true poses."""
+    """The set that was written, how many of its images have a pose, and the file with the true poses."""
 
     folder: Path
     images: int
@@ -52,27 +53,27 @@ class MadeScene:
     "--of",
     "own",
     type=click.Path(path_type=Path),
-    help="Take these images and poses, in any form that `refine` reads, for true instead of making some.",
+    help="Use these images and poses, in any format that `refine` reads, as the truth instead of rendering some.",
 )
-@click.option("--views", type=click.IntRange(3, 400), default=60, show_default=True, help="Images.")
+@click.option("--views", type=click.IntRange(3, 400), default=60, show_default=True, help="Number of images.")
 @click.option("--size", type=click.IntRange(16, 800), default=100, show_default=True, help="Their width, px.")
 @click.option(
     "--noise",
     type=click.FloatRange(0, 1),
     default=0.15,
     show_default=True,
-    help="BARF's sigma, for dome and vase.",
+    help="Standard deviation of the pose noise, as in BARF, for dome and vase.",
 )
 @click.option(
-    "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of scene and noise."
+    "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Seed of scene and noise."
 )
 @json_option
 def make_scene_command(
     output: Path, kind: str, own: Path | None, views: int, size: int, noise: float, seed: int, as_json: bool
 ) -> None:
-    """Write images with wrong or missing poses to OUTPUT, and the true poses beside it.
+    """Make a scene with wrong or missing poses, and a file with the true ones.
 
-    The true poses are in OUTPUT.truth.json; `biresnerf evaluate` compares a result with them.
+    The scene is written to OUTPUT, the true poses to OUTPUT.truth.json; `biresnerf evaluate` compares a result with it.
     """
     made = make_scene(output, kind, own=own, views=views, size=size, noise=noise, seed=seed)
     if as_json:
@@ -108,10 +109,7 @@ def make_scene(
     Raises:
         InputError: `output` is not empty, or `own` cannot be read or lacks poses.
     """
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise InputError(
-            "output_not_empty", "is not an empty folder.", where=str(output), hint="Name a new folder."
-        )
+    require_empty(output)
     from biresnerf.data.formats.transforms.read_transforms import read_transforms
 
     path = _copied(own, output) if own else _made(output, kind, views, size, seed)
@@ -134,7 +132,7 @@ def _made(output: Path, kind: str, views: int, size: int, seed: int) -> Path:
 
 
 def _copied(own: Path, output: Path) -> Path:
-    """The user's images in `output`, with their poses in a transforms.json of nerfstudio's dialect."""
+    """Copies the user's images to `output`, with their poses in a transforms.json of nerfstudio's dialect."""
     import numpy as np
 
     from biresnerf.data.formats.read_dataset import read_dataset
@@ -145,7 +143,7 @@ def _copied(own: Path, output: Path) -> Path:
     if not dataset.posed.all():
         raise InputError(
             "poses_missing",
-            f"{int((~dataset.posed).sum())} of {len(dataset)} images have no pose that could be taken for true.",
+            f"{int((~dataset.posed).sum())} of {len(dataset)} images have no pose that could serve as the truth.",
             where=str(own),
             hint="Give a set with all poses, for example a result of `biresnerf refine`.",
         )
@@ -189,7 +187,7 @@ def _make_wrong(dataset: Dataset, path: Path, kind: str, noise: float, seed: int
 
 
 def _keep_half(dataset: Dataset, path: Path) -> int:
-    """Replaces the transforms file by a COLMAP model of the first half of the images; gives how many these are."""
+    """Replaces the transforms file by a COLMAP model of the first half of the images; returns their number."""
     from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
     from biresnerf.data.model.image_order import natural_order
     from biresnerf.data.model.result_model import model_of_poses

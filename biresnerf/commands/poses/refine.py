@@ -27,7 +27,7 @@ LINE_EVERY = 20  # reports of progress between two lines where there is no termi
 
 
 class StopRequest:
-    """Turns SIGINT and SIGTERM into a wish to stop; a second signal ends the process at once."""
+    """Set by SIGINT and SIGTERM; a second signal ends the process at once."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -103,7 +103,7 @@ def describe(progress: Progress) -> str:
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default=None, help="Default: auto.")
 @click.option("--seed", type=int, default=None, help="Default: 0.")
 @settings_option
-@click.option("--verbose", "-v", is_flag=True, help="Log what happens.")
+@click.option("--verbose", "-v", is_flag=True, help="Print log messages.")
 @json_option
 def refine_command(
     input_path: Path,
@@ -115,10 +115,10 @@ def refine_command(
     verbose: bool,
     as_json: bool,
 ) -> int:
-    """Refine the camera poses of INPUT: a folder of images, with poses in any form that is read or without.
+    """Refine the camera poses of INPUT, a folder of images with or without poses.
 
     Results go to OUT: transforms.json and colmap/sparse/0 in the input's own frame and scale, report.json,
-    renders/ and config.json. --json prints report.json. The same command goes on where an interrupted one stopped.
+    renders/ and config.json. --json prints report.json. Run the same command again to resume.
     """
     named = {"preset": preset, "device": device, "seed": seed}
     options = parse_options({**settings, **{key: value for key, value in named.items() if value is not None}})
@@ -144,7 +144,7 @@ def refine_command(
 
 
 def summary(report: Report, output: Path) -> str:
-    """What a person wants to know at the end."""
+    """The result in a few lines of text."""
     moved = sorted(image.moved_deg for image in report.images)
     lines = report.verdict.in_words() if report.verdict is not None else []
     lines += [

@@ -1,4 +1,4 @@
-"""`biresnerf report RESULT`: report.html of a finished result, written again."""
+"""`biresnerf report RESULT`: writes the report.html of a finished result again."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from biresnerf.errors import BiresnerfError
 
 @click.command("report")
 @click.argument("result", type=click.Path(path_type=Path))
-@click.option("--title", help="What it is of. Default: how many images there are.")
+@click.option("--title", help="Title of the page. Default: the number of images.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object: the file and its size.")
 def report_command(result: Path, title: str | None, as_json: bool) -> None:
-    """Write report.html of RESULT anew, from the files that lie there.
+    """Write the report.html of RESULT again, from the files in it.
 
-    One page with everything there is to see, opened from disk without network.
+    The page shows the whole result and needs no network.
     """
     from biresnerf.viewer.report_html import REPORT_HTML, read_report, write_report_html
 

@@ -126,7 +126,7 @@ def test_what_goes_wrong_is_one_line_and_its_own_exit_status(
         (("list",), {"BIRESNERF_URL": closed.url}, exit_codes.KEY, "API key"),
         (("list",), {"BIRESNERF_URL": closed.url, "BIRESNERF_API_KEY": "brn_x"}, exit_codes.KEY, "unknown"),
         (("fork", job, "--set", "warmup_steps=50"), {}, exit_codes.INPUT, "stage 1"),
-        (("logs", job, "--follow", "--json"), {}, exit_codes.INPUT, "no end"),
+        (("logs", job, "--follow", "--json"), {}, exit_codes.INPUT, "exclude each other"),
     ]
     for arguments, variables, status, said in tries:
         result = run(service, *arguments, **variables)  # type: ignore[arg-type]

@@ -100,10 +100,11 @@ def test_the_client_and_the_stream_take_a_key(closed: Running, tenants: tuple[Te
 
 def test_a_client_shows_its_key_to_its_own_service_alone(service: Running, tenants: tuple[Tenant, Tenant]):
     with Client("http://127.0.0.1:9", api_key="brn_secret") as client:
-        elsewhere = client._http.build_request("GET", f"{service.url}/livez")
-        sent = next(client._http.auth.auth_flow(elsewhere))
+        http = client._client._http
+        elsewhere = http.build_request("GET", f"{service.url}/livez")
+        sent = next(http.auth.auth_flow(elsewhere))
         assert "authorization" not in sent.headers
-        own = next(client._http.auth.auth_flow(client._http.build_request("GET", "/livez")))
+        own = next(http.auth.auth_flow(http.build_request("GET", "/livez")))
         assert own.headers["authorization"] == "Bearer brn_secret"
 
 
