@@ -15,6 +15,7 @@ from pathlib import Path
 
 import psutil
 
+from biresnerf.wire.datasets import CheckReport
 from workers.database.embedded_postgres import EmbeddedPostgres
 from workers.database.migrate import migrate
 from workers.process.die_with_parent import tethered
@@ -22,7 +23,11 @@ from workers.settings.settings import Settings
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = ROOT / "tests" / "workers" / "counting_program.py"
-CHECK = 'print(\'{"report": {"images": 1}}\')'
+_FOUND = CheckReport(
+    images=1, with_pose=1, without_pose=0, poses="given", cameras=1, camera_models=("PINHOLE",),
+    intrinsics=("given",), format="colmap", masks=0, transparency=False, warnings=(),
+)  # fmt: skip
+CHECK = f"print({json.dumps({'report': _FOUND.model_dump(mode='json')})!r})"
 PAUSE_S = 0.3  # before what ended is started again, as a container's restart policy would
 
 
