@@ -42,7 +42,7 @@ from service.routes import (
 )
 from service.routes import derived_jobs as job_life
 from workers.engine import open_stores
-from workers.process.watchdog import watched
+from workers.process.watchdog import end_if_hung
 from workers.settings.errors import NotFound, Unavailable
 from workers.settings.settings import Settings
 from workers.settings.traces import flush_traces
@@ -73,7 +73,7 @@ def create_app(settings: Settings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        async with watched(), open_stores(settings) as stores:
+        async with end_if_hung(), open_stores(settings) as stores:
             service = Service(settings, stores, metrics)
             app.state.service = service
             swept = await asyncio.to_thread(sweep_staging, service.staging_dir)

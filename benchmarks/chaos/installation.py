@@ -18,7 +18,7 @@ import psutil
 from biresnerf.wire.datasets import CheckReport
 from workers.database.embedded_postgres import EmbeddedPostgres
 from workers.database.migrate import migrate
-from workers.process.die_with_parent import tethered
+from workers.process.die_with_parent import dying_with_parent
 from workers.settings.settings import Settings
 
 ROOT = Path(__file__).parents[2]
@@ -128,7 +128,7 @@ class Installation:
             with log.open("ab") as output:
                 # Without a file for their standard input children would share the terminal.
                 kept.process = await asyncio.create_subprocess_exec(
-                    *tethered(list(kept.command), signal_number=signal.SIGKILL),
+                    *dying_with_parent(list(kept.command), signal_number=signal.SIGKILL),
                     stdin=asyncio.subprocess.DEVNULL,
                     stdout=output,
                     stderr=output,

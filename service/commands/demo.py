@@ -29,7 +29,7 @@ from biresnerf.commands.jobs.service_options import service_at
 from biresnerf.errors import BiresnerfError, InputError
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.report import Report
-from workers.process.die_with_parent import tethered
+from workers.process.die_with_parent import dying_with_parent
 
 # Marks a folder that a later run may clear.
 _MARK = ".made-by-biresnerf-demo"
@@ -91,7 +91,7 @@ def _service() -> Iterator[str]:
     with log.open("wb") as errors:
         # In a session of its own, Ctrl-C does not reach it. It ends by itself if this process is killed.
         process = subprocess.Popen(
-            tethered(command, signal_number=signal.SIGINT),
+            dying_with_parent(command, signal_number=signal.SIGINT),
             env=environment,
             stdout=subprocess.PIPE,
             stderr=errors,

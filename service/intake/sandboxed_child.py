@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.errors import Fault, InputError
 from service.http.problems import ProblemError
-from workers.process.die_with_parent import tethered
+from workers.process.die_with_parent import dying_with_parent
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ async def run_confined(module: str, request: BaseModel, limits: Limits) -> dict[
     """
     command = [sys.executable, "-P", "-m", module, limits.model_dump_json()]
     child = await asyncio.create_subprocess_exec(
-        *tethered(command, signal_number=signal.SIGKILL),
+        *dying_with_parent(command, signal_number=signal.SIGKILL),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,

@@ -26,7 +26,7 @@ from click.testing import CliRunner
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from service.commands.keys import keys_command
 from service.commands.tenants import tenants_command
-from workers.process.die_with_parent import tethered
+from workers.process.die_with_parent import dying_with_parent
 
 PROGRAM = Path(__file__).with_name("quick_program.py")
 MIB = 2**20
@@ -90,7 +90,7 @@ def running_service(folder: Path, **settings: Any) -> Iterator[Running]:
     command = [sys.executable, "-m", "biresnerf.command_line", "up", "--port", "0", "--slots", "1"]
     with log.open("wb") as output:
         process = subprocess.Popen(
-            tethered(command, signal_number=signal.SIGINT),
+            dying_with_parent(command, signal_number=signal.SIGINT),
             env={**os.environ, **said},
             stdout=subprocess.PIPE,
             stderr=output,

@@ -30,7 +30,7 @@ from workers.database.postgres_binaries import (
     server_version,
     unprivileged_user,
 )
-from workers.process.die_with_parent import tethered
+from workers.process.die_with_parent import dying_with_parent
 from workers.settings.errors import SetupError
 
 log = logging.getLogger(__name__)
@@ -82,7 +82,9 @@ class EmbeddedPostgres:
         command = [str(binaries / "postgres"), "-D", str(self.data), "-k", str(self.sockets), *options]
         with self._open_log() as output:
             self.process = subprocess.Popen(
-                tethered(command, signal_number=signal.SIGINT, user=self.user),  # SIGINT: fast shutdown
+                dying_with_parent(
+                    command, signal_number=signal.SIGINT, user=self.user
+                ),  # SIGINT: fast shutdown
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
@@ -191,7 +193,9 @@ class EmbeddedPostgres:
         shutil.rmtree(building, ignore_errors=True)
         arguments = ("-A", "trust", "-U", "postgres", "-E", "UTF8", "--locale=C", "-D", str(building))
         made = subprocess.run(
-            tethered([str(binaries / "initdb"), *arguments], signal_number=signal.SIGKILL, user=self.user),
+            dying_with_parent(
+                [str(binaries / "initdb"), *arguments], signal_number=signal.SIGKILL, user=self.user
+            ),
             capture_output=True,
             text=True,
             cwd=self.root,

@@ -64,7 +64,7 @@ async def record_file(
 
 async def require_open(connection: Connection, dataset_id: str, tenant: str | None) -> None:
     """Locks the dataset's row; raises `NotFound`, `Conflict` (``dataset_not_open``)."""
-    state = await locked(connection, dataset_id, tenant)
+    state = await lock_dataset(connection, dataset_id, tenant)
     if state != "open":
         raise Conflict("dataset_not_open", f"Dataset {dataset_id} is {state}; it takes no more files.")
 
@@ -95,7 +95,7 @@ async def require_place(
     return int(row["bytes"])
 
 
-async def locked(connection: Connection, dataset_id: str, tenant: str | None) -> DatasetState:
+async def lock_dataset(connection: Connection, dataset_id: str, tenant: str | None) -> DatasetState:
     """The state of the dataset, which stays as it is until the transaction ends; raises `NotFound`."""
     sql = f"SELECT state FROM datasets WHERE id = %s AND {MINE} FOR UPDATE"
     row = await connection.row(sql, dataset_id, tenant)

@@ -20,7 +20,7 @@ from workers.datasets.dataset_rows import (
     KNOWN,
     MINE,
     file_key,
-    locked,
+    lock_dataset,
     record_file,
     require_open,
     require_place,
@@ -248,7 +248,7 @@ class DatasetStore:
         Then call `check` (in a background task, or awaited), which leads to ``ready`` or ``rejected``.
         """
         async with self._database.transaction() as connection:
-            await locked(connection, dataset_id, self._tenant)
+            await lock_dataset(connection, dataset_id, self._tenant)
             dataset = await self._required(connection, dataset_id)
             if dataset.state != "open":
                 return dataset
@@ -277,7 +277,7 @@ class DatasetStore:
     async def delete(self, dataset_id: str) -> None:
         """Delete a dataset with its files; raises `NotFound`, `Conflict` (``dataset_in_use`` by jobs)."""
         async with self._database.transaction() as connection:
-            await locked(connection, dataset_id, self._tenant)
+            await lock_dataset(connection, dataset_id, self._tenant)
             await self._required(connection, dataset_id)
             users = await jobs_of_dataset(connection, dataset_id)
             if users:

@@ -69,7 +69,7 @@ class UploadStore:
         """
         limit = self._settings.max_archive_bytes if kind == "archive" else self._settings.max_file_bytes
         if size > limit:
-            raise LimitReached("body_too_large", f"At most {limit} bytes are taken at once, not {size}.")
+            raise LimitReached("body_too_large", f"At most {limit} bytes are accepted at once, not {size}.")
         upload_id = new_id("up")
         folder = f"datasets/{dataset_id}/uploads/{upload_id}"
         if path is not None:

@@ -62,7 +62,7 @@ class DerivedJobs(JobStore):
             if known is not None:
                 return known, False
         fork_id = new_id("job")
-        taken = await self._copied(parent["reusable"], stage, fork_id)
+        copied = await self._copied(parent["reusable"], stage, fork_id)
         async with self._database.transaction() as connection:
             known = await self._known_or_room(connection, parent, idempotency_key, fingerprint)
             if known is not None:
@@ -72,7 +72,7 @@ class DerivedJobs(JobStore):
                 "labels": Jsonb(dict(labels or {})),
                 "idempotency_key": idempotency_key,
                 "fingerprint": fingerprint,
-                "reusable": Jsonb(taken),
+                "reusable": Jsonb(copied),
                 "forked_from": job_id,
                 "forked_stage": stage,
             }
@@ -105,15 +105,15 @@ class DerivedJobs(JobStore):
                 " VALUES (%s, clock_timestamp() + make_interval(secs => %s))",
                 (f"jobs/{fork_id}", ABANDONED_S),
             )
-        taken: dict[str, Any] = {}
+        copied: dict[str, Any] = {}
         for name in LATEST_FIRST[LATEST_FIRST.index(stage) :]:
             if name not in reusable:
                 continue
             source, target = reusable[name]["prefix"], f"jobs/{fork_id}/taken/{name}"
             for file in reusable[name]["files"]:
                 await self._files.copy(f"{source}/{file}", f"{target}/{file}")
-            taken[name] = {"prefix": target, "files": reusable[name]["files"]}
-        return taken
+            copied[name] = {"prefix": target, "files": reusable[name]["files"]}
+        return copied
 
     async def export(self, job_id: str, formats: Sequence[ExportName]) -> tuple[JobView, bool]:
         """Queue an export of the job's result in further forms; the same request finds the same export.

@@ -14,7 +14,7 @@ FORGET_CHECKPOINTS = "UPDATE jobs SET checkpoint = NULL WHERE checkpoint ->> 'pr
 
 
 async def date_jobs(connection: Connection, kept_s: float | None) -> None:
-    """Write down when results expire: ``kept_s`` after their jobs ended, or never."""
+    """Set the dates of expiry: ``kept_s`` after the end of each job, or none."""
     await connection.execute(
         "UPDATE jobs SET expires_at = finished_at + make_interval(secs => %s)"
         " WHERE finished_at IS NOT NULL AND state <> 'expired'"
@@ -24,11 +24,11 @@ async def date_jobs(connection: Connection, kept_s: float | None) -> None:
 
 
 async def expire_jobs(connection: Connection, limit: int) -> int:
-    """Let the files of jobs go that are due, as many as ``limit``; returns how many."""
+    """Expire the results that are due, at most ``limit``; returns how many."""
     due = await connection.rows(
         "SELECT id, tenant, finished_at, artifacts FROM jobs WHERE expires_at <= clock_timestamp()"
         " AND state IN ('succeeded', 'failed', 'cancelled')"
-        # An export or a fork that waits or runs still reads its files.
+        # An unfinished export or fork still reads the files.
         " AND NOT EXISTS (SELECT 1 FROM jobs AS heir WHERE jobs.id IN (heir.parent, heir.forked_from)"
         " AND heir.state IN ('queued', 'running'))"
         " ORDER BY expires_at LIMIT %s FOR UPDATE SKIP LOCKED",

@@ -1,6 +1,6 @@
 """Every change of a job's state, from its submission to its end.
 
-Each function runs in the caller's transaction. Those that end a job ask for its row lock, which the caller holds.
+Each function runs in the caller's transaction. To end a job, the caller must hold its row lock.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ STALL_S = 60.0
 async def add_event(
     connection: Connection, job_id: str, event: EventType, data: Mapping[str, Any] | None = None
 ) -> None:
-    """Append to the job's history, and wake who follows it."""
+    """Append to the job's history, and wake its subscribers."""
     await connection.execute("SELECT add_job_event(%s, %s, %s)", (job_id, event, Jsonb(dict(data or {}))))
 
 
@@ -80,7 +80,7 @@ async def requeue(
     forget_checkpoint: bool = False,
     smaller: Mapping[str, Any] | None = None,
 ) -> None:
-    """Let the job wait again. Its queue entry is the caller's to put back.
+    """Set the job back to queued. The caller puts its queue entry back.
 
     Args:
         fence: drop the token, so that the attempt that ran it can write no more.
@@ -123,7 +123,7 @@ async def take_back(connection: Connection, entry_id: int) -> None:
 
 
 async def requeue_lost(connection: Connection, silent_s: float) -> None:
-    """Queue again unfinished jobs that the queue does not know (any more), unchanged for ``silent_s``."""
+    """Queue unfinished jobs again whose queue entry is gone, if they have not changed for ``silent_s``."""
     for job in await connection.rows(
         "SELECT jobs.id, jobs.queue_order, jobs.held"
         " FROM jobs LEFT JOIN queue_entries AS entry ON entry.id = jobs.queue_id"
@@ -148,7 +148,7 @@ async def offer_held_jobs(connection: Connection) -> None:
 async def request_cancel(
     connection: Connection, job_id: str, tenant: str | None, keep_partial: bool, stall_s: float
 ) -> None:
-    """Cancel a queued job, or ask its worker to. Nothing is changed where that was asked for, or the job is over."""
+    """Cancel a queued job, or ask its worker to. Does nothing where that was requested before, or the job is over."""
     job = await connection.row(
         "UPDATE jobs SET cancel_requested = true, keep_partial = %s"
         " WHERE id = %s AND tenant = coalesce(%s, tenant) AND state IN ('queued', 'running')"
@@ -204,7 +204,7 @@ async def finish_cancelled(
     keep: str | None = None,
     stall_s: float = STALL_S,
 ) -> None:
-    """End a job on request, with what its user wants of the files: all there are, or the log alone.
+    """End a job on request, with the files that its user wants: all there are, or the log alone.
 
     Where a partial result is wanted and the process did not come to write one, the last preview is it.
 

@@ -1,4 +1,4 @@
-"""Runs a program that dies with its parent: `python tether.py PARENT_PID SIGNAL USER COMMAND…`.
+"""Runs a program that dies with its parent: `python die_with_parent.py PARENT_PID SIGNAL USER COMMAND…`.
 
 A program of its own (standard library only, started by path) instead of a ``preexec_fn``, because Python code
 between fork and exec can deadlock in a process that has threads. USER is a user name, or ``-`` for no change.
@@ -34,8 +34,8 @@ def main(arguments: list[str]) -> None:
     os.execvp(command[0], command)
 
 
-def tethered(command: list[str], *, signal_number: int, user: str | None = None) -> list[str]:
-    """The command line that runs ``command`` tied to this process."""
+def dying_with_parent(command: list[str], *, signal_number: int, user: str | None = None) -> list[str]:
+    """The command line of ``command`` as a process that dies with this one."""
     return [
         *(sys.executable, "-I", "-S", os.path.abspath(__file__)),
         *(str(os.getpid()), str(signal_number), user or "-"),

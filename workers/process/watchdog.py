@@ -19,7 +19,7 @@ LOOKS = 10
 
 
 @contextlib.asynccontextmanager
-async def watched(stuck_s: float = STUCK_S) -> AsyncIterator[None]:
+async def end_if_hung(stuck_s: float = STUCK_S) -> AsyncIterator[None]:
     """While inside, the process ends with `EXIT_STUCK` where this event loop does nothing for ``stuck_s``."""
     watchdog = _Watchdog(stuck_s / LOOKS)
     watchdog.start()

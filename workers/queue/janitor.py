@@ -84,18 +84,18 @@ class Janitor:
                 await job_queue.delete_old_entries(connection)
 
     def _distrust_after_a_pause(self, now_s: float) -> None:
-        """A machine that slept, or a database that froze: everybody was silent, and everybody lives.
+        """After a machine slept or a database froze all workers were silent, though all live.
 
-        Told by the database's clock, for the one we measure pauses with stands still while a machine sleeps.
+        Measured by the database's clock: our monotonic clock stands still while a machine sleeps.
         """
         paused_s = now_s - self._round_at if self._round_at is not None else 0.0
         self._round_at = now_s
         if paused_s > self._settings.janitor_s + self._settings.stall_s / 2:
-            log.warning("janitor: nothing went on for %.0f s; workers get time to give a sign", paused_s)
+            log.warning("janitor: nothing happened for %.0f s; workers get time for a heartbeat", paused_s)
             self._healthy_since, self._saw_outage = None, True
 
     def _silence_means_death(self, database_age_s: float) -> bool:
-        """After an outage of the database living workers first need time to give a sign."""
+        """After an outage of the database living workers first need time for a heartbeat."""
         patience_s = 1.5 * self._settings.stall_s
         seen_s = time.monotonic() - (self._healthy_since or time.monotonic())
         return seen_s >= patience_s or (not self._saw_outage and database_age_s >= patience_s)

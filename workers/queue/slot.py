@@ -25,7 +25,7 @@ from workers.database.statistics import announce_slot
 from workers.jobs.claim import Claim, Fenced, cancel_requested, claim_job, input_bytes
 from workers.process.disk_space import job_disk_budget
 from workers.process.waiting import first_done, retry_while_unavailable
-from workers.process.watchdog import watched
+from workers.process.watchdog import end_if_hung
 from workers.queue.heartbeat import Heartbeat
 from workers.queue.janitor import Janitor, release_worker
 from workers.run.attempt import Attempt
@@ -70,7 +70,7 @@ class SlotLock:
 
 
 class Slot:
-    """Takes jobs from the queue and runs them one after the other until told to stop."""
+    """Takes jobs from the queue and runs them one after the other until it is stopped."""
 
     def __init__(self, settings: Settings, name: str) -> None:
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", name):
@@ -83,10 +83,12 @@ class Slot:
 
     async def run(self) -> None:
         """Until SIGTERM or SIGINT. A running job then writes a checkpoint and goes back to the queue."""
-        shutil.rmtree(self._scratch, ignore_errors=True)  # a predecessor's; the lock says it is gone
+        shutil.rmtree(
+            self._scratch, ignore_errors=True
+        )  # left by a predecessor, which the lock shows to be gone
         self._scratch.mkdir(parents=True)
         async with (
-            watched(),
+            end_if_hung(),
             open_database(
                 self._settings.require_database_url(),
                 connections=5,
@@ -110,7 +112,7 @@ class Slot:
 
     @contextlib.asynccontextmanager
     async def _registered(self, database: Database) -> AsyncIterator[int]:
-        """This slot's id as a worker of the queue, which gives signs of life until the end."""
+        """This slot's id as a worker of the queue, which sends heartbeats until the end."""
 
         async def register() -> int:
             async with database.transaction() as connection:
@@ -119,7 +121,7 @@ class Slot:
         worker_id = await retry_while_unavailable(register)
         self._lock.remember(worker_id)
         await retry_while_unavailable(lambda: announce_slot(database, HOST, self._name, worker_id))
-        # Time for a second try, on another connection, before a janitor takes us for dead.
+        # Time for a second try, on another connection, before a janitor takes the job back.
         in_time_s = self._settings.stall_s / 3
         heartbeat = Heartbeat(database.url, self._settings.beat_s, worker_id, answer_s=in_time_s)
         heartbeat.start()
@@ -154,8 +156,8 @@ class Slot:
                 again_in_s = await self._run_job(database, listener, entry)
             except Fenced as fenced:
                 log.warning("%s; leaving", fenced)
-                os._exit(EXIT_FENCED)  # without a word to the queue: its entry belongs to the new owner
-            except Exception:  # a fault of ours; another slot may do better, and this one goes on
+                os._exit(EXIT_FENCED)  # its queue entry belongs to the new owner
+            except Exception:  # our own failure must not end the slot
                 log.exception("the job goes back to the queue")
                 again_in_s = self._settings.stall_s / 4
 
@@ -168,7 +170,7 @@ class Slot:
 
     async def _run_job(self, database: Database, listener: Listener, entry: Entry) -> float | None:
         """In how many seconds the queue offers the job again; none where it is over."""
-        if not await self._has_room(database, entry.job_id):
+        if not await self._fits_on_disk(database, entry.job_id):
             return self._settings.stall_s / 4
         claim = await claim_job(database, entry.job_id, self._settings.max_attempts)
         if claim is None:
@@ -185,7 +187,7 @@ class Slot:
     async def _stop_when_asked(
         self, database: Database, listener: Listener, entry: Entry, attempt: Attempt
     ) -> None:
-        """Stop the attempt when its job is cancelled, or when this slot is told to end."""
+        """Stop the attempt when its job is cancelled, or when this slot is stopped."""
         with listener.waiting(str(entry.id)) as changed:
             while True:
                 changed.clear()
@@ -198,8 +200,8 @@ class Slot:
                 stopped = [] if self._stop.is_set() else [self._stop.wait()]
                 await first_done(changed.wait(), asyncio.sleep(self._settings.poll_s), *stopped)
 
-    async def _has_room(self, database: Database, job_id: str) -> bool:
-        """Whether the job's files fit on the local disk; where not, another host may have room now, or we later."""
+    async def _fits_on_disk(self, database: Database, job_id: str) -> bool:
+        """Whether the job's files fit on the local disk. If not, the job waits for space here or on another host."""
         size = await retry_while_unavailable(lambda: input_bytes(database, job_id))
         try:
             job_disk_budget(self._settings).require(size)

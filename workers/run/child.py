@@ -9,7 +9,7 @@ import signal
 from collections.abc import AsyncIterator, Mapping, Sequence
 from pathlib import Path
 
-from workers.process.die_with_parent import tethered
+from workers.process.die_with_parent import dying_with_parent
 
 LINE_BYTES_MAX = 2**20
 TAIL_BYTES = 4000
@@ -32,7 +32,7 @@ class Child:
         inherited["PYTHONSAFEPATH"] = "1"
         with log.open("ab") as errors:
             process = await asyncio.create_subprocess_exec(
-                *tethered([*command, str(folder)], signal_number=signal.SIGKILL),
+                *dying_with_parent([*command, str(folder)], signal_number=signal.SIGKILL),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=errors,

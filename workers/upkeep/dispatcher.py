@@ -1,7 +1,7 @@
-"""The dispatcher: a small process for what has to be done beside the jobs: it sends webhooks and lets things expire.
+"""The dispatcher: a small process that sends webhooks and expires results and datasets.
 
-Several may run at the same time, each on any host: what one has taken, the others leave. Jobs need none of
-them; while no dispatcher runs, messages wait in the database.
+Several may run at the same time, on any hosts: each message is claimed by one of them. Jobs need none of them; while no
+dispatcher runs, messages wait in the database.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sys
 from workers.database.database import open_database
 from workers.database.notifications import Listener
 from workers.process.waiting import first_done
-from workers.process.watchdog import watched
+from workers.process.watchdog import end_if_hung
 from workers.settings.errors import SetupError
 from workers.settings.logs import set_up_logging
 from workers.settings.settings import Settings
@@ -30,7 +30,7 @@ WEBHOOK_CHANNEL = "biresnerf_webhooks"
 async def dispatch(settings: Settings, stop: asyncio.Event) -> None:
     """Work until ``stop``, then finish what is under way; raises `SetupError`."""
     async with (
-        watched(),
+        end_if_hung(),
         open_database(settings.require_database_url(), connections=4, silence_s=settings.stall_s) as database,
     ):
         listener = Listener(database, settings.poll_s, WEBHOOK_CHANNEL)

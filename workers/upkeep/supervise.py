@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from workers.database.database import open_database
 from workers.database.embedded_postgres import EmbeddedPostgres
 from workers.database.migrate import migrate
-from workers.process.die_with_parent import tethered
+from workers.process.die_with_parent import dying_with_parent
 from workers.process.waiting import first_done
 from workers.queue.janitor import release_worker
 from workers.settings.errors import SetupError
@@ -140,7 +140,7 @@ class _Supervisor:
         while not self._stop.is_set():
             try:
                 process = await asyncio.create_subprocess_exec(
-                    *tethered(list(spec.command), signal_number=signal.SIGKILL),
+                    *dying_with_parent(list(spec.command), signal_number=signal.SIGKILL),
                     stdin=asyncio.subprocess.DEVNULL,
                     env={**self._environment, **spec.variables},
                     start_new_session=True,

@@ -13,10 +13,10 @@ from workers.process.watchdog import EXIT_STUCK
 
 PROGRAM = """
 import asyncio, sys, time
-from workers.process.watchdog import watched
+from workers.process.watchdog import end_if_hung
 
 async def main():
-    async with watched(1.0):
+    async with end_if_hung(1.0):
         print("ready", flush=True)
         if sys.argv[1] == "hangs":
             time.sleep(60)

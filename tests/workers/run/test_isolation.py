@@ -26,8 +26,8 @@ def test_importing_it_loads_no_heavy_library(module: str):
 def test_the_tether_kills_the_program_when_its_parent_dies(tmp_path):
     program = f"""
 import subprocess, sys, time
-from workers.process.die_with_parent import tethered
-child = subprocess.Popen(tethered(["sleep", "600"], signal_number=9))
+from workers.process.die_with_parent import dying_with_parent
+child = subprocess.Popen(dying_with_parent(["sleep", "600"], signal_number=9))
 open({str(tmp_path / "pid")!r}, "w").write(str(child.pid))
 time.sleep(0.5)
 """
