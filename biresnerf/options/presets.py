@@ -92,6 +92,9 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
     },
 }
 
+# These keep their proportion to `steps`.
+SCALED_BY_STEPS = ("coarse_steps_min", "coarse_steps_max", "check_every", "warmup_steps")
+
 COMMON_VALUES: dict[str, Any] = {
     "holdout": "auto",
     "exposure": "auto",
@@ -152,9 +155,8 @@ def preset_values(
     elif device == "cuda":
         values |= {key: values[key] * factor for key, factor in CUDA_SCALE.items()}
     if steps is not None:
-        # A run with fewer steps keeps the preset's proportions.
         ratio = steps / values["steps"]
-        for key in ("coarse_steps_min", "coarse_steps_max", "check_every", "warmup_steps"):
+        for key in SCALED_BY_STEPS:
             values[key] = max(10, round(values[key] * ratio))
         # In proportion, trials would be too short to distinguish good poses from better ones.
         values["trial_steps"] = max(10, min(values["trial_steps"], steps // 4))

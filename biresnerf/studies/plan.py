@@ -8,13 +8,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from biresnerf.options.presets import SCALED_BY_STEPS
 from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.studies.cell import Cell, CellResult, EqualTime, Perturbation, Scene
 from biresnerf.studies.run_cells import finished, run_in_child
 
 # At equal time a variant's speed is measured by a probe, then by a run of about this share of the time.
 PROBE_STEPS, CALIBRATION_SHARE = 20, 0.1
-_SCALED = ("coarse_steps_min", "coarse_steps_max", "check_every", "warmup_steps")
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def with_steps(options: RefineOptions, steps: int) -> RefineOptions:
     """The same run in proportion, `steps` long. Raises `InputError` where options do not allow it."""
     own = options.resolved("cpu")
     ratio = steps / own.steps
-    scaled = {key: max(10, round(getattr(own, key) * ratio)) for key in _SCALED}
+    scaled = {key: max(10, round(getattr(own, key) * ratio)) for key in SCALED_BY_STEPS}
     scaled["coarse_steps_max"] = min(scaled["coarse_steps_max"], steps)
     scaled["coarse_steps_min"] = min(scaled["coarse_steps_min"], scaled["coarse_steps_max"])
     return parse_options({**options.model_dump(), **scaled, "steps": steps})

@@ -41,7 +41,6 @@ class JointOptimiser:
         images: photos at working size.
         frame: the unit frame.
         unit_from_cam: start poses [n, 4, 4].
-        options: resolved.
         held_out: images whose rays move their own pose but never the field.
         mobility: each camera's factor of the pose rate [2, n] in stage 1 and stage 2; 1 where left out.
         bodies: which cameras move together, and which not at all; all by themselves where left out.

@@ -82,7 +82,7 @@ METHODS: dict[MethodName, Method] = {
 def build_field(
     method: Method, options: ResolvedOptions, frame: SceneFrame, device: torch.device, threads: int
 ) -> RadianceField:
-    """The method's radiance field at its start; `options` must be resolved."""
+    """The method's radiance field at its start."""
     if method.network or options.wiring == "residual":
         torch.set_num_threads(threads)  # in plain torch, and the kernels are at rest
     if method.network:

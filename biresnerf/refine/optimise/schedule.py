@@ -47,7 +47,7 @@ def smooth_ramp(q: float) -> float:
 
 @dataclass(frozen=True)
 class Schedule:
-    """All schedules of a run; `options` must be resolved. `switch` is the step stage 2 began at, None before.
+    """All schedules of a run. `switch` is the step stage 2 began at, None before.
 
     Attributes:
         pixel: what a pixel spans at the scene, unit lengths.

@@ -59,7 +59,7 @@ class FrozenTrials:
         images: photos at working size.
         unseen: indices of the views that no field is trained on.
         rigs: sets of poses [n, 4, 4] that the scene box is taken from, all of them alike; in one frame.
-        options: resolved; the field's sizes and rates.
+        options: the field's sizes and rates.
         steps: of each training; an open scene takes `OPEN_STEPS` times as many.
         should_stop: asked after every step.
     """
