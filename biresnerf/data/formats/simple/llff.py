@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, in_order
@@ -41,9 +40,6 @@ _NEAREST, _FARTHEST = 0.1, 99.9
 MAX_IMAGES = 100_000
 _MAX_HEADER_BYTES = 4096
 _COLUMNS = 17
-_HEADER = re.compile(
-    rb"\{'descr': '(<f[48])', 'fortran_order': (True|False), 'shape': \(([0-9]{1,9}), 17\),? ?\}[ \n]*"
-)
 
 
 def parse_llff(_root: Path, file: Path) -> ParsedPoses:
@@ -83,11 +79,7 @@ def _camera(height: float, width: float, focal: float, where: str) -> Camera:
 
 
 def _rows(file: Path) -> NDArray[np.float64]:
-    """The rows, float64 [n, 17], finite.
-
-    The npy format (numpy.lib.format) is read by hand: nothing is allocated before the file is known to hold it, nothing
-    is unpickled, and its header, a Python literal, is matched and not evaluated.
-    """
+    """The rows, float64 [n, 17], finite."""
 
     def invalid(what: str, code: str = "pose_file_invalid") -> InputError:
         return InputError(
@@ -96,22 +88,19 @@ def _rows(file: Path) -> NDArray[np.float64]:
 
     try:
         with file.open("rb") as stream:
-            content = stream.read(_MAX_HEADER_BYTES + MAX_IMAGES * _COLUMNS * 8 + 1)
+            version = npy.read_magic(stream)
+            read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+            shape, by_columns, dtype = read_header(stream, max_header_size=_MAX_HEADER_BYTES)
+            content = stream.read(_COLUMNS * MAX_IMAGES * 8 + 1)
     except OSError as error:
         raise invalid(f"cannot be read: {error.strerror}.") from None
-    start = {1: 10, 2: 12}.get(content[6] if len(content) > 12 else 0, 0)
-    if not content.startswith(b"\x93NUMPY") or not start:
-        raise invalid("is no npy file.")
-    length = int.from_bytes(content[8:start], "little")
-    match = _HEADER.fullmatch(content[start : start + min(length, _MAX_HEADER_BYTES)])
-    if match is None:
+    except ValueError:
+        raise invalid("is no npy file.") from None
+    if dtype.kind != "f" or len(shape) != 2 or shape[1] != _COLUMNS:
         raise invalid(f"holds something other than rows of {_COLUMNS} floating-point numbers.")
-    dtype, by_columns, count = np.dtype(match[1].decode()), match[2] == b"True", int(match[3])
-    numbers = content[start + length :]
-    if count > MAX_IMAGES or len(numbers) != count * _COLUMNS * dtype.itemsize:
-        raise invalid(f"has {count} rows by its header, but its content is shorter or longer.")
-    order: Literal["F", "C"] = "F" if by_columns else "C"
-    rows = np.frombuffer(numbers, dtype).reshape((count, _COLUMNS), order=order).astype(np.float64)
+    if not 0 <= shape[0] <= MAX_IMAGES or len(content) != shape[0] * _COLUMNS * dtype.itemsize:
+        raise invalid(f"has {shape[0]} rows by its header, but its content is shorter or longer.")
+    rows = np.frombuffer(content, dtype).reshape(shape, order="F" if by_columns else "C").astype(np.float64)
     if not np.isfinite(rows).all():
         raise invalid("NaN or an infinite number.", "pose_not_finite")
     return rows
