@@ -14,9 +14,9 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import load_images
 from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.camera.camera import Intrinsics
-from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.parameters.parametrisations import Se3World
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from biresnerf.refine.views.evaluation import FIT_RATE, FIT_STEPS, fit_rays, render_view
 
@@ -62,8 +62,8 @@ def _fitted(
 ) -> Tensor:
     """unit_from_cam [3, 4] of one view, moved to where its photo fits the field best."""
     device = optimiser.device
-    length = optimiser.frame.distance / RIG_DISTANCE
-    pose = PoseParameters(torch.from_numpy(unit_from_cam[None]), "se3_world", length, device)
+    form = Se3World(optimiser.poses.parametrisation.length)
+    pose = PoseParameters(torch.from_numpy(unit_from_cam[None]), form, device)
     pixels = torch.nonzero(torch.ones(photo.shape[:2]) if counts is None else counts)
     rays = fit_rays(optimiser)
     which = torch.full((rays,), index, device=device)

@@ -19,6 +19,7 @@ from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Ren
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.optimise.pose_hypotheses import pose_hypotheses
+from biresnerf.refine.parameters.parametrisations import Se3World
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from biresnerf.refine.scene.shared_views import shared_shares
 
@@ -218,9 +219,8 @@ class LostCameraRepair:
         """Poses [k, 3, 4] after some steps of Adam on the photometric error alone, all in one batch."""
         optimiser = self.optimiser
         bottom = matrices.new_tensor([0.0, 0, 0, 1]).expand(len(matrices), 1, 4)
-        poses = PoseParameters(
-            torch.cat([matrices, bottom], 1), "se3_world", optimiser.poses.length, optimiser.device
-        )
+        form = Se3World(optimiser.poses.parametrisation.length)
+        poses = PoseParameters(torch.cat([matrices, bottom], 1), form, optimiser.device)
         count = len(matrices) * rays
         owner = torch.arange(len(matrices), device=optimiser.device).repeat_interleave(rays)
         image = torch.full((count,), camera, device=optimiser.device)

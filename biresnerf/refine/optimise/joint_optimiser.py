@@ -24,6 +24,7 @@ from biresnerf.refine.optimise.pose_hypotheses import photo_distances
 from biresnerf.refine.parameters.camp_preconditioner import camp_preconditioner
 from biresnerf.refine.parameters.exposure import Exposure
 from biresnerf.refine.parameters.intrinsics_parameters import IntrinsicsParameters
+from biresnerf.refine.parameters.parametrisations import PARAMETRISATIONS
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from biresnerf.refine.parameters.rigid_bodies import RigidBodies
 from biresnerf.refine.scene.scene_frame import SceneFrame
@@ -109,19 +110,16 @@ class JointOptimiser:
     def _pose_parameters(self, unit_from_cam: Tensor) -> PoseParameters:
         options, distance = self.options, self.frame.distance
         length = distance / RIG_DISTANCE
-        preconditioner = None
-        if options.pose_parametrisation == "so3xr3_camp":
-            preconditioner = camp_preconditioner(
-                unit_from_cam, self.intrinsics, distance, length, options.seed
-            )
+
+        def precondition(poses: Tensor) -> Tensor:
+            return camp_preconditioner(poses, self.intrinsics, distance, length, options.seed)
+
         return PoseParameters(
             unit_from_cam,
-            options.pose_parametrisation,
-            length,
+            PARAMETRISATIONS[options.pose_parametrisation].create(length, precondition),
             self.device,
             betas=self.method.pose_betas,
             double_step=options.double_pose_step,
-            preconditioner=preconditioner,
             body=torch.from_numpy(self.bodies.of),
         )
 
@@ -131,10 +129,6 @@ class JointOptimiser:
         self.camera_errors.forget(camera)
         self.exposure.forget(camera)
         self.mobility[:, self.poses.members(camera)] = 1.0
-        if self.poses.preconditioner is not None:
-            fresh = self._pose_parameters(self.poses.poses()).preconditioner
-            assert fresh is not None
-            self.poses.preconditioner[camera] = fresh[camera]
 
     def marching(self, interval: float) -> Marching:
         near = self.schedule.near(self.step_index, self.switch)

@@ -16,6 +16,7 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.errors import InputError
 from biresnerf.geometry.similarity import Similarity, align_robust
 from biresnerf.options.refine_options import ResolvedOptions
+from biresnerf.refine.parameters.parametrisations import PARAMETRISATIONS
 
 # Fixed centres nearer to each other than this share of the rig's spread leave its scale open.
 _APART = 1e-6
@@ -112,12 +113,13 @@ def rigid_bodies(dataset: Dataset, options: ResolvedOptions) -> RigidBodies:
     rows = _fixed_rows(dataset, options.fixed)
     of = np.arange(len(dataset))
     moments = _moments(dataset)
-    if moments and options.pose_parametrisation == "so3xr3_camp":
+    form = options.pose_parametrisation
+    if moments and not PARAMETRISATIONS[form].moves_bodies:
         raise InputError(
             "invalid_options",
-            "so3xr3_camp moves every camera for itself, and this set's cameras belong to a rig.",
+            f"{form} moves every camera by itself, and this set's cameras belong to a rig.",
             where="pose_parametrisation",
-            hint="Take se3_world or so3xr3, or a model without rigs.bin and frames.bin.",
+            hint="Use se3_world or so3xr3, or a model without rigs.bin and frames.bin.",
         )
     for group in moments:
         of[group] = group[0]

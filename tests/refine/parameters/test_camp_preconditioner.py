@@ -15,6 +15,7 @@ from biresnerf.refine.parameters.camp_preconditioner import (
     pixels_by_points,
     projection_jacobian,
 )
+from biresnerf.refine.parameters.parametrisations import CampSo3xR3, Parametrisation, So3xR3
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set
 
@@ -87,13 +88,13 @@ def test_a_fisheye_that_sees_behind_itself_has_a_preconditioner_too():
     assert float(torch.linalg.eigvalsh(p).min()) > 0
 
 
-def parameters(p: torch.Tensor | None, form: str) -> PoseParameters:
-    return PoseParameters(poses(3), form, LENGTH, CPU, preconditioner=p)
+def parameters(form: Parametrisation) -> PoseParameters:
+    return PoseParameters(poses(3), form, CPU)
 
 
 def test_parameters_are_those_of_so3xr3_times_the_preconditioner_with_finite_gradient_at_zero():
     p = camp_preconditioner(poses(3), intrinsics(3), DISTANCE, LENGTH, seed=0)
-    camp, plain = parameters(p, "so3xr3_camp"), parameters(None, "so3xr3")
+    camp, plain = parameters(CampSo3xR3(LENGTH, lambda _: p)), parameters(So3xR3(LENGTH))
     torch.testing.assert_close(camp.matrices(), poses(3)[:, :3].float())
     weight = torch.rand(3, 3, 4, generator=torch.Generator().manual_seed(1))
     for each in (camp, plain):
@@ -114,10 +115,16 @@ def test_parameters_are_those_of_so3xr3_times_the_preconditioner_with_finite_gra
 
 
 def test_a_preconditioner_without_its_parametrisation_is_refused():
-    with pytest.raises(ValueError, match="so3xr3_camp"):
-        parameters(torch.eye(6).expand(3, 6, 6), "so3xr3")
-    with pytest.raises(ValueError, match="so3xr3_camp"):
-        parameters(None, "so3xr3_camp")
+    with pytest.raises(TypeError):
+        So3xR3(LENGTH, lambda _: torch.eye(6).expand(3, 6, 6))
+    with pytest.raises(TypeError):
+        CampSo3xR3(LENGTH)
+
+
+def test_bodies_of_several_cameras_are_refused_where_cameras_have_coordinates_of_their_own():
+    form = CampSo3xR3(LENGTH, lambda _: torch.eye(6).expand(3, 6, 6))
+    with pytest.raises(ValueError, match="CampSo3xR3"):
+        PoseParameters(poses(3), form, CPU, body=torch.tensor([0, 0, 1]))
 
 
 def test_a_run_with_it_steps_and_restores_its_state(tmp_path):

@@ -24,6 +24,7 @@ from biresnerf.refine.parameters.intrinsics_parameters import (
     lenses_of,
     refined_part,
 )
+from biresnerf.refine.parameters.parametrisations import PARAMETRISATIONS
 from biresnerf.refine.parameters.pose_parameters import PoseParameters, dolly_directions
 from biresnerf.refine.scene.scene_frame import scene_frame
 from biresnerf.refine.verdict.run_report import camera_reports
@@ -144,7 +145,7 @@ def test_a_dolly_leaves_the_picture_at_the_centre_as_it_was():
         return focal * in_cam[..., :2] / in_cam[..., 2:]
 
     for parametrisation in ("se3_world", "so3xr3"):
-        p = PoseParameters(poses, parametrisation, 1.0, CPU)
+        p = PoseParameters(poses, PARAMETRISATIONS[parametrisation](1.0), CPU)
         with torch.no_grad():
             p.rotation += 0.2
             p.translation -= 0.1

@@ -18,6 +18,7 @@ from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.options.refine_options import RefineOptions
+from biresnerf.refine.parameters.parametrisations import PARAMETRISATIONS, Se3World
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from biresnerf.refine.parameters.rigid_bodies import RigidBodies, rigid_bodies
 from tests.data.formats.random_sets import random_model, random_poses
@@ -99,7 +100,9 @@ def test_a_parametrisation_that_would_tear_a_rig_is_refused():
 def test_cameras_of_a_body_keep_their_places_and_those_of_others_move_apart(form):
     dataset = rigged_dataset()
     bodies, given = rigid_bodies(dataset, RefineOptions()), dataset.world_from_cam
-    poses = PoseParameters(torch.from_numpy(given), form, 1.3, CPU, body=torch.from_numpy(bodies.of))
+    poses = PoseParameters(
+        torch.from_numpy(given), PARAMETRISATIONS[form](1.3), CPU, body=torch.from_numpy(bodies.of)
+    )
     assert torch.equal(poses.matrices(), torch.from_numpy(given[:, :3]).float())
     for _ in range(20):
         ((poses.matrices() - torch.linspace(-1, 1, 12).reshape(3, 4)) ** 2).sum().backward()
@@ -114,7 +117,9 @@ def test_cameras_of_a_body_keep_their_places_and_those_of_others_move_apart(form
 @FORMS
 def test_bodies_of_one_camera_step_as_if_there_were_no_bodies(form):
     given = torch.from_numpy(random_poses(np.random.default_rng(2), 4))
-    both = [PoseParameters(given, form, 1.3, CPU, body=body) for body in (None, torch.arange(4))]
+    both = [
+        PoseParameters(given, PARAMETRISATIONS[form](1.3), CPU, body=body) for body in (None, torch.arange(4))
+    ]
     for poses in both:
         for _ in range(3):
             ((poses.matrices() - 1) ** 2).sum().backward()
@@ -127,7 +132,9 @@ def test_bodies_of_one_camera_step_as_if_there_were_no_bodies(form):
 def test_replacing_one_camera_takes_its_body_along(form):
     dataset = rigged_dataset()
     bodies, given = rigid_bodies(dataset, RefineOptions()), dataset.world_from_cam
-    poses = PoseParameters(torch.from_numpy(given), form, 1.3, CPU, body=torch.from_numpy(bodies.of))
+    poses = PoseParameters(
+        torch.from_numpy(given), PARAMETRISATIONS[form](1.3), CPU, body=torch.from_numpy(bodies.of)
+    )
     ((poses.matrices() - 1) ** 2).sum().backward()
     poses.step(1e-2)
     before = poses.poses().numpy()
@@ -145,7 +152,7 @@ def test_a_body_moves_as_far_as_its_least_mobile_camera():
     dataset = rigged_dataset()
     bodies = rigid_bodies(dataset, RefineOptions())
     given = torch.from_numpy(dataset.world_from_cam)
-    poses = PoseParameters(given, "se3_world", 1.3, CPU, body=torch.from_numpy(bodies.of))
+    poses = PoseParameters(given, Se3World(1.3), CPU, body=torch.from_numpy(bodies.of))
     mobility = torch.ones(6)
     mobility[bodies.shared[1][0]] = 0.0
     ((poses.matrices() - 1) ** 2).sum().backward()
