@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import importlib
+import importlib.util
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,6 +22,9 @@ from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.parameters.parametrisations import Se3World
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from biresnerf.refine.views.evaluation import FIT_RATE, FIT_STEPS, fit_rays, render_view
+
+# What torchvision names the file; the package would download it, which a measurement must not do by itself.
+VGG_WEIGHTS = "vgg16-397923af.pth"
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,3 +84,23 @@ def _fitted(
         optimiser.method.loss(rendering.colour, photo[y, x].to(device)).mean().backward()
         pose.step(FIT_RATE * 0.1 ** (step / FIT_STEPS))
     return pose.matrices().detach()[0]
+
+
+def lpips_absent() -> str | None:
+    """Why LPIPS cannot be measured here; None where it can."""
+    if importlib.util.find_spec("lpips") is None or importlib.util.find_spec("torchvision") is None:
+        return "the packages lpips and torchvision are not installed"
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / VGG_WEIGHTS
+    return None if weights.is_file() else f"the weights {weights} are not there"
+
+
+def lpips_vgg() -> Callable[[Tensor, Tensor], float]:
+    """A function of two images [h, w, 3] in 0..1; call only where `lpips_absent` finds nothing."""
+    model = importlib.import_module("lpips").LPIPS(net="vgg", verbose=False).eval()
+
+    @torch.no_grad()
+    def distance(image: Tensor, reference: Tensor) -> float:
+        a, b = (2 * x.permute(2, 0, 1)[None].float() - 1 for x in (image, reference))
+        return float(model(a, b))
+
+    return distance

@@ -10,7 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.studies.cell import Outcome
 from biresnerf.studies.plan import Entry
-from biresnerf.studies.statistics import PairedTest, paired_wilcoxon
 
 _FROZEN = ConfigDict(frozen=True, extra="forbid")
 
@@ -77,6 +76,20 @@ class Summary(BaseModel):
     scenes: int
     mean: dict[str, float | None]
     median: dict[str, float | None]
+
+
+class PairedTest(BaseModel):
+    """A two-sided Wilcoxon signed-rank test of ``other - first``."""
+
+    model_config = _FROZEN
+
+    pairs: int = Field(description="n: scenes x starts x seeds that both variants finished.")
+    differing: int = Field(description="Pairs that differ; the test leaves the others out.")
+    statistic: float | None = Field(
+        description="The smaller of the two rank sums; None without a difference."
+    )
+    p_value: float | None
+    median_difference: float = Field(description="Median of other - first.")
 
 
 class Difference(BaseModel):
@@ -181,6 +194,30 @@ def differences_of(entries: Sequence[Entry]) -> tuple[Difference, ...]:
             if test is not None:
                 differences.append(Difference(metric=metric.key, first=variants[0], other=other, test=test))
     return tuple(differences)
+
+
+def paired_wilcoxon(first: Sequence[float], other: Sequence[float]) -> PairedTest | None:
+    """Test pairs of results of two variants, in the same order; None where there are none.
+
+    The test is exact for up to 50 differing pairs without ties, as scipy decides.
+    """
+    from scipy.stats import wilcoxon
+
+    difference = np.asarray(other, dtype=np.float64) - np.asarray(first, dtype=np.float64)
+    if not len(difference):
+        return None
+    differing = int(np.count_nonzero(difference))
+    statistic = p_value = None
+    if differing:
+        tested = wilcoxon(difference, zero_method="wilcox", alternative="two-sided")
+        statistic, p_value = float(tested.statistic), float(tested.pvalue)
+    return PairedTest(
+        pairs=len(difference),
+        differing=differing,
+        statistic=statistic,
+        p_value=p_value,
+        median_difference=float(np.median(difference)),
+    )
 
 
 def failures_of(entries: Sequence[Entry]) -> tuple[Failure, ...]:

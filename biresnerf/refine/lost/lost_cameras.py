@@ -74,7 +74,7 @@ class LostCameraRepair:
     def due(self) -> bool:
         """Whether one of the fixed points has been reached; the switch asks by itself."""
         optimiser, options = self.optimiser, self.optimiser.options
-        if not optimiser.method.additions:
+        if not optimiser.method.robust_extensions:
             return False
         if optimiser.switch is None:
             least = float(options.coarse_steps_min)
@@ -87,7 +87,7 @@ class LostCameraRepair:
     def run(self, *, switching: bool = False) -> None:
         """Try to bring all lost cameras home, the worst first, as far as the budget goes."""
         optimiser = self.optimiser
-        if not optimiser.method.additions:
+        if not optimiser.method.robust_extensions:
             return
         self._times = 3 if switching else self._times + 1 if optimiser.switch is None else 4
         total = float(optimiser.schedule.samples(optimiser.schedule.steps, 0)) * optimiser.schedule.steps

@@ -15,9 +15,9 @@ from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Ren
 from biresnerf.geometry.camera.camera import Intrinsics, directions_with_gradient
 from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.refine.optimise.async_metrics import LateFigures, StepResult
+from biresnerf.refine.optimise.async_metrics import AsyncMetrics, StepResult
 from biresnerf.refine.optimise.camera_errors import CameraErrors
-from biresnerf.refine.optimise.methods import METHODS, build_field, occupancy_side
+from biresnerf.refine.optimise.methods import find_method
 from biresnerf.refine.optimise.optimiser_state import Part, StepState, load_state_of, state_of
 from biresnerf.refine.optimise.photo_sampler import PhotoSampler, PixelBatch
 from biresnerf.refine.optimise.pose_hypotheses import photo_distances
@@ -65,16 +65,16 @@ class JointOptimiser:
     ) -> None:
         self.frame, self.options, self.device, self.threads = frame, options, device, threads
         self.bodies = bodies or RigidBodies.free(len(images))
-        self.method = METHODS[options.method]
-        self.field = build_field(self.method, options, frame, device, threads)
+        self.method = find_method(options.method)
+        self.field = self.method.build_field(options, frame, device, threads)
         self.lenses = lenses or IntrinsicsParameters.held(images.cameras, device)
         self.poses = self._pose_parameters(torch.from_numpy(unit_from_cam))
         self.schedule = self.method.schedule(options, frame.pixel, frame.unbounded, frame.distance)
         self._images = images
         self.sampler = sampler or PhotoSampler(images, held_out, device)
         self.camera_errors = CameraErrors(images, held_out, device)
-        self.directions, self.figures = directions_for(device), LateFigures(device)
-        self.occupancy = make_occupancy(occupancy_side(self.method, options), device)
+        self.directions, self.metrics = directions_for(device), AsyncMetrics(device)
+        self.occupancy = make_occupancy(self.method.occupancy_side(options), device)
         self.generator = torch.Generator().manual_seed(options.seed)
         # What a step draws, it draws on the device: the host's draws would have to be waited for.
         on_device = None if device.type == "cpu" else torch.Generator(device).manual_seed(options.seed)
@@ -90,7 +90,7 @@ class JointOptimiser:
         self.pose_scale = 1.0
         self.mobility = (
             torch.ones(2, len(self.poses), device=device)
-            if mobility is None or not self.method.additions
+            if mobility is None or not self.method.robust_extensions
             else torch.tensor(mobility, dtype=torch.float32, device=device)
         )
         self.mobility[:, torch.from_numpy(self.bodies.fixed).to(device)] = 0.0
@@ -132,7 +132,7 @@ class JointOptimiser:
 
     def marching(self, interval: float) -> Marching:
         near = self.schedule.near(self.step_index, self.switch)
-        near = self.frame.distance * (max(near, self.frame.near) if self.method.additions else near)
+        near = self.frame.distance * (max(near, self.frame.near) if self.method.robust_extensions else near)
         far = self.schedule.far(self.frame.far)
         return Marching(interval, near, far, MOST_SAMPLES, self.occupancy.occupied)
 
@@ -210,12 +210,12 @@ class JointOptimiser:
         shown = colour.detach().clamp(max=1)
         self.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach())
         error = ((shown - batch.sharp) ** 2)[: batch.trained].mean()
-        told_loss, told_error = self.figures.read(loss.detach(), error)
-        return StepResult(told_loss, told_error, len(origin), rendering.samples)
+        loss_value, error_value = self.metrics.read(loss.detach(), error)
+        return StepResult(loss_value, error_value, len(origin), rendering.samples)
 
     def _loss(self, colour: Tensor, batch: PixelBatch) -> Tensor:
         loss, weights = self.method.loss(colour, batch.target), self.camera_errors.weights
-        if weights is not None and self.method.additions:
+        if weights is not None and self.method.robust_extensions:
             loss = loss * weights[batch.image][:, None]
         return loss.mean()
 

@@ -80,7 +80,7 @@ class TwoStages:
             options.coarse_steps_min,
             options.coarse_steps_max,
             options.detector,
-            guarded=optimiser.method.additions,
+            guarded=optimiser.method.robust_extensions,
         )
         self.estimate, self._previews = Estimate(), PreviewTimer(options.checkpoint_every_s)
         self._reported = self._saved = 0.0

@@ -11,7 +11,7 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refine.optimise.methods import METHODS
+from biresnerf.refine.optimise.methods import find_method
 from biresnerf.refine.parameters.intrinsics_parameters import lenses_of
 from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refine.scene.scene import Scene
@@ -49,7 +49,7 @@ def pose_mobility(start: InitialPoses) -> NDArray[np.float64]:
 
 def stage_lengths(start: InitialPoses, asked: RefineOptions, resolved: ResolvedOptions) -> ResolvedOptions:
     """`resolved` with a shorter stage 1 where matches placed most cameras, unless its length was `asked` for."""
-    if not (start.mostly_matched and METHODS[resolved.method].additions):
+    if not (start.mostly_matched and find_method(resolved.method).robust_extensions):
         return resolved
     names = [n for n in ("coarse_steps_min", "coarse_steps_max") if getattr(asked, n) is None]
     shorter = {name: round(MATCHED_COARSE_SHARE * getattr(resolved, name)) for name in names}

@@ -42,7 +42,7 @@ class ViewScore:
 
 def fit_rays(optimiser: JointOptimiser) -> int:
     """Rays of one step of fitting poses to the frozen field: as BARF, but no more than a large network can afford."""
-    return min(FIT_RAYS, optimiser.rays) if optimiser.method.network else FIT_RAYS
+    return min(FIT_RAYS, optimiser.rays) if optimiser.method.large_network else FIT_RAYS
 
 
 def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:

@@ -1,19 +1,199 @@
-"""`biresnerf compare SCENE...`: methods and options against each other, on poses made wrong by a known amount."""
+"""`biresnerf compare SCENE...`: methods and options against each other, on poses made wrong by a known amount.
+
+And what `biresnerf study` shares with it.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import importlib.util
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from itertools import product
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from biresnerf.studies.commands.comparison_options import (
-    chosen_variants,
-    comparison_options,
-    make_plan,
-    require,
-    run_and_write,
-    shared_settings,
-)
+from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.machine.this_machine import describe_machine
+from biresnerf.commands.settings_option import parse_settings, settings_option
+from biresnerf.errors import InputError
+from biresnerf.options.presets import PRESETS
+
+if TYPE_CHECKING:
+    from biresnerf.studies.cell import Perturbation
+    from biresnerf.studies.plan import Entry, Plan, Variant
+
+TABLES_MARKDOWN, TABLES_JSON, CELLS = "tables.md", "tables.json", "cells"
+
+
+def _numbers(kind: Callable[[str], Any]) -> Callable[..., Any]:
+    def read(
+        _context: click.Context, _parameter: click.Parameter, text: str | None
+    ) -> tuple[Any, ...] | None:
+        if text is None:
+            return None
+        try:
+            return tuple(dict.fromkeys(kind(part) for part in text.split(",")))
+        except ValueError:
+            raise click.BadParameter(f"{text!r} is no list of numbers like 1,2,3") from None
+
+    return read
+
+
+def comparison_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a click command the options of a comparison."""
+    options: list[Callable[..., Any]] = [
+        click.argument("scenes", nargs=-1, required=True, type=click.Path(path_type=Path)),
+        click.option(
+            "--output", "-o", required=True, type=click.Path(path_type=Path),
+            help="Folder for cells and tables; what is finished there is not run again.",
+        ),
+        click.option("--preset", type=click.Choice(list(PRESETS)), help="Of all variants. Default: balanced."),
+        settings_option,
+        click.option("--size", type=click.IntRange(16, 4096), help="Long side (px): max_image_size of all variants."),
+        click.option("--methods", metavar="A,B", help="Variants that differ in the option `method`."),
+        click.option(
+            "--variant", "variants", multiple=True, metavar="'NAME: KEY=VALUE ...'",
+            help="A variant of the options, by name; may be repeated. The first one is what others are tested against.",
+        ),
+        click.option("--noise", callback=_numbers(float), metavar="A,B", help="BARF's sigma. Default: 0.15."),
+        click.option(
+            "--seeds", callback=_numbers(int), default="1", show_default=True, metavar="1,2,3",
+            help="Of noise and run alike.",
+        ),
+        click.option("--every", type=click.IntRange(1), default=1, metavar="K", help="Use each K-th view."),
+        click.option(
+            "--start", type=click.Choice(["noise", "identity"]), default="noise", show_default=True,
+            help="identity: all cameras start at one pose, as BARF's forward-facing sets do.",
+        ),
+        click.option("--turn-one", type=float, default=0.0, metavar="DEG", help="Turn one camera in place as well."),
+        click.option(
+            "--lose", type=click.FloatRange(0, 1), default=0.0, metavar="SHARE",
+            help="Turn this share of the cameras about the scene by 45 to 180 degrees as well.",
+        ),
+        click.option("--equal-time", is_flag=True, help="Give all variants the first one's optimisation time."),
+        click.option(
+            "--test-views", type=click.IntRange(0), default=25, show_default=True,
+            help="Score at most so many views of transforms_test.json, where there is one.",
+        ),
+        click.option("--retry-failed", is_flag=True, help="Run recorded failures again."),
+        json_option,
+    ]  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def shared_settings(given: dict[str, Any]) -> dict[str, Any]:
+    """Refinement options of all variants, as the command line has them."""
+    settings = dict(given["settings"])
+    for key, value in (("preset", given["preset"]), ("max_image_size", given["size"])):
+        if value is not None:
+            settings[key] = value
+    return settings
+
+
+def chosen_variants(given: dict[str, Any]) -> tuple[Variant, ...]:
+    """Variants of `--methods`, then of `--variant`. Raises `InputError` for names that are missing or double."""
+    from biresnerf.studies.plan import Variant
+
+    methods = given["methods"].split(",") if given["methods"] else []
+    variants = [Variant(name, {"method": name}) for name in methods]
+    for text in given["variants"]:
+        name, separator, settings = text.partition(":")
+        if not separator or not name.strip():
+            raise InputError(
+                "invalid_options",
+                f"{text!r} is not 'NAME: KEY=VALUE ...'.",
+                where="--variant",
+                hint="Give a name, a colon and options.",
+            )
+        variants.append(Variant(name.strip(), parse_settings(tuple(settings.split()))))
+    names = [variant.name for variant in variants]
+    if len(set(names)) < len(names):
+        raise InputError(
+            "invalid_options", "two variants have one name.", where="--variant", hint="Name them differently."
+        )
+    return tuple(variants)
+
+
+def make_plan(
+    given: dict[str, Any], variants: Sequence[Variant], settings: dict[str, Any], noises: Sequence[float]
+) -> Plan:
+    """The plan of a command line; scenes are read and options checked before anything runs."""
+    from biresnerf.studies.plan import Plan, Variant
+    from biresnerf.studies.scenes import find_scene
+
+    scenes = tuple(find_scene(path, given["every"], given["test_views"]) for path in given["scenes"])
+    if len({scene.name for scene in scenes}) < len(scenes):
+        raise InputError(
+            "invalid_options", "two scenes have one name.", where="SCENES", hint="Rename one's folder."
+        )
+    starts = tuple(_start(given, noise, seed) for noise, seed in product(noises, given["seeds"]))
+    chosen = tuple(variants) or (Variant("default", {}),)
+    plan = Plan(scenes, starts, chosen, settings, given["equal_time"])
+    for scene, start, variant in product(scenes, starts, chosen):
+        plan.options(variant, scene, start)
+    return plan
+
+
+def _start(given: dict[str, Any], noise: float, seed: int) -> Perturbation:
+    from biresnerf.studies.cell import Perturbation
+
+    identity = given["start"] == "identity"
+    return Perturbation(
+        kind=given["start"],
+        noise=0.0 if identity else noise,
+        seed=seed,
+        turn_one_deg=given["turn_one"],
+        lose_share=given["lose"],
+    )
+
+
+def run_and_write(plan: Plan, given: dict[str, Any]) -> list[Entry]:
+    """Run what is not finished, write tables.md and tables.json, print one of them."""
+    from biresnerf.data.model.atomic_file import whole_file
+    from biresnerf.studies.markdown import as_markdown
+    from biresnerf.studies.plan import Runner, run_plan
+    from biresnerf.studies.tables import make_tables
+
+    signal.signal(signal.SIGTERM, _end)
+    output: Path = given["output"]
+    entries = run_plan(
+        plan, Runner(output / CELLS, lambda text: click.echo(text, err=True), given["retry_failed"])
+    )
+    variants = {variant.name: variant.settings for variant in plan.variants}
+    tables = make_tables(entries, variants, plan.settings, describe_machine())
+    for name, text in (
+        (TABLES_JSON, tables.model_dump_json(indent=1)),
+        (TABLES_MARKDOWN, as_markdown(tables)),
+    ):
+        with whole_file(output / name) as temporary:
+            temporary.write_text(text, "utf-8")
+    if given["as_json"]:
+        print_json(tables)
+    else:
+        click.echo(as_markdown(tables))
+    return entries
+
+
+def _end(number: int, _frame: FrameType | None) -> None:
+    sys.exit(128 + number)
+
+
+def require(*packages: str) -> None:
+    """Raise `InputError` before anything runs where what the tables or plots need is not installed."""
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    if missing:
+        raise InputError(
+            "extra_missing",
+            f"needs {' and '.join(missing)}, which is not installed.",
+            where="biresnerf compare",
+            hint="Install it with: pip install 'biresnerf[compare]'",
+        )
 
 
 @click.command("compare")

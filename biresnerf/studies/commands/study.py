@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from biresnerf.errors import InputError
-from biresnerf.studies.commands.comparison_options import (
+from biresnerf.studies.commands.compare import (
     CELLS,
     chosen_variants,
     comparison_options,

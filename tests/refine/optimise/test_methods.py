@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,15 +14,15 @@ from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_robust
-from biresnerf.options.presets import METHOD_VALUES, PRESETS
+from biresnerf.options.presets import METHOD_VALUES, PRESETS, MethodName
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Monitor, Progress
-from biresnerf.refine.optimise import methods
-from biresnerf.refine.optimise.methods import METHODS
+from biresnerf.refine.optimise.methods import find_method
 from biresnerf.refine.stages.checkpoint import load_checkpoint
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.report import Report
+from biresnerf.studies.baselines import methods as baselines
 from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_run, tiny_set
 
 SMALL_GRID = {
@@ -38,7 +39,8 @@ SMALL = {
     "barf": FEW_SAMPLES,
 }
 NARROW = 16  # units of BARF's network here, which is as deep as ever
-EACH = pytest.mark.parametrize("method", list(METHODS))
+METHODS = get_args(MethodName)
+EACH = pytest.mark.parametrize("method", METHODS)
 
 
 def small_options(method: str, **changed) -> RefineOptions:
@@ -50,7 +52,7 @@ def small_options(method: str, **changed) -> RefineOptions:
 @pytest.fixture(autouse=True, scope="module")
 def narrow_network():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(methods, "BARF_HIDDEN", NARROW)
+        patch.setattr(baselines, "BARF_HIDDEN", NARROW)
         yield
 
 
@@ -67,7 +69,7 @@ def scene(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module", params=list(METHODS))
+@pytest.fixture(scope="module", params=METHODS)
 def run(request, scene, tmp_path_factory) -> Run:
     told: list[Progress] = []
     output = tmp_path_factory.mktemp("results") / "out"
@@ -77,7 +79,7 @@ def run(request, scene, tmp_path_factory) -> Run:
 
 def test_a_run_goes_from_photos_to_a_complete_report_that_names_the_method(run):
     report = run.report
-    method = METHODS[report.options.method]
+    method = find_method(report.options.method)
     assert report.state == "complete"
     assert report.steps_done == 20
     assert report.heldout.count == 1
@@ -88,7 +90,7 @@ def test_a_run_goes_from_photos_to_a_complete_report_that_names_the_method(run):
 
 
 def test_progress_tells_the_stages_a_method_has_and_never_falls(run):
-    method = METHODS[run.report.options.method]
+    method = find_method(run.report.options.method)
     stages = {progress.stage for progress in run.progress}
     assert "fine" in stages
     assert method.two_stages or "coarse" not in stages

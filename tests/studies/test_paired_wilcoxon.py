@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import wilcoxon
 
-from biresnerf.studies.statistics import paired_wilcoxon
+from biresnerf.studies.tables import paired_wilcoxon
 
 
 def test_ranks_of_a_case_worked_by_hand():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.refine.optimise.methods import METHODS
+from biresnerf.refine.optimise.methods import find_method
 from biresnerf.refine.optimise.schedule import Schedule
 from biresnerf.refine.parameters.parametrisations import So3xR3
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
@@ -17,7 +17,7 @@ ONE_STAGE = ("baa-ngp", "nerfacc-barf", "barf")
 
 def schedule(method: str, *, unbounded: bool = False, steps: int | None = None) -> Schedule:
     options = RefineOptions(preset="paper", method=method, steps=steps).resolved("cpu")
-    return METHODS[method].schedule(options, 0.005, unbounded, DISTANCE)
+    return find_method(method).schedule(options, 0.005, unbounded, DISTANCE)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from biresnerf.field.radiance_field import FieldRates, Marching, PositionGradient, Rays
-from biresnerf.field.reference.mlp_field import LAYERS, SKIP, MlpField, positional_encoding
+from biresnerf.studies.baselines.mlp_field import LAYERS, SKIP, MlpField, positional_encoding
 
 CPU = torch.device("cpu")
 HIDDEN, LENGTH = 12, 0.8

@@ -1,19 +1,32 @@
-"""Schedules of the published methods: all shares of the steps asked for: short runs keep the proportions."""
+"""The published methods that ours is compared with: their fields, schedules and losses.
+
+All schedules are shares of the steps asked for, so short runs keep the proportions.
+"""
 
 from __future__ import annotations
 
-from biresnerf.field.radiance_field import FieldRates, PositionGradient
+import torch
+
+from biresnerf.field.backends import make_field
+from biresnerf.field.grid_levels import grid_levels
+from biresnerf.field.radiance_field import FieldRates, FieldShape, PositionGradient, RadianceField
 from biresnerf.geometry.perturb import RIG_DISTANCE
+from biresnerf.options.refine_options import ResolvedOptions
+from biresnerf.refine.optimise.loss import half_squared_error, squared_error
+from biresnerf.refine.optimise.methods import BuildField, Method, reconstruction_levels, two_grids
 from biresnerf.refine.optimise.schedule import EMPTY_LOOKED_AT, NEAR_SHARES, POSE_DIP, Schedule, smooth_ramp
+from biresnerf.refine.scene.scene_frame import SceneFrame
+from biresnerf.studies.baselines.mlp_field import MlpField
 
 # Steps that look at all cells of the occupancy grid, as shares: 256 of BAA-NGP's 40 000, of NerfAcc-BARF's 200 000.
 FIRST_LOOKS, NERFACC_BARF_FIRST_LOOKS = 256 / 40_000, 256 / 200_000
 BARF_NEAR, BARF_FAR = 0.5, 1.5  # depths 2 to 6 of cameras 4 away
 NERFACC_BARF_INTERVAL = 0.03  # of cameras 4 away
+BARF_HIDDEN, BARF_SAMPLES = 256, 128  # units of a layer, samples per ray
 
 
 class PlainSchedule(Schedule):
-    """Without additions of ours: sharp photos, no near bound, empty space skipped from the start, plain gradients."""
+    """Without our extensions: sharp photos, no near bound, empty space skipped from the start, plain gradients."""
 
     first_looks = FIRST_LOOKS
 
@@ -44,7 +57,7 @@ class PlainSchedule(Schedule):
 
 
 class PaperSchedule(PlainSchedule):
-    """The two stages with what the paper tells of: coarse-to-fine ray sampling, and a smooth warm-up at the switch."""
+    """The two stages with what the paper describes: coarse-to-fine ray sampling, and a smooth warm-up at the switch."""
 
     def _warmed(self, step: int, switch: int) -> float:
         return smooth_ramp((step - switch + 1) / self.options.warmup_steps)
@@ -87,3 +100,52 @@ class BarfSchedule(OneStageSchedule):
 
     def far(self, far: float) -> float:
         return far if self.unbounded else BARF_FAR * self.distance
+
+
+def one_grid(
+    options: ResolvedOptions, frame: SceneFrame, device: torch.device, threads: int
+) -> RadianceField:
+    """One hashed grid whose levels open from coarse to fine."""
+    levels = reconstruction_levels(options)
+    shape = FieldShape(levels, grid_levels(0, 1, 1, 0), frame.unbounded, broadcast=True)
+    return make_field(shape, options.seed, device, threads)
+
+
+def barf_network(samples_per_ray: int | None) -> BuildField:
+    """BARF's network, sampled in strata, or marched through the occupancy grid where no number is given."""
+
+    def build(
+        options: ResolvedOptions, frame: SceneFrame, device: torch.device, threads: int
+    ) -> RadianceField:
+        torch.set_num_threads(threads)  # in plain torch, and the kernels are at rest
+        return MlpField(
+            options.seed,
+            device,
+            hidden=BARF_HIDDEN,
+            unbounded=frame.unbounded,
+            length=frame.distance / RIG_DISTANCE,
+            stratified=samples_per_ray,
+        )
+
+    return build
+
+
+def _published_occupancy(options: ResolvedOptions) -> int:
+    """128 cells a side in the publications, for images of 400 px; fewer for smaller ones."""
+    size = options.max_image_size
+    return 128 if size > 200 else 64 if size > 64 else 32
+
+
+# Guo et al. 2023 as far as it is known, its gaps filled from BAA-NGP, which it builds on.
+BIRESNERF_PAPER = Method(two_grids, PaperSchedule, half_squared_error, _published_occupancy, two_stages=True)
+# Liu et al. 2023.
+BAA_NGP = Method(one_grid, OneStageSchedule, half_squared_error, _published_occupancy)
+# BARF on NerfAcc's occupancy grid (Li et al. 2023).
+NERFACC_BARF = Method(
+    barf_network(None), BarfSchedule, squared_error, _published_occupancy, large_network=True, rays_least=16
+)
+# Lin et al. 2021.
+BARF = Method(
+    barf_network(BARF_SAMPLES), BarfSchedule, squared_error, _published_occupancy,
+    large_network=True, pruned=False, rays_least=8,
+)  # fmt: skip
