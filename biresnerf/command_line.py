@@ -83,7 +83,7 @@ SECTIONS = (
     ),
     Section(
         "Research",
-        "compare",
+        "studies",
         {
             "compare": "biresnerf.studies.commands.compare:compare_command",
             "study": "biresnerf.studies.commands.study:study_command",

@@ -180,7 +180,7 @@ def imported(package: str) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("package", "extras"),
     [
-        ("biresnerf", ["client", "colmap", "compare"]),
+        ("biresnerf", ["client", "colmap", "studies"]),
         ("workers", ["service", "otel"]),
         ("service", ["service"]),
     ],

@@ -192,7 +192,7 @@ def require(*packages: str) -> None:
             "extra_missing",
             f"needs {' and '.join(missing)}, which is not installed.",
             where="biresnerf compare",
-            hint="Install it with: pip install 'biresnerf[compare]'",
+            hint="Install it with: pip install 'biresnerf[studies]'",
         )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
@@ -97,6 +99,13 @@ def test_progress_tells_the_stages_a_method_has_and_never_falls(run):
     fractions = [progress.fraction for progress in run.progress]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
+
+
+def test_every_method_that_can_be_chosen_is_found_and_no_baseline_is_loaded_before():
+    assert all(find_method(name).loss for name in METHODS)
+    code = "import biresnerf.pipeline, sys; print(*(name for name in sys.modules if 'studies' in name))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert loaded.stdout.split() == []
 
 
 @EACH
