@@ -13,7 +13,7 @@ from benchmarks.torch_forms import encode_unrolled, encode_vectorised
 from benchmarks.yardstick import Yardstick, build_yardstick, check_yardstick
 from biresnerf.field.cpu import encoding
 from biresnerf.field.cpu.field import tasks
-from biresnerf.field.cpu.segments import add_position_gradient
+from biresnerf.field.cpu.segments_backward import add_position_gradient
 from biresnerf.field.grid_levels import GridLevels, grid_levels
 from biresnerf.field.reference import operations as reference
 

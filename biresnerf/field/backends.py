@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from biresnerf.errors import InputError
-from biresnerf.field.cuda.device_occupancy import DeviceOccupancyGrid
-from biresnerf.field.occupancy import OccupancyGrid
+from biresnerf.field.occupancy import DeviceOccupancyGrid, OccupancyGrid
 from biresnerf.field.radiance_field import FieldShape, RadianceField
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.options.refine_options import Device, RefineOptions, ResolvedOptions

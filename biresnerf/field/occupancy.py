@@ -59,6 +59,12 @@ class OccupancyGrid:
         dilate: bool,
     ) -> None:
         """Look again at the occupied cells and a random share `looked_at` of the others, at a random point in each."""
+        self._look(field, step, generator, looked_at)
+        if prune:
+            self._prune(dilate)
+
+    def _look(self, field: RadianceField, step: float, generator: torch.Generator, looked_at: float) -> None:
+        """Let the running maximum decay and raise it where cells are looked at."""
         cells = torch.arange(self.side**3)
         if looked_at < 1:
             chosen = torch.rand(len(cells), generator=generator) < looked_at
@@ -70,8 +76,6 @@ class OccupancyGrid:
             part = part.to(self.device)
             length = step * interval_growth(position.to(self.device)) if field.unbounded else step
             self.thickness[part] = torch.maximum(self.thickness[part], density * length)
-        if prune:
-            self._prune(dilate)
 
     def _points(self, cells: Tensor, generator: torch.Generator) -> Tensor:
         """A random point [n, 3] in each cell, on the generator's device."""
@@ -95,3 +99,30 @@ class OccupancyGrid:
     def load_state(self, state: dict[str, Tensor]) -> None:
         self.thickness.copy_(state["thickness"])
         self.occupied = state["occupied"].to(self.device).clone()  # not shared with a snapshot
+
+
+class DeviceOccupancyGrid(OccupancyGrid):
+    """The same rule without the host ever asking how many cells it concerns; takes a generator on the grid's device."""
+
+    def _look(self, field: RadianceField, step: float, generator: torch.Generator, looked_at: float) -> None:
+        count = self.side**3
+        cells = torch.arange(count, device=self.device)
+        total = torch.full((1,), count, device=self.device)
+        if looked_at < 1:
+            chosen = torch.rand(count, generator=generator, device=self.device) < looked_at
+            chosen |= self.occupied.reshape(-1).bool()
+            place = torch.cumsum(chosen, 0)
+            total = place[-1:]
+            # The cells to look at come first; the rest is filled with the index of a cell that does not exist.
+            first = torch.full((count + 1,), count, device=self.device)
+            cells = first.scatter_(0, torch.where(chosen, place - 1, count), cells)[:count]
+            cells = torch.where(torch.arange(count, device=self.device) < total, cells, count)
+        found = torch.zeros(count + 1, device=self.device)
+        for begin in range(0, count, DENSITY_CHUNK):
+            part = cells[begin : begin + DENSITY_CHUNK]
+            position = self._points(part.clamp(max=count - 1), generator)
+            density = field.density_of_first((total - begin).clamp(0, len(part)), position)
+            length = step * interval_growth(position) if field.unbounded else step
+            found.scatter_(0, part, density * length)
+        self.thickness *= DECAY
+        torch.maximum(self.thickness, found[:count], out=self.thickness)

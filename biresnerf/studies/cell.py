@@ -1,4 +1,4 @@
-"""One cell of a comparison as data: a scene, the poses it starts from, and the options; and what came out."""
+"""One cell of a comparison as data: scene, start poses, options, and the result."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ CELL, RESULT, LOG, RUN = "cell.json", "result.json", "log.txt", "run"  # in the 
 
 
 class Perturbation(BaseModel):
-    """How the poses that a run starts from are made of the true ones."""
+    """How the start poses of a run are made from the true ones."""
 
     model_config = _FROZEN
 
     kind: Literal["noise", "identity"] = "noise"
     noise: float = Field(0.15, ge=0, le=2, description="BARF's sigma.")
     seed: int = Field(1, ge=0)
-    turn_one_deg: float = Field(0.0, description="One camera is turned in place by so much.")
+    turn_one_deg: float = Field(0.0, description="One camera is turned in place by this angle.")
     lose_share: float = Field(0.0, ge=0, le=1, description="Share of the cameras turned about the scene.")
 
     @property
     def label(self) -> str:
-        """All but the seed, for people."""
+        """All but the seed, as text."""
         parts = ["identity" if self.kind == "identity" else f"noise {self.noise:g}"]
         if self.turn_one_deg:
             parts.append(f"one camera turned by {self.turn_one_deg:g}°")
@@ -48,12 +48,12 @@ class Scene(BaseModel):
     file: Path = Field(description="Transforms file with true poses.")
     test_file: Path | None = Field(description="Views that no run sees, with true poses.")
     digest: str
-    every: int = Field(1, ge=1, description="Every so many-th view is used.")
-    test_views: int = Field(0, ge=0, description="At most so many of the test file's views are rendered.")
+    every: int = Field(1, ge=1, description="Every n-th view is used.")
+    test_views: int = Field(0, ge=0, description="At most this many views of the test file are rendered.")
 
 
 class EqualTime(BaseModel):
-    """Why a run has the number of steps it has, where it was given another's time."""
+    """How the number of steps was chosen for a run that was given another's time."""
 
     model_config = _FROZEN
 
@@ -74,7 +74,7 @@ class Cell(BaseModel):
 
     @property
     def key(self) -> str:
-        """Differs whenever the result may: of the scene's content, the start and the options, presets filled in."""
+        """Hash of everything that may change the result: scene content, start, and options with presets filled in."""
         content = [
             self.scene.model_dump_json(exclude={"name", "file", "test_file"}),
             self.start.model_dump_json(),
@@ -89,7 +89,7 @@ class Cell(BaseModel):
 
 
 class CameraResult(BaseModel):
-    """Rotation error of one camera after an alignment that lost cameras do not drag along."""
+    """Rotation error of one camera after an alignment that is robust to lost cameras."""
 
     model_config = _FROZEN
 
@@ -113,12 +113,12 @@ class ViewQuality(BaseModel):
 
 
 class Outcome(BaseModel):
-    """What a run that came to its end gave."""
+    """The result of a completed run."""
 
     model_config = _FROZEN
 
     version: str
-    options: ResolvedOptions = Field(description="As used, with everything filled in.")
+    options: ResolvedOptions = Field(description="As used, with all values filled in.")
     before: PoseError
     after: PoseError
     cameras: tuple[CameraResult, ...]
@@ -142,7 +142,7 @@ class Outcome(BaseModel):
 
 
 class CellResult(BaseModel):
-    """``result.json`` of a cell: its outcome, or why there is none."""
+    """``result.json`` of a cell: its outcome, or the error."""
 
     model_config = _FROZEN
 

@@ -10,7 +10,7 @@ _TITLES = {metric.key: metric for metric in METRICS}
 
 
 def as_markdown(tables: Tables) -> str:
-    """All tables, one after the other; columns that no run has a figure for are left out."""
+    """All tables, one after the other; columns without any value are left out."""
     parts = [_rows(tables), _summaries(tables), _differences(tables.differences), _variants(tables)]
     if tables.failures:
         parts.append(_failures(tables))
@@ -67,11 +67,11 @@ def _differences(differences: Sequence[Difference]) -> str:
 
 
 def _variants(tables: Tables) -> str:
-    def told(settings: dict[str, object]) -> str:
+    def as_text(settings: dict[str, object]) -> str:
         return " ".join(f"{key}={value}" for key, value in settings.items())
 
-    lines = [[name, told(settings) or "as shared"] for name, settings in tables.variants.items()]
-    shared = told(tables.settings)
+    lines = [[name, as_text(settings) or "as shared"] for name, settings in tables.variants.items()]
+    shared = as_text(tables.settings)
     return (
         "## Variants\n\n" + (f"All: {shared}\n\n" if shared else "") + _table(["variant", "options"], lines)
     )

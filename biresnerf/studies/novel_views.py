@@ -1,4 +1,4 @@
-"""Views that no run saw, rendered from their true poses and scored: the test-time refinement of BARF."""
+"""Unseen views, rendered from their true poses after BARF's test-time refinement; and LPIPS to score them."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from biresnerf.refine.parameters.parametrisations import Se3World
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from biresnerf.refine.views.evaluation import FIT_RATE, FIT_STEPS, fit_rays, render_view
 
-# What torchvision names the file; the package would download it, which a measurement must not do by itself.
+# torchvision's name of the file. The package would download it, which a measurement must not do.
 VGG_WEIGHTS = "vgg16-397923af.pth"
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoAndRender:
-    """Both [h, w, 3] in 0..1, at working size; `counts` [h, w] says where they may be compared, None: anywhere."""
+    """Both [h, w, 3] in 0..1, at working size; `counts` [h, w] marks the pixels to compare, None means all."""
 
     photo: Tensor
     render: Tensor
@@ -39,10 +39,10 @@ class PhotoAndRender:
 def render_test_views(
     optimiser: JointOptimiser, views: Dataset, truth: NDArray[np.float64]
 ) -> Iterator[PhotoAndRender]:
-    """Each test view from its true pose, carried into the optimised frame and fitted there to the frozen field.
+    """Each test view at its true pose, transformed to the optimised frame and fitted to the frozen field.
 
-    A similarity from the true training poses `truth` [n, 4, 4] to the optimised ones (robust: one lost camera
-    must not spoil all views) carries the poses; then 100 steps on 1024 rays each, as BARF does.
+    A similarity from the true training poses `truth` [n, 4, 4] to the optimised ones (robust, as one lost
+    camera must not spoil all views) transforms the poses; then 100 steps on 1024 rays each, as in BARF.
     """
     options = optimiser.options
     images = load_images(views, options.max_image_size, options.background)
@@ -66,7 +66,7 @@ def _fitted(
     index: int,
     intrinsics: Intrinsics,
 ) -> Tensor:
-    """unit_from_cam [3, 4] of one view, moved to where its photo fits the field best."""
+    """unit_from_cam [3, 4] of one view after fitting its photo to the field."""
     device = optimiser.device
     form = Se3World(optimiser.poses.parametrisation.length)
     pose = PoseParameters(torch.from_numpy(unit_from_cam[None]), form, device)
@@ -87,15 +87,15 @@ def _fitted(
 
 
 def lpips_absent() -> str | None:
-    """Why LPIPS cannot be measured here; None where it can."""
+    """The reason why LPIPS cannot be measured here; None if it can."""
     if importlib.util.find_spec("lpips") is None or importlib.util.find_spec("torchvision") is None:
         return "the packages lpips and torchvision are not installed"
     weights = Path(torch.hub.get_dir()) / "checkpoints" / VGG_WEIGHTS
-    return None if weights.is_file() else f"the weights {weights} are not there"
+    return None if weights.is_file() else f"the weights {weights} are missing"
 
 
 def lpips_vgg() -> Callable[[Tensor, Tensor], float]:
-    """A function of two images [h, w, 3] in 0..1; call only where `lpips_absent` finds nothing."""
+    """A function of two images [h, w, 3] in 0..1; call only if `lpips_absent` returns None."""
     model = importlib.import_module("lpips").LPIPS(net="vgg", verbose=False).eval()
 
     @torch.no_grad()

@@ -1,4 +1,4 @@
-"""What a comparison runs: variants of the options on scenes, starts and seeds; and at equal time, how long."""
+"""What a comparison runs: variants of the options on scenes, starts and seeds, optionally at equal time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PROBE_STEPS, CALIBRATION_SHARE = 20, 0.1
 
 @dataclass(frozen=True)
 class Variant:
-    """A named set of options; `settings` are over those that all variants share."""
+    """A named set of options; `settings` override those that all variants share."""
 
     name: str
     settings: dict[str, Any]
@@ -27,7 +27,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class Plan:
-    """All of a comparison. The first variant is the one that the others are compared with.
+    """A whole comparison. All other variants are compared with the first.
 
     Attributes:
         settings: options of all variants.
@@ -41,9 +41,9 @@ class Plan:
     equal_time: bool = False
 
     def options(self, variant: Variant, scene: Scene, start: Perturbation) -> RefineOptions:
-        """The variant's options. Where they say nothing, the run's own seed is that of the noise, it starts from
-        the wrong poses themselves without asking feature matches, films no orbit, gives back the refined poses without
-        a verdict, and holds out no views of a scene that has test views of its own. Raises `InputError`.
+        """The variant's options. By default the run's seed is that of the noise, it starts from the perturbed poses
+        without feature matches, renders no orbit, returns the refined poses without a verdict, and holds out no
+        views of a scene that has test views. Raises `InputError`.
         """
         defaults: dict[str, Any] = {
             "seed": start.seed,
@@ -54,7 +54,7 @@ class Plan:
         if scene.test_file is not None:
             defaults["holdout"] = 0
         options = parse_options({**defaults, **self.settings, **variant.settings})
-        options.resolved("cpu")  # refuses what fits no preset, before anything runs
+        options.resolved("cpu")  # raises for invalid combinations before anything runs
         return options
 
 
@@ -80,11 +80,11 @@ def with_steps(options: RefineOptions, steps: int) -> RefineOptions:
 
 @dataclass(frozen=True)
 class Runner:
-    """Takes cells from what is finished, or runs them.
+    """Returns finished cells, and runs the others.
 
     Attributes:
         cells: the folder of all cells.
-        say: told of each cell that was run.
+        say: called with a line about each cell that is run.
         retry_failed: whether a recorded failure is run again.
     """
 
@@ -124,7 +124,7 @@ def _entries(plan: Plan, run: Callable[[Cell, str], CellResult]) -> Iterator[Ent
 def _run_in_same_time(
     cell: Cell, first: CellResult, run: Callable[[Cell, str], CellResult], title: str
 ) -> CellResult:
-    """The cell with as many steps as fit into what the first variant took, judged by short runs of its own."""
+    """The cell with as many steps as fit into the first variant's time, estimated by short runs of its own."""
     if first.outcome is None:
         return CellResult(cell=cell, error="the first variant failed, so there is no time to equal")
     seconds = first.outcome.optimisation_s
@@ -139,7 +139,7 @@ def _run_in_same_time(
         if calibration.outcome is None:
             return CellResult(cell=cell, error=f"calibration failed: {calibration.error}")
         ms_per_step = 1000 * calibration.outcome.optimisation_s / steps
-        # A probe of few steps says how long a measurement may be that takes a tenth of the time.
+        # The probe tells how many steps a measurement can have that takes a tenth of the time.
         longer = round(CALIBRATION_SHARE * 1000 * seconds / ms_per_step)
         if steps > PROBE_STEPS or longer < 2 * PROBE_STEPS:
             break

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH, HEIGHT = 6.4, 6.0  # inches
-BEFORE_SWITCH, AFTER_SWITCH = 0.75, 1.5  # of the switch's step: what the plot of the warm-up shows
+BEFORE_SWITCH, AFTER_SWITCH = 0.75, 1.5  # steps shown in the plot of the warm-up, as factors of the switch
 
 
 def _figure(rows: int, columns: int = 1) -> tuple[Figure, Any]:
     import matplotlib
 
     matplotlib.use("Agg")
-    # Text as text, and names that do not change from one drawing to the next.
+    # Keep text as text, and ids reproducible.
     matplotlib.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "biresnerf", "font.size": 10})
     import matplotlib.pyplot as plt
 
@@ -49,7 +49,7 @@ def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
 def _line_with_range(
     axes: Axes, points: Sequence[tuple[float, list[float]]], label: str, **style: Any
 ) -> None:
-    """Means over the seeds, and a band from the least to the greatest."""
+    """Means over the seeds, with a band from minimum to maximum."""
     known = [(x, values) for x, values in points if values]
     if not known:
         return

@@ -36,7 +36,7 @@ EXIT_STOPPED = 143
 
 
 class StopRequest:
-    """A wish to stop: SIGINT, SIGTERM, or the end of the process that waits for the result."""
+    """Whether to stop: after SIGINT or SIGTERM, or when the parent process has ended."""
 
     def __init__(self) -> None:
         self._asked, self._parent = False, os.getppid()
@@ -51,7 +51,7 @@ class StopRequest:
 
 
 class TruthObserver:
-    """Measures a run against the true poses [n, 4, 4]: at each check, and on test views at its end."""
+    """Measures a run against the true poses [n, 4, 4]: at each check, and on test views at the end."""
 
     def __init__(self, truth: NDArray[np.float64], test_views: Dataset | None) -> None:
         self.truth, self.test_views = truth, test_views
@@ -59,7 +59,7 @@ class TruthObserver:
         self.seconds = 0.0
 
     def at_check(self, optimiser: JointOptimiser) -> dict[str, float]:
-        """Errors after BARF's alignment, as tables have them: mean rotation and mean centre."""
+        """Errors after BARF's alignment, as in the tables: mean rotation and mean centre."""
         poses = optimiser.poses.poses().numpy()
         errors = camera_errors(align_by_spread(poses, self.truth).apply_to_poses(poses), self.truth)
         return {
@@ -88,7 +88,7 @@ class TruthObserver:
 
 
 def run_cell(folder: Path, should_stop: Callable[[], bool]) -> CellResult:
-    """Run the cell that `folder`/cell.json describes and measure what it gives; goes on from a checkpoint."""
+    """Run the cell of `folder`/cell.json and measure its result; resumes from a checkpoint."""
     cell = Cell.model_validate_json((folder / CELL).read_text("utf-8"))
     run = folder / RUN
     if not (run / CHECKPOINT).is_file():
@@ -104,7 +104,7 @@ def run_cell(folder: Path, should_stop: Callable[[], bool]) -> CellResult:
         should_stop=should_stop,
         observer=Observer(observer.at_check, observer.at_end),
     )
-    # What a user would be given is measured, read back from the file.
+    # Measure what a user would receive: the poses read back from the file.
     refined = np.stack(list(read_poses(run / "transforms.json").values()))
     outcome = Outcome(
         version=__version__,
@@ -160,7 +160,7 @@ def _held_out_quality(report: Report, run: Path) -> ViewQuality | None:
 
 
 def _perceptual(pairs: list[tuple[torch.Tensor, torch.Tensor]]) -> tuple[float | None, str | None]:
-    """Mean LPIPS, or why there is none."""
+    """Mean LPIPS, or the reason why there is none."""
     absent = lpips_absent()
     if absent is not None:
         return None, absent
@@ -169,7 +169,7 @@ def _perceptual(pairs: list[tuple[torch.Tensor, torch.Tensor]]) -> tuple[float |
 
 
 def peak_memory_bytes() -> int:
-    """The most this process ever held. Linux's VmHWM, as ru_maxrss begins with what the parent held."""
+    """Peak memory of this process. Linux's VmHWM, as ru_maxrss starts with the parent's."""
     status = Path("/proc/self/status")
     if status.is_file():
         for line in status.read_text().splitlines():

@@ -1,4 +1,4 @@
-"""Runs cells one after the other, each in its own process, and keeps what they gave."""
+"""Runs cells one after the other, each in its own process, and keeps their results."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from biresnerf.studies.cell import CELL, LOG, RESULT, RUN, Cell, CellResult
 
 EXIT_STOPPED = 143  # of a cell's process that was asked to stop
 LAST_LINES = 12  # of a failed process's output
-STOPPING_S = 60.0  # that a process is given to write its checkpoint
+STOPPING_S = 60.0  # for a process to write its checkpoint
 
 
 def finished(cells: Path, cell: Cell) -> CellResult | None:
-    """The result that an earlier run of the comparison left, outcome or failure."""
+    """The result of an earlier run of the comparison, outcome or failure; None if there is none."""
     path = cells / cell.folder_name / RESULT
     return CellResult.model_validate_json(path.read_text("utf-8")) if path.is_file() else None
 
 
 def run_in_child(cells: Path, cell: Cell) -> CellResult:
-    """Run a cell in a process of its own; goes on where an interrupted one stopped.
+    """Run a cell in its own process; resumes an interrupted one.
 
-    A process that fails in any way leaves a result that says so.
+    A process that fails in any way leaves a result with the error.
 
     Raises:
         Interrupted: the cell was stopped from outside; it keeps its checkpoint.
@@ -50,10 +50,10 @@ def run_in_child(cells: Path, cell: Cell) -> CellResult:
     if result is not None and status == 0:
         return result
     if status == EXIT_STOPPED:
-        raise Interrupted(f"{folder.name} was stopped; run again to go on")
-    said = (folder / LOG).read_text("utf-8", errors="replace").strip().splitlines()[-LAST_LINES:]
+        raise Interrupted(f"{folder.name} was stopped; run again to resume")
+    last_lines = (folder / LOG).read_text("utf-8", errors="replace").strip().splitlines()[-LAST_LINES:]
     reason = f"killed by signal {-status}" if status < 0 else f"exit status {status}"
-    failure = CellResult(cell=cell, error="\n".join([reason, *said]))
+    failure = CellResult(cell=cell, error="\n".join([reason, *last_lines]))
     shutil.rmtree(folder / RUN, ignore_errors=True)
     _write(folder / RESULT, failure.model_dump_json(indent=1))
     return failure

@@ -1,4 +1,4 @@
-"""The scenes of a comparison: found, read, and given the poses that a run starts from."""
+"""The scenes of a comparison: found, read, and given start poses."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ TRAIN_NAME, TEST_NAME = "transforms_train.json", "transforms_test.json"
 
 @dataclass(frozen=True, eq=False)
 class StartingRig:
-    """Poses world_from_cam [n, 4, 4] to start from, and which cameras were displaced on top of the noise."""
+    """Start poses world_from_cam [n, 4, 4], and which cameras were displaced on top of the noise."""
 
     world_from_cam: NDArray[np.float64]
     displaced: tuple[int, ...]
 
 
 def find_scene(path: Path, every: int, test_views: int) -> Scene:
-    """The scene in a folder, or of a transforms file, read once to see that it can be.
+    """The scene in a folder or of a transforms file, read once to validate it.
 
     Views of a transforms_test.json beside a transforms_train.json are test views.
 
     Raises:
-        InputError: what `read_transforms` says, or ``poses_missing`` where images have none.
+        InputError: as `read_transforms`, or ``poses_missing`` if images have no pose.
     """
     file = path
     if path.is_dir():
@@ -93,7 +93,7 @@ def read_test_views(scene: Scene) -> Dataset | None:
 
 
 def with_poses(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> Dataset:
-    """The same set with other poses [n, 4, 4]."""
+    """The same set with these poses [n, 4, 4]."""
     frames = (
         replace(frame, world_from_cam=pose)
         for frame, pose in zip(dataset.frames, world_from_cam, strict=True)
@@ -102,7 +102,7 @@ def with_poses(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> Dataset
 
 
 def starting_rig(truth: NDArray[np.float64], start: Perturbation) -> StartingRig:
-    """True poses [n, 4, 4] made as wrong as `start` says; the same seed does the same."""
+    """True poses [n, 4, 4] perturbed as `start` says; deterministic for a seed."""
     from biresnerf.geometry.perturb import orbit_away, perturb_poses, turn_in_place
 
     count = len(truth)

@@ -12,7 +12,7 @@ from biresnerf.studies.plan import Variant
 RESOLUTIONS = (32, 48, 64, 72, 96, 128, 256, 512, 1024, 4096)
 LEVELS = (1, 2, 3, 4, 6, 8, 16)
 NOISES = (0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.35)
-CHECKS_PER_WARMUP = 10  # so that a curve shows what happens in it
+CHECKS_PER_WARMUP = 10  # so that a curve resolves it
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,9 @@ class Study:
     """A predefined comparison.
 
     Attributes:
-        about: what is swept, for the help and the plot's axis.
-        swept: the option that differs between the variants; None where it is not one number.
-        variants: of the study; none where the caller's own are compared.
+        about: what is varied, for the help and the plot's axis.
+        swept: the option that differs between the variants; None if it is not a single number.
+        variants: of the study; empty if the caller's own are compared.
         noises: default noise levels.
         settings: options of all variants, given the caller's.
     """
@@ -41,7 +41,7 @@ def _stage_1_only(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _same_switch(given: dict[str, Any]) -> dict[str, Any]:
-    """Stage 2 begins at the cap in all variants, so that their curves part there and not before."""
+    """Stage 2 begins at the cap in all variants, so that their curves differ only from there on."""
     options = parse_options(given).resolved("cpu")
     return {
         **given,

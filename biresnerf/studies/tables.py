@@ -16,7 +16,7 @@ _FROZEN = ConfigDict(frozen=True, extra="forbid")
 
 @dataclass(frozen=True)
 class Metric:
-    """One column. ``of`` gives None where a run has no such figure; ``over_seeds`` joins those of several seeds."""
+    """One column. ``of`` returns None where a run has no such value; ``over_seeds`` combines several seeds."""
 
     key: str
     title: str
@@ -48,20 +48,20 @@ METRICS = (
     Metric("optimisation_s", "both s", 1, lambda o: o.optimisation_s, tested=True),
     Metric("peak_mb", "memory MB", 0, lambda o: o.peak_memory_bytes / 2**20, _most),
     Metric("steps", "steps", 0, lambda o: float(o.options.steps)),
-    # A method of one stage is in its last from the first step: no reason, no switch.
+    # A method of one stage has no switch.
     Metric("switch_step", "switch", 0, lambda o: float(o.switch_step or 0) if o.switch_reason else None),
 )
 
 
 class Row(BaseModel):
-    """One variant on one scene from one kind of start, over the seeds: means; of max and memory the largest."""
+    """One variant on one scene from one kind of start, over the seeds: means; for max and memory the largest."""
 
     model_config = _FROZEN
 
     scene: str
     start: str
     variant: str
-    seeds: tuple[int, ...] = Field(description="Of the runs that came to their end.")
+    seeds: tuple[int, ...] = Field(description="Of the completed runs.")
     failed: int
     values: dict[str, float | None]
 
@@ -84,7 +84,7 @@ class PairedTest(BaseModel):
     model_config = _FROZEN
 
     pairs: int = Field(description="n: scenes x starts x seeds that both variants finished.")
-    differing: int = Field(description="Pairs that differ; the test leaves the others out.")
+    differing: int = Field(description="Pairs that differ; the test ignores the others.")
     statistic: float | None = Field(
         description="The smaller of the two rank sums; None without a difference."
     )
@@ -173,7 +173,7 @@ def summaries_of(rows: Sequence[Row]) -> tuple[Summary, ...]:
 
 
 def differences_of(entries: Sequence[Entry]) -> tuple[Difference, ...]:
-    """Wilcoxon's test of every other variant against the first, for each metric that says which is better."""
+    """Wilcoxon's test of every other variant against the first, for each tested metric."""
     variants = list(dict.fromkeys(entry.variant for entry in entries))
     outcomes = {
         (entry.scene, entry.start, entry.variant): entry.result.outcome
@@ -197,7 +197,7 @@ def differences_of(entries: Sequence[Entry]) -> tuple[Difference, ...]:
 
 
 def paired_wilcoxon(first: Sequence[float], other: Sequence[float]) -> PairedTest | None:
-    """Test pairs of results of two variants, in the same order; None where there are none.
+    """Test pairs of results of two variants, in the same order; None if there are none.
 
     The test is exact for up to 50 differing pairs without ties, as scipy decides.
     """
@@ -235,7 +235,7 @@ def failures_of(entries: Sequence[Entry]) -> tuple[Failure, ...]:
 
 
 def notes_of(entries: Sequence[Entry]) -> tuple[str, ...]:
-    """What a reader of the tables must know: which views were scored, why LPIPS is absent, how time was equalled."""
+    """Notes on the tables: which views were scored, why LPIPS is absent, how equal time was reached."""
     notes: dict[str, None] = {}
     for entry in entries:
         outcome, equal = entry.result.outcome, entry.result.cell.equal_time
@@ -249,7 +249,7 @@ def notes_of(entries: Sequence[Entry]) -> tuple[str, ...]:
             took = f", took {outcome.optimisation_s:.1f} s" if outcome is not None else ""
             notes[
                 f"{entry.scene}, {entry.start.label}, seed {entry.start.seed}, {entry.variant}: "
-                f"{equal.seconds:.1f} s to fill at {equal.calibration_ms_per_step:.1f} ms a step "
+                f"{equal.seconds:.1f} s at {equal.calibration_ms_per_step:.1f} ms a step "
                 f"(measured over {equal.calibration_steps} steps) gave {entry.result.cell.options.steps} steps{took}"
             ] = None
     return tuple(notes)

@@ -227,25 +227,22 @@ def _adam_touched(p, g, m, v, rate, beta1, beta2, eps, correction1, correction2)
             store(g, i, f4(0))
 
 
+@njit(**KERNEL)
+def _scatter_level(x, begin, end, hashed, gradient, scale, stride, g0, g1, corner, value):
+    """Add the gradients of points begin[s]:end[s] to one level's."""
+    mask = u4(gradient.shape[0] // 2 - 1)
+    for s in range(begin.shape[0]):
+        lo, hi = begin[s], end[s]
+        if hashed:
+            _scatter_hashed(x, gradient, scale, stride, mask, g0, g1, corner, value, lo, hi)
+        else:
+            _scatter_dense(x, gradient, scale, stride, mask, g0, g1, corner, value, lo, hi)
+
+
 @njit(**PARALLEL_KERNEL)
 def update_table(
-    x,
-    begin,
-    end,
-    g,
-    scale,
-    stride,
-    hashed,
-    offset,
-    table,
-    moment1,
-    moment2,
-    rates,
-    adam,
-    scratch,
-    counter,
-    workers,
-):
+    x, begin, end, g, scale, stride, hashed, offset, table, moment1, moment2, rates, adam, scratch, counter, workers
+):  # fmt: skip
     """Scatter the feature gradients of points begin[s]:end[s] into each level and take its Adam step at once.
 
     A level's gradient lives in its worker's `scratch` row (kept zero), so it stays in cache and no two workers
@@ -260,37 +257,10 @@ def update_table(
             if rates[level] != f4(0):
                 lo, hi = 2 * offset[level], 2 * offset[level + 1]
                 gradient = scratch[worker][: hi - lo]
-                mask = u4((hi - lo) // 2 - 1)
-                g0, g1 = g[2 * level], g[2 * level + 1]
-                for s in range(begin.shape[0]):
-                    if hashed[level]:
-                        _scatter_hashed(
-                            x,
-                            gradient,
-                            scale[level],
-                            stride[level],
-                            mask,
-                            g0,
-                            g1,
-                            corner,
-                            value,
-                            begin[s],
-                            end[s],
-                        )
-                    else:
-                        _scatter_dense(
-                            x,
-                            gradient,
-                            scale[level],
-                            stride[level],
-                            mask,
-                            g0,
-                            g1,
-                            corner,
-                            value,
-                            begin[s],
-                            end[s],
-                        )
+                _scatter_level(
+                    x, begin, end, hashed[level], gradient, scale[level], stride[level],
+                    g[2 * level], g[2 * level + 1], corner, value,
+                )  # fmt: skip
                 _adam_touched(
                     table[lo:hi], gradient, moment1[lo:hi], moment2[lo:hi],
                     rates[level], adam[0], adam[1], adam[2], adam[3], adam[4],

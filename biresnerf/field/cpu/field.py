@@ -12,8 +12,9 @@ from biresnerf.field.cpu import encoding, network
 from biresnerf.field.cpu import rays as ray_kernels
 from biresnerf.field.cpu.harmonics import add_harmonics_gradient, harmonics
 from biresnerf.field.cpu.matrix_blocks import CHANNELS, from_tiles
-from biresnerf.field.cpu.samples import Samples, segments
-from biresnerf.field.cpu.segments import render_segments, render_segments_backward
+from biresnerf.field.cpu.samples import Composited, Samples, segments
+from biresnerf.field.cpu.segments import render_segments
+from biresnerf.field.cpu.segments_backward import render_segments_backward
 from biresnerf.field.grid_field import GridField
 from biresnerf.field.grid_levels import GridLevels
 from biresnerf.field.radiance_field import (
@@ -153,15 +154,17 @@ class CpuField(GridField):
         segment, learning = segments(offset, rays.trained)
         samples = Samples(
             segment, learning, offset, x, t, dt, ray, features, jacobians,
-            take("outputs", OUTPUTS * n), take("density", n), take("alpha", n), take("kept", n, dtype=np.int32),
-            take("kept begin", count, dtype=np.int64), take("kept end", count, dtype=np.int64), take("colour", 3 * n),
+            Composited(
+                take("outputs", OUTPUTS * n), take("density", n), take("alpha", n), take("kept", n, dtype=np.int32),
+                take("kept begin", count, dtype=np.int64), take("kept end", count, dtype=np.int64),
+                take("colour", 3 * n),
+            ),
         )  # fmt: skip
         colour, opacity, depth = np.empty((count, 3), f4), np.empty(count, f4), np.empty(count, f4)
         render_segments(
             segment, offset, t, dt, ray, features.reshape(-1), len(features), view.reshape(-1),
-            rays.background.numpy(), *(w.reshape(-1) for w in self._weights()),
-            samples.outputs, samples.density, samples.alpha, samples.kept, samples.kept_begin, samples.kept_end,
-            samples.colour, colour, opacity, depth, tasks(), self.workers,
+            rays.background.numpy(), tuple(w.reshape(-1) for w in self._weights()), samples.composited,
+            colour, opacity, depth, tasks(), self.workers,
         )  # fmt: skip
         return samples, colour, opacity, depth
 
@@ -178,10 +181,9 @@ class CpuField(GridField):
         second = s.jacobians[1] if len(s.jacobians) > 1 else np.empty((0, 6, n), f4)
         render_segments_backward(
             s.segment, s.learning, longest, s.offset, s.dt, s.ray, s.features.reshape(-1), width, view.reshape(-1),
-            *(w.reshape(-1) for w in weights), s.outputs, s.density, s.alpha, s.kept, s.kept_begin, s.kept_end,
-            s.colour, colour, opacity, g_colour, g_opacity, s.jacobians[0], second, f4(gradient.reconstruction_share),
-            s.x, take("g density", n), take("g colour", 3 * n), g_features.reshape(-1), dx, g_view, *sums,
-            tasks(), self.workers,
+            tuple(w.reshape(-1) for w in weights), s.composited, colour, opacity, g_colour, g_opacity,
+            s.jacobians[0], second, f4(gradient.reconstruction_share), s.x, take("g density", n),
+            take("g colour", 3 * n), g_features.reshape(-1), dx, g_view, tuple(sums), tasks(), self.workers,
         )  # fmt: skip
         if s.learning:
             self._keep_network_gradients(
@@ -208,7 +210,7 @@ class CpuField(GridField):
         samples, g_features = self._pending
         # Kept samples lie without gaps from each segment's first sample on.
         begin = samples.offset[samples.segment[: samples.learning]]
-        end = samples.kept_end[samples.segment[1 : samples.learning + 1] - 1]
+        end = samples.composited.kept_end[samples.segment[1 : samples.learning + 1] - 1]
         pose = name == "pose"
         grid = self.shape.pose_grid if pose else self.shape.reconstruction_grid
         table = self.pose_table if pose else self.reconstruction_table

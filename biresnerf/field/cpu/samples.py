@@ -3,10 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 SEGMENT, MOST_SEGMENTS = 1024, 64  # samples of a segment, until that makes too many
+
+
+class Composited(NamedTuple):
+    """What compositing n samples leaves for the backward pass. Values of `colour` are of the kept samples."""
+
+    outputs: np.ndarray  # [16 n]
+    density: np.ndarray  # [n]
+    alpha: np.ndarray  # [n]
+    kept: np.ndarray  # [n]
+    kept_begin: np.ndarray  # [rays]
+    kept_end: np.ndarray  # [rays]
+    colour: np.ndarray  # [3 n]
 
 
 @dataclass(frozen=True)
@@ -14,7 +27,7 @@ class Samples:
     """What the forward pass leaves for the backward pass; arrays are views of `Buffers`.
 
     Rays segment[s]:segment[s + 1] form segment s; `learning` segments give gradients to the field. Of the samples of
-    ray r, offset[r]:offset[r + 1], light reaches those whose indices are kept[kept_begin[r]:kept_end[r]].
+    ray r, offset[r]:offset[r + 1], light reaches those with indices kept[kept_begin[r]:kept_end[r]].
     """
 
     segment: np.ndarray
@@ -26,13 +39,7 @@ class Samples:
     ray: np.ndarray
     features: np.ndarray
     jacobians: list[np.ndarray]
-    outputs: np.ndarray
-    density: np.ndarray
-    alpha: np.ndarray
-    kept: np.ndarray
-    kept_begin: np.ndarray
-    kept_end: np.ndarray
-    colour: np.ndarray
+    composited: Composited
 
 
 def segments(offset: np.ndarray, trained: int) -> tuple[np.ndarray, int]:

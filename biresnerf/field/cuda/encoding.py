@@ -16,6 +16,22 @@ PRIME_Z = tl.constexpr(805459861)
 
 
 @triton.jit
+def samples_of_program(n, BLOCK: tl.constexpr):
+    """Indices of this program's samples, and which of them are below n."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    return i, i < n
+
+
+@triton.jit
+def _level_of_program(stride, hashed, offset):
+    """This program's level: its stride, whether it is hashed, its first entry and number of entries."""
+    level = tl.program_id(1)
+    base = tl.load(offset + level)
+    size = (tl.load(offset + level + 1) - base).to(tl.int32)
+    return level, tl.load(stride + level), tl.load(hashed + level) != 0, base, size
+
+
+@triton.jit
 def _locate(x, i, here, capacity, scale):
     """Cell and fraction within it of samples' positions, per axis."""
     px = tl.load(x + i, mask=here, other=0.5) * scale + 0.5
@@ -51,15 +67,11 @@ def encode(
 ):  # fmt: skip
     """Features of `taken` points x [3, capacity] from row `row` on; `words` is the table, an entry per int64."""
     n = tl.load(taken)
-    begin = tl.program_id(0) * BLOCK
-    if begin >= n:
+    if tl.program_id(0) * BLOCK >= n:
         return
-    level = tl.program_id(1)
-    i = begin + tl.arange(0, BLOCK)
-    here = i < n
-    s, side, by_hash = tl.load(scale + level), tl.load(stride + level), tl.load(hashed + level) != 0
-    base = tl.load(offset + level)
-    size = (tl.load(offset + level + 1) - base).to(tl.int32)
+    i, here = samples_of_program(n, BLOCK)
+    level, side, by_hash, base, size = _level_of_program(stride, hashed, offset)
+    s = tl.load(scale + level)
     ix, iy, iz, fx, fy, fz = _locate(x, i, here, capacity, s)
     f0 = tl.zeros([BLOCK], tl.float32)
     f1, x0, x1, y0, y1, z0, z1 = f0, f0, f0, f0, f0, f0, f0
@@ -104,11 +116,9 @@ def position_gradient(
 ):  # fmt: skip
     """g_x [3, capacity] (+)= share J^T g for feature gradients from row `row` on."""
     n = tl.load(taken)
-    begin = tl.program_id(0) * BLOCK
-    if begin >= n:
+    if tl.program_id(0) * BLOCK >= n:
         return
-    i = begin + tl.arange(0, BLOCK)
-    here = i < n
+    i, here = samples_of_program(n, BLOCK)
     a = tl.zeros([BLOCK], tl.float32)
     b, c = a, a
     for level in range(levels):
@@ -141,15 +151,10 @@ def table_gradient(
 ):  # fmt: skip
     """Add the trained samples' feature gradients to the table's gradient [entries, 2], by atomic additions."""
     n = tl.minimum(tl.load(ray_offset + tl.load(trained_rays).to(tl.int32)), tl.load(taken))
-    begin = tl.program_id(0) * BLOCK
-    if begin >= n:
+    if tl.program_id(0) * BLOCK >= n:
         return
-    level = tl.program_id(1)
-    i = begin + tl.arange(0, BLOCK)
-    here = i < n
-    base = tl.load(offset + level)
-    size = (tl.load(offset + level + 1) - base).to(tl.int32)
-    side, by_hash = tl.load(stride + level), tl.load(hashed + level) != 0
+    i, here = samples_of_program(n, BLOCK)
+    level, side, by_hash, base, size = _level_of_program(stride, hashed, offset)
     ix, iy, iz, fx, fy, fz = _locate(x, i, here, capacity, tl.load(scale + level))
     g = g_features + (row + 2 * level).to(tl.int64) * capacity + i
     u = tl.load(g, mask=here, other=0.0)

@@ -7,13 +7,20 @@ import triton.language as tl
 
 
 @triton.jit
-def view_harmonics(direction, ray_count, view, BLOCK: tl.constexpr):
-    """view [rays, 16] of unit directions [rays, 3]."""
+def _directions(direction, ray_count, BLOCK: tl.constexpr):
+    """This program's rays, which of them exist, and their directions."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = r < tl.load(ray_count).to(tl.int32)
     x = tl.load(direction + 3 * r, mask=here, other=0.0)
     y = tl.load(direction + 3 * r + 1, mask=here, other=0.0)
     z = tl.load(direction + 3 * r + 2, mask=here, other=0.0)
+    return r, here, x, y, z
+
+
+@triton.jit
+def view_harmonics(direction, ray_count, view, BLOCK: tl.constexpr):
+    """view [rays, 16] of unit directions [rays, 3]."""
+    r, here, x, y, z = _directions(direction, ray_count, BLOCK)
     xx, yy, zz = x * x, y * y, z * z
     out = view + 16 * r
     tl.store(out, 0.0 * x + 0.28209479177387814, mask=here)
@@ -37,11 +44,7 @@ def view_harmonics(direction, ray_count, view, BLOCK: tl.constexpr):
 @triton.jit
 def harmonics_gradient(direction, ray_count, g_harmonics, g_direction, BLOCK: tl.constexpr):
     """Add the harmonics' Jacobian, transposed, times g_harmonics [rays, 16] to g_direction [rays, 3]."""
-    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = r < tl.load(ray_count).to(tl.int32)
-    x = tl.load(direction + 3 * r, mask=here, other=0.0)
-    y = tl.load(direction + 3 * r + 1, mask=here, other=0.0)
-    z = tl.load(direction + 3 * r + 2, mask=here, other=0.0)
+    r, here, x, y, z = _directions(direction, ray_count, BLOCK)
     xx, yy, zz = x * x, y * y, z * z
     g = g_harmonics + 16 * r
     gx = tl.load(g_direction + 3 * r, mask=here, other=0.0)

@@ -11,6 +11,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from biresnerf.field.cuda.encoding import samples_of_program
+
 HIDDEN = tl.constexpr(64)
 OUT = tl.constexpr(16)  # outputs of the density network, view harmonics, and the padded width of the colour
 
@@ -59,13 +61,30 @@ def _density(z):
 
 @triton.jit
 def _first_layer(
-    low, high, w1, columns, LOW: tl.constexpr, LOW_PAD: tl.constexpr, HIGH: tl.constexpr, HIGH_PAD: tl.constexpr,
-    PRECISION: tl.constexpr,
+    features, i, here, capacity, w1, columns, LOW: tl.constexpr, LOW_PAD: tl.constexpr, HIGH: tl.constexpr,
+    HIGH_PAD: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
+    """Both modules' features of samples i, and the first hidden layer made of them; `high` is `low` without HIGH."""
+    low = _tile(features, 0, i, here, capacity, LOW, LOW_PAD)
+    high = low
+    if HIGH > 0:
+        high = _tile(features, LOW, i, here, capacity, HIGH, HIGH_PAD)
     h = _product(low, tl.trans(_weights(w1, HIDDEN, HIDDEN, LOW, LOW_PAD, 0, LOW)), PRECISION)
     if HIGH > 0:
         h += _product(high, tl.trans(_weights(columns, HIDDEN, HIDDEN, HIGH, HIGH_PAD, 0, HIGH)), PRECISION)
-    return tl.maximum(h, 0.0)
+    return low, high, tl.maximum(h, 0.0)
+
+
+@triton.jit
+def _outputs(
+    features, i, here, capacity, w1, columns, w2, LOW: tl.constexpr, LOW_PAD: tl.constexpr, HIGH: tl.constexpr,
+    HIGH_PAD: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
+    """Outputs [samples, 16] of the density network."""
+    _low, _high, h1 = _first_layer(
+        features, i, here, capacity, w1, columns, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION
+    )
+    return _product(h1, tl.trans(_weights(w2, OUT, OUT, HIDDEN, HIDDEN, 0, HIDDEN)), PRECISION)
 
 
 @triton.jit
@@ -96,17 +115,10 @@ def network_forward(
 ):  # fmt: skip
     """Outputs of the density network [16, capacity], density [capacity], colour [3, capacity] of `taken` samples."""
     n = tl.load(taken)
-    begin = tl.program_id(0) * BLOCK
-    if begin >= n:
+    if tl.program_id(0) * BLOCK >= n:
         return
-    i = begin + tl.arange(0, BLOCK)
-    here = i < n
-    low = _tile(features, 0, i, here, capacity, LOW, LOW_PAD)
-    high = low
-    if HIGH > 0:
-        high = _tile(features, LOW, i, here, capacity, HIGH, HIGH_PAD)
-    h1 = _first_layer(low, high, w1, columns, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION)
-    z = _product(h1, tl.trans(_weights(w2, OUT, OUT, HIDDEN, HIDDEN, 0, HIDDEN)), PRECISION)
+    i, here = samples_of_program(n, BLOCK)
+    z = _outputs(features, i, here, capacity, w1, columns, w2, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION)
     _h3, _h4, rgb = _colour_layers(z, _view(view, ray, i, here), w3, w4, w5, PRECISION)
     _store_tile(outputs, 0, i, here, capacity, OUT, OUT, z)
     tl.store(density + i, _density(z), mask=here)
@@ -121,17 +133,10 @@ def network_density(
 ):  # fmt: skip
     """density [capacity] alone, for the occupancy grid."""
     n = tl.load(taken)
-    begin = tl.program_id(0) * BLOCK
-    if begin >= n:
+    if tl.program_id(0) * BLOCK >= n:
         return
-    i = begin + tl.arange(0, BLOCK)
-    here = i < n
-    low = _tile(features, 0, i, here, capacity, LOW, LOW_PAD)
-    high = low
-    if HIGH > 0:
-        high = _tile(features, LOW, i, here, capacity, HIGH, HIGH_PAD)
-    h1 = _first_layer(low, high, w1, columns, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION)
-    z = _product(h1, tl.trans(_weights(w2, OUT, OUT, HIDDEN, HIDDEN, 0, HIDDEN)), PRECISION)
+    i, here = samples_of_program(n, BLOCK)
+    z = _outputs(features, i, here, capacity, w1, columns, w2, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION)
     tl.store(density + i, _density(z), mask=here)
 
 
@@ -208,11 +213,9 @@ def density_backward(
         i = block * BLOCK + tl.arange(0, BLOCK)
         here = i < n
         counts = (i < trained)[:, None]
-        low = _tile(features, 0, i, here, capacity, LOW, LOW_PAD)
-        high = low
-        if HIGH > 0:
-            high = _tile(features, LOW, i, here, capacity, HIGH, HIGH_PAD)
-        h1 = _first_layer(low, high, w1, columns, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION)
+        low, high, h1 = _first_layer(
+            features, i, here, capacity, w1, columns, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION
+        )
         g = _tile(g_outputs, 0, i, here, capacity, OUT, OUT)
         d2 += _product(tl.trans(tl.where(counts, g, 0.0)), h1, PRECISION)
         g = _product(g, _weights(w2, OUT, OUT, HIDDEN, HIDDEN, 0, HIDDEN), PRECISION)

@@ -1,1 +1,1 @@
-"""Cameras that are far off: found and brought home."""
+"""Repairs cameras that are far off, and measures how certain each pose is. Finding them is `optimise`'s part."""

@@ -1,4 +1,4 @@
-"""Bringing lost cameras home: poses from elsewhere are tried against the frozen field.
+"""Repair of lost cameras: other poses are tried against the frozen field.
 
 A camera that starts too far off ends in a local minimum, or sees nothing and gets no gradient at all. The error
 over its pose has many minima, but the field that the other cameras have formed tells them apart: many poses are
@@ -57,7 +57,7 @@ class RepairState(BaseModel):
 
 
 class LostCameraRepair:
-    """Looks for lost cameras at fixed points of the run and gives them other poses (method 4.6).
+    """Looks for lost cameras at fixed points of the run and gives them other poses.
 
     Attributes:
         repaired: images whose pose was replaced.
@@ -72,7 +72,7 @@ class LostCameraRepair:
         self._spent = 0.0  # samples
 
     def due(self) -> bool:
-        """Whether one of the fixed points has been reached; the switch asks by itself."""
+        """Whether one of the fixed points has been reached. The switch runs a repair without asking."""
         optimiser, options = self.optimiser, self.optimiser.options
         if not optimiser.method.robust_extensions:
             return False
@@ -85,7 +85,7 @@ class LostCameraRepair:
         return self._times < 4 and optimiser.step_index >= late
 
     def run(self, *, switching: bool = False) -> None:
-        """Try to bring all lost cameras home, the worst first, as far as the budget goes."""
+        """Try to repair all lost cameras, the worst first, as far as the budget goes."""
         optimiser = self.optimiser
         if not optimiser.method.robust_extensions:
             return
@@ -95,8 +95,8 @@ class LostCameraRepair:
         allowance = min(self._spent + EVENT_SHARE * total, RUN_SHARE * total)
         self._marching = self._coarse_marching()
         alone = self._alone()
-        # Matches are better evidence than a young field's error: cameras they placed stay (dtu's were 2 deg off, and
-        # 7 to 9 deg where repair sent them).
+        # Matches are better evidence than the error of a young field: cameras they placed stay (on dtu these were 2 deg
+        # off, and 7 to 9 deg after a repair).
         suspects = (optimiser.camera_errors.suspects | alone) & (optimiser.mobility[0] > 0)
         relative = torch.where(suspects, optimiser.camera_errors.relative, -torch.inf)
         worst_first = relative.argsort(descending=True, stable=True)[: int(suspects.sum())].tolist()
@@ -109,13 +109,13 @@ class LostCameraRepair:
 
     @torch.no_grad()
     def _alone(self) -> Tensor:
-        """Mask [n] of training cameras that look where nearly nobody else does: no error tells them."""
+        """Mask [n] of training cameras that look where almost no other does: their error cannot show it."""
         optimiser = self.optimiser
         alone = torch.zeros(len(optimiser.poses), dtype=torch.bool, device=optimiser.device)
         if not optimiser.frame.unbounded:
-            return alone  # the scene ends at its box, and who looks elsewhere sees nothing
-        everyone = torch.arange(len(alone), device=optimiser.device)
-        unshared = self._shared(optimiser.poses.matrices(), everyone) < ALONE
+            return alone  # the scene ends at its box, and a camera that looks elsewhere sees nothing
+        cameras = torch.arange(len(alone), device=optimiser.device)
+        unshared = self._shared(optimiser.poses.matrices(), cameras) < ALONE
         unshared &= ~optimiser.camera_errors.held_out
         return unshared if float(unshared.float().mean()) <= ALONE_MOST else alone
 
@@ -159,10 +159,10 @@ class LostCameraRepair:
         image = torch.full((len(tried),), camera, device=optimiser.device)
         scores = self._scores(tried, image)
         old = float(scores[0])
-        # A guess has no claim to stay.
+        # A guess need not be clearly beaten.
         better = 1.0 if bool(optimiser.camera_errors.doubted[camera]) else BETTER
         bound = min(better * old, max(NEAR_MEDIAN * median, FAR_BETTER * old))
-        if alone:  # its own error says nothing, nor does that of another pose with a view of its own
+        if alone:  # its own error says nothing, nor does that of another pose that shares no view
             bound = NEAR_MEDIAN * median
             shared = self._shared(tried, image) >= ALONE
             if not bool(shared.any()):
@@ -174,14 +174,14 @@ class LostCameraRepair:
             scores = self._scores(tried, image[: len(tried)])
             best = int(scores.argmin())
             error = float(scores[best])
-            taken = error < bound
-            if taken and (optimiser.switch is None or error < median):
-                break  # the run itself brings it the rest of the way
+            accepted = error < bound
+            if accepted and (optimiser.switch is None or error < median):
+                break  # the run itself optimises the rest
         logger.info(
             "camera %d stands out (error %.3g, others %.3g): best pose found has %.3g, %s",
-            camera, old, median, error, "taken" if taken else "not taken",
+            camera, old, median, error, "accepted" if accepted else "rejected",
         )  # fmt: skip
-        if taken:
+        if accepted:
             optimiser.replace_pose(camera, tried[best])
             self.repaired = sorted({*self.repaired, camera})
         elif old < NEAR_MEDIAN * median and not alone:
@@ -238,7 +238,7 @@ class LostCameraRepair:
         return poses.matrices().detach()
 
     def _blur(self) -> float:
-        """What the field has been shown of late (px): half of the schedule's width, which batches draw a share of."""
+        """Blur of recent targets (px): half of the schedule's width, of which batches draw a random share."""
         optimiser = self.optimiser
         sampler = optimiser.sampler
         return optimiser.schedule.blur(optimiser.step_index, optimiser.switch, sampler.long_side) / 2
@@ -256,7 +256,7 @@ class LostCameraRepair:
         return optimiser.field.render(rays, self._marching, gradient)
 
     def _coarse_marching(self) -> Marching:
-        """Coarser samples than the run's, and a cell more around what is occupied: gradients begin there."""
+        """Coarser samples than the run's, and one more cell around occupied ones: gradients begin there."""
         optimiser = self.optimiser
         interval = optimiser.schedule.interval(optimiser.step_index, optimiser.switch)
         marching = optimiser.marching(max(interval, LEAST_INTERVAL))

@@ -1,8 +1,8 @@
-"""Which photos do not say where they were taken from: they fit as well with their camera carried round the scene.
+"""Finds photos that do not determine their pose: they fit as well after their camera was turned about the scene.
 
-A thing that looks alike from several sides, a vase whose handle is hidden, lets a camera slide far while its error
-stays as small as that of the others: no error tells. So each camera is carried about the scene's centre in the
-direction that its photo resists least, and the photo asked again.
+An object that looks alike from several sides, such as a vase with a hidden handle, lets a camera slide far while its
+error stays small, so the error alone cannot show it. Each camera is turned about the scene's centre in the direction
+to which its photo is least sensitive, and the error is measured again.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 
 Array = NDArray[np.float64]
 
-SIDE = 16  # asked are 16 x 16 pixels spread over the photo
+SIDE = 16  # 16 x 16 pixels spread over the photo are compared
 AT_ONCE = 32  # cameras
-# Degrees that a camera is carried by. Less says nothing: carried by 4, many cameras of a plain vase that were right to
-# half a degree fitted as well.
+# Degrees by which a camera is turned. Smaller angles say nothing: at 4, many cameras of a plain vase that were right
+# to half a degree fitted as well.
 ANGLES_DEG = (8.0, 16.0, 32.0)
-# Of the error before: what hardly differs. Of 40 cameras of the vase five are below it, the worst of all among them; on
-# a textured dome the least is 2.4.
+# An error ratio below this hardly differs from 1. Five of the vase's 40 cameras are below it, the worst one among
+# them; on a textured dome the smallest ratio is 2.4.
 AS_WELL = 1.25
-# Root mean square of what the field leaves unexplained of a photo. Above it, that may be the very texture which would
-# tell places apart: after 250 steps fox's (0.93 and more), after 120 steps that of a small textured set.
+# Root mean square of a photo's residual. Above this, the residual may be the very texture that would distinguish
+# poses: after 250 steps fox's (0.93 and more), after 120 steps that of a small textured set.
 EXPLAINED = 0.03
 STEP = 0.01  # of finite differences: radians, and shares of the camera's distance
-SLACK = 1e-6  # keeps what no pixel resists solvable
+SLACK = 1e-6  # keeps the system solvable for directions to which no pixel is sensitive
 
 
 @torch.no_grad()
 def unsure_deg(optimiser: JointOptimiser) -> Array:
-    """The largest of `ANGLES_DEG` that each camera [n] can be carried by and fit its photo as well; 0 where none.
+    """The largest of `ANGLES_DEG` by which each camera [n] can be turned and still fit its photo; 0 where none.
 
-    As well as now, or as the median camera does. 0 as well where the field does not explain the photo so far that it
-    could tell, and for cameras that are held fixed: those are taken to be right.
+    It still fits if the error is about as small as now, or as the median camera's. Also 0 where the field does not
+    explain the photo well enough to decide, and for fixed cameras, which are assumed right.
     """
     probes = [
         _Probe(optimiser, part)
@@ -55,14 +55,14 @@ def unsure_deg(optimiser: JointOptimiser) -> Array:
 
 
 class _Probe:
-    """Some cameras, and their photos' errors from places near theirs.
+    """Some cameras, and the errors of their photos at poses near theirs.
 
     A motion [k, 6] is a rotation about the scene's centre by the camera's axes (radians), then a shift along them
     (in the camera's distance).
 
     Attributes:
-        weakest: motions that turn by one radian in the direction that photos resist least: with the shift that makes
-            up for most of it, and without.
+        weakest: motions that turn by one radian in the direction to which photos are least sensitive: with the shift
+            that compensates most of it, and without.
     """
 
     def __init__(self, optimiser: JointOptimiser, cameras: Tensor) -> None:
@@ -108,7 +108,7 @@ class _Probe:
         )
 
     def least_error(self, angle: float) -> Tensor:
-        """The smallest error [k] of the cameras carried by `angle` (radians), either way."""
+        """The smallest error [k] of the cameras turned by `angle` (radians), either way."""
         ways = [self.error(sign * angle * motion) for motion in self.weakest for sign in (-1, 1)]
         return torch.stack(ways).amin(0)
 

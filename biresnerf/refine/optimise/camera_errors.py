@@ -1,4 +1,4 @@
-"""How well each camera agrees with the field, from the training batches themselves; which ones stand out as lost."""
+"""How well each camera agrees with the field, measured on the training batches; which ones stand out as lost."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from biresnerf.data.photos.images import ImageSet
 STANDS_OUT = 2.0  # times the median error
 STANDS_OUT_UNTRAINED = 4.0  # for held-out views too few to be compared with each other
 DEVIATIONS = 4.0  # and this many standard deviations, estimated as 1.4826 x the median absolute deviation
-SUSPECT_DEVIATIONS = 2.0  # enough to try other poses: those are judged by themselves
+SUSPECT_DEVIATIONS = 2.0  # enough to try other poses, which are judged on their own
 # A photo that is hard to render stands out late in a run, when others are nearly exact (0.03 at most on lego and
 # temple); a camera in a wrong place leaves this share of its photo's variance unexplained (0.12 and more there).
 UNEXPLAINED = 0.08
@@ -20,7 +20,7 @@ UNEXPLAINED_UNTRAINED = 0.7
 MAD_TO_DEVIATION = 1.4826
 OWN_YARDSTICK_FROM = 4  # held-out views
 IN_A_ROW = 2  # blocks
-COVERAGE = 0.1  # of the photo's share that is no background: rendering less has lost the scene from sight
+COVERAGE = 0.1  # of the photo's foreground share: a camera that renders less no longer sees the scene
 DOUBTED_WEIGHT = 0.1  # of a camera whose pose is a guess, until it agrees with the field
 SMOOTHING = 0.5  # share of the newest block in the moving average
 BACKGROUND_TOLERANCE = 0.05  # colours nearer to the background than this count as background
@@ -47,7 +47,7 @@ def foreground_shares(images: ImageSet) -> np.ndarray:
 
 
 def _counted(values: np.ndarray, images: ImageSet, index: int) -> np.ndarray:
-    """Those of `values` [h, w, ...] whose pixels of image `index` count, one after another."""
+    """`values` [h, w, ...] at the pixels of image `index` that count, flattened."""
     counts = images.counts_image(index)
     return values.reshape(-1, *values.shape[2:]) if counts is None else values[counts]
 
@@ -94,7 +94,7 @@ class CameraErrors:
     Attributes:
         shares: see `foreground_shares`.
         errors: moving average [n] over blocks; infinite where there is none yet.
-        doubted: mask [n] of cameras that began at a guess and have not been seen to agree with the others' field.
+        doubted: mask [n] of cameras that began at a guess and have not yet agreed with the field of the others.
         lost: mask [n] of cameras that stood out for `IN_A_ROW` blocks, and of those in doubt.
         weights: of each camera's rays in the loss [n], None where all weigh the same.
     """
@@ -132,7 +132,7 @@ class CameraErrors:
         return self.errors / known.median().clamp(min=1e-12) if len(known) else self.errors
 
     def _weigh(self) -> None:
-        """A lost camera must not fog the field where it believes it stands."""
+        """Weigh lost cameras less: they must not fog the field where they wrongly stand."""
         self.weights = None
         if bool(self.lost.any()):
             known = self.errors.isfinite()
@@ -141,23 +141,23 @@ class CameraErrors:
             self.weights = torch.where(self.lost, weights, torch.ones_like(weights))
 
     def doubt(self, cameras: np.ndarray) -> None:
-        """Begin with little weight, and as suspects, for cameras [n] whose pose is a guess."""
+        """Mark cameras (mask [n]) with guessed poses: they begin with little weight, and as suspects."""
         self.doubted.copy_(torch.from_numpy(cameras))
         self._weigh()
 
     def believe(self, camera: int) -> None:
-        """The camera has been seen to agree with the others' field."""
+        """The camera agrees with the field of the others."""
         self.doubted[camera] = False
         self._weigh()
 
     def add(self, image: Tensor, colour: Tensor, target: Tensor, opacity: Tensor) -> None:
-        """One batch: image [rays], colours [rays, 3] rendered and wanted, opacity [rays]."""
+        """One batch: image [rays], rendered and target colours [rays, 3], opacity [rays]."""
         squared = ((colour - target) ** 2).mean(1)
         for total, values in zip(self._sums, (torch.ones_like(squared), squared, opacity), strict=True):
             total.index_add_(0, image, values)
 
     def close_block(self) -> None:
-        """Take the block's errors into the moving average and look who stands out."""
+        """Add the block's errors to the moving average and find the cameras that stand out."""
         rays, squared, opacity = self._sums
         measured = rays > 0
         block = squared / rays.clamp(min=1) / self.shares
@@ -179,7 +179,7 @@ class CameraErrors:
         return out & (self.errors > UNEXPLAINED * self._variances)
 
     def forget(self, camera: int) -> None:
-        """Start over with one camera: its pose is another one now."""
+        """Reset one camera, after its pose was replaced."""
         self.errors[camera] = torch.inf
         self._stood_out[camera] = 0
         self.doubted[camera] = False

@@ -42,11 +42,11 @@ class JointOptimiser:
         images: photos at working size.
         frame: the unit frame.
         unit_from_cam: start poses [n, 4, 4].
-        held_out: images whose rays move their own pose but never the field.
-        mobility: each camera's factor of the pose rate [2, n] in stage 1 and stage 2; 1 where left out.
-        bodies: which cameras move together, and which not at all; all by themselves where left out.
-        lenses: the intrinsics, where they may move; as the images have them where left out.
-        sampler: of the same images and held-out views, where another optimiser has made it already.
+        held_out: images that move their own pose but never the field.
+        mobility: each camera's factor of the pose rate [2, n] in stage 1 and stage 2; default 1.
+        bodies: which cameras move together, and which not at all; by default each moves independently.
+        lenses: the intrinsics, where they may move; by default those of the images.
+        sampler: of the same images and held-out views, if another optimiser has one already.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class JointOptimiser:
         self.directions, self.metrics = directions_for(device), AsyncMetrics(device)
         self.occupancy = make_occupancy(self.method.occupancy_side(options), device)
         self.generator = torch.Generator().manual_seed(options.seed)
-        # What a step draws, it draws on the device: the host's draws would have to be waited for.
+        # Steps draw random numbers on the device, as draws of the host would have to be waited for.
         on_device = None if device.type == "cpu" else torch.Generator(device).manual_seed(options.seed)
         self.draws = on_device or self.generator
         seen = images.pixels if images.counts is None else images.pixels[images.counts]
@@ -85,7 +85,7 @@ class JointOptimiser:
         around = self.background if frame.background is not None else None
         self.exposure = Exposure(images, options.exposure, held_out, around, device)
         self.step_index = 0
-        # The step that stage 2 began at. What has one stage is in its last from the first step on.
+        # The step at which stage 2 began. A method of one stage is in its last from the first step.
         self.switch: int | None = None if self.method.two_stages else 0
         self.pose_scale = 1.0
         self.mobility = (
@@ -99,7 +99,7 @@ class JointOptimiser:
 
     @cached_property
     def photo_distances(self) -> NDArray[np.float32]:
-        """How unlike the photos are, see `photo_distances`; worked out when a lost camera first needs it."""
+        """How unlike the photos are, see `photo_distances`; computed when a lost camera first needs it."""
         return photo_distances(self._images)
 
     @property
@@ -124,7 +124,7 @@ class JointOptimiser:
         )
 
     def replace_pose(self, camera: int, unit_from_cam: Tensor) -> None:
-        """Start one camera over from another pose [3, 4]: as free as any, with nothing known of it yet."""
+        """Restart one camera at another pose [3, 4], as free as any and with no history."""
         self.poses.replace(camera, unit_from_cam)
         self.camera_errors.forget(camera)
         self.exposure.forget(camera)
@@ -244,11 +244,11 @@ class JointOptimiser:
         self.rays = int(min(max(wanted, self.method.rays_least), RAYS_MOST))
 
     def coarse_state(self) -> dict[str, Tensor]:
-        """What a rollback within stage 1 restores: all but the reconstruction module, which has not moved."""
+        """Tensors that a rollback in stage 1 restores: all but the reconstruction module, which has not moved."""
         return {name: tensor for name, tensor in self.state().items() if "reconstruction" not in name}
 
     def load_coarse_state(self, state: dict[str, Tensor]) -> None:
-        """Undo the steps since `coarse_state`, but not the random draws: other pixels may do better."""
+        """Undo the steps since `coarse_state`, but not the random draws: other pixels may work better."""
         drawn = self.generator.get_state()
         self._load_tensors({**self.state(), **state})
         self.generator.set_state(drawn)

@@ -1,7 +1,7 @@
 """Random pixels of the photos, with their colour at a chosen sharpness. Photos stay bytes in memory.
 
-Masked pixels are never drawn, and no blurred colour holds any of theirs: levels of the pyramid know how much of each
-of their pixels counts, and are averaged by it.
+Masked pixels are never drawn, nor mixed into blurred colours: each level of the pyramid stores how much of each pixel
+counts, and averages are weighted by it.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class PhotoSampler:
         self._host: torch.Generator | None = None
 
     def _counted_pixels(self, images: ImageSet) -> tuple[Tensor, Tensor]:
-        """Which pixels count, int32 image after image, and where each image's begin [n + 1]."""
+        """Indices (int32) of the pixels that count, image after image, and where each image's begin [n + 1]."""
         masks = (images.counts_image(i) for i in range(len(images)))
         parts = [np.flatnonzero(mask).astype(np.int32) for mask in masks if mask is not None]
         begin = torch.from_numpy(np.cumsum([0, *map(len, parts)]))
@@ -119,7 +119,7 @@ class PhotoSampler:
         if generator.device.type == "cpu":
             position = self._spread(rays, 0, views, generator)
             return position, int((position < self.training).sum())
-        # On a GPU the host would have to wait for that sum, so it chooses it: the same to a ray.
+        # On a GPU the host would have to wait for that sum, so it fixes the number, equal to within a ray.
         trained = round(rays * self.training / views)
         parts = (
             self._spread(trained, 0, self.training, generator),
@@ -135,7 +135,7 @@ class PhotoSampler:
         return first + where.long().clamp(max=end - first - 1).to(self.device)
 
     def _share(self, generator: torch.Generator) -> float:
-        """A random number in [0, 1); on a GPU from a generator of the host's, which need not wait for it."""
+        """A random number in [0, 1); on a GPU from a generator of the host, which then need not wait."""
         if generator.device.type == "cpu":
             return float(torch.rand((), generator=generator))
         if self._host is None:
@@ -187,7 +187,7 @@ def _masks(images: ImageSet) -> list[NDArray[np.uint8] | None]:
 def _half(
     image: NDArray[np.uint8], share: NDArray[np.uint8] | None
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-    """Image and mask at half the size; colours averaged over what counts, the share of it never rounded to nothing."""
+    """Image and mask at half the size; colours averaged over pixels that count, shares never rounded down to 0."""
     height, width = max(1, image.shape[0] // 2), max(1, image.shape[1] // 2)
     if share is None:
         return _bytes(area_resize(image, width, height)), None

@@ -1,4 +1,4 @@
-"""Where a lost camera might stand: poses to try, in the frame of the optimised poses (scene centre at the origin)."""
+"""Poses to try for a lost camera, in the frame of the optimised poses (scene centre at the origin)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def pose_hypotheses(given: Array, now: Array, camera: int, trusted: NDArray[np.b
         given: unit_from_cam [n, 4, 4] that the run started from.
         now: unit_from_cam [n, 4, 4] at present.
         camera: index of the lost one.
-        trusted: mask [n] of cameras whose present pose is believed.
+        trusted: mask [n] of cameras with a present pose that is believed.
         far: difference [n] of each photo from the camera's, see `photo_distances`.
 
     Returns:
@@ -82,7 +82,7 @@ def _apart(poses: Array, pose: Array) -> Array:
 
 
 def _orbits(pose: Array) -> Array:
-    """The camera carried about the origin: around its own horizontal and vertical axis, and around both."""
+    """The camera turned about the origin: around its own horizontal and vertical axis, and around both."""
     angles = [sign * angle for angle in ORBITS_DEG for sign in (-1, 1)]
     turns = [(a, 0) for a in angles] + [(0, a) for a in angles]
     turns += [(a, b) for a in (-20, 20) for b in (-20, 20)]

@@ -12,13 +12,13 @@ from biresnerf.options.refine_options import ResolvedOptions
 COARSE_INTERVAL = 2.5e-2  # ray marching interval at the start, unit lengths: half a cell of the pose module
 FINE_INTERVAL = 3.3e-3  # BAA-NGP's 5e-3 in a box of side 3
 INTERVAL_PIXELS = 0.4  # no finer than this share of a pixel
-# Scenes with surroundings fill the whole ray with samples: coarser intervals and a double budget keep enough rays.
+# In scenes with surroundings samples fill the whole ray: coarser intervals and twice the budget keep enough rays.
 OPEN_COARSE_INTERVAL, OPEN_INTERVAL_PIXELS, OPEN_SAMPLES = 3e-2, 1.0, 2
-# And without a background to stand out from, gradients say nothing until the field has formed: poses that move
-# from the first step stagger away (fox at noise 0.05: 3.9 deg became 5.1; with this wait, 1.6).
+# Without a background to stand out from, gradients mean nothing until the field has formed: poses that move from
+# the first step drift away (fox at noise 0.05: 3.9 deg became 5.1; with this wait, 1.6).
 OPEN_POSE_START = 0.5  # of the least length of stage 1
-# Of the cameras' distance: nothing nearer is sampled, at the start and from the switch on. A field that may put
-# colour right before each camera explains any photo from any pose.
+# Shares of the cameras' distance, at the start and from the switch on: nothing nearer is sampled. A field that may
+# put colour right in front of each camera explains any photo from any pose.
 NEAR_SHARES = (0.4, 0.1)
 UNPRUNED_SHARE = 0.1  # of the least length of stage 1: until then every cell counts as occupied
 RAMP_SHARE = 0.75  # of the greatest length of stage 1: the interval has reached its fine value
@@ -32,7 +32,7 @@ POSE_STAGE2_CAP = 1e-3
 LENS_START, LENS_SHARE = 0.5, 1.0
 FIELD_DIP = 0.3
 FREEZE_SHARE = 0.95  # of all steps: poses stand still from then on
-# In stage 1 as NerfAcc; in stage 2 empty space hardly fills any more, and each look costs all levels.
+# In stage 1 as NerfAcc; in stage 2 empty space rarely fills again, and each look costs all levels.
 EMPTY_LOOKED_AT = (0.25, 1 / 16)
 FRESH_STEPS = (
     256,
@@ -140,14 +140,14 @@ class Schedule:
         return rate
 
     def focal_moves(self, switch: int | None) -> bool:
-        """Whether focal lengths move: in stage 1. Where poses are still off, stage 2 drives them from the truth.
+        """Whether focal lengths move: only in stage 1, as stage 2 drives them away from the truth where poses are off.
 
-        What has one stage, and so a switch at step 0, moves them all along.
+        A method of one stage has its switch at step 0 and moves them throughout.
         """
         return not switch
 
     def lens_rate(self, step: int, switch: int | None) -> float:
-        """Learning rate of the intrinsics: a share of the poses', later: what these can explain is theirs."""
+        """Learning rate of the intrinsics: the poses' rate, rising later, so that poses explain what they can first."""
         start = LENS_START * self.options.coarse_steps_min
         return LENS_SHARE * self.pose_rate(step, switch) * smooth_ramp((step - start) / start)
 

@@ -1,4 +1,4 @@
-"""CamP (Park et al. 2023): coordinates for camera poses in which every direction moves the picture by as much.
+"""CamP (Park et al. 2023): pose coordinates in which every direction moves the image by the same amount.
 
 A pose parameter theta = (rotation, translation) of `so3xr3` moves the projections of points in view by J theta. With
 Sigma = mean J^T J, theta = P phi and P = (Sigma + damping)^(-1/2), a unit of phi moves them by about the image's size,
@@ -63,7 +63,7 @@ def camp_preconditioner(
         size = torch.stack([intrinsics.width[i], intrinsics.height[i]]).double()
         image = torch.full((POINTS,), i)
         direction = directions_in_cam(intrinsics, image, across * size)
-        # A fisheye has no depth along its axis to speak of: rays to its sides have none.
+        # For a fisheye, depth is measured along the ray: rays to its sides have no depth along the axis.
         points = direction * depth if intrinsics.fisheye[i] else direction / direction[:, 2:] * depth
         by_point = pixels_by_points(intrinsics, image, points) / size.max()
         jacobian = projection_jacobian(points, by_point, pose[:3, :3], length)

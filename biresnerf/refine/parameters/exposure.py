@@ -1,8 +1,8 @@
-"""How bright each photo is against the others: three factors a photo, one a channel, found with poses and field.
+"""Exposure compensation: three factors per photo, one per channel, optimised with poses and field.
 
-Cameras choose their exposure and white balance anew for each photo. A field that has one colour for a point explains
-that away by haze before the cameras and by moving them. Three numbers a photo cannot do what a pose does: a factor
-moves no edge. A photo's colours are powers of the light, so a change of exposure is a factor on them, too.
+Cameras choose exposure and white balance for each photo. A field with one colour per point would explain the
+differences by haze in front of the cameras and by moving them. Three factors per photo cannot replace a pose: a factor
+moves no edge. Photo colours are powers of the light, so a change of exposure is a factor on them, too.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from biresnerf.field.adam_state import adam_state, load_adam_state
 from biresnerf.field.radiance_field import Rendering
 from biresnerf.options.refine_options import ExposureChoice
 
-# Standard deviation of the photos' logarithmic brightness from which on `auto` compensates: a tripod's photos of one
-# scene stay below (0.02 to 0.03 in fern, horns, lund_door), and there is nothing to gain.
+# Standard deviation of the photos' logarithmic brightness from which on `auto` compensates: photos with equal exposure
+# stay below (0.02 to 0.03 in fern, horns, lund_door), with nothing to gain.
 AUTO_FROM = 0.03
 RATE_SHARE = 1.0  # of the networks' learning rate
-PRIOR = 1e-4  # weight of the squared logarithms: what nothing is known of stays as the others are
-MOST = 3.0  # factor; a camera that has lost the scene would take any
+PRIOR = 1e-4  # weight of the squared logarithms: photos without evidence stay like the others
+MOST = 3.0  # factor; a camera that does not see the scene would accept any
 SATURATED = 0.99  # a photo as bright as this may have been brighter
 
 
@@ -49,8 +49,8 @@ class Exposure:
     """The photos' factors and their optimiser. Over the training photos, the factors' mean logarithm is zero.
 
     Args:
-        background: colour [3] behind the scene, which no exposure changes (it is none of the photo's light, or burnt
-            out, or black); None where the scene has surroundings.
+        background: colour [3] behind the scene, which exposure does not change (it is not part of the photo's light, or
+            saturated, or black); None where the scene has surroundings.
 
     Attributes:
         on: whether there is any compensation; otherwise all factors are and stay 1.
@@ -77,13 +77,13 @@ class Exposure:
         self._adam = torch.optim.Adam([self.log_gain], betas=(0.9, 0.99), eps=1e-8)
 
     def shown(self, rendering: Rendering, image: Tensor) -> Tensor:
-        """Colours [rays, 3] that the photos `image` [rays] show of what was rendered."""
+        """Rendered colours [rays, 3] as the photos `image` [rays] show them."""
         return self._lit(rendering, self.log_gain[image].exp()) if self.on else rendering.colour
 
     def refitted(self, rendering: Rendering, target: Tensor, weight: Tensor | None, groups: int) -> Tensor:
         """Colours [rays, 3] with factors for each of `groups` equal parts of the rays, fitted to `target` [rays, 3].
 
-        For poses that are being tried: the factors at hand fit the pose that the camera has. No gradient to factors.
+        For poses that are being tried: the present factors fit the present pose. No gradient to factors.
         """
         if not self.on:
             return rendering.colour
@@ -102,7 +102,7 @@ class Exposure:
         return gain * (rendering.colour - behind) + behind
 
     def forgiven(self, colour: Tensor, target: Tensor) -> Tensor:
-        """`colour`, or the target's where that is saturated and the colour brighter still: no error then."""
+        """`colour`, but the target where that is saturated and the colour brighter still, which is no error."""
         if not self.on:
             return colour
         return torch.where((target >= SATURATED) & (colour > target), target, colour)
@@ -121,7 +121,7 @@ class Exposure:
 
     @torch.no_grad()
     def forget(self, camera: int) -> None:
-        """Start over with one photo: its pose is another one now."""
+        """Reset one photo's factors, after its pose was replaced."""
         self.log_gain[camera] = 0
         for moment in self._adam.state.get(self.log_gain, {}).values():
             if moment.shape == self.log_gain.shape:

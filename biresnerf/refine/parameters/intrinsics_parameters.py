@@ -27,8 +27,8 @@ COLUMNS = 13
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k4", "k5", "k6", "p1", "p2")  # of a fisheye, else of FULL_OPENCV
 # The corner's distance r by which a unit of each coefficient moves it is r to this power.
 _POWERS = (3, 5, 7, 9, 3, 5, 7, 2, 2)
-# Standard deviations that increments are expected within, and the weight of that in the loss: what the photos say
-# nothing about stays where it is.
+# Expected standard deviations of the increments, and the weight of this prior in the loss: parameters without
+# evidence in the photos stay.
 DEVIATIONS = (0.2, 0.02, 0.05, 0.05, *(0.1,) * 9)
 PRIOR_WEIGHT = 1e-6
 
@@ -42,7 +42,7 @@ def lenses_of(
     *,
     dollies: bool = True,
 ) -> IntrinsicsParameters:
-    """The parameters of a set's cameras, with what the option lets move."""
+    """The parameters of a set's cameras, free as far as the option allows."""
     return IntrinsicsParameters(
         dataset.cameras,
         [frame.camera for frame in dataset.frames],
@@ -55,7 +55,7 @@ def lenses_of(
 
 
 def refined_part(option: RefineIntrinsics, source: IntrinsicsSource) -> RefinedPart:
-    """What of a camera is refined: what was asked for, or the focal length where nobody measured it."""
+    """What is refined of a camera: as requested, or for `auto` the focal length if it was never measured."""
     if option == "auto":
         return "focal" if source in ("exif", "guessed") else "none"
     return option
@@ -65,15 +65,15 @@ class IntrinsicsParameters:
     """Increments on the intrinsics of the set's cameras, zero at the start, one row per camera.
 
     A camera keeps its model: a coefficient that the model does not have stays zero, and one focal length stays one.
-    Photos of held-out views move nothing here.
+    Held-out photos have no effect.
 
     Args:
         cameras: of the set, at full size.
-        of_image: which of them took each image.
+        of_image: index of each image's camera.
         parts: what of each camera may move.
         working: each image's camera at working size.
-        held_out: images that only their own pose may learn from.
-        dollies: whether cameras move with their focal length; not where some are fixed, or hold each other.
+        held_out: images without effect here; they only move their own pose.
+        dollies: whether cameras move with their focal length; not where some are fixed or belong to a rig.
     """
 
     def __init__(
@@ -91,8 +91,8 @@ class IntrinsicsParameters:
         self.parts = tuple(parts)
         self.given = Intrinsics.from_cameras(working).to(device)
         self.of_image = torch.tensor(of_image, dtype=torch.int64, device=device)
-        self.teaches = torch.ones(len(working), 1, dtype=torch.bool, device=device)
-        self.teaches[list(held_out)] = False
+        self.is_training = torch.ones(len(working), 1, dtype=torch.bool, device=device)
+        self.is_training[list(held_out)] = False
         self.free = torch.stack([_free(c, part) for c, part in zip(cameras, parts, strict=True)]).to(device)
         self.unit = torch.stack([_units(camera) for camera in cameras]).to(device)
         self.precision = PRIOR_WEIGHT / torch.tensor(DEVIATIONS, dtype=torch.float64, device=device) ** 2
@@ -108,8 +108,7 @@ class IntrinsicsParameters:
     @classmethod
     def held(cls, working: Sequence[Camera], device: torch.device) -> IntrinsicsParameters:
         """Intrinsics that stay as they are."""
-        everyone = range(len(working))
-        return cls(working, everyone, ["none"] * len(working), working, [], device)
+        return cls(working, range(len(working)), ["none"] * len(working), working, [], device)
 
     @property
     def moving(self) -> bool:
@@ -124,7 +123,7 @@ class IntrinsicsParameters:
     def differentiable(self) -> Intrinsics:
         """The same as a function of the increments."""
         q = (self.increments * self.free)[self.of_image]
-        q = torch.where(self.teaches, q, q.detach())
+        q = torch.where(self.is_training, q, q.detach())
         given = self.given
         return replace(
             given,
@@ -136,15 +135,15 @@ class IntrinsicsParameters:
         )
 
     def with_gradient(self, unit_from_cam: Tensor) -> tuple[Tensor, Intrinsics]:
-        """Poses [n, 3, 4] as they are, but as a function of the focal lengths, and the intrinsics.
+        """The same poses [n, 3, 4], but as a function of the focal lengths, and the intrinsics.
 
-        Poses and focal lengths are all but exchangeable: without this, a focal length could only creep along while
-        all cameras follow. So cameras move with it (see `PoseParameters.dolly`), and it learns what that costs.
+        Poses and focal lengths are nearly exchangeable: alone, a focal length could change only as fast as all cameras
+        follow. So cameras move with it (see `PoseParameters.dolly`), and its gradient includes that motion.
         """
         if not self.dollies:
             return unit_from_cam, self.differentiable()
         q = (self.increments * self.free)[:, FOCAL][self.of_image, None]
-        q = torch.where(self.teaches, q, q.detach())
+        q = torch.where(self.is_training, q, q.detach())
         move = (q - q.detach()).to(unit_from_cam) * dolly_directions(unit_from_cam.detach())
         return torch.cat([unit_from_cam[:, :, :3], (unit_from_cam[:, :, 3] + move)[:, :, None]], 2), (
             self.differentiable()

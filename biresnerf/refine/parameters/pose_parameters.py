@@ -9,7 +9,10 @@ from biresnerf.field.adam_state import adam_state, load_adam_state
 from biresnerf.refine.parameters.parametrisations import Parametrisation
 
 EPSILON = 1e-12
-SECOND_EPSILON, SECOND_DECAY = 1e-15, 1e-6  # BAA-NGP's settings for the field, whose Adam owns the poses too
+SECOND_EPSILON, SECOND_DECAY = (
+    1e-15,
+    1e-6,
+)  # BAA-NGP: its optimiser of the field moves the poses too
 
 
 class PoseParameters:
@@ -56,7 +59,7 @@ class PoseParameters:
         return self.parametrisation.moved(self.start, rotation, translation, self.body)
 
     def members(self, camera: int) -> list[int]:
-        """The cameras of one's body, itself among them."""
+        """The cameras of one camera's body, itself included."""
         if self.body is None:
             return [camera]
         return torch.nonzero(self.body == self.body[camera])[:, 0].tolist()
@@ -66,9 +69,7 @@ class PoseParameters:
         """unit_from_cam [n, 4, 4] in float64, without gradient; rotations to that precision."""
         top = self.matrices().double().cpu()
         left, _, right = torch.linalg.svd(top[:, :, :3])
-        top[:, :, :3] = (
-            left @ right
-        )  # the nearest rotation: what is written must not carry float32's rounding
+        top[:, :, :3] = left @ right  # the nearest rotation, without float32's rounding
         bottom = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(len(top), 1, 4)
         return torch.cat([top, bottom], 1)
 
@@ -94,16 +95,16 @@ class PoseParameters:
 
     @torch.no_grad()
     def dolly(self, log_focal: Tensor) -> None:
-        """Move cameras along their axes as a change of their focal lengths [n] asks, so that the centre looks the same.
+        """Move cameras along their axes to compensate a change of their focal lengths [n] at the scene's centre.
 
-        Their starting places move: increments and their moments stay as they are.
+        The start poses move; increments and their moments stay.
         """
         now = self.matrices()
         shift = dolly_directions(now) * log_focal.expm1().to(now)[:, None]
         self.start[:, :, 3] += self.parametrisation.start_shift(self.start, now, shift)
 
     def restart_adam(self) -> None:
-        """Forget the moments: what follows is another optimisation."""
+        """Reset the moments, before another optimisation."""
         parameters = [self.rotation, self.translation]
         self._adam = torch.optim.Adam(parameters, betas=self.betas, eps=EPSILON)
         self._second = None
@@ -113,7 +114,7 @@ class PoseParameters:
             )
 
     def replace(self, camera: int, unit_from_cam: Tensor) -> None:
-        """Start one camera, and its body with it, over from another pose [3, 4], without the momentum so far."""
+        """Restart one camera, with its body, at another pose [3, 4] and without momentum."""
         with torch.no_grad():
             self._carry_body(camera, unit_from_cam)
             row = camera if self.body is None else int(self.body[camera])
@@ -163,9 +164,9 @@ class PoseParameters:
 
 
 def dolly_directions(unit_from_cam: Tensor) -> Tensor:
-    """Where camera centres [n, 3] go for each unit of the log of their focal length: back from the origin's plane.
+    """Motion of camera centres [n, 3] per unit of log focal length that keeps the origin's plane as it looks.
 
-    What lies there looks the same then, and what lies near it nearly so: a dolly zoom. Cameras that look away stay.
+    A dolly zoom. Cameras that look away from the origin stay.
     """
     forward, centre = unit_from_cam[:, :, 2], unit_from_cam[:, :, 3]
     depth = -(forward * centre).sum(1, keepdim=True)

@@ -1,7 +1,7 @@
-"""Cameras that must not move, and cameras that move together: what the optimiser takes as one rigid body.
+"""Cameras that must not move, and cameras that move together as one rigid body.
 
-A fixed camera ends where it began, to the bit, and ties the frame of the result. The cameras of one moment of a rig
-share one motion, so their places in the rig stay as they are.
+A fixed camera ends exactly where it began and determines the frame of the result. The cameras of one moment of a rig
+share one motion, so their relative poses stay.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ class RigidBodies:
 
     @property
     def tied(self) -> bool:
-        """Whether any camera may not move for itself."""
+        """Whether any camera cannot move independently."""
         return bool(self.fixed.any() or self.shared)
 
     def held(self, world_from_cam: NDArray[np.float64], given: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Poses [n, 4, 4] with every body as it is in ``given``, and the fixed ones where they are there.
+        """Poses [n, 4, 4] with every body's relative poses, and all fixed poses, as in ``given``.
 
-        Where fixed cameras stand elsewhere, the whole rig is carried along first, so that the others keep their place
-        beside them.
+        If fixed cameras stand elsewhere, the whole set is first aligned to them, so that the others keep their place
+        relative to them.
         """
         poses = np.array(world_from_cam, dtype=np.float64)
         if self.fixed.any() and not np.array_equal(poses[self.fixed], given[self.fixed]):
@@ -65,7 +65,7 @@ class RigidBodies:
     def restored(
         self, world_from_cam: NDArray[np.float64], given: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Poses [n, 4, 4] without what rounding moved: bodies as in ``given`` to all digits, fixed ones to the bit."""
+        """Poses [n, 4, 4] without rounding errors: bodies as in ``given`` to float64, fixed ones exactly."""
         poses = world_from_cam.copy()
         for group in self.shared:
             if not np.array_equal(poses[group], given[group]):
@@ -77,10 +77,11 @@ class RigidBodies:
     def input_from_optimised(
         self, optimised: NDArray[np.float64], given: NDArray[np.float64]
     ) -> Similarity | None:
-        """What carries an optimised rig [n, 4, 4] to the input's frame where bodies leave less than a similarity open.
+        """The similarity from optimised poses [n, 4, 4] to the input's frame, as far as bodies determine it.
 
-        None where they leave all of it open. Fixed cameras have not moved, so the frame is the input's already; one of
-        them alone leaves the scale about its centre. Rigs leave no scale, unless their cameras share one centre.
+        None where they determine nothing of it. Fixed cameras have not moved, so the frame is the input's already; a
+        single one leaves the scale about its centre free. Rigs determine the scale, unless their cameras share one
+        centre.
         """
         if self.fixed.any():
             centres = given[self.fixed][:, :3, 3]
@@ -117,7 +118,7 @@ def rigid_bodies(dataset: Dataset, options: ResolvedOptions) -> RigidBodies:
     if moments and not PARAMETRISATIONS[form].moves_bodies:
         raise InputError(
             "invalid_options",
-            f"{form} moves every camera by itself, and this set's cameras belong to a rig.",
+            f"{form} moves every camera independently, and this set's cameras belong to a rig.",
             where="pose_parametrisation",
             hint="Use se3_world or so3xr3, or a model without rigs.bin and frames.bin.",
         )
@@ -144,7 +145,7 @@ def _fixed_rows(dataset: Dataset, fixed: Sequence[str]) -> list[int]:
         if dataset.frames[row].pose_source != "given":
             raise InputError(
                 "fixed_without_pose",
-                f"{name!r} is to be kept where it is, but the input does not say where that is.",
+                f"{name!r} is to stay fixed, but the input has no pose for it.",
                 where="fixed",
                 hint="Give its pose, or leave it out of fixed.",
             )

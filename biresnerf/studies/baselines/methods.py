@@ -18,7 +18,7 @@ from biresnerf.refine.optimise.schedule import EMPTY_LOOKED_AT, NEAR_SHARES, POS
 from biresnerf.refine.scene.scene_frame import SceneFrame
 from biresnerf.studies.baselines.mlp_field import MlpField
 
-# Steps that look at all cells of the occupancy grid, as shares: 256 of BAA-NGP's 40 000, of NerfAcc-BARF's 200 000.
+# Steps that update all cells of the occupancy grid, as shares: 256 of BAA-NGP's 40 000, of NerfAcc-BARF's 200 000.
 FIRST_LOOKS, NERFACC_BARF_FIRST_LOOKS = 256 / 40_000, 256 / 200_000
 BARF_NEAR, BARF_FAR = 0.5, 1.5  # depths 2 to 6 of cameras 4 away
 NERFACC_BARF_INTERVAL = 0.03  # of cameras 4 away

@@ -1,6 +1,6 @@
-"""`biresnerf compare SCENE...`: methods and options against each other, on poses made wrong by a known amount.
+"""`biresnerf compare SCENE...`: methods and options against each other, on poses perturbed by a known amount.
 
-And what `biresnerf study` shares with it.
+Also the options and functions that `biresnerf study` shares.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def comparison_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.argument("scenes", nargs=-1, required=True, type=click.Path(path_type=Path)),
         click.option(
             "--output", "-o", required=True, type=click.Path(path_type=Path),
-            help="Folder for cells and tables; what is finished there is not run again.",
+            help="Folder for cells and tables; finished cells are not run again.",
         ),
         click.option("--preset", type=click.Choice(list(PRESETS)), help="Of all variants. Default: balanced."),
         settings_option,
@@ -88,7 +88,7 @@ def comparison_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def shared_settings(given: dict[str, Any]) -> dict[str, Any]:
-    """Refinement options of all variants, as the command line has them."""
+    """Refinement options of all variants, from the command line."""
     settings = dict(given["settings"])
     for key, value in (("preset", given["preset"]), ("max_image_size", given["size"])):
         if value is not None:
@@ -97,7 +97,7 @@ def shared_settings(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def chosen_variants(given: dict[str, Any]) -> tuple[Variant, ...]:
-    """Variants of `--methods`, then of `--variant`. Raises `InputError` for names that are missing or double."""
+    """Variants of `--methods`, then of `--variant`. Raises `InputError` for missing or duplicate names."""
     from biresnerf.studies.plan import Variant
 
     methods = given["methods"].split(",") if given["methods"] else []
@@ -115,7 +115,10 @@ def chosen_variants(given: dict[str, Any]) -> tuple[Variant, ...]:
     names = [variant.name for variant in variants]
     if len(set(names)) < len(names):
         raise InputError(
-            "invalid_options", "two variants have one name.", where="--variant", hint="Name them differently."
+            "invalid_options",
+            "two variants have the same name.",
+            where="--variant",
+            hint="Name them differently.",
         )
     return tuple(variants)
 
@@ -123,14 +126,14 @@ def chosen_variants(given: dict[str, Any]) -> tuple[Variant, ...]:
 def make_plan(
     given: dict[str, Any], variants: Sequence[Variant], settings: dict[str, Any], noises: Sequence[float]
 ) -> Plan:
-    """The plan of a command line; scenes are read and options checked before anything runs."""
+    """The plan of a command line; scenes and options are validated before anything runs."""
     from biresnerf.studies.plan import Plan, Variant
     from biresnerf.studies.scenes import find_scene
 
     scenes = tuple(find_scene(path, given["every"], given["test_views"]) for path in given["scenes"])
     if len({scene.name for scene in scenes}) < len(scenes):
         raise InputError(
-            "invalid_options", "two scenes have one name.", where="SCENES", hint="Rename one's folder."
+            "invalid_options", "two scenes have the same name.", where="SCENES", hint="Rename one's folder."
         )
     starts = tuple(_start(given, noise, seed) for noise, seed in product(noises, given["seeds"]))
     chosen = tuple(variants) or (Variant("default", {}),)
@@ -154,7 +157,7 @@ def _start(given: dict[str, Any], noise: float, seed: int) -> Perturbation:
 
 
 def run_and_write(plan: Plan, given: dict[str, Any]) -> list[Entry]:
-    """Run what is not finished, write tables.md and tables.json, print one of them."""
+    """Run unfinished cells, write tables.md and tables.json, and print one of them."""
     from biresnerf.data.model.atomic_file import whole_file
     from biresnerf.studies.markdown import as_markdown
     from biresnerf.studies.plan import Runner, run_plan
@@ -185,7 +188,7 @@ def _end(number: int, _frame: FrameType | None) -> None:
 
 
 def require(*packages: str) -> None:
-    """Raise `InputError` before anything runs where what the tables or plots need is not installed."""
+    """Raise `InputError` if a package that tables or plots need is missing, before anything runs."""
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(
@@ -201,10 +204,10 @@ def require(*packages: str) -> None:
 def compare_command(**given: Any) -> int:
     """Perturb the true poses of SCENES, refine them with each variant, and measure the results against the truth.
 
-    A scene is a folder with a transforms.json (or transforms_train.json) of true poses. Each run has a process
-    of its own; finished ones are kept in OUT/cells, and the same command goes on where it was stopped.
+    A scene is a folder with a transforms.json (or transforms_train.json) of true poses. Each run has its own
+    process; finished ones are kept in OUT/cells, and the same command resumes after a stop.
     OUT/tables.md and OUT/tables.json hold errors, image quality, times, memory, and Wilcoxon's test between the
-    first variant and each other one. A run that fails is a line in the tables; the exit status is then 1.
+    first variant and each other one. A failed run is a line in the tables; the exit status is then 1.
     """
     require("scipy")
     plan = make_plan(given, chosen_variants(given), shared_settings(given), given["noise"] or (0.15,))

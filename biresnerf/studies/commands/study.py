@@ -24,11 +24,11 @@ NAMES = ("resolution", "levels", "warm-up", "noise")
 @click.argument("name", type=click.Choice(NAMES))
 @comparison_options
 def study_command(name: str, **given: Any) -> int:
-    """Repeat a study of the paper on SCENES, as `biresnerf compare` with variants made for it, and plot it.
+    """Repeat a study of the paper on SCENES, as `biresnerf compare` with variants made for it, and plot the results.
 
-    resolution and levels sweep the pose-estimation module in stage 1 alone; warm-up shows training PSNR and
-    pose error around the switch with and without it; noise sweeps the error of the given poses for the methods
-    or variants named. The plot is OUT/NAME.svg and OUT/NAME.png.
+    resolution and levels vary the pose-estimation module in stage 1 alone; warm-up shows training PSNR and
+    pose error around the switch with and without it; noise varies the error of the given poses for the named
+    methods or variants. The plot is OUT/NAME.svg and OUT/NAME.png.
     """
     require("scipy", "matplotlib")
     from biresnerf.studies.plots import plot_curves, plot_noise, plot_sweep
@@ -38,7 +38,7 @@ def study_command(name: str, **given: Any) -> int:
     if variants and study.variants:
         raise InputError(
             "invalid_options",
-            f"the study {name} has variants of its own.",
+            f"the study {name} has its own variants.",
             where="--variant",
             hint="Leave them out, or use `biresnerf compare`.",
         )

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from biresnerf.field.cuda.device_occupancy import DeviceOccupancyGrid
-from biresnerf.field.occupancy import OccupancyGrid
+from biresnerf.field.occupancy import DeviceOccupancyGrid, OccupancyGrid
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 SIDE = 16
