@@ -1,1 +1,1 @@
-"""The radiance field and its rendering on CPU and GPU. Knows neither files nor how poses are optimised."""
+"""The radiance field and its rendering on CPU and GPU. Knows neither files nor the optimisation of poses."""

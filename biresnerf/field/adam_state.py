@@ -16,7 +16,7 @@ def adam_state(name: str, optimiser: torch.optim.Optimizer) -> dict[str, Tensor]
 
 
 def load_adam_state(name: str, optimiser: torch.optim.Optimizer, state: dict[str, Tensor]) -> None:
-    """Restore what `adam_state` gave; parameters it does not speak of have taken no step."""
+    """Restore what `adam_state` returned; parameters without an entry have taken no step."""
     saved = optimiser.state_dict()
     saved["state"] = {}
     for i in saved["param_groups"][0]["params"]:

@@ -14,7 +14,7 @@ from biresnerf.field.radiance_field import RadianceField
 DECAY = 0.95
 THRESHOLD = 0.01
 GROWTH_UP_TO = 60.0  # inner boxes: how far unbounded rays reach
-DENSITY_CHUNK = 1 << 18  # cells whose density is asked for at once
+DENSITY_CHUNK = 1 << 18  # cells evaluated at once
 
 
 def interval_growth(position: Tensor) -> Tensor:
@@ -58,13 +58,13 @@ class OccupancyGrid:
         prune: bool,
         dilate: bool,
     ) -> None:
-        """Look again at the occupied cells and a random share `looked_at` of the others, at a random point in each."""
+        """Evaluate the occupied cells and a random share `looked_at` of the others, at a random point in each."""
         self._look(field, step, generator, looked_at)
         if prune:
             self._prune(dilate)
 
     def _look(self, field: RadianceField, step: float, generator: torch.Generator, looked_at: float) -> None:
-        """Let the running maximum decay and raise it where cells are looked at."""
+        """Decay the running maximum, and raise it in the cells that are evaluated."""
         cells = torch.arange(self.side**3)
         if looked_at < 1:
             chosen = torch.rand(len(cells), generator=generator) < looked_at
@@ -85,7 +85,7 @@ class OccupancyGrid:
     def _prune(self, dilate: bool) -> None:
         bound = self.thickness.mean().clamp(max=THRESHOLD)
         occupied = (self.thickness > bound).to(torch.uint8).reshape(self.side, self.side, self.side)
-        # A camera that is still off must meet density a cell away, or it has no gradient to come back by.
+        # A camera that is still off needs density one cell away, or it gets no gradient.
         self.occupied = dilated(occupied) if dilate else occupied
 
     @property
@@ -113,7 +113,7 @@ class DeviceOccupancyGrid(OccupancyGrid):
             chosen |= self.occupied.reshape(-1).bool()
             place = torch.cumsum(chosen, 0)
             total = place[-1:]
-            # The cells to look at come first; the rest is filled with the index of a cell that does not exist.
+            # The cells to evaluate come first; the rest is filled with the index of a cell that does not exist.
             first = torch.full((count + 1,), count, device=self.device)
             cells = first.scatter_(0, torch.where(chosen, place - 1, count), cells)[:count]
             cells = torch.where(torch.arange(count, device=self.device) < total, cells, count)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Sines: a baseline or a ray along it so short leaves the epipolar plane to rounding.
+# Sines: with a baseline or ray component this short, the epipolar plane is determined by rounding errors.
 _DEGENERATE = 1e-9
 
 

@@ -18,14 +18,14 @@ def rms_spread(centres: NDArray[np.float64]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Focus:
-    """The point nearest to all optical axes, and how far that is to be trusted.
+    """The point nearest to all optical axes, and how well it is determined.
 
     Attributes:
         point: [3], in the frame of the poses.
         conditioning: smallest eigenvalue of the mean of ``I - d d^T``, from 0 (all axes parallel) to 2/3
             (axes from all around): the mean squared sine of the angle between the axes and the direction they
-            fix least.
-        well_posed: whether the axes fix the point; if not, ``point`` is the one nearest to the mean camera
+            determine least.
+        well_posed: whether the axes determine the point; if not, ``point`` is the one nearest to the mean camera
             centre.
         mean_distance: mean distance of the camera centres from ``point``.
         in_front: share of cameras that have ``point`` in front of them.
@@ -50,8 +50,8 @@ def focus_point(world_from_cam: NDArray[np.float64]) -> Focus:
     centres = poses[:, :3, 3]
     axes = poses[:, :3, 2] / np.linalg.norm(poses[:, :3, 2], axis=1, keepdims=True)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    # About the mean centre, so that a direction left free keeps the point there and large coordinates cost no
-    # digits.
+    # Relative to the mean centre, so that an undetermined direction keeps the point there and large coordinates
+    # keep their precision.
     middle = centres.mean(axis=0)
     offset = np.einsum("nij,nj->i", across, centres - middle) / len(poses)
     values, vectors = np.linalg.eigh(across.mean(axis=0))

@@ -11,8 +11,8 @@ from biresnerf.geometry.lie import se3_exp
 
 RIG_DISTANCE = 4.0  # of the cameras from the scene in the Blender sets that BARF's noise levels were made for
 LOST_DEG = (45.0, 180.0)
-# What tracking by camera and inertial sensors loses over a minute's walk around a table: two degrees or so of heading,
-# a few percent of the distance.
+# Drift of visual-inertial tracking over a minute's walk around a table: about two degrees of heading and a few percent
+# of the distance.
 HEADING_STEP_DEG, HEADING_KEPT = 0.12, 0.8  # a photo's change of heading rate, and how much of the rate stays
 SCALE_ERROR, STEP_LOST = 0.01, 0.03
 JITTER_DEG, JITTER_OF_DISTANCE = 0.25, 0.004
@@ -47,7 +47,7 @@ def perturb_poses(world_from_cam: NDArray[np.float64], noise: float, seed: int) 
 
 
 def turn_in_place(world_from_cam: NDArray[np.float64], index: int, angle_deg: float) -> NDArray[np.float64]:
-    """Poses [n, 4, 4] with camera `index` turned about its own vertical axis; 180 lets it look the other way."""
+    """Poses [n, 4, 4] with camera `index` turned about its own vertical axis; 180 turns it to face backwards."""
     angle = np.radians(angle_deg)
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     moved = np.array(world_from_cam, dtype=np.float64)
@@ -58,7 +58,7 @@ def turn_in_place(world_from_cam: NDArray[np.float64], index: int, angle_deg: fl
 def orbit_away(world_from_cam: NDArray[np.float64], indices: list[int], seed: int) -> NDArray[np.float64]:
     """Poses [n, 4, 4] with some cameras turned about the rig's focus by 45 to 180 degrees, about random axes.
 
-    They still look at the scene, from a wrong side: the errors that cost a camera its way back.
+    They still look at the scene, but from a wrong side: the errors from which a camera does not recover by itself.
     """
     poses = np.array(world_from_cam, dtype=np.float64)
     focus = focus_point(poses).point
@@ -79,9 +79,9 @@ def orbit_away(world_from_cam: NDArray[np.float64], indices: list[int], seed: in
 def drift_like_a_phone(world_from_cam: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
     """Poses [n, 4, 4], in the order they were taken, as a phone's tracking gives them: drift, jitter, level.
 
-    Each motion from one photo to the next is turned by a heading that drifts smoothly and lengthened by one wrong
-    scale, and a little is lost of it; gravity holds roll and pitch, so about the rig's own up axis alone the cameras
-    drift. On top each pose jitters. The first pose stays but for its jitter.
+    Each motion between successive photos is rotated by a smoothly drifting heading, scaled by one wrong factor, and
+    slightly shortened. Gravity fixes roll and pitch, so cameras drift only about the rig's up axis. Each pose also
+    jitters. Apart from that the first pose stays.
     """
     poses = np.asarray(world_from_cam, dtype=np.float64)
     random = np.random.default_rng([seed, 6])

@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 
 def interpolate_pose(first: Array, second: Array, share: float) -> Array:
     """The pose [4, 4] at ``share`` of the way from ``first`` to ``second``: its centre on the line between theirs,
-    its rotation on the shortest turn (of opposite ones, some shortest turn).
+    its rotation on the shortest path (for opposite rotations, one of them).
 
     Args:
         first, second: world_from_cam [4, 4].

@@ -1,4 +1,4 @@
-"""Similarities (scale, rotation, translation) and the one that best carries a camera rig onto another."""
+"""Similarities (scale, rotation, translation), and alignment of one camera rig with another."""
 
 from __future__ import annotations
 
@@ -81,9 +81,9 @@ def align_by_spread(a_from_cam: Array, b_from_cam: Array) -> Similarity:
 
     Scale is the ratio of the root-mean-square spreads, which is not the least-squares one (`trajectory_error`
     has that); the rotation comes from the singular value decomposition of the correlation with the determinant
-    kept at +1 (Umeyama 1991), so flat rigs are safe however they are tilted. What the centres leave free is
-    fixed by the cameras' rotations: the turn about the line of collinear centres, the whole rotation where all
-    centres are one point (scale is 1 then).
+    kept at +1 (Umeyama 1991), so flat rigs are handled at any tilt. Where the centres leave the rotation
+    undetermined, the cameras' rotations decide: about the line of collinear centres, or the whole rotation if all
+    centres coincide (scale is 1 then).
 
     Args:
         a_from_cam, b_from_cam: poses [n, 4, 4] of the same n >= 1 cameras in the same order.
@@ -97,10 +97,10 @@ def align_by_spread(a_from_cam: Array, b_from_cam: Array) -> Similarity:
 
 
 def align_row_flip(a_from_cam: Array, b_from_cam: Array) -> Similarity:
-    """As `align_by_spread` with the published code's way out of a reflection: the third row of the rotation negated.
+    """As `align_by_spread` but with the published code's handling of reflections: it negates the rotation's third row.
 
-    It is no best rotation then: on flat rigs that are tilted in b it is wrong by tens of degrees. Only to compare with
-    figures made by BARF's or BAA-NGP's evaluation.
+    That is not the best rotation: on flat rigs that are tilted in b it is wrong by tens of degrees. Only for comparison
+    with numbers from BARF's or BAA-NGP's evaluation.
 
     Raises:
         ValueError: as `align_by_spread`.
@@ -120,13 +120,13 @@ def align_row_flip(a_from_cam: Array, b_from_cam: Array) -> Similarity:
 def align_robust(
     a_from_cam: Array, b_from_cam: Array, *, with_rotations: bool = False, with_scale: bool = True
 ) -> Similarity:
-    """As `align_by_spread`, with cameras that do not follow the others weighed down.
+    """As `align_by_spread`, but robust to outlier cameras.
 
-    ``with_rotations`` lets the cameras' rotations have their say in the turn beside the centres: not BARF's
-    metric, but the better estimate of a frame from noisy poses. Without ``with_scale`` the scale is 1.
+    ``with_rotations`` estimates the rotation from the cameras' rotations as well as their centres: not BARF's
+    metric, but a better estimate of a frame from noisy poses. Without ``with_scale`` the scale is 1.
 
     Iteratively reweighted least squares with Cauchy weights; the scale is twice the median residual of each
-    round, for centres and for rotations apart.
+    round, separately for centres and rotations.
 
     Raises:
         ValueError: as `align_by_spread`.
@@ -140,7 +140,7 @@ def align_robust(
         moved = b_from_a.apply_to_poses(a)
         centre_residual = np.linalg.norm(moved[:, :3, 3] - b[:, :3, 3], axis=1)
         rotation_residual = np.linalg.norm(moved[:, :3, :3] - b[:, :3, :3], axis=(1, 2))
-        # Floors far below any real residual: an exact fit of the majority must not divide by zero.
+        # Floors far below any real residual, so that an exact fit of the majority does not divide by zero.
         weights_centre = _cauchy(centre_residual, floor=1e-12 * max(spread, 1e-300))
         weights_rotation = _cauchy(rotation_residual, floor=1e-12)
         last = b_from_a

@@ -17,7 +17,7 @@ _NO_BASELINE = 1e-6
 
 
 class TrajectoryError(BaseModel):
-    """Errors of a rig by further definitions than `PoseError` has; lengths in units of the truth's world."""
+    """Errors of a rig by definitions other than those of `PoseError`; lengths in units of the truth's world."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -65,7 +65,7 @@ def _least_squares(estimate: Array, truth: Array) -> Similarity:
     a, b = estimate[:, :3, 3], truth[:, :3, 3]
     from_middle = (a - a.mean(axis=0)) @ barf.rotation.T
     along = float(np.sum((b - b.mean(axis=0)) * from_middle))
-    if along <= 0.0:  # the centres are one point, or have nothing to do with each other
+    if along <= 0.0:  # the centres coincide, or are uncorrelated
         return barf
     scale = along / float(np.sum(from_middle**2))
     return Similarity(scale, barf.rotation, b.mean(axis=0) - scale * barf.rotation @ a.mean(axis=0))
@@ -79,11 +79,11 @@ def _steps(world_from_cam: Array) -> Array:
 def relative_errors_deg(estimate: Array, truth: Array) -> Array:
     """For each pair of cameras [n (n - 1) / 2] the larger of the errors of its relative rotation and direction.
 
-    Pairs whose true centres are one have no direction; only their rotation counts.
+    Pairs with coinciding true centres have no direction; only their rotation counts.
     """
     size = float(np.ptp(truth[:, :3, 3], axis=0).max())
     found = [np.zeros(0)]
-    for first in range(len(truth) - 1):  # a row of pairs at a time: all at once would need much memory
+    for first in range(len(truth) - 1):  # one row of pairs at a time, to save memory
         ours = rigid_inverse(estimate[first]) @ estimate[first + 1 :]
         true = rigid_inverse(truth[first]) @ truth[first + 1 :]
         turned = rotation_between_deg(true, ours)
@@ -94,7 +94,7 @@ def relative_errors_deg(estimate: Array, truth: Array) -> Array:
 
 
 def _angle_deg(a: Array, b: Array) -> Array:
-    """Angles [n] between vectors [n, 3], to full precision; to or from none at all it is 90 degrees."""
+    """Angles [n] between vectors [n, 3], to full precision; 90 degrees if either is zero."""
     across = np.linalg.norm(np.cross(a, b), axis=1)
     along = np.einsum("ni,ni->n", a, b)
     return np.where((across == 0) & (along == 0), 90.0, np.degrees(np.arctan2(across, along)))
@@ -103,7 +103,7 @@ def _angle_deg(a: Array, b: Array) -> Array:
 def area_under_recall(errors: Array, limit: float) -> float:
     """Area under the share of ``errors`` below x, for x from 0 to ``limit``, over ``limit``: from 0 to 1.
 
-    The share rises in straight lines from one error to the next, as structure-from-motion benchmarks have it.
+    The share is interpolated linearly between errors, as in structure-from-motion benchmarks.
     """
     ordered = np.concatenate(([0.0], np.sort(errors)))
     share = np.arange(len(ordered)) / len(errors)

@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 
 ROUNDS = 12  # of reweighting; steps fall below 1e-9 of the depth well before
 CAUCHY_PX = 1.0  # residuals beyond this lose weight
-# Where all rays of a point are parallel to this share, their system is mended by a little of the identity.
+# If all rays of a point are parallel to this precision, a little of the identity regularises their system.
 _RIDGE = 1e-12
 
 
@@ -19,8 +19,8 @@ def triangulate(
     """Points nearest to their rays: [count, 3].
 
     Iteratively reweighted least squares of the rays' angles to the point: a ray counts by the inverse square of its
-    length, as its pixel's error is an angle, and less where that error is large (Cauchy). Nothing is kept of points
-    whose rays do not meet: the caller is to look at what they leave.
+    length, as its pixel's error is an angle, and less where that error is large (Cauchy). Points with rays that do
+    not meet are not filtered: the caller must check the residuals.
 
     Args:
         origins, directions: of each ray, [rays, 3]; directions of unit length.
@@ -31,7 +31,7 @@ def triangulate(
     if count == 0:
         return np.zeros((0, 3))
     middle = origins.mean(axis=0)
-    origins = origins - middle  # large coordinates cost no digits
+    origins = origins - middle  # keeps precision for large coordinates
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     weights = np.ones(len(origins))
     xyz: Array = np.zeros((count, 3), dtype=np.float64)

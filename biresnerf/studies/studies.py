@@ -52,21 +52,24 @@ def _same_switch(given: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def _stage_1_sweep(about: str, option: str, symbol: str, values: tuple[int, ...]) -> Study:
+    return Study(
+        about=f"{about}, stage 1 alone",
+        swept=option,
+        variants=tuple(Variant(f"{symbol} {value}", {option: value}) for value in values),
+        noises=(0.15,),
+        settings=_stage_1_only,
+    )
+
+
 STUDIES = {
-    "resolution": Study(
-        about="largest resolution of the pose-estimation module (cells a side), stage 1 alone",
-        swept="pose_resolution_max",
-        variants=tuple(Variant(f"N_max {n}", {"pose_resolution_max": n}) for n in RESOLUTIONS),
-        noises=(0.15,),
-        settings=_stage_1_only,
+    "resolution": _stage_1_sweep(
+        "largest resolution of the pose-estimation module (cells a side)",
+        "pose_resolution_max",
+        "N_max",
+        RESOLUTIONS,
     ),
-    "levels": Study(
-        about="levels of the pose-estimation module, stage 1 alone",
-        swept="pose_levels",
-        variants=tuple(Variant(f"L {n}", {"pose_levels": n}) for n in LEVELS),
-        noises=(0.15,),
-        settings=_stage_1_only,
-    ),
+    "levels": _stage_1_sweep("levels of the pose-estimation module", "pose_levels", "L", LEVELS),
     "warm-up": Study(
         about="smooth warm-up of the learning rate after the switch, against none",
         swept=None,

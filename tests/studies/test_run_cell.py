@@ -11,7 +11,7 @@ from biresnerf.report import Report
 from biresnerf.studies.cell import CELL, RUN, Cell, Perturbation
 from biresnerf.studies.run_cell import run_cell
 from biresnerf.studies.scenes import find_scene
-from tests.refine.tiny_scene import tiny_options
+from tests.refine.tiny_scene import tiny_run
 
 
 def test_a_stopped_cell_goes_on_and_is_measured_from_an_identity_start(tmp_path):
@@ -19,7 +19,7 @@ def test_a_stopped_cell_goes_on_and_is_measured_from_an_identity_start(tmp_path)
     cell = Cell(
         scene=find_scene(tmp_path / "scene", every=1, test_views=25),
         start=Perturbation(kind="identity", noise=0.0),
-        options=tiny_options(start="given", holdout=2),
+        options=tiny_run(start="given", holdout=2),
     )
     folder = tmp_path / "cell"
     folder.mkdir()
@@ -32,7 +32,7 @@ def test_a_stopped_cell_goes_on_and_is_measured_from_an_identity_start(tmp_path)
     assert outcome.resumed == 1
     # One pose for all: each camera is as far from its own as it is turned against the others' mean.
     assert outcome.before.aligned.rotation_deg.mean > 30
-    assert outcome.options == cell.options
+    assert outcome.options == cell.options.resolved("cpu")
     report = Report.model_validate_json((folder / RUN / "report.json").read_text())
     assert (outcome.views.kind, outcome.views.count) == ("held out", 2)
     assert outcome.views.psnr == report.heldout.psnr

@@ -111,33 +111,19 @@ def _view(view, ray, i, here):
 def network_forward(
     features, view, ray, taken, w1, columns, w2, w3, w4, w5, outputs, density, colour, capacity,
     LOW: tl.constexpr, LOW_PAD: tl.constexpr, HIGH: tl.constexpr, HIGH_PAD: tl.constexpr,
-    PRECISION: tl.constexpr, BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr, BLOCK: tl.constexpr, WITH_COLOUR: tl.constexpr,
 ):  # fmt: skip
-    """Outputs of the density network [16, capacity], density [capacity], colour [3, capacity] of `taken` samples."""
-    n = tl.load(taken)
-    if tl.program_id(0) * BLOCK >= n:
-        return
-    i, here = samples_of_program(n, BLOCK)
-    z = _outputs(features, i, here, capacity, w1, columns, w2, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION)
-    _h3, _h4, rgb = _colour_layers(z, _view(view, ray, i, here), w3, w4, w5, PRECISION)
-    _store_tile(outputs, 0, i, here, capacity, OUT, OUT, z)
-    tl.store(density + i, _density(z), mask=here)
-    _store_tile(colour, 0, i, here, capacity, 3, OUT, rgb)
-
-
-@triton.jit
-def network_density(
-    features, taken, w1, columns, w2, density, capacity,
-    LOW: tl.constexpr, LOW_PAD: tl.constexpr, HIGH: tl.constexpr, HIGH_PAD: tl.constexpr,
-    PRECISION: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """density [capacity] alone, for the occupancy grid."""
+    """Density [capacity] of `taken` samples; WITH_COLOUR also outputs [16, capacity] and colour [3, capacity]."""
     n = tl.load(taken)
     if tl.program_id(0) * BLOCK >= n:
         return
     i, here = samples_of_program(n, BLOCK)
     z = _outputs(features, i, here, capacity, w1, columns, w2, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION)
     tl.store(density + i, _density(z), mask=here)
+    if WITH_COLOUR:
+        _h3, _h4, rgb = _colour_layers(z, _view(view, ray, i, here), w3, w4, w5, PRECISION)
+        _store_tile(outputs, 0, i, here, capacity, OUT, OUT, z)
+        _store_tile(colour, 0, i, here, capacity, 3, OUT, rgb)
 
 
 @triton.jit

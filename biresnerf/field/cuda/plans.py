@@ -69,7 +69,7 @@ def backward(w: Workspace) -> list[Any]:
 
 def density(w: Workspace) -> list[Any]:
     """Density of the points that are given as samples."""
-    return [*_encoding(w, with_jacobian=False), _per_tile(network.network_density, w)]
+    return [*_encoding(w, with_jacobian=False), _per_tile(network.network_forward, w, WITH_COLOUR=False)]
 
 
 def update_pose(w: Workspace) -> list[Any]:
@@ -89,7 +89,7 @@ def _rendering(w: Workspace, with_jacobian: bool) -> list[Any]:
         _per_ray(rays.pack, w, most=w.capacity.most),
         _per_ray_block(harmonics.view_harmonics, w),
         *_encoding(w, with_jacobian),
-        _per_tile(network.network_forward, w),
+        _per_tile(network.network_forward, w, WITH_COLOUR=True),
         _per_ray(rays.composite, w),
     ]
 
@@ -144,9 +144,9 @@ def _per_sample(kernel: Any, w: Workspace, name: str, *, per_level: bool = False
     return bind(kernel, grid, {**w.buffers, **module}, capacity=w.capacity.samples, BLOCK=size, **others)
 
 
-def _per_tile(kernel: Any, w: Workspace) -> Launch:
+def _per_tile(kernel: Any, w: Workspace, **others: Any) -> Launch:
     settings = _networks(w)
-    return bind(kernel, (-(-w.capacity.samples // settings["BLOCK"]),), {**w.buffers, **settings})
+    return bind(kernel, (-(-w.capacity.samples // settings["BLOCK"]),), {**w.buffers, **settings}, **others)
 
 
 def _networks(w: Workspace) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from biresnerf.geometry.camera.lens import lens_reach
 
 # Columns of `Intrinsics.distortion`: numerator, denominator, tangential.
 ABOVE, BELOW, TANGENTIAL = slice(0, 4), slice(4, 7), slice(7, 9)
-# Radians from the axis: nearer to it, series stand for quotients whose gradient would be 0 / 0.
+# Radians from the axis: closer to it, series replace quotients with a gradient of 0 / 0.
 _NEAR_AXIS = 1e-8
 
 

@@ -35,7 +35,7 @@ MODEL_PARAMETERS: dict[str, tuple[str, ...]] = {
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
 }
 FISHEYE_MODELS = frozenset({"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"})
-# Where the model asked for cannot hold a camera, the first of these that can.
+# If the requested model cannot represent a camera, the first of these that can is used.
 _FALLBACKS = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 
 

@@ -76,7 +76,7 @@ def distort_jacobian(x: Array, y: Array, c: Coefficients) -> tuple[Array, Array,
 
 
 def newton_step(x: Array, y: Array, to_x: Array, to_y: Array, c: Coefficients) -> tuple[Array, Array]:
-    """What to take off x, y so that they distort, to first order, to `to_x`, `to_y`."""
+    """The step to subtract from x, y so that they distort, to first order, to `to_x`, `to_y`."""
     now_x, now_y = distort(x, y, c)
     return solve(distort_jacobian(x, y, c), now_x - to_x, now_y - to_y)
 

@@ -1,4 +1,4 @@
-"""Whether a camera's numbers describe a lens that every pixel of the image can be seen through."""
+"""Whether a camera's parameters describe a lens that gives every pixel of the image a viewing ray."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SAME, _EXACT = 1e-5, 1e-11
 
 
 class _Border(NamedTuple):
-    """Why the border cannot be seen, or how far from the axis it lies on the plane of directions."""
+    """Why the border has no viewing rays, or how far from the axis it lies on the plane of directions."""
 
     problem: str | None
     reach: float
@@ -41,8 +41,8 @@ def lens_problem(full: FullParameters, width: int, height: int) -> str | None:
     """A sentence on why no real lens has this distortion over this image, or None where one may.
 
     The undistorted positions of border pixels are followed outward from the principal point, where distortion
-    vanishes; they must stay within reach, the picture must not fold on the way, and the way rays are computed later,
-    which is not followed step by step, must find the same positions.
+    vanishes. They must stay within reach, the image must not fold on the way, and the direct solution that is used for
+    rays later must find the same positions.
     """
     return _border_seen(full, width, height).problem
 
@@ -80,7 +80,7 @@ def _border_seen(full: FullParameters, width: int, height: int) -> _Border:
     if seen.problem is not None:
         return seen
     pixels = np.concatenate([share * target.T for share in shares], axis=1)
-    # Far from every root Newton's method may run off to infinity; that is an answer too.
+    # Far from every root Newton's method may diverge to infinity, which also answers the question.
     with np.errstate(all="ignore"):
         direct = np.stack(undistort(pixels[0], pixels[1], c))
         there = np.abs(np.stack(distort(direct[0], direct[1], c)) - pixels).max() < _EXACT

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from biresnerf.geometry.camera.camera_models import FullParameters
 from biresnerf.geometry.camera.distortion import coefficients_of, distort, undistort
 
-_NEAR_AXIS = 1e-8  # radians; nearer to it an angle and its sine are one
+_NEAR_AXIS = 1e-8  # radians; closer to it an angle equals its sine
 
 
 def rays_of_pixels(lens: FullParameters, pixel_xy: NDArray[np.float64]) -> NDArray[np.float64]:
