@@ -59,12 +59,8 @@ class Parametrisation(ABC):
         return
 
     def state(self) -> dict[str, Tensor]:
-        """Tensors for a checkpoint."""
+        """Tensors for a checkpoint, to be overwritten in place when one is loaded."""
         return {}
-
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore what `state` returned."""
-        return
 
 
 class Se3World(Parametrisation):
@@ -125,9 +121,6 @@ class CampSo3xR3(So3xR3):
 
     def state(self) -> dict[str, Tensor]:
         return {"preconditioner": self.preconditioner}
-
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        self.preconditioner.copy_(state["preconditioner"])
 
 
 PARAMETRISATIONS: dict[PoseParametrisation, type[Parametrisation]] = {

@@ -120,8 +120,8 @@ class PoseParameters:
             row = camera if self.body is None else int(self.body[camera])
             for parameter in (self.rotation, self.translation):
                 parameter[row] = 0
-                for adam in (self._adam, self._second):
-                    for moment in adam.state.get(parameter, {}).values() if adam is not None else ():
+                for adam in self._adams().values():
+                    for moment in adam.state.get(parameter, {}).values():
                         if moment.shape == parameter.shape:
                             moment[row] = 0
         self.parametrisation.restart(camera, self.poses())
@@ -140,27 +140,24 @@ class PoseParameters:
     def forget_gradients(self) -> None:
         self._adam.zero_grad(set_to_none=True)
 
+    def _tensors(self) -> dict[str, Tensor]:
+        increments = {"rotation": self.rotation.detach(), "translation": self.translation.detach()}
+        return {"start": self.start, **increments, **self.parametrisation.state()}
+
+    def _adams(self) -> dict[str, torch.optim.Adam]:
+        return {"adam": self._adam} if self._second is None else {"adam": self._adam, "second": self._second}
+
     def state(self) -> dict[str, Tensor]:
-        state = {
-            "start": self.start,
-            "rotation": self.rotation.detach(),
-            "translation": self.translation.detach(),
-        }
-        state.update(self.parametrisation.state())
-        state.update(adam_state("adam", self._adam))
-        if self._second is not None:
-            state.update(adam_state("second", self._second))
+        state = self._tensors()
+        for name, adam in self._adams().items():
+            state.update(adam_state(name, adam))
         return state
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        with torch.no_grad():
-            self.start.copy_(state["start"])
-            self.rotation.copy_(state["rotation"])
-            self.translation.copy_(state["translation"])
-            self.parametrisation.load_state(state)
-        load_adam_state("adam", self._adam, state)
-        if self._second is not None:
-            load_adam_state("second", self._second, state)
+        for name, tensor in self._tensors().items():
+            tensor.copy_(state[name])
+        for name, adam in self._adams().items():
+            load_adam_state(name, adam, state)
 
 
 def dolly_directions(unit_from_cam: Tensor) -> Tensor:

@@ -140,7 +140,7 @@ def test_a_cell_that_fails_is_recorded_and_not_the_end(scene, tmp_path):
     [
         (["--variant", "no colon"], "is not 'NAME: KEY=VALUE"),
         (["--variant", "a: stepz=1"], "stepz: unknown option"),
-        (["--variant", "a:", "--variant", "a:"], "one name"),
+        (["--variant", "a:", "--variant", "a:"], "same name"),
         (["--seeds", "one"], "no list of numbers"),
         (["--every", "4"], "at least 3"),
     ],
