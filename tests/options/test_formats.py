@@ -6,13 +6,13 @@ import subprocess
 import sys
 from dataclasses import replace
 
-from biresnerf.data.formats.registry import codecs
+from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.options.formats import formats
 
 
 def test_the_declarations_are_those_of_the_modules_that_read_and_write():
-    assert list(codecs()) == list(formats())
-    for name, codec in codecs().items():
+    assert list(ALL_CODECS) == list(formats())
+    for name, codec in ALL_CODECS.items():
         assert replace(codec.format, module=formats()[name].module) == formats()[name]
 
 
@@ -27,7 +27,7 @@ def test_declarations_are_read_without_numpy_and_without_any_reader():
 def test_a_format_that_has_names_in_folders_is_read_and_one_that_has_a_place_is_written():
     ranks = [one.rank for one in formats().values()]
     assert len(set(ranks)) == len(ranks)
-    for name, codec in codecs().items():
+    for name, codec in ALL_CODECS.items():
         assert (codec.parse is not None) == bool(codec.format.found_as), name
         assert (codec.write is not None) == bool(codec.format.in_set or codec.format.in_result), name
 

@@ -177,7 +177,7 @@ def dataset_of(
 
 
 def fitted_camera(camera: Camera, header: ImageHeader, image: PoseEntry, notes: list[str]) -> Camera:
-    """``camera`` for the image's true size; resized where it is one factor away, refused where it is not."""
+    """``camera`` resized to the image's true size. Raises InputError ``image_size_mismatch`` for another shape."""
     size = (header.width, header.height)
     if (camera.width, camera.height) == size:
         return camera

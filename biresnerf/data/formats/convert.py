@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from biresnerf.data.formats.codec import WriteContext
-from biresnerf.data.formats.registry import codecs
+from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.transforms.write_intrinsics import lens_values
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes
 from biresnerf.data.model.atomic_file import whole_file
@@ -71,7 +71,7 @@ def convert(
     with _whole_folder(folder) as staging:
         context = WriteContext(chosen, bounds)
         for name in names:
-            codec = codecs()[name]
+            codec = ALL_CODECS[name]
             assert codec.write is not None, f"{name} is declared with a place in a set"
             codec.write(refined, staging / codec.format.in_set, context)
         if any("lens file" in formats()[name].needs for name in names) and len(chosen.cameras) == 1:

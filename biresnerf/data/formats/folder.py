@@ -8,7 +8,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from biresnerf.data.formats.codec import Codec
-from biresnerf.data.formats.registry import codecs
+from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.photos.named_images import IMAGE_FOLDER, images_below, images_in, visible
 from biresnerf.errors import InputError
 
@@ -47,7 +47,7 @@ def look_into(folder: Path) -> FolderContents:
     found = list(_pose_places(root))
     if found:
         name, place = found[0]
-        image_root = codecs()[name].image_root(place) if place == root else root
+        image_root = ALL_CODECS[name].image_root(place) if place == root else root
         return FolderContents(image_root, name, place, (), _notes(root, found))
     images = images_in(root) or images_below(root / IMAGE_FOLDER)
     if not images:
@@ -66,7 +66,7 @@ def look_at(file: Path) -> FolderContents:
     Raises:
         InputError: ``input_unsupported``.
     """
-    readable = [(name, codec) for name, codec in codecs().items() if codec.parse is not None]
+    readable = [(name, codec) for name, codec in ALL_CODECS.items() if codec.parse is not None]
 
     def by_suffix_alone(item: tuple[str, Codec]) -> bool:
         codec = item[1]
@@ -90,12 +90,12 @@ def usual_name(file: Path) -> str | None:
     contents = look_at(file)
     if contents.format is None or contents.poses != file:
         return None
-    return codecs()[contents.format].format.found_as[0].replace("*", "cameras")
+    return ALL_CODECS[contents.format].format.found_as[0].replace("*", "cameras")
 
 
 def _pose_places(root: Path) -> Iterator[tuple[str, Path]]:
     """All poses in ``root`` by the name of their format, those that are preferred first."""
-    for name, codec in codecs().items():
+    for name, codec in ALL_CODECS.items():
         for pattern in codec.format.found_as:
             places = [root / pattern]
             if "*" in pattern:

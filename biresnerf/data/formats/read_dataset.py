@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, dataset_of
 from biresnerf.data.formats.folder import FolderContents, look_at, look_into
-from biresnerf.data.formats.registry import codecs
+from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.photos.masks import refuse_unfit_mask
 from biresnerf.data.photos.named_images import photos_beside
@@ -36,7 +36,7 @@ def read_dataset(path: Path, within: Path | None = None) -> Dataset:
     if contents.format is None or contents.poses is None:
         dataset = _read_images(contents.root, contents.images, within)
     else:
-        codec = codecs()[contents.format]
+        codec = ALL_CODECS[contents.format]
         dataset = codec.bind(_parse(contents.format, contents.root, contents.poses), contents.root, within)
     for index, frame in enumerate(dataset.frames):
         refuse_unfit_mask(frame, dataset.camera_of(index))
@@ -99,7 +99,7 @@ def find_input(path: Path) -> FolderContents:
 
 
 def _parse(name: str, root: Path, place: Path) -> ParsedPoses:
-    parse = codecs()[name].parse
+    parse = ALL_CODECS[name].parse
     assert parse is not None, "only formats that are read are found"
     return parse(root, place)
 

@@ -10,7 +10,7 @@ import numpy as np
 from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.colmap.format import COLMAP
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
-from biresnerf.data.formats.registry import codecs
+from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.simple.poses_json import POSES, PoseImage, matrix_of, read_poses_json
 from biresnerf.data.model.dataset import Camera, Dataset
 from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
@@ -52,14 +52,14 @@ def write_result_formats(
 
 def write_format(refined: RefinedSet, folder: Path, name: str, context: WriteContext) -> None:
     """Writes one format where a result in ``folder`` has it. Raises InputError ``export_not_possible``."""
-    codec = codecs()[name]
+    codec = ALL_CODECS[name]
     assert codec.write is not None, f"{name} has a place in results"
     codec.write(refined, folder / codec.format.in_result, context)
 
 
 def formats_given_back(dataset: Dataset) -> tuple[str, ...]:
     """The formats that a result has because its input was in them, beside those that every result has."""
-    return tuple(name for name, codec in codecs().items() if codec.given_back(dataset))
+    return tuple(name for name, codec in ALL_CODECS.items() if codec.given_back(dataset))
 
 
 def read_result(folder: Path, photos: Path | None = None) -> RefinedSet:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from biresnerf.data.formats.registry import codecs
+from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.result_formats import write_result_formats
 from biresnerf.data.formats.simple.bundler import write_bundler
 from biresnerf.data.formats.simple.llff import write_llff
@@ -287,4 +287,4 @@ def test_all_exports_are_written_and_those_that_cannot_be_say_why(tmp_path):
 def test_every_export_that_may_be_asked_for_has_a_writer():
     [allowed] = RefineOptions.model_fields["exports"].annotation.__args__[:1]
     assert set(allowed.__args__) == {"colmap-text", "instant-ngp", "kitti", "bundler", "pinhole"}
-    assert all(codecs()[name].write is not None for name in allowed.__args__)
+    assert all(ALL_CODECS[name].write is not None for name in allowed.__args__)

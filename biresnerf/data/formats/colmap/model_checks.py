@@ -1,4 +1,4 @@
-"""What a COLMAP model must be, table by table and as a whole, whichever form it was read from."""
+"""What a COLMAP model must be, table by table and as a whole, binary or text."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def broken(where: str, what: str, code: str = "pose_file_invalid", hint: str = _
 def refuse_repeated(table: dict[int, Any], number: int, what: str) -> None:
     """Raises InputError where ``table`` has the id already."""
     if number in table:
-        raise broken(f"{what} {number}", "the id stands twice")
+        raise broken(f"{what} {number}", "two rows have this id")
 
 
 def sensor_type(kind: int, where: str) -> SensorType:
@@ -136,7 +136,7 @@ def image_name(raw: bytes | str, where: str) -> str:
 
 
 def rigid_pose(numbers: Sequence[float], where: str) -> RigidPose:
-    """The pose of a quaternion (w, x, y, z) and a translation. Raises InputError where it is none."""
+    """The pose of a quaternion (w, x, y, z) and a translation. Raises InputError unless it is rigid and finite."""
     values = np.array(numbers, dtype=np.float64)
     if not np.isfinite(values).all():
         raise broken(where, "NaN or an infinite number in the pose", "pose_not_finite", "Remove the image.")
@@ -164,7 +164,7 @@ def points_of_records(
 ) -> ColmapPoints:
     """The points of parsed columns; ``elements`` [k, 2] has image ids and features of all tracks in a row."""
     if len(np.unique(ids)) != len(ids) or (ids < 0).any():
-        raise broken(file, "a point's id stands twice or is out of range")
+        raise broken(file, "two points have the same id, or an id is out of range")
     if not (np.isfinite(xyz).all() and np.isfinite(errors).all()):
         raise broken(file, "a point's position or error is no finite number", "pose_not_finite")
     starts = np.concatenate([np.zeros(1, np.int64), np.cumsum(lengths)])

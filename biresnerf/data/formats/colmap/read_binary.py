@@ -179,7 +179,7 @@ def parse_rigs(data: bytes, file: str) -> dict[int, ColmapRig]:
                 raise broken(where, "a yes or no is neither")
             pose = rigid_pose(source.take(_POSE, f"a pose of rig {number}"), where) if has_pose else None
             if sensor in others or sensor == reference:
-                raise broken(where, f"the sensor {sensor[0]} {sensor[1]} stands twice")
+                raise broken(where, f"the sensor {sensor[0]} {sensor[1]} is listed twice")
             others[sensor] = pose
         refuse_repeated(rigs, number, f"{file} rig")
         rigs[number] = ColmapRig(number, reference, others)

@@ -37,7 +37,7 @@ def parse_colmap(_root: Path, model_folder: Path) -> ParsedPoses:
 
 
 def bind_colmap(parsed: ParsedPoses, root: Path, within: Path | None = None) -> Dataset:
-    """The images of a model, and those beside them that the model has not registered, without pose.
+    """The images of a model, and the unregistered ones beside them, without pose.
 
     Images lie in ``root``/images, or in ``root`` itself and those of its folders that the model names.
 
@@ -95,7 +95,7 @@ def _for_these_images(model: ColmapModel, dataset: Dataset, table: str) -> Colma
 
 
 def _likely_camera(model: ColmapModel, path: Path, name: str) -> int | None:
-    """Of an image that the model has not: the camera that took most of those of its shape; None where none did."""
+    """The camera of an unregistered image: the one that took most images of its shape; None where none did."""
     header = read_header(path, name)
     uses = Counter(image.camera_id for image in model.images.values())
     for number, _ in uses.most_common():

@@ -213,7 +213,7 @@ def parse_rigs(text: str, file: str) -> dict[int, ColmapRig]:
             if has_pose not in ("0", "1"):
                 raise broken(words.where, "a yes or no is neither")
             if sensor in others or sensor == reference:
-                raise broken(words.where, f"the sensor {sensor[0]} {sensor[1]} stands twice")
+                raise broken(words.where, f"the sensor {sensor[0]} {sensor[1]} is listed twice")
             others[sensor] = _pose(words, "a sensor's pose") if has_pose == "1" else None
         return number, ColmapRig(number, reference, others)
 

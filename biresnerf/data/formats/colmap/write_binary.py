@@ -33,7 +33,7 @@ def write_colmap_binary(model: ColmapModel, folder: Path) -> None:
     A points3D.bin is written even without points: readers fail without it.
 
     Raises:
-        ValueError: a name that the form cannot hold.
+        ValueError: a name that the tables cannot hold.
     """
     if any("\0" in image.name or not image.name for image in model.images.values()):
         raise ValueError("image names must not be empty and not hold NUL")

@@ -94,7 +94,7 @@ def read_cameras(file: Path) -> list[tuple[Lens, NDArray[np.float64] | None]]:
     if len(lines) != 1 + _LINES_PER_CAMERA * cameras + _LINES_PER_POINT * points:
         raise _invalid(
             file.name,
-            f"has not the lines of the {cameras} cameras and {points} points it names: {len(lines)}.",
+            f"has {len(lines)} lines, which is not what {cameras} cameras and {points} points take.",
         )
     entries = []
     for index in range(cameras):
@@ -193,15 +193,15 @@ def bundler_problem(camera: Camera) -> str | None:
 
 
 def refuse_lenses(
-    cameras: Iterable[Camera], problem_of: Callable[[Camera], str | None], form: str, where: str, hint: str
+    cameras: Iterable[Camera], problem_of: Callable[[Camera], str | None], title: str, where: str, hint: str
 ) -> None:
-    """Raises InputError ``export_not_possible`` for the first lens with a problem; ``form`` is whose (Bundler's)."""
+    """Raises InputError ``export_not_possible`` for the first lens with a problem; ``title`` is the format's."""
     for camera in cameras:
         problem = problem_of(camera)
         if problem is not None:
             raise InputError(
                 "export_not_possible",
-                f"{form} cannot hold a lens of this set: {problem}.",
+                f"{title} cannot hold a lens of this set: {problem}.",
                 where=where,
                 hint=hint,
             )
@@ -214,7 +214,7 @@ def write_bundler(refined: RefinedSet, folder: Path) -> None:
         InputError: ``export_not_possible``: a lens that the format cannot hold.
     """
     hint = "Export `pinhole`: it holds undistorted images, and a bundle.out for them."
-    refuse_lenses(refined.cameras, bundler_problem, "Bundler's format", "bundler", hint)
+    refuse_lenses(refined.cameras, bundler_problem, "Bundler", "bundler", hint)
     lines = ["# Bundle file v0.3", f"{len(refined)} {len(refined.model.points)}"]
     for index, cam_from_world in enumerate(refined.cam_from_world):
         full = refined.camera_of(index).full()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, in_order
@@ -40,6 +41,9 @@ _NEAREST, _FARTHEST = 0.1, 99.9
 MAX_IMAGES = 100_000
 _MAX_HEADER_BYTES = 4096
 _COLUMNS = 17
+_HEADER = re.compile(
+    rb"\{'descr': '(<f[48])', 'fortran_order': (True|False), 'shape': \(([0-9]{1,9}), 17\),? ?\}[ \n]*"
+)
 
 
 def parse_llff(_root: Path, file: Path) -> ParsedPoses:
@@ -79,7 +83,11 @@ def _camera(height: float, width: float, focal: float, where: str) -> Camera:
 
 
 def _rows(file: Path) -> NDArray[np.float64]:
-    """The rows, float64 [n, 17], finite."""
+    """The rows, float64 [n, 17], finite.
+
+    The npy header is matched and not evaluated as the Python literal that it is: on hostile headers numpy.load raises
+    more than ValueError (TokenError, RecursionError, MemoryError), and it allocates before it reads.
+    """
 
     def invalid(what: str, code: str = "pose_file_invalid") -> InputError:
         return InputError(
@@ -88,26 +96,29 @@ def _rows(file: Path) -> NDArray[np.float64]:
 
     try:
         with file.open("rb") as stream:
-            version = npy.read_magic(stream)
-            read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-            shape, by_columns, dtype = read_header(stream, max_header_size=_MAX_HEADER_BYTES)
-            content = stream.read(_COLUMNS * MAX_IMAGES * 8 + 1)
+            content = stream.read(_MAX_HEADER_BYTES + MAX_IMAGES * _COLUMNS * 8 + 1)
     except OSError as error:
         raise invalid(f"cannot be read: {error.strerror}.") from None
-    except ValueError:
-        raise invalid("is no npy file.") from None
-    if dtype.kind != "f" or len(shape) != 2 or shape[1] != _COLUMNS:
+    start = {1: 10, 2: 12}.get(content[6] if len(content) > 12 else 0, 0)
+    if not content.startswith(b"\x93NUMPY") or not start:
+        raise invalid("is no npy file.")
+    length = int.from_bytes(content[8:start], "little")
+    match = _HEADER.fullmatch(content[start : start + min(length, _MAX_HEADER_BYTES)])
+    if match is None:
         raise invalid(f"holds something other than rows of {_COLUMNS} floating-point numbers.")
-    if not 0 <= shape[0] <= MAX_IMAGES or len(content) != shape[0] * _COLUMNS * dtype.itemsize:
-        raise invalid(f"has {shape[0]} rows by its header, but its content is shorter or longer.")
-    rows = np.frombuffer(content, dtype).reshape(shape, order="F" if by_columns else "C").astype(np.float64)
+    dtype, by_columns, count = np.dtype(match[1].decode()), match[2] == b"True", int(match[3])
+    numbers = content[start + length :]
+    if count > MAX_IMAGES or len(numbers) != count * _COLUMNS * dtype.itemsize:
+        raise invalid(f"has {count} rows by its header, but its content is shorter or longer.")
+    order: Literal["F", "C"] = "F" if by_columns else "C"
+    rows = np.frombuffer(numbers, dtype).reshape((count, _COLUMNS), order=order).astype(np.float64)
     if not np.isfinite(rows).all():
         raise invalid("NaN or an infinite number.", "pose_not_finite")
     return rows
 
 
 def llff_problem(camera: Camera) -> str | None:
-    """Why LLFF's form cannot hold this lens, or None where it can."""
+    """Why LLFF cannot hold this lens, or None where it can."""
     problem = bundler_problem(camera)
     if problem is None and any(camera.full()[4:]):
         return "it is distorted"
@@ -115,19 +126,19 @@ def llff_problem(camera: Camera) -> str | None:
 
 
 def rows_by_name(refined: RefinedSet) -> list[int]:
-    """The images as readers of a form without names take them: by the order of their files' names."""
+    """The images in the order of their files' names, in which readers of a format without names take them."""
     return sorted(range(len(refined)), key=lambda index: refined.images[index].file_name)
 
 
 def given_bounds(file: Path, count: int) -> NDArray[np.float64]:
-    """The bounds of depth [count, 2] of a ``poses_bounds.npy`` that has been read as an input of so many images.
+    """The depth bounds [count, 2] in the ``poses_bounds.npy`` of an input with ``count`` images.
 
     Raises:
-        ValueError: the file has not a row for each image.
+        ValueError: the file does not have a row for each image.
     """
     rows = np.load(file, allow_pickle=False)
     if rows.shape != (count, 17):
-        raise ValueError(f"{file.name} has {rows.shape}, not a row for each of {count} images")
+        raise ValueError(f"{file.name} has shape {rows.shape}, not a row for each of {count} images")
     return np.asarray(rows[:, 15:], dtype=np.float64)
 
 
@@ -135,20 +146,20 @@ def write_llff(refined: RefinedSet, path: Path, bounds: NDArray[np.float64] | No
     """Writes the set in the order of its files' names.
 
     Args:
-        bounds: nearest and farthest depth [n, 2] of the images; where left out, of the points that each sees.
+        bounds: nearest and farthest depth [n, 2] of the images; default: those of the points that each image sees.
 
     Raises:
-        InputError: ``export_not_possible``: a lens that the form cannot hold; ``bounds_missing``: no points are seen.
+        InputError: ``export_not_possible``: a lens that the format cannot hold; ``bounds_missing``: no points are seen.
     """
     hint = "Convert to pinhole, which undistorts the photos, then that folder to llff."
-    refuse_lenses(refined.cameras, llff_problem, "LLFF's form", "llff", hint)
+    refuse_lenses(refined.cameras, llff_problem, "LLFF", "llff", hint)
     if bounds is None:
         bounds = np.array([_bounds_of_points(refined, index) for index in range(len(refined))])
     write_poses_bounds(refined, bounds, path)
 
 
 def _bounds_of_points(refined: RefinedSet, index: int) -> tuple[float, float]:
-    """Between these depths lie the points that the image sees, but for a thousandth at either end."""
+    """The depths between which the image sees all points but a thousandth at either end."""
     model = refined.model
     seen = model.points.track_image_ids == refined.image_ids[index]
     of_point = np.repeat(np.arange(len(model.points)), np.diff(model.points.track_starts))
@@ -158,9 +169,9 @@ def _bounds_of_points(refined: RefinedSet, index: int) -> tuple[float, float]:
     if not len(depths):
         raise InputError(
             "bounds_missing",
-            "sees no points that would tell its bounds of depth.",
+            "sees no points to take its depth bounds from.",
             where=refined.images[index].name,
-            hint="Give the depth of what is nearest and farthest: --bounds NEAR FAR.",
+            hint="Give the nearest and farthest depth: --bounds NEAR FAR.",
         )
     near, far = np.percentile(depths, (_NEAREST, _FARTHEST)).tolist()
     return near, far

@@ -134,7 +134,7 @@ def _labelled(chunk: ElementTree.Element, file: Path) -> dict[str, ElementTree.E
         if label in entries:
             raise InputError(
                 "duplicate_image",
-                "the label stands twice.",
+                "two cameras have this label.",
                 where=f"{file.name} camera {label!r}",
                 hint="Remove one.",
             )

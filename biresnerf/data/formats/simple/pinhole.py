@@ -102,7 +102,7 @@ def write_pinhole(refined: RefinedSet, folder: Path, should_stop: Callable[[], b
 
     Raises:
         InputError: ``export_not_possible``, or a code of `decode` for a photo that cannot be read.
-        Interrupted: ``should_stop``, asked before each photo, said so; a folder that was new is gone again.
+        Interrupted: ``should_stop`` returned true before a photo; a folder that was new is removed again.
     """
     new = not folder.exists()
     names = _names(refined)
@@ -121,9 +121,9 @@ def write_pinhole(refined: RefinedSet, folder: Path, should_stop: Callable[[], b
         if new:
             shutil.rmtree(folder, ignore_errors=True)
         raise
-    pack = _as_pinhole(refined, cameras, names)
-    write_colmap_binary(pack.model, folder / "sparse" / "0")
-    write_bundler(pack, folder)
+    undistorted_set = _as_pinhole(refined, cameras, names)
+    write_colmap_binary(undistorted_set.model, folder / "sparse" / "0")
+    write_bundler(undistorted_set, folder)
     with whole_file(folder / "names.json") as temporary:
         named = dict(zip(names, (image.name for image in refined.images), strict=True))
         temporary.write_text(json.dumps(named, indent=1, ensure_ascii=False) + "\n", "utf-8")

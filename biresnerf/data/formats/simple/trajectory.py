@@ -113,7 +113,7 @@ class Trajectory:
             raise _invalid(file.name, "holds no pose.")
         self.dialect = _COLUMNS[columns]
         if len(set(self.times_s)) != len(self.times_s):
-            raise _invalid(file.name, "a time stands twice.")
+            raise _invalid(file.name, "two poses have the same time.")
 
     def _note_name(self, line: str) -> None:
         match = _NAMED_TIME.match(line.strip())
@@ -176,10 +176,10 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
         InputError: ``pose_count_mismatch``.
     """
     count, times = len(trajectory.poses), trajectory.times_s
-    said = [trajectory.name_of_time.get(time, "") for time in times]
-    if said and all(said) and len(set(said)) == count:
+    named = [trajectory.name_of_time.get(time, "") for time in times]
+    if named and all(named) and len(set(named)) == count:
         try:
-            found, _ = match_files(said, names, lambda _: trajectory.file.name)
+            found, _ = match_files(named, names, lambda _: trajectory.file.name)
             return {name: index for index, name in enumerate(found)}, "by the names in its comments"
         except InputError:
             pass  # comments about something else
@@ -198,7 +198,7 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
         return {name: i for i, name in enumerate(names)}, "in the order of the images' names"
     raise InputError(
         "pose_count_mismatch",
-        f"has {count} poses for {len(names)} images, and nothing says which is whose.",
+        f"has {count} poses for {len(names)} images, and does not say which belongs to which.",
         where=trajectory.file.name,
         hint="Name images by their time, add rgb.txt (time and name a line), or give one pose an image.",
     )
@@ -285,7 +285,7 @@ def write_tum(refined: RefinedSet, path: Path) -> None:
 def write_kitti(refined: RefinedSet, path: Path) -> None:
     """One line an image: the 12 numbers of [R | t], row by row.
 
-    The form knows neither names nor comments, so lines are in the order of the files' names, as readers take them.
+    The format has neither names nor comments, so lines are in the order of the files' names, as readers take them.
     """
     poses = refined.world_from_cam[rows_by_name(refined)]
     _write_lines(path, [" ".join(repr(value) for value in pose[:3].ravel().tolist()) for pose in poses])

@@ -39,11 +39,11 @@ class Fields:
         return f"{self.file} frames[{self.index}].{key}" if self.own(key) else f"{self.file} {key}"
 
     def own(self, key: str) -> bool:
-        """Whether the frame itself says it."""
+        """Whether the frame itself has the key."""
         return self.frame.get(key) is not None
 
     def get(self, key: str) -> float | None:
-        """The number, or None where neither says it. Raises InputError where it is no finite number."""
+        """The number, or None where neither has the key. Raises InputError for other than a finite number."""
         value = self.frame[key] if self.own(key) else self.top.get(key)
         if value is None:
             return None
@@ -98,14 +98,14 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
 def _guessed(
     fields: Fields, header: ImageHeader, model: str | None, fisheye: bool, notes: list[str]
 ) -> FrameCamera:
-    """The lens of a frame for which nobody gives a focal length: EXIF's, or a normal lens, in the model declared.
+    """The lens of a frame without a focal length: EXIF's, or a normal lens, in the declared model.
 
     Raises:
         InputError: ``intrinsics_missing`` where the file describes the rest of the lens, or a fisheye.
     """
-    said = [key for key in ("cx", "cy", *COEFFICIENTS) if fields.get(key)]
-    if fisheye or said:
-        what = f"{said[0]} is given" if said else "the lens is a fisheye"
+    given = [key for key in ("cx", "cy", *COEFFICIENTS) if fields.get(key)]
+    if fisheye or given:
+        what = f"{given[0]} is given" if given else "the lens is a fisheye"
         raise InputError(
             "intrinsics_missing",
             f"{what}, but no focal length: neither fl_x nor camera_angle_x.",
@@ -188,7 +188,7 @@ def _coefficients(fields: Fields, model: str | None, fisheye: bool) -> dict[str,
     if model == "FULL_OPENCV":
         return values
     if fisheye:
-        # instant-ngp keeps p1 and p2 in the places of k3 and k4, the last one named wins; nobody means that.
+        # instant-ngp keeps p1 and p2 in the places of k3 and k4, and the last one wins, which is never meant.
         for key in ("p1", "p2", "k5", "k6"):
             if values[key]:
                 raise _unsupported(fields, key, f"{key} is not zero, but a fisheye has k1 to k4 only.")
@@ -212,7 +212,7 @@ def _parameters(
         # axes.
         fy = fx if fx is not None else fy
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
-    assert fx is not None, "who has none is told so before"
+    assert fx is not None, "a frame without focal length has a guessed lens"
     assert fy is not None
     cx, cy = fields.get("cx"), fields.get("cy")
     notes = []

@@ -49,7 +49,7 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
 
 
 def parse_transforms(_root: Path, path: Path) -> ParsedPoses:
-    """Names and poses of the frames; what does not name its image has an empty name. Raises InputError."""
+    """Names and poses of the frames; a frame that names no image has an empty name. Raises InputError."""
     document = read_json_object(path)
     rows = _frame_objects(document, path.name)
     source = _source_format(document, path)
@@ -108,7 +108,7 @@ def bind_transforms(parsed: ParsedPoses, root: Path, within: Path | None = None)
 
 
 def _named_size(row: dict[str, Any], document: dict[str, Any]) -> tuple[float | None, float | None]:
-    """w and h that go with a frame; None for what is no number, which is refused where it is used."""
+    """w and h that apply to a frame; None for other than numbers, which `camera_of_frame` refuses."""
     top = {} if row.get("fl_x") is not None else document  # its own focal length goes with its own size
     width, height = (_usable(row.get(key, top.get(key))) for key in ("w", "h"))
     return width, height

@@ -1,4 +1,4 @@
-"""The pinhole pack: each pixel shows what its ray met in the photo, by COLMAP's lens and another sampler."""
+"""Undistorted photos: each pixel shows what its ray met in the photo, by COLMAP's lens and another sampler."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_every_pixel_shows_what_colmaps_lens_says_its_ray_met():
     )
     for seed, (camera, pinhole, seen) in enumerate(zip(cameras, flat, json.loads(said.stdout), strict=True)):
         picture, at = photo(seed), np.array(seen)
-        assert (at > -0.5).all()  # nothing blank: every pixel of the pack was seen by the photo
+        assert (at > -0.5).all()  # nothing blank: every pixel was seen by the photo
         assert (at < np.array(SIZE) + 0.5).all()
         for channel in range(3):
             expected = map_coordinates(
@@ -137,7 +137,7 @@ def test_photos_model_and_bundle_agree_and_names_lead_back(tmp_path):
         with Image.open(tmp_path / "out/images" / image.name) as picture:
             assert picture.size == (camera.width, camera.height)
             assert picture.mode == ("RGBA" if row == 2 else "RGB")
-        # Where a point lies in the pack is where the photo's pixel went.
+        # Where a point lies in the new picture is where the photo's pixel went.
         points = seen_points(refined, row)
         old = ours(refined, row, points)
         pose = refined.world_from_cam[row]
