@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import weakref
 from collections.abc import Awaitable, Callable, Iterator
+from concurrent import futures
 from concurrent.futures import Future
 from contextlib import ExitStack
 from queue import SimpleQueue
@@ -57,6 +58,7 @@ class Client:
         self.url = self._client.url
         stack = ExitStack()
         self._portal = stack.enter_context(start_blocking_portal())
+        stack.callback(self._portal.call, self._portal.stop, True)  # ends what other threads still do
         stack.callback(self._portal.call, self._client.close)
         # Also when the client is dropped or the process exits: the loop's thread must not outlive them.
         self._close = weakref.finalize(self, stack.close)
@@ -147,18 +149,27 @@ class Client:
             *(relayed(value) for value in arguments),
             **{name: relayed(value) for name, value in named.items()},
         )
-        future = self._start(work, messages)
+        scope = self._portal.call(anyio.CancelScope)
+
+        async def cancellable() -> list[T]:
+            with scope:
+                return [await work()]
+            return []
+
+        future: Future[list[T]] | None = None
         try:
+            future = self._start(cancellable, messages)
             while (message := messages.get()) is not None:
                 callback, returned = message
                 callback()
                 self._portal.start_task_soon(returned.set)
         except BaseException:
-            if future.cancel():
-                while messages.get() is not None:  # until its files and connections are closed
-                    pass
+            # Not by the future: Ctrl-C may come while the work starts, before there is one.
+            self._portal.start_task_soon(scope.cancel)
+            if future is not None:
+                futures.wait([future])  # until its files and connections are closed
             raise
-        return future.result()
+        return future.result()[0]
 
     def _start(self, work: Callable[[], Awaitable[T]], messages: _Messages) -> Future[T]:
         """Runs ``work`` on the event loop; puts None in the queue at its end."""
