@@ -13,7 +13,7 @@ export PIP_CONSTRAINT := constraints.txt
 export PIP_BUILD_CONSTRAINT := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup web test test-fast lint format demo serve bench openapi docs fuzz audit sbom compose-check
+.PHONY: help setup web test test-fast lint format demo serve bench docs fuzz audit sbom compose-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -47,10 +47,7 @@ serve: web  ## the service on this machine
 bench: setup  ## the measurements; BENCH="arguments"
 	$(BIN)/python -m benchmarks $(BENCH)
 
-openapi: setup  ## write docs/openapi.json anew, after a change of the HTTP interface
-	$(BIN)/python -m service.docs.openapi docs/openapi.json
-
-docs: setup  ## write the pages and notebooks anew that are made of the code
+docs: setup  ## write the generated pages, notebooks and schemas (docs/openapi.json) again
 	$(BIN)/python -m docs.generate
 
 fuzz: setup  ## thousands of made-up requests against a real service; FUZZ="arguments"

@@ -19,7 +19,7 @@ from biresnerf.errors import FaultError
 from service import web_page
 from service.docs import docs_page
 from service.docs.api_description import describe
-from service.http.access import Access, say_who_is_let_in
+from service.http.access import Access, log_access
 from service.http.dependencies import Service
 from service.http.metrics import WebMetrics
 from service.http.observe import Observed, is_probe
@@ -81,7 +81,7 @@ def create_app(settings: Settings) -> FastAPI:
                 logger.info("removed %d unfinished uploads", swept)
             service.keep_running(asyncio.create_task(_check_unfinished(service)))
             service.keep_running(asyncio.create_task(_tend_uploads(service)))
-            await say_who_is_let_in(service)
+            await log_access(service)
             try:
                 yield
             finally:

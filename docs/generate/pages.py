@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from docs.generate.commands_page import commands_page
@@ -10,8 +11,16 @@ from docs.generate.notebooks import notebook
 from docs.generate.options_page import options_page
 from docs.generate.result_schema import result_schema
 from docs.generate.settings_page import settings_page
+from service.app import create_app
+from workers.settings.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
+def openapi_document() -> str:
+    """The HTTP interface; needs neither database nor network."""
+    app = create_app(Settings(database_url="postgresql://nowhere"))
+    return json.dumps(app.openapi(), indent=1, ensure_ascii=False) + "\n"
 
 
 def generated() -> dict[Path, str]:
@@ -23,6 +32,7 @@ def generated() -> dict[Path, str]:
         ROOT / "docs/formats.md": format_page(ROOT / "docs/formats.md"),
         ROOT / "service/web/formats.ts": page_formats(),
         ROOT / "docs/result.schema.json": result_schema(),
+        ROOT / "docs/openapi.json": openapi_document(),
     }
     walks = [path for path in sorted((ROOT / "examples").glob("*.py")) if "# %%" in path.read_text("utf-8")]
     return pages | {walk.with_suffix(".ipynb"): notebook(walk) for walk in walks}

@@ -1,8 +1,8 @@
 """Who calls, for whom, and what they may do.
 
 Every request but those of `OPEN` is identified before anything of it is read (`Access`), so a route that
-forgets to ask is closed, not open. A route says with its parameter what it needs: `CallerHere` (scope
-``read``), `DatasetWriterHere`, `JobWriterHere`, `AdminHere`.
+forgets to ask is closed, not open. A route says with its parameter what it needs: `ReadCaller` (scope
+``read``), `DatasetWriter`, `JobWriter`, `Admin`.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ def _is_public_name(host: str) -> bool:
     return "." in host.rstrip(".") and not on_loopback(host)
 
 
-async def say_who_is_let_in(service: Service) -> None:
+async def log_access(service: Service) -> None:
     """Logs at the start what an operator could otherwise find out too late."""
     settings = service.settings
     if settings.auth == "off" and not on_loopback(settings.host):
@@ -284,7 +284,7 @@ async def _caller(
     return caller
 
 
-CallerHere = Annotated[Caller, Security(_caller, scopes=["read"])]
-DatasetWriterHere = Annotated[Caller, Security(_caller, scopes=["datasets:write"])]
-JobWriterHere = Annotated[Caller, Security(_caller, scopes=["jobs:write"])]
-AdminHere = Annotated[Caller, Security(_caller, scopes=["admin"])]
+ReadCaller = Annotated[Caller, Security(_caller, scopes=["read"])]
+DatasetWriter = Annotated[Caller, Security(_caller, scopes=["datasets:write"])]
+JobWriter = Annotated[Caller, Security(_caller, scopes=["jobs:write"])]
+Admin = Annotated[Caller, Security(_caller, scopes=["admin"])]

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import re
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +16,6 @@ from fastapi import Path as PathParameter
 
 from service.http.metrics import WebMetrics
 from service.http.problems import ProblemError
-from service.http.upload_places import UploadPlaces
 from workers.engine import Stores
 from workers.process.disk_space import DiskBudget, upload_disk_budget
 from workers.process.turns import Turns
@@ -22,6 +24,38 @@ from workers.settings.settings import Settings
 # Archives that one process unpacks at the same time; each takes a core, and memory of its own.
 UNPACKED_AT_ONCE = 4
 _ID = re.compile(r"^[a-z]{2,3}_[0-9A-Za-z]{1,40}$", re.ASCII)
+
+
+class UploadPlaces:
+    """How many uploads each client may send at once, counted by each web process alone; 0 is no limit."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._taken: Counter[str] = Counter()
+
+    @contextmanager
+    def taken(self, client: str | None) -> Iterator[None]:
+        """A place for as long as the context; none is needed where there is no client to count.
+
+        Raises:
+            ProblemError: ``too_many_uploads``: all are taken.
+        """
+        if client is None or not self._limit:
+            yield
+            return
+        if self._taken[client] >= self._limit:
+            raise ProblemError(
+                "too_many_uploads",
+                f"{self._limit} uploads are under way, which is the limit.",
+                hint="Go on when one of them is done.",
+            )
+        self._taken[client] += 1
+        try:
+            yield
+        finally:
+            self._taken[client] -= 1
+            if not self._taken[client]:
+                del self._taken[client]
 
 
 @dataclass
@@ -62,7 +96,7 @@ def service_of(request: Request) -> Service:
     return found
 
 
-ServiceHere = Annotated[Service, Depends(service_of)]
+CurrentService = Annotated[Service, Depends(service_of)]
 
 
 def _known_form(identity: str) -> str:

@@ -1,11 +1,12 @@
-"""JSON bodies read strictly: capped, no NaN, no repeated keys, every fault with its pointer."""
+"""JSON bodies, read strictly: of limited size, no NaN, no repeated keys, a pointer to every wrong field."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from typing import Any, TypeVar
 
+from fastapi import Request
 from pydantic import BaseModel, ValidationError
 
 from biresnerf.wire.problems import FieldProblem
@@ -16,28 +17,32 @@ JSON_BYTES_MAX = 2**20
 Model = TypeVar("Model", bound=BaseModel)
 
 
-async def read_json(
-    content_type: str,
-    content_length: str | None,
-    stream: AsyncIterator[bytes],
-    model: type[Model],
-    limit: int = JSON_BYTES_MAX,
-) -> Model:
+async def read_json(request: Request, model: type[Model], limit: int = JSON_BYTES_MAX) -> Model:
     """The body, of ``limit`` bytes at most, as the model.
 
     Raises:
         ProblemError: ``unsupported_media``, ``body_too_large``, ``malformed_json``, ``invalid_request``,
             ``invalid_options``.
     """
+    content_type = request.headers.get("content-type", "")
     if content_type.split(";")[0].strip().lower() != "application/json":
         raise ProblemError(
             "unsupported_media",
             f"The Content-Type {content_type!r} is not application/json.",
             where="Content-Type",
         )
-    refuse_announced_excess(content_length, limit)
-    body = b"".join([chunk async for chunk in capped(stream, limit)])
-    return fit(load_json(body), model)
+    refuse_announced_excess(request.headers.get("content-length"), limit)
+    body = b"".join([chunk async for chunk in capped(request.stream(), limit)])
+    return validate(load_json(body), model)
+
+
+def body_of(model: type[Model]) -> Callable[[Request], Awaitable[Model]]:
+    """A dependency that reads the request's body as the model."""
+
+    async def read(request: Request) -> Model:
+        return await read_json(request, model)
+
+    return read
 
 
 def load_json(text: bytes | str) -> Any:
@@ -50,8 +55,8 @@ def load_json(text: bytes | str) -> Any:
         raise ProblemError("malformed_json", f"{error}.") from None
 
 
-def fit(values: Any, model: type[Model]) -> Model:
-    """Values as the model; raises `ProblemError` with the pointer of every fault."""
+def validate(values: Any, model: type[Model]) -> Model:
+    """Values as the model; raises `ProblemError` with the pointer of every wrong field."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -91,6 +96,12 @@ def _detail(item: Any) -> str:
     if item["type"] == "extra_forbidden":
         return "There is no such field."
     return f"{item['msg']}."
+
+
+def json_request(model: type[BaseModel], *, required: bool = True) -> dict[str, Any]:
+    """The `openapi_extra` of a route that reads its JSON body by hand."""
+    body: dict[str, Any] = {"content": {"application/json": json_content(model)}}
+    return {"requestBody": {"required": True, **body} if required else body}
 
 
 def json_content(model: type[BaseModel]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from biresnerf.report import Report
 from biresnerf.wire.jobs import job_url
 from biresnerf.wire.results import ArtifactList, ArtifactView
 from service.answers.downloads import ANSWERS, Asked, answer_with, find_artifact
-from service.http.access import Caller, CallerHere
+from service.http.access import Caller, ReadCaller
 from service.http.dependencies import JobId
 from service.http.problems import ProblemError, declared
 from workers.records import Artifact
@@ -25,7 +25,7 @@ REPORT = "report.json"
     operation_id="listArtifacts",
     responses=declared("not_found", "expired", "database_unavailable", "internal_error"),
 )
-async def list_artifacts(job_id: JobId, caller: CallerHere) -> ArtifactList:
+async def list_artifacts(job_id: JobId, caller: ReadCaller) -> ArtifactList:
     """All files of the result and of its exports. While the job runs, previews: the poses so far and a render."""
     found = await caller.jobs.artifacts(job_id)
     items = [
@@ -52,7 +52,7 @@ async def list_artifacts(job_id: JobId, caller: CallerHere) -> ArtifactList:
     responses=ANSWERS,
 )
 async def get_artifact(
-    job_id: JobId, name: str, request: Request, caller: CallerHere, asked: Asked
+    job_id: JobId, name: str, request: Request, caller: ReadCaller, asked: Asked
 ) -> Response:
     """One file. Its strong ETag is the SHA-256 of its bytes.
 
@@ -68,7 +68,7 @@ async def get_artifact(
     response_model=Report,
     responses=declared("not_found", "expired", "result_not_ready", "database_unavailable", "internal_error"),
 )
-async def get_report(job_id: JobId, caller: CallerHere) -> Response:
+async def get_report(job_id: JobId, caller: ReadCaller) -> Response:
     """The machine-readable account of a finished job (the artifact `report.json`)."""
     artifact = await find_report(caller, job_id)
     content = await whole_file(caller, artifact)

@@ -20,12 +20,12 @@ from biresnerf.wire.datasets import (
     dataset_url,
 )
 from biresnerf.wire.safe_paths import checked_path
-from service.http.access import CallerHere, DatasetWriterHere
+from service.http.access import DatasetWriter, ReadCaller
 from service.http.dependencies import DatasetId, next_link, service_of
 from service.http.problems import ProblemError, declared
 from service.intake.archive_import import take_archive
 from service.intake.dataset_finalize import begin_check, finish_check
-from service.intake.json_body import JSON_BYTES_MAX, json_content, read_json
+from service.intake.json_body import JSON_BYTES_MAX, json_request, read_json
 from service.intake.uploads import capped, refuse_announced_excess, staging_folder, write_stream
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
@@ -42,11 +42,8 @@ _DIGEST = re.compile(r"sha-256=:([A-Za-z0-9+/=]+):")
 
 
 async def _new_dataset(request: Request) -> NewDataset:
-    headers = request.headers
     limit = JSON_BYTES_MAX + ENTRY_BYTES * service_of(request).settings.max_files
-    return await read_json(
-        headers.get("content-type", ""), headers.get("content-length"), request.stream(), NewDataset, limit
-    )
+    return await read_json(request, NewDataset, limit)
 
 
 @router.post(
@@ -58,12 +55,10 @@ async def _new_dataset(request: Request) -> NewDataset:
         *("malformed_json", "body_too_large", "unsupported_media", "unsafe_path", "body_timeout"),
         *("quota_exhausted", *_WRITES),
     ),
-    openapi_extra={
-        "requestBody": {"required": True, "content": {"application/json": json_content(NewDataset)}}
-    },
+    openapi_extra=json_request(NewDataset),
 )
 async def create_dataset(
-    caller: DatasetWriterHere, body: Annotated[NewDataset, Depends(_new_dataset)], response: Response
+    caller: DatasetWriter, body: Annotated[NewDataset, Depends(_new_dataset)], response: Response
 ) -> DatasetView:
     """A dataset to be filled. Of a manifest, `missing` in the answer is what has to be sent.
 
@@ -82,7 +77,7 @@ async def create_dataset(
 async def list_datasets(
     request: Request,
     response: Response,
-    caller: CallerHere,
+    caller: ReadCaller,
     state: DatasetState | None = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     cursor: Annotated[str | None, Query(max_length=500)] = None,
@@ -94,7 +89,7 @@ async def list_datasets(
 
 
 @router.get("/{dataset_id}", operation_id="getDataset", responses=declared("not_found", *_ALWAYS))
-async def get_dataset(dataset_id: DatasetId, caller: CallerHere) -> DatasetView:
+async def get_dataset(dataset_id: DatasetId, caller: ReadCaller) -> DatasetView:
     """The dataset, with what the check found in it once it is final."""
     return await caller.datasets.get(dataset_id)
 
@@ -105,7 +100,7 @@ async def get_dataset(dataset_id: DatasetId, caller: CallerHere) -> DatasetView:
     operation_id="deleteDataset",
     responses=declared("not_found", "dataset_in_use", *_WRITES),
 )
-async def delete_dataset(dataset_id: DatasetId, caller: DatasetWriterHere) -> None:
+async def delete_dataset(dataset_id: DatasetId, caller: DatasetWriter) -> None:
     """Deletes the dataset and its files. Its jobs, finished ones too, have to be deleted first."""
     await caller.datasets.delete(dataset_id)
 
@@ -119,7 +114,7 @@ async def list_files(
     dataset_id: DatasetId,
     request: Request,
     response: Response,
-    caller: CallerHere,
+    caller: ReadCaller,
     limit: Annotated[int, Query(ge=1, le=1000)] = 1000,
     cursor: Annotated[str | None, Query(max_length=2000)] = None,
 ) -> FileList:
@@ -157,7 +152,7 @@ async def put_file(
     dataset_id: DatasetId,
     path: str,
     request: Request,
-    caller: DatasetWriterHere,
+    caller: DatasetWriter,
     content_length: Annotated[int | None, Header(ge=0)] = None,
     repr_digest: Annotated[str | None, Header(description="`sha-256=:BASE64:`")] = None,
     if_none_match: Annotated[str | None, Header(description="`*` forbids to replace a file.")] = None,
@@ -215,7 +210,7 @@ def _announced_digest(header: str | None) -> str | None:
         }
     },
 )
-async def upload_archive(dataset_id: DatasetId, request: Request, caller: DatasetWriterHere) -> DatasetView:
+async def upload_archive(dataset_id: DatasetId, request: Request, caller: DatasetWriter) -> DatasetView:
     """All files of a zip, tar or tar.gz, as the raw body. Folders that merely wrap everything are dropped.
 
     All or nothing: where one entry is not acceptable, no file is taken.
@@ -242,7 +237,7 @@ async def upload_archive(dataset_id: DatasetId, request: Request, caller: Datase
 )
 async def finalize_dataset(
     dataset_id: DatasetId,
-    caller: DatasetWriterHere,
+    caller: DatasetWriter,
     prefer: Annotated[str, Header(description="`respond-async` answers at once.")] = "",
 ) -> Response:
     """Freezes the files and checks them: poses, intrinsics, names, and every pixel.

@@ -10,13 +10,12 @@ from fastapi.responses import Response
 
 from biresnerf.wire.jobs import ForkJob, JobList, JobView, LogLine, NewExport, job_url
 from biresnerf.wire.problems import FieldProblem
-from biresnerf.wire.results import IMAGE_COLUMNS, ImageList
+from biresnerf.wire.results import IMAGE_COLUMNS, ImageList, ImageRow
 from service.answers.job_answers import POLL_S, checked_key, job_answer
-from service.answers.report_rows import image_rows
-from service.http.access import Caller, CallerHere, JobWriterHere
+from service.http.access import Caller, JobWriter, ReadCaller
 from service.http.dependencies import JobId
 from service.http.problems import ProblemError, declared
-from service.intake.json_body import json_content, read_json
+from service.intake.json_body import json_request, read_json
 from service.routes.artifacts import find_report, whole_file
 from workers.jobs.derived_jobs import DerivedJobs
 
@@ -40,7 +39,7 @@ _LOG: dict[int | str, dict[str, Any]] = {
 )
 async def get_job_log(
     job_id: JobId,
-    caller: CallerHere,
+    caller: ReadCaller,
     after: Annotated[int, Query(ge=0, le=2**31, description="Lines after this one.")] = 0,
     limit: Annotated[int, Query(ge=1, le=10_000)] = 1000,
     form: Annotated[
@@ -76,7 +75,7 @@ def _json_line(line: LogLine) -> str:
 )
 async def list_images(
     job_id: JobId,
-    caller: CallerHere,
+    caller: ReadCaller,
     sort: Annotated[
         str,
         Query(
@@ -95,7 +94,23 @@ async def list_images(
             "invalid_request", detail, errors=[FieldProblem(pointer="/query/sort", detail=detail)]
         )
     report = json.loads(await whole_file(caller, await find_report(caller, job_id)))
-    return image_rows(report, column, descending=sort.startswith("-"), limit=limit)
+    return _image_rows(report, column, descending=sort.startswith("-"), limit=limit)
+
+
+def _image_rows(report: dict[str, Any], column: str, *, descending: bool, limit: int) -> ImageList:
+    """The rows by a column of `IMAGE_COLUMNS`, or in the set's order; what is unknown comes last."""
+    rows = [_row(image) for image in report["images"]]
+    if column:
+        known = [row for row in rows if getattr(row, column) is not None]
+        known.sort(key=lambda row: getattr(row, column), reverse=descending)
+        rows = known + [row for row in rows if getattr(row, column) is None]
+    return ImageList(partial=report["state"] == "partial", items=rows[:limit])
+
+
+def _row(image: dict[str, Any]) -> ImageRow:
+    before, after = image.get("trial_psnr_before"), image.get("trial_psnr_after")
+    gain = after - before if before is not None and after is not None else None
+    return ImageRow.model_validate({**image, "delta_psnr": gain})
 
 
 @router.post(
@@ -103,7 +118,7 @@ async def list_images(
     status_code=202,
     operation_id="forkJob",
     response_model=JobView,
-    openapi_extra={"requestBody": {"content": {"application/json": json_content(ForkJob)}}},
+    openapi_extra=json_request(ForkJob, required=False),
     responses=declared(
         *(
             "fork_not_possible",
@@ -119,19 +134,14 @@ async def list_images(
 async def fork_job(
     job_id: JobId,
     request: Request,
-    caller: JobWriterHere,
+    caller: JobWriter,
     idempotency_key: Annotated[
         str | None, Header(description="The same key with the same request answers with the same job.")
     ] = None,
 ) -> Response:
     """Queues a job on the same dataset with other options, that takes over the work of a stage of this one."""
     key = checked_key(idempotency_key)
-    body = await read_json(
-        request.headers.get("content-type", ""),
-        request.headers.get("content-length"),
-        request.stream(),
-        ForkJob,
-    )
+    body = await read_json(request, ForkJob)
     changes = body.options.model_dump(mode="json", exclude_unset=True)
     job, new = await _derived(caller).fork(
         job_id, changes, body.from_stage, labels=body.labels, idempotency_key=key
@@ -145,7 +155,7 @@ async def fork_job(
     operation_id="exportJob",
     response_model=JobView,
     tags=["results"],
-    openapi_extra={"requestBody": {"content": {"application/json": json_content(NewExport)}}},
+    openapi_extra=json_request(NewExport, required=False),
     responses={
         200: {"model": JobView, "description": "It was asked for before, and is there."},
         **declared(
@@ -159,24 +169,19 @@ async def fork_job(
         ),
     },
 )
-async def export_job(job_id: JobId, request: Request, caller: JobWriterHere) -> Response:
+async def export_job(job_id: JobId, request: Request, caller: JobWriter) -> Response:
     """Writes the result in further forms; its files then stand among those of the job.
 
     The answer is a job of its own, to be followed and cancelled as any other. The same request finds the same
     export.
     """
-    body = await read_json(
-        request.headers.get("content-type", ""),
-        request.headers.get("content-length"),
-        request.stream(),
-        NewExport,
-    )
+    body = await read_json(request, NewExport)
     job, new = await _derived(caller).export(job_id, body.formats)
     return job_answer(job, status=200 if job.final else 202, new=new)
 
 
 @router.get("/exports", operation_id="listExports", tags=["results"], responses=declared(*_ALWAYS))
-async def list_exports(job_id: JobId, caller: CallerHere) -> JobList:
+async def list_exports(job_id: JobId, caller: ReadCaller) -> JobList:
     """All exports of the job, the oldest first."""
     page = await _derived(caller).exports(job_id)
     return JobList(items=page.items)

@@ -11,7 +11,7 @@ from fastapi import APIRouter, Header, Query
 from fastapi.responses import StreamingResponse
 
 from biresnerf.wire.problems import FieldProblem
-from service.http.access import CallerHere
+from service.http.access import ReadCaller
 from service.http.dependencies import JobId
 from service.http.metrics import WebMetrics
 from service.http.problems import ProblemError, declared
@@ -68,7 +68,7 @@ class EventStream(StreamingResponse):
 )
 async def follow_job(
     job_id: JobId,
-    caller: CallerHere,
+    caller: ReadCaller,
     after: Annotated[
         int | None, Query(ge=0, le=2**31, description="Replay what came after this event.")
     ] = None,

@@ -10,7 +10,7 @@ from fastapi.responses import PlainTextResponse, Response
 from biresnerf.wire.problems import FieldProblem
 from biresnerf.wire.service import Health
 from service.http.access import may_scrape
-from service.http.dependencies import Service, ServiceHere
+from service.http.dependencies import CurrentService, Service
 from service.http.metrics import Exposition
 from service.http.problems import ProblemError, declared
 from workers.settings.errors import Unavailable
@@ -32,14 +32,14 @@ async def livez() -> Health:
 
 
 @router.get("/readyz", operation_id="readyz", responses=declared(*_LACKING, "internal_error"))
-async def readyz(service: ServiceHere) -> Health:
+async def readyz(service: CurrentService) -> Health:
     """Database, file storage and queue answer: jobs can be taken. 503 as soon as the service is stopping."""
     await _require_everything(service)
     return Health()
 
 
 @router.get("/startupz", operation_id="startupz", responses=declared(*_LACKING, "internal_error"))
-async def startupz(service: ServiceHere) -> Health:
+async def startupz(service: CurrentService) -> Health:
     """The service has been ready once since its start; from then on `readyz` tells how it is."""
     if not service.started.is_set():
         await _require_everything(service)
@@ -73,7 +73,7 @@ async def _require_everything(service: Service) -> None:
     },
 )
 async def get_metrics(
-    service: ServiceHere,
+    service: CurrentService,
     accept: Annotated[str, Header()] = "",
     authorization: Annotated[
         str, Header(description="`Bearer` and BIRESNERF_METRICS_TOKEN, or an admin key.")

@@ -18,11 +18,11 @@ from service.answers.job_answers import (
     preferred_wait_s,
     waited_for,
 )
-from service.http.access import CallerHere, JobWriterHere
+from service.http.access import JobWriter, ReadCaller
 from service.http.dependencies import JobId, next_link
 from service.http.http_conditionals import none_match
 from service.http.problems import ProblemError, declared
-from service.intake.json_body import json_content, read_json
+from service.intake.json_body import json_content, json_request, read_json
 from service.routes.one_shot import submit_form
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -84,7 +84,7 @@ _BODY = {
 )
 async def submit_job(
     request: Request,
-    caller: JobWriterHere,
+    caller: JobWriter,
     idempotency_key: Annotated[
         str | None, Header(description="The same key with the same request answers with the same job.")
     ] = None,
@@ -102,7 +102,7 @@ async def submit_job(
     if kind == "multipart/form-data":
         job, new = await submit_form(caller, request, idempotency_key)
     elif kind == "application/json":
-        body = await read_json(kind, request.headers.get("content-length"), request.stream(), NewJob)
+        body = await read_json(request, NewJob)
         job, new = await caller.jobs.submit(
             body.dataset_id,
             body.options,
@@ -129,7 +129,7 @@ async def submit_job(
 async def list_jobs(
     request: Request,
     response: Response,
-    caller: CallerHere,
+    caller: ReadCaller,
     state: JobState | None = None,
     label: Annotated[str | None, Query(max_length=201, description="`name:value`")] = None,
     created_after: Annotated[
@@ -167,7 +167,7 @@ def _label(text: str | None) -> tuple[str, str] | None:
 )
 async def get_job(
     job_id: JobId,
-    caller: CallerHere,
+    caller: ReadCaller,
     wait: Annotated[
         float, Query(ge=0, le=60, description="Answer when the job is over, or after so many seconds.")
     ] = 0,
@@ -186,18 +186,17 @@ async def get_job(
     "/{job_id}/cancel",
     operation_id="cancelJob",
     response_model=JobView,
-    openapi_extra={"requestBody": {"content": {"application/json": json_content(CancelJob)}}},
+    openapi_extra=json_request(CancelJob, required=False),
     responses={
         202: {"model": JobView, "description": "Asked for; the job ends within 10 seconds."},
         **declared("not_found", *_JSON, *_WRITES),
     },
 )
-async def cancel_job(job_id: JobId, request: Request, caller: JobWriterHere) -> Response:
+async def cancel_job(job_id: JobId, request: Request, caller: JobWriter) -> Response:
     """Ends a job, with a partial result if the body asks for one. One that is over already stays as it is."""
     body = CancelJob()
     if request.headers.get("content-type"):
-        length = request.headers.get("content-length")
-        body = await read_json(request.headers["content-type"], length, request.stream(), CancelJob)
+        body = await read_json(request, CancelJob)
     job = await caller.jobs.cancel(job_id, keep_partial=body.keep_partial)
     return job_answer(job, status=200 if job.final else 202)
 
@@ -208,6 +207,6 @@ async def cancel_job(job_id: JobId, request: Request, caller: JobWriterHere) -> 
     operation_id="deleteJob",
     responses=declared("not_found", "state_conflict", *_WRITES),
 )
-async def delete_job(job_id: JobId, caller: JobWriterHere) -> None:
+async def delete_job(job_id: JobId, caller: JobWriter) -> None:
     """Deletes a job that is over, with its results and its exports."""
     await caller.jobs.delete(job_id)

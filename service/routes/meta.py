@@ -11,7 +11,7 @@ from biresnerf import __version__
 from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.service import Info, OptionsView, SizeLimits
-from service.http.access import CallerHere
+from service.http.access import ReadCaller
 from service.http.http_conditionals import none_match
 from service.http.problems import declared
 from service.intake.archive_import import RATIO_MAX
@@ -27,7 +27,7 @@ ARCHIVES = ["application/zip", "application/x-tar", "application/gzip"]
     responses={304: {"description": "As you have it."}, **declared("internal_error")},
 )
 async def get_options(
-    response: Response, _: CallerHere, if_none_match: Annotated[str | None, Header()] = None
+    response: Response, _: ReadCaller, if_none_match: Annotated[str | None, Header()] = None
 ) -> OptionsView | Response:
     """JSON Schema of the options, and the presets with every value filled in."""
     view = OptionsView(
@@ -44,7 +44,7 @@ async def get_options(
 
 
 @router.get("/v1/info", operation_id="getInfo", responses=declared("internal_error", "database_unavailable"))
-async def get_info(caller: CallerHere) -> Info:
+async def get_info(caller: ReadCaller) -> Info:
     """Version and limits of this service, your share of it, and how many of your jobs are in each state."""
     limits = {
         name: getattr(caller.service.settings, name)

@@ -14,7 +14,7 @@ from service.http.access import Caller
 from service.http.problems import ProblemError
 from service.intake.archive_import import file_sha256, take_archive
 from service.intake.dataset_finalize import begin_check, finish_check
-from service.intake.json_body import fit, load_json
+from service.intake.json_body import load_json, validate
 from service.intake.uploads import Form, refuse_announced_excess, staging_folder
 from workers.settings.errors import EngineError
 from workers.webhooks.webhooks import request_with
@@ -93,6 +93,6 @@ async def _make_job(
 
 
 def _texts(form: Form) -> JobTexts:
-    said = {name: text.strip() for name, text in form.texts.items() if text.strip()}
-    values = {name: text if name == PLAIN else load_json(text) for name, text in said.items()}
-    return fit(values, JobTexts)
+    given = {name: text.strip() for name, text in form.texts.items() if text.strip()}
+    values = {name: text if name == PLAIN else load_json(text) for name, text in given.items()}
+    return validate(values, JobTexts)

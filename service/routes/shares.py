@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import hmac
 import time
 from datetime import UTC, datetime
 from typing import Annotated
@@ -12,23 +15,15 @@ from fastapi.responses import Response, StreamingResponse
 
 from biresnerf.wire.results import NewShare, ShareView
 from service.answers.downloads import ANSWERS, Asked, answer_with, find_artifact
-from service.answers.share_links import require_signature, signature
-from service.http.access import JobWriterHere
-from service.http.dependencies import JobId, ServiceHere
-from service.http.problems import declared
-from service.intake.json_body import json_content, read_json
+from service.http.access import JobWriter
+from service.http.dependencies import CurrentService, JobId
+from service.http.problems import ProblemError, declared
+from service.intake.json_body import body_of, json_request
 
 _POST = (
     *("malformed_json", "body_too_large", "unsupported_media", "body_timeout", "invalid_request"),
     *("not_found", "cross_site", "database_unavailable", "internal_error"),
 )
-
-
-async def _new_share(request: Request) -> NewShare:
-    headers = request.headers
-    return await read_json(
-        headers.get("content-type", ""), headers.get("content-length"), request.stream(), NewShare
-    )
 
 
 router = APIRouter(prefix="/v1", tags=["results"])
@@ -39,20 +34,18 @@ router = APIRouter(prefix="/v1", tags=["results"])
     status_code=201,
     operation_id="shareArtifact",
     responses=declared(*_POST),
-    openapi_extra={
-        "requestBody": {"required": True, "content": {"application/json": json_content(NewShare)}}
-    },
+    openapi_extra=json_request(NewShare),
 )
 async def share_artifact(
     job_id: JobId,
-    caller: JobWriterHere,  # the link outlives the key that made it
-    body: Annotated[NewShare, Depends(_new_share)],
+    caller: JobWriter,  # the link outlives the key that made it
+    body: Annotated[NewShare, Depends(body_of(NewShare))],
     response: Response,
 ) -> ShareView:
     """A link to one file that needs no key and is good for a time. Whoever has the link has the file."""
     artifact = await find_artifact(caller.jobs, job_id, body.name)
     expires = int(time.time()) + body.valid_s
-    signed = signature(caller.service.stores.share_key, job_id, artifact.name, expires)
+    signed = _signature(caller.service.stores.share_key, job_id, artifact.name, expires)
     href = f"/v1/shared/{quote(job_id, safe='')}/{quote(artifact.name)}?expires={expires}&signature={signed}"
     response.headers["Location"] = href
     return ShareView(name=artifact.name, href=href, expires_at=datetime.fromtimestamp(expires, UTC))
@@ -76,10 +69,25 @@ async def get_shared(
     expires: Annotated[int, Query(ge=0, lt=2**40)],
     signed: Annotated[str, Query(alias="signature", max_length=100)],
     request: Request,
-    service: ServiceHere,
+    service: CurrentService,
     asked: Asked,
 ) -> Response:
     """The file of a link made by `POST /v1/jobs/{id}/shares`. Needs no key."""
-    require_signature(service.stores.share_key, job_id, name, expires, signed)
+    _require_signature(service.stores.share_key, job_id, name, expires, signed)
     artifact = await find_artifact(service.stores.jobs, job_id, name)
     return await answer_with(service, artifact, asked, reading=request.method == "GET")
+
+
+def _signature(key: bytes, job_id: str, name: str, expires: int) -> str:
+    """What only a holder of ``key`` can make for this file and time."""
+    message = "\n".join(["biresnerf share 1", job_id, str(expires), name]).encode()
+    return base64.urlsafe_b64encode(hmac.digest(key, message, hashlib.sha256)).decode().rstrip("=")
+
+
+def _require_signature(key: bytes, job_id: str, name: str, expires: int, given: str) -> None:
+    """Raises ``ProblemError``: ``not_found`` for a link we never made, ``link_expired`` for an old one."""
+    made = _signature(key, job_id, name, expires)
+    if not hmac.compare_digest(made.encode(), given.encode(errors="replace")):
+        raise ProblemError("not_found", "This service never gave out such a link.")
+    if expires < time.time():
+        raise ProblemError("link_expired", "The link was good for a time, which is over.")

@@ -4,27 +4,20 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Depends
 
 from biresnerf.wire.datasets import FileView, NewSignedUploads, SignedUpload, SignedUploads
 from biresnerf.wire.safe_paths import checked_path
-from service.http.access import Caller, DatasetWriterHere
+from service.http.access import Caller, DatasetWriter
 from service.http.dependencies import DatasetId, UploadId
 from service.http.problems import ProblemError, declared
-from service.intake.json_body import json_content, read_json
+from service.intake.json_body import body_of, json_request
 from workers.records import Upload
 from workers.settings.errors import NotFound
 
 router = APIRouter(prefix="/v1", tags=["uploads"])
 _BODY = ("malformed_json", "unsupported_media", "body_timeout", "invalid_request")
 _ALWAYS = ("not_found", "cross_site", "database_unavailable", "storage_unavailable", "internal_error")
-
-
-async def _new_uploads(request: Request) -> NewSignedUploads:
-    headers = request.headers
-    return await read_json(
-        headers.get("content-type", ""), headers.get("content-length"), request.stream(), NewSignedUploads
-    )
 
 
 @router.post(
@@ -35,12 +28,12 @@ async def _new_uploads(request: Request) -> NewSignedUploads:
         *("direct_upload_unavailable", "dataset_not_open", "body_too_large", "too_many_files"),
         *("unsafe_path", "quota_exhausted", *_BODY, *_ALWAYS),
     ),
-    openapi_extra={
-        "requestBody": {"required": True, "content": {"application/json": json_content(NewSignedUploads)}}
-    },
+    openapi_extra=json_request(NewSignedUploads),
 )
 async def sign_uploads(
-    dataset_id: DatasetId, caller: DatasetWriterHere, body: Annotated[NewSignedUploads, Depends(_new_uploads)]
+    dataset_id: DatasetId,
+    caller: DatasetWriter,
+    body: Annotated[NewSignedUploads, Depends(body_of(NewSignedUploads))],
 ) -> SignedUploads:
     """An address at the store for each file. `PUT` the bytes there, then `POST …/complete` the upload here."""
     await caller.datasets.get(dataset_id)
@@ -80,7 +73,7 @@ def _key(upload: Upload) -> str:
         *("body_too_large", "too_many_files", "quota_exhausted", *_ALWAYS),
     ),
 )
-async def complete_upload(upload_id: UploadId, caller: DatasetWriterHere) -> FileView:
+async def complete_upload(upload_id: UploadId, caller: DatasetWriter) -> FileView:
     """Verifies size and SHA-256 of what arrived at the store; only then it is a file of the dataset.
 
     Where they are others (422), the bytes can be sent again. The same request again changes nothing.

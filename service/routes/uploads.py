@@ -18,7 +18,7 @@ from fastapi.responses import JSONResponse, Response
 
 from biresnerf.wire.datasets import UploadView, upload_url
 from biresnerf.wire.safe_paths import checked_path
-from service.http.access import CallerHere, DatasetWriterHere
+from service.http.access import DatasetWriter, ReadCaller
 from service.http.dependencies import DatasetId, UploadId
 from service.http.problems import ProblemError, declared
 from service.intake.archive_import import begin_taking
@@ -70,7 +70,7 @@ def _where(upload: Upload) -> dict[str, str]:
     operation_id="describeUploads",
     responses=declared("not_found", "internal_error"),
 )
-async def describe_uploads(dataset_id: DatasetId, caller: CallerHere) -> Response:
+async def describe_uploads(dataset_id: DatasetId, caller: ReadCaller) -> Response:
     """What of the tus protocol is spoken here."""
     headers = {
         "Tus-Version": VERSION,
@@ -93,7 +93,7 @@ async def describe_uploads(dataset_id: DatasetId, caller: CallerHere) -> Respons
 )
 async def create_upload(
     dataset_id: DatasetId,
-    caller: DatasetWriterHere,
+    caller: DatasetWriter,
     upload_length: Annotated[int, Header(ge=0, lt=2**62, description="Bytes that are going to be sent.")],
     upload_metadata: Annotated[str, Header(description=_METADATA, max_length=8192)] = "",
 ) -> Response:
@@ -135,13 +135,13 @@ def _metadata(header: str) -> dict[str, str]:
     responses=declared("not_found", *_ALWAYS),
     dependencies=[SameVersion],
 )
-async def head_upload(upload_id: UploadId, caller: CallerHere) -> Response:
+async def head_upload(upload_id: UploadId, caller: ReadCaller) -> Response:
     """At which byte the upload goes on (`Upload-Offset`)."""
     return Response(status_code=200, headers=_where(await caller.uploads.get(upload_id)))
 
 
 @router.get("/uploads/{upload_id}", operation_id="getUpload", responses=declared("not_found", *_ALWAYS))
-async def get_upload(upload_id: UploadId, caller: CallerHere) -> UploadView:
+async def get_upload(upload_id: UploadId, caller: ReadCaller) -> UploadView:
     """How far the upload is, and once all is received, what became of it (`stored` or `rejected`)."""
     return await caller.uploads.get(upload_id)
 
@@ -168,7 +168,7 @@ _APPENDS: dict[str, Any] = {
 async def append_upload(
     upload_id: UploadId,
     request: Request,
-    caller: DatasetWriterHere,
+    caller: DatasetWriter,
     upload_offset: Annotated[int, Header(ge=0, lt=2**62, description="Number of the first byte sent.")],
 ) -> Response:
     """The next bytes. What arrived is kept however the connection ends; `HEAD` says how much that is.
@@ -197,6 +197,6 @@ async def append_upload(
     responses=declared("not_found", "cross_site", *_ALWAYS),
     dependencies=[SameVersion],
 )
-async def delete_upload(upload_id: UploadId, caller: DatasetWriterHere) -> None:
+async def delete_upload(upload_id: UploadId, caller: DatasetWriter) -> None:
     """Gives the upload up. What it has brought into the dataset already stays there."""
     await caller.uploads.delete(upload_id)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
@@ -17,10 +17,10 @@ from biresnerf.wire.webhooks import (
     delivery_path,
     webhook_url,
 )
-from service.http.access import CallerHere, JobWriterHere
+from service.http.access import JobWriter, ReadCaller
 from service.http.dependencies import DeliveryId, WebhookId, next_link
 from service.http.problems import declared
-from service.intake.json_body import json_content, read_json
+from service.intake.json_body import body_of, json_request
 
 router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 _ALWAYS = ("database_unavailable", "internal_error")
@@ -28,33 +28,15 @@ _WRITES = ("cross_site", *_ALWAYS)
 _BODY = ("malformed_json", "body_too_large", "unsupported_media", "body_timeout", "invalid_request")
 
 
-async def _new(request: Request) -> NewWebhook:
-    headers = request.headers
-    return await read_json(
-        headers.get("content-type", ""), headers.get("content-length"), request.stream(), NewWebhook
-    )
-
-
-async def _change(request: Request) -> WebhookChange:
-    headers = request.headers
-    return await read_json(
-        headers.get("content-type", ""), headers.get("content-length"), request.stream(), WebhookChange
-    )
-
-
-def _body_of(model: type[NewWebhook] | type[WebhookChange]) -> dict[str, Any]:
-    return {"requestBody": {"required": True, "content": {"application/json": json_content(model)}}}
-
-
 @router.post(
     "",
     status_code=201,
     operation_id="createWebhook",
-    openapi_extra=_body_of(NewWebhook),
+    openapi_extra=json_request(NewWebhook),
     responses=declared(*_BODY, "webhook_url_refused", "too_many_webhooks", *_WRITES),
 )
 async def create_webhook(
-    caller: JobWriterHere, body: Annotated[NewWebhook, Depends(_new)], response: Response
+    caller: JobWriter, body: Annotated[NewWebhook, Depends(body_of(NewWebhook))], response: Response
 ) -> WebhookWithSecret:
     """A webhook for all jobs and datasets. The secret in the answer is not told again."""
     webhook, secret = await caller.webhooks.create(caller.tenant, body.url, body.events, body.description)
@@ -66,7 +48,7 @@ async def create_webhook(
 async def list_webhooks(
     request: Request,
     response: Response,
-    caller: CallerHere,
+    caller: ReadCaller,
     job: Annotated[
         str | None, Query(max_length=100, pattern="^[0-9A-Za-z_]*$", description="Those of this job alone.")
     ] = None,
@@ -80,7 +62,7 @@ async def list_webhooks(
 
 
 @router.get("/{webhook_id}", operation_id="getWebhook", responses=declared("not_found", *_ALWAYS))
-async def get_webhook(webhook_id: WebhookId, caller: CallerHere) -> WebhookView:
+async def get_webhook(webhook_id: WebhookId, caller: ReadCaller) -> WebhookView:
     """The webhook, and whether it works."""
     return await caller.webhooks.get(webhook_id)
 
@@ -88,11 +70,11 @@ async def get_webhook(webhook_id: WebhookId, caller: CallerHere) -> WebhookView:
 @router.patch(
     "/{webhook_id}",
     operation_id="changeWebhook",
-    openapi_extra=_body_of(WebhookChange),
+    openapi_extra=json_request(WebhookChange),
     responses=declared("not_found", *_BODY, "webhook_url_refused", *_WRITES),
 )
 async def change_webhook(
-    caller: JobWriterHere, webhook_id: WebhookId, body: Annotated[WebhookChange, Depends(_change)]
+    caller: JobWriter, webhook_id: WebhookId, body: Annotated[WebhookChange, Depends(body_of(WebhookChange))]
 ) -> WebhookView:
     """Changes what is given; switches it off or on again."""
     return await caller.webhooks.change(webhook_id, **body.model_dump())
@@ -104,7 +86,7 @@ async def change_webhook(
     operation_id="deleteWebhook",
     responses=declared("not_found", *_WRITES),
 )
-async def delete_webhook(webhook_id: WebhookId, caller: JobWriterHere) -> None:
+async def delete_webhook(webhook_id: WebhookId, caller: JobWriter) -> None:
     """Deletes it with its deliveries; what waits is not sent."""
     await caller.webhooks.delete(webhook_id)
 
@@ -112,7 +94,7 @@ async def delete_webhook(webhook_id: WebhookId, caller: JobWriterHere) -> None:
 @router.post(
     "/{webhook_id}/secret", operation_id="rotateWebhookSecret", responses=declared("not_found", *_WRITES)
 )
-async def rotate_secret(webhook_id: WebhookId, caller: JobWriterHere) -> WebhookWithSecret:
+async def rotate_secret(webhook_id: WebhookId, caller: JobWriter) -> WebhookWithSecret:
     """A new secret. For 24 hours messages are signed with the one before too."""
     webhook, secret = await caller.webhooks.rotate(webhook_id)
     return WebhookWithSecret(**dict(webhook), secret=secret)
@@ -124,7 +106,7 @@ async def rotate_secret(webhook_id: WebhookId, caller: JobWriterHere) -> Webhook
     operation_id="testWebhook",
     responses=declared("not_found", "state_conflict", *_WRITES),
 )
-async def test_webhook(webhook_id: WebhookId, caller: JobWriterHere, response: Response) -> DeliveryView:
+async def test_webhook(webhook_id: WebhookId, caller: JobWriter, response: Response) -> DeliveryView:
     """Sends a message `webhook.test`; the delivery at `Location` tells what came of it."""
     delivery = await caller.webhooks.test(webhook_id)
     response.headers["Location"] = delivery_path(delivery.webhook_id, delivery.id)
@@ -140,7 +122,7 @@ async def list_deliveries(
     webhook_id: WebhookId,
     request: Request,
     response: Response,
-    caller: CallerHere,
+    caller: ReadCaller,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     cursor: Annotated[str | None, Query(max_length=500)] = None,
 ) -> DeliveryList:
@@ -155,7 +137,7 @@ async def list_deliveries(
     operation_id="getDelivery",
     responses=declared("not_found", *_ALWAYS),
 )
-async def get_delivery(webhook_id: WebhookId, delivery_id: DeliveryId, caller: CallerHere) -> DeliveryView:
+async def get_delivery(webhook_id: WebhookId, delivery_id: DeliveryId, caller: ReadCaller) -> DeliveryView:
     """One message and its attempts."""
     return await caller.webhooks.delivery(webhook_id, delivery_id)
 
@@ -166,6 +148,6 @@ async def get_delivery(webhook_id: WebhookId, delivery_id: DeliveryId, caller: C
     operation_id="redeliver",
     responses=declared("not_found", "state_conflict", *_WRITES),
 )
-async def redeliver(webhook_id: WebhookId, delivery_id: DeliveryId, caller: JobWriterHere) -> DeliveryView:
+async def redeliver(webhook_id: WebhookId, delivery_id: DeliveryId, caller: JobWriter) -> DeliveryView:
     """Sends a message again at once, under the id it had, so that a receiver can tell."""
     return await caller.webhooks.redeliver(webhook_id, delivery_id)
