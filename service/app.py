@@ -1,4 +1,4 @@
-"""The web application: routes put together, the engine opened once, every error told as a problem."""
+"""The web application: its routes, the engine for its lifetime, and a problem for every error."""
 
 from __future__ import annotations
 
@@ -55,11 +55,10 @@ _ROUTERS = [module.router for module in (*_RESOURCES, meta, health, docs_page, w
 _DESCRIPTION = """
 Refines the camera poses of an image set.
 
-1. `POST /v1/datasets`, with a manifest to learn what has to be sent; then `PUT …/files/{path}` for each file,
-   or `POST …/archive` for all, or `POST …/uploads` for what should survive broken connections; then
-   `POST …/finalize`.
+1. `POST /v1/datasets`, with a manifest to learn which files to send; then `PUT …/files/{path}` for each file,
+   `POST …/archive` for all of them, or `POST …/uploads` for resumable uploads; then `POST …/finalize`.
 2. `POST /v1/jobs` with the dataset's id (or one multipart request with an archive does both).
-3. `GET /v1/jobs/{id}` or its event stream tells how far it is.
+3. `GET /v1/jobs/{id}` or its event stream reports the progress.
 4. `GET /v1/jobs/{id}/artifacts` lists the refined poses, the report and the renders.
 
 Every error is `application/problem+json` (RFC 9457) with a stable `code`.
@@ -79,8 +78,8 @@ def create_app(settings: Settings) -> FastAPI:
             swept = await asyncio.to_thread(sweep_staging, service.staging_dir)
             if swept:
                 logger.info("removed %d unfinished uploads", swept)
-            service.keep_running(asyncio.create_task(_check_unfinished(service)))
-            service.keep_running(asyncio.create_task(_tend_uploads(service)))
+            service.keep_running(asyncio.create_task(_finish_checks(service)))
+            service.keep_running(asyncio.create_task(_finish_uploads(service)))
             await log_access(service)
             try:
                 yield
@@ -105,7 +104,7 @@ def create_app(settings: Settings) -> FastAPI:
         telemetry={"metrics": False, "logs": False, "operation_spans": False, "exclude": is_probe},
     )
     app.add_middleware(Access, settings=settings)
-    app.add_middleware(RequestContext)  # it tells what Access refuses
+    app.add_middleware(RequestContext)  # it responds to what Access refuses
     app.add_middleware(Observed, metrics=metrics)
     _answer_with_problems(app)
     for router in _ROUTERS:
@@ -114,48 +113,48 @@ def create_app(settings: Settings) -> FastAPI:
     return app
 
 
-async def _check_unfinished(service: Service) -> None:
-    """Checks that another process began, or should have, and will not end: it was killed, here or elsewhere."""
+async def _finish_checks(service: Service) -> None:
+    """Finishes checks whose process was killed."""
     while True:
         try:
             for dataset_id in await service.stores.datasets.unfinished():
                 with contextlib.suppress(NotFound):  # deleted meanwhile
                     await service.stores.datasets.check(dataset_id)
         except Unavailable as error:
-            logger.warning("unfinished checks wait: %s", error.detail)
+            logger.warning("unfinished checks are waiting: %s", error.detail)
         except Exception:
-            logger.exception("a check failed on our side; it is tried again")
+            logger.exception("a check failed; it will be retried")
         await asyncio.sleep(_UNFINISHED_EVERY_S)
 
 
-async def _tend_uploads(service: Service) -> None:
-    """Brings in what another process received and will not bring in; gives up what does not go on."""
+async def _finish_uploads(service: Service) -> None:
+    """Finishes uploads that another process received but did not store; deletes those that expired."""
     while True:
         try:
             for upload_id in await service.stores.uploads.untaken():
                 await take_upload(service, upload_id)
             await service.stores.uploads.expire()
         except Unavailable as error:
-            logger.warning("received uploads wait: %s", error.detail)
+            logger.warning("received uploads are waiting: %s", error.detail)
         except Exception:
-            logger.exception("an upload was not brought in on our side; it is tried again")
+            logger.exception("an upload could not be stored; it will be retried")
         await asyncio.sleep(_UNFINISHED_EVERY_S)
 
 
 def _answer_with_problems(app: FastAPI) -> None:
     async def problem(request: Request, error: Exception) -> Response:
-        told = _as_problem(error)
-        if told.code == "method_not_allowed":
+        answer = _as_problem(error)
+        if answer.code == "method_not_allowed":
             # The framework names the methods of the first route at this path only.
-            told.headers["Allow"] = ", ".join(_methods_at(request))
-        return render(told, request)
+            answer.headers["Allow"] = ", ".join(_methods_at(request))
+        return render(answer, request)
 
     for kind in (FaultError, RequestValidationError, HTTPException):
         app.add_exception_handler(kind, problem)
 
 
 def _methods_at(request: Request) -> list[str]:
-    """All methods that the request's path answers."""
+    """All methods of the request's path."""
     path: str = request.scope["path"]
     found: set[str] = set()
     for router in _ROUTERS:
@@ -179,7 +178,7 @@ def _from_http_exception(error: HTTPException) -> ProblemError:
     codes = {404: "not_found", 405: "method_not_allowed", 413: "body_too_large", 415: "unsupported_media"}
     code = codes.get(error.status_code, "malformed_body" if error.status_code < 500 else "internal_error")
     detail = {
-        "not_found": "Nothing is at this address.",
-        "method_not_allowed": "This address answers other methods; the Allow header names them.",
+        "not_found": "There is nothing at this address.",
+        "method_not_allowed": "This address supports other methods; see the Allow header.",
     }.get(code, str(error.detail))
     return ProblemError(code, detail, headers=dict(error.headers or {}))

@@ -1,1 +1,1 @@
-"""What goes over the wire between a service and its clients, defined once for both. Needs pydantic alone."""
+"""The messages between the service and its clients, defined once for both. Needs pydantic only."""

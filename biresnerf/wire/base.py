@@ -1,4 +1,4 @@
-"""What every message between clients and the service is made of."""
+"""The base of all messages between clients and the service."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 
 class Record(BaseModel):
-    """Base of everything that crosses a process border."""
+    """Base of every message."""
 
-    # A message holds every field, those with a default too: the schemas of answers call them required.
+    # Responses contain every field, those with a default too, so their schemas call all fields required.
     model_config = ConfigDict(frozen=True, extra="forbid", json_schema_serialization_defaults_required=True)
 
 

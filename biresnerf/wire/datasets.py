@@ -1,4 +1,4 @@
-"""Datasets, their files, and the uploads that bring those."""
+"""Datasets, their files, and uploads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UploadState = Literal["receiving", "received", "stored", "rejected"]
 
 
 class ManifestEntry(Record):
-    """A file the client says it is going to send."""
+    """A file that the client is going to send."""
 
     path: str
     size: int | None = Field(None, ge=0, lt=2**53)
@@ -44,7 +44,7 @@ class CheckReport(Record):
 
 
 class DatasetLinks(Record):
-    """Where the parts of a dataset are."""
+    """Paths of the parts of a dataset."""
 
     self: str
     files: str
@@ -63,17 +63,20 @@ class DatasetView(Record):
     """A set of uploaded files."""
 
     id: str = Field(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
-    tenant: str = Field("local", description="Whose it is.")
+    tenant: str = Field("local", description="The owner.")
     name: str = Field(examples=["kitchen"])
     state: DatasetState = Field(examples=["ready"])
     files: int = Field(0, examples=[61])
     bytes: int = Field(0, examples=[48_211_034])
     missing: tuple[str, ...] = Field((), description="Manifest paths not received yet.")
-    report: CheckReport | None = Field(None, description="What its check found; none unless it is ready.")
+    report: CheckReport | None = Field(
+        None, description="What the check found; null unless the dataset is ready."
+    )
     error: JobError | None = Field(None, examples=[None])
     created_at: datetime
     expires_at: datetime | None = Field(
-        None, description="When its files go unless it is used; none while a job uses it, or never."
+        None,
+        description="When its files are deleted unless it is used; null while a job uses it, or if they are kept.",
     )
     revision: int = Field(0, examples=[63])
     links: DatasetLinks = Field(default_factory=DatasetLinks.of)
@@ -97,7 +100,7 @@ class NewDataset(Record):
     manifest: list[ManifestEntry] = Field(
         default=[],
         max_length=100_000,
-        description="What is going to be sent; the answer lists what is missing.",
+        description="The files that will be sent; the response lists those that are missing.",
     )
 
 
@@ -118,7 +121,7 @@ class FileList(Record):
 
 
 class UploadView(Record):
-    """Bytes on their way into a dataset."""
+    """An upload into a dataset."""
 
     id: str = Field(examples=["up_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
     dataset_id: str = Field(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
@@ -128,15 +131,15 @@ class UploadView(Record):
     sha256: str | None = None
     state: UploadState
     received: int = Field(
-        examples=[16_777_216], description="Bytes that are safe; the next byte to send has this number."
+        examples=[16_777_216], description="Bytes received and stored: the offset of the next byte to send."
     )
     error: JobError | None = Field(None, examples=[None], description="Why it was rejected.")
     created_at: datetime
-    expires_at: datetime = Field(description="It is given up then, unless it goes on.")
+    expires_at: datetime = Field(description="When it is deleted if no more bytes arrive.")
 
 
 class FileToSend(Record):
-    """A file that the client is going to send to the store itself."""
+    """A file that the client will send directly to the store."""
 
     path: str = Field(max_length=4096)
     size: int = Field(ge=0)
@@ -144,7 +147,7 @@ class FileToSend(Record):
 
 
 class NewSignedUploads(Record):
-    """Files to send to the store itself."""
+    """Files to send directly to the store."""
 
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"files": [{"path": "a.jpg", "size": 12, "sha256": "0" * 64}]}]}
@@ -154,14 +157,14 @@ class NewSignedUploads(Record):
 
 
 class SignedUpload(Record):
-    """Where to send one file: the bytes as the body of a PUT, without a key."""
+    """Where to send one file: PUT its bytes there; no key is needed."""
 
     upload: UploadView
     url: str = Field(examples=["https://s3.example.org/bucket/datasets/…/content?X-Amz-Signature=…"])
 
 
 class SignedUploads(Record):
-    """The addresses, in the order of the files."""
+    """The signed URLs, in the order of the files."""
 
     items: list[SignedUpload]
 

@@ -1,4 +1,4 @@
-"""Jobs: how they are, what happens to them, and what is sent to make, fork, end and export them."""
+"""Jobs, their history, and the requests to submit, fork, cancel and export them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ WantedStage = Literal["auto", "seeding", "coarse"]
 
 
 class JobProgress(Record):
-    """How far the running attempt is. ``fraction`` never falls within one attempt."""
+    """Progress of the running attempt. ``fraction`` never decreases within an attempt."""
 
     fraction: float = Field(0.0, examples=[0.31], ge=0.0, le=1.0)
     step: int = Field(0, examples=[620])
@@ -50,7 +50,7 @@ class JobProgress(Record):
 
 
 class JobLinks(Record):
-    """Where the parts of a job are."""
+    """Paths of the parts of a job."""
 
     self: str
     dataset: str
@@ -74,27 +74,29 @@ class JobLinks(Record):
 
 
 class JobView(Record):
-    """A job as clients see it. ``revision`` grows with every change (use it as a weak ETag)."""
+    """A job. ``revision`` grows with every change (use it as a weak ETag)."""
 
     id: str = Field(examples=["job_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
-    tenant: str = Field("local", description="Whose it is.")
+    tenant: str = Field("local", description="The owner.")
     kind: JobKind = Field("refine", description="`export` writes the result of `parent` in further forms.")
-    parent: str | None = Field(None, description="Of an export: the job whose result it writes.")
-    forked_from: str | None = Field(None, description="The job that this one started from.")
-    forked_stage: ReusableStage | None = Field(None, description="Whose work of that job it took over.")
+    parent: str | None = Field(None, description="The job whose result an export writes.")
+    forked_from: str | None = Field(None, description="The job that this one was forked from.")
+    forked_stage: ReusableStage | None = Field(
+        None, description="The stage of that job whose result was reused."
+    )
     dataset_id: str = Field(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
     state: JobState = Field(examples=["running"])
     stage: Stage | None = Field(None, examples=["coarse"])
     progress: JobProgress = JobProgress()
     priority: PriorityName = "normal"
-    queue_position: int | None = Field(None, description="1 is next; none unless queued.")
+    queue_position: int | None = Field(None, description="1 is next; null unless queued.")
     attempt: int = Field(0, examples=[1])
     cancel_requested: bool = False
     created_at: datetime
     started_at: datetime | None = None
     finished_at: datetime | None = None
     expires_at: datetime | None = Field(
-        None, description="When its files go, once it is over; none where they are kept for ever."
+        None, description="When its files are deleted; null until the job has ended, or if they are kept."
     )
     options: dict[str, Any] = Field(
         examples=[{"preset": "fast"}], description="RefineOptions as requested; of an export, its formats."
@@ -106,20 +108,22 @@ class JobView(Record):
         "the worker's device. Null until the job runs.",
     )
     smaller: dict[str, Any] = Field(
-        {}, description="Options that a second try uses instead, after the first ran out of memory."
+        {},
+        description="Options that replace the original ones in the retry after the first attempt ran out of memory.",
     )
     partial: bool = Field(
-        False, description="The files are those of a job that was stopped: its best poses until then."
+        False, description="The files are from a job that was stopped: its best poses so far."
     )
     metrics: dict[str, float] = Field({}, examples=[{"loss": 0.012, "psnr": 19.2}])
     message: str = ""
     verdict: VerdictName | None = Field(
         None,
-        description="Whether refinement helped, once the job has succeeded; the report has the evidence.",
+        description="Whether refinement helped; set once the job has succeeded. The report has the evidence.",
     )
     error: JobError | None = Field(None, examples=[None])
     thumbnail: str | None = Field(
-        None, description="The artifact that is a small picture of it; while it runs, the latest preview's."
+        None,
+        description="The artifact with a small picture of the result, or of the latest preview while the job runs.",
     )
     labels: dict[str, str] = Field({}, examples=[{"run": "a"}])
     revision: int = Field(0, examples=[17])
@@ -127,7 +131,7 @@ class JobView(Record):
 
     @property
     def final(self) -> bool:
-        """Nothing will change any more."""
+        """Whether the job has ended."""
         return self.state in FINAL_JOB_STATES
 
 
@@ -158,7 +162,7 @@ class JobList(Record):
 
 
 class JobTexts(Record):
-    """What may be asked of a job besides its input; the text fields of the one-shot form."""
+    """The options of a new job besides its input; also the text fields of the one-shot form."""
 
     options: RefineOptions = RefineOptions()
     labels: Labels = Field({})
@@ -183,29 +187,29 @@ class NewJob(JobTexts):
 
 
 class CancelJob(Record):
-    """How a job is to end."""
+    """A request to cancel a job."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"keep_partial": True}]})
 
     keep_partial: bool = Field(
         False,
-        description="Publish the best poses so far, with a report whose state is `partial`; else only the log.",
+        description="Publish the best poses so far, with a report in state `partial`; otherwise only the log.",
     )
 
 
 class ForkJob(Record):
-    """What is to be different in a job that takes over the work of another."""
+    """The changes in a job that reuses the work of another."""
 
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"options": {"warmup_steps": 200}, "from_stage": "coarse"}]}
     )
 
     options: RefineOptions = Field(
-        RefineOptions(), description="Those to be different; all others stay as they were asked for."
+        RefineOptions(), description="Options to change; all others stay as requested for the original job."
     )
     from_stage: WantedStage = Field(
         "auto",
-        description="Whose work is taken over: COLMAP's answer (`seeding`), poses and field at the end of stage 1 "
+        description="Which stage's result is reused: COLMAP's poses (`seeding`), poses and field at the end of stage 1 "
         "(`coarse`), or the latest that the options allow.",
     )
     labels: Labels = Field(default_factory=dict)

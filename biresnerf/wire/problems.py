@@ -1,4 +1,4 @@
-"""An error as the service tells it (RFC 9457), and what went wrong with a job or a dataset."""
+"""The errors of responses (RFC 9457), and those of jobs, uploads and datasets."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ class FieldProblem(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     pointer: str = Field(
-        description="JSON pointer into the body (`#/options/steps`), or `query/limit` and the like."
+        description="JSON pointer into the body (`#/options/steps`), or a place such as `query/limit`."
     )
     detail: str
 
 
 class Problem(Fault):
-    """An error as RFC 9457 has it, with a stable `code`."""
+    """An error response after RFC 9457, with a stable `code`."""
 
     type: str = Field(examples=["urn:biresnerf:problem:unsafe_path"])
     title: str = Field(examples=["A file name is not safe"])

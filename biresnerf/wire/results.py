@@ -1,4 +1,4 @@
-"""What a job leaves behind: files, links to them, and a row for each image."""
+"""The result of a job: its files, links to them, and a row per image."""
 
 from __future__ import annotations
 
@@ -23,11 +23,9 @@ class ResultFile(Record):
 
 
 class ArtifactView(ResultFile):
-    """One file of a result, and where it is."""
+    """One file of a result, with its path."""
 
-    preview: bool = Field(
-        False, description="It shows a job that is not over; another one will take its place."
-    )
+    preview: bool = Field(False, description="A preview of a running job; the next one replaces it.")
     href: str = Field(examples=["/v1/jobs/job_01JD8Y3V1QKZ5M0C7W2N4T6XAB/artifacts/transforms.json"])
 
 
@@ -38,7 +36,7 @@ class ArtifactList(Record):
 
 
 class ImageRow(ImageReport):
-    """One image, and how much better its photo was predicted from the refined poses."""
+    """The report of one image, with the change of its PSNR."""
 
     delta_psnr: float | None = Field(
         None, examples=[3.5], description="trial_psnr_after - trial_psnr_before."
@@ -48,7 +46,7 @@ class ImageRow(ImageReport):
 class ImageList(Record):
     """The images of a result."""
 
-    partial: bool = Field(description="The job was stopped before its end.")
+    partial: bool = Field(description="The job was stopped before it was complete.")
     items: list[ImageRow]
 
 
@@ -56,16 +54,16 @@ IMAGE_COLUMNS = frozenset(ImageRow.model_fields) - {"exposure"}
 
 
 class NewShare(Record):
-    """A link to make."""
+    """A link to create."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"name": "transforms.json", "valid_s": 3600}]})
 
-    name: str = Field(max_length=1000, description="The file, as the list of artifacts names it.")
-    valid_s: int = Field(3600, ge=1, le=30 * 86_400, description="How long the link is good.")
+    name: str = Field(max_length=1000, description="The name of the file in the list of artifacts.")
+    valid_s: int = Field(3600, ge=1, le=30 * 86_400, description="How long the link is valid.")
 
 
 class ShareView(Record):
-    """A link to one file that needs no key."""
+    """A link to one file; it needs no API key."""
 
     name: str = Field(examples=["transforms.json"])
     href: str = Field(

@@ -1,4 +1,4 @@
-"""Which file names a client may send, and the set of names one dataset may hold."""
+"""Which file names clients may send, and which names may stand together in one dataset."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ PART_BYTES_MAX = 255
 PATH_BYTES_MAX = 1024
 DEPTH_MAX = 16
 _DRIVE = re.compile(r"^[A-Za-z]:")
-_MEND = "Use relative names with forward slashes, such as images/0001.png."
-# Devices on Windows, whatever follows the dot: a file of that name could not be unpacked there.
+_HINT = "Use relative names with forward slashes, such as images/0001.png."
+# Device names on Windows, with any extension: such a file cannot be unpacked there.
 _DEVICE = re.compile(r"^(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³])(\..*)?$", re.IGNORECASE)
-# They turn the direction of what follows around, so that a name reads as another one.
+# Bidirectional controls: they make a name look like another one.
 _TURNS_TEXT = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
-# What Finder and Explorer add by themselves; nobody means to send it.
+# Files that Finder and Explorer create by themselves.
 _LITTER = {".ds_store", "thumbs.db", "desktop.ini"}
 
 
@@ -24,16 +24,16 @@ def checked_path(name: str) -> str:
     """`name` as a safe relative POSIX path (a leading `./` dropped); raises `InputError` ``unsafe_path``.
 
     Refuses `..`, absolute names, drive letters, backslashes, NUL and control characters, undecodable
-    bytes, marks that turn text around, names of devices, empty parts, parts longer than 255 bytes and nesting
+    bytes, bidirectional controls, device names, empty parts, parts longer than 255 bytes and nesting
     deeper than 16.
     """
-    fault = _fault(name)
-    if fault:
-        raise InputError("unsafe_path", fault, where=_printable(name), hint=_MEND)
+    problem = _problem(name)
+    if problem:
+        raise InputError("unsafe_path", problem, where=_printable(name), hint=_HINT)
     return "/".join(part for part in name.split("/") if part != ".")
 
 
-def _fault(name: str) -> str | None:
+def _problem(name: str) -> str | None:
     parts = name.split("/")
     # U+FFFD stands where bytes could not be decoded.
     if any(char == "\ufffd" or unicodedata.category(char) in {"Cc", "Cs", "Zl", "Zp"} for char in name):
@@ -63,25 +63,25 @@ def _fault(name: str) -> str | None:
 
 
 def _printable(name: str) -> str:
-    """The name for a message: escapes made visible, and no longer than a message should be."""
+    """The name for a message: escaped and truncated."""
     return name.encode("unicode_escape").decode()[:300]
 
 
 def is_litter(path: str) -> bool:
-    """Whether a desktop added the file by itself (`__MACOSX/`, `._a.png`, `.DS_Store`)."""
+    """Whether the operating system created the file by itself (`__MACOSX/`, `._a.png`, `.DS_Store`)."""
     parts = path.split("/")
     return "__MACOSX" in parts or parts[-1].startswith("._") or parts[-1].lower() in _LITTER
 
 
 class NameSet:
-    """Names that must stay apart on every file system: no two equal but for case or Unicode form."""
+    """A set of names without conflicts on any file system: no two differ only in case or Unicode form."""
 
     def __init__(self) -> None:
         self._files: dict[str, str] = {}
         self._folders: dict[str, str] = {}
 
     def add(self, path: str) -> None:
-        """Takes one safe path; raises `InputError` ``name_collision`` where it meets another."""
+        """Adds a safe path; raises `InputError` ``name_collision`` if it conflicts with another."""
         parts = path.split("/")
         for depth in range(1, len(parts)):
             folder = "/".join(parts[:depth])

@@ -1,4 +1,4 @@
-"""What a service says of itself."""
+"""What a service reports about itself."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from biresnerf.wire.jobs import JobState, PriorityName
 
 
 class TenantShare(Record):
-    """What a tenant may use and what it uses. A limit of 0 is none."""
+    """The limits and the usage of a tenant. A limit of 0 means no limit."""
 
     id: str = Field(examples=["anna"])
     weight: float = Field(
-        examples=[1.0], description="Share of the slots where tenants wait for them; 1 is usual."
+        examples=[1.0], description="Share of the worker slots when tenants compete for them; 1 by default."
     )
     top_priority: PriorityName = Field(
-        examples=["normal"], description="The highest priority its jobs may ask for."
+        examples=["normal"], description="The highest priority its jobs may have."
     )
-    max_running: int = Field(examples=[2], description="Jobs at the same time.")
-    max_queued: int = Field(examples=[100], description="Jobs that wait.")
+    max_running: int = Field(examples=[2], description="Jobs that may run at the same time.")
+    max_queued: int = Field(examples=[100], description="Jobs that may wait.")
     max_stored_bytes: int = Field(
         examples=[107_374_182_400], description="Bytes of datasets, uploads and results together."
     )
@@ -33,7 +33,7 @@ class TenantShare(Record):
 
 
 class OptionsView(Record):
-    """What may be asked for: the JSON Schema of `options`, and every preset with all values filled in.
+    """The JSON Schema of `options`, and every preset with all values filled in.
 
     In the schema each option also has `stage`, the first whose work depends on it; `changes_result`; and `level`:
     `usual`, `expert` or `research`.
@@ -49,7 +49,7 @@ class OptionsView(Record):
 
 
 class SizeLimits(Record):
-    """What the service takes."""
+    """Size and time limits of the service."""
 
     max_files: int = Field(examples=[1000])
     max_file_bytes: int = Field(examples=[67_108_864])
@@ -62,17 +62,17 @@ class SizeLimits(Record):
 
 
 class Info(Record):
-    """What this service is."""
+    """Version, limits and load of the service."""
 
     name: Literal["biresnerf"] = "biresnerf"
     version: str = Field(examples=["0.1.0"])
     limits: SizeLimits
     archives: list[str] = Field(examples=[["application/zip", "application/x-tar", "application/gzip"]])
     job_counts: dict[JobState, int] = Field(examples=[{"queued": 2, "running": 1, "succeeded": 40}])
-    share: TenantShare = Field(description="What you may use, and what you use. A limit of 0 is none.")
+    share: TenantShare = Field(description="Your limits and your usage. A limit of 0 means no limit.")
 
 
 class Health(Record):
-    """The answer of a healthy process."""
+    """The response of a healthy process."""
 
     status: Literal["ok"] = "ok"

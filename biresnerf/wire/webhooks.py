@@ -31,12 +31,12 @@ Url = Annotated[str, Field(max_length=2000, examples=["https://hooks.example.org
 
 
 def new_secret() -> str:
-    """A fresh signing secret."""
+    """A new signing secret."""
     return SECRET_PREFIX + base64.b64encode(secrets.token_bytes(32)).decode()
 
 
 def key_of(secret: str) -> bytes:
-    """The bytes that sign; raises `ValueError` where the text is no secret."""
+    """The signing key; raises `ValueError` if the text is no secret."""
     try:
         key = base64.b64decode(secret.removeprefix(SECRET_PREFIX), validate=True)
     except (binascii.Error, ValueError):
@@ -55,7 +55,7 @@ Secret = Annotated[str, AfterValidator(_is_secret)]
 
 
 class WebhookLinks(Record):
-    """Where the parts of a webhook are."""
+    """Paths of the parts of a webhook."""
 
     self: str
     deliveries: str
@@ -70,26 +70,28 @@ class WebhookLinks(Record):
 
 
 class WebhookView(Record):
-    """Who hears of what. The secret is told once, when it is made."""
+    """A webhook. Its secret is shown only once, when it is created."""
 
     id: str = Field(examples=["wh_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
     tenant: str = Field(examples=["local"])
     url: str = Field(examples=["https://hooks.example.org/biresnerf"])
     description: str = ""
     events: tuple[WebhookEvent, ...] = Field(examples=[["job.succeeded", "job.failed"]])
-    job_id: str | None = Field(None, description="Hears of this job only, and goes with it.")
+    job_id: str | None = Field(
+        None, description="Only events of this job are sent; the webhook is deleted with the job."
+    )
     enabled: bool = Field(examples=[True])
-    disabled_why: str | None = Field(None, description="Why the service switched it off, where it did.")
-    failing_since: datetime | None = Field(None, description="No delivery has succeeded since.")
+    disabled_why: str | None = Field(None, description="Why the service disabled it; null if it did not.")
+    failing_since: datetime | None = Field(None, description="No delivery has succeeded since then.")
     previous_secret_until: datetime | None = Field(
-        None, description="Until then messages are signed with the secret before the last one too."
+        None, description="Until then messages are also signed with the previous secret."
     )
     created_at: datetime
     links: WebhookLinks = Field(default_factory=WebhookLinks.of)
 
 
 class WebhookAttempt(Record):
-    """One try to deliver: when, how long it took, and the status that came back, or why none did."""
+    """One attempt to deliver: its time, duration, and the status received, or the error."""
 
     number: int = Field(examples=[1])
     at: datetime
@@ -99,7 +101,7 @@ class WebhookAttempt(Record):
 
 
 class DeliveryLinks(Record):
-    """Where the parts of a delivery are."""
+    """Paths of the parts of a delivery."""
 
     self: str
     redeliver: str
@@ -112,13 +114,13 @@ class DeliveryLinks(Record):
 
 
 class DeliveryView(Record):
-    """One message to one webhook; ``id`` is what the receiver finds in the header `webhook-id`."""
+    """One message to one webhook; the receiver finds ``id`` in the header `webhook-id`."""
 
     id: str = Field(examples=["msg_5f1c0d9e6a0b4a3c8d7e6f5a4b3c2d1e"])
     webhook_id: str = Field(examples=["wh_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
     event: str = Field(examples=["webhook.test"])
     state: DeliveryState = Field(examples=["delivered"])
-    next_attempt_at: datetime | None = Field(None, description="None unless pending.")
+    next_attempt_at: datetime | None = Field(None, description="Null unless pending.")
     created_at: datetime
     finished_at: datetime | None = None
     body: str = Field(
@@ -130,7 +132,7 @@ class DeliveryView(Record):
 
 
 class JobWebhook(Record):
-    """A webhook for one job, sent along with it. The sender makes the secret."""
+    """A webhook for one job, part of its request. The client chooses the secret."""
 
     url: str = Field(max_length=2000)
     secret: Secret = Field(
@@ -144,7 +146,7 @@ class JobWebhook(Record):
 
 
 class NewWebhook(Record):
-    """A webhook to make."""
+    """A webhook to create."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -155,23 +157,25 @@ class NewWebhook(Record):
     )
 
     url: Url
-    events: Events = Field(default=list(ALL_EVENTS), description="What to send; everything where left out.")
+    events: Events = Field(default=list(ALL_EVENTS), description="Events to send; all by default.")
     description: Description = ""
 
 
 class WebhookChange(Record):
-    """What to change of a webhook; what is left out stays."""
+    """Changes of a webhook; fields that are left out stay as they are."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"enabled": True}]})
 
     url: Url | None = None
     events: Events | None = None
     description: Description | None = None
-    enabled: bool | None = Field(None, description="Off drops what waits; on (again) forgets failures.")
+    enabled: bool | None = Field(
+        None, description="`false` drops the messages that wait; `true` forgets earlier failures."
+    )
 
 
 class WebhookWithSecret(WebhookView):
-    """A webhook with the secret its messages are signed with, which is not told again."""
+    """A webhook with its signing secret, which is shown only this once."""
 
     secret: str = Field(examples=["whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSwMfKQ9r8GKYo="])
 

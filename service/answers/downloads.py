@@ -1,4 +1,4 @@
-"""One file of a result as an answer: whole, in part, unchanged, or at the store itself."""
+"""One file of a result as a response: whole, a range, not modified, or a redirect to the store."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from workers.jobs.jobs import JobStore
 from workers.records import Artifact
 
 _BINARY: dict[str, Any] = {
-    # Each file in its own media type, which the list of artifacts tells.
+    # Each file has its own media type, which the list of artifacts contains.
     "content": {"*/*": {"schema": {"description": "The bytes."}}}
 }
 ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"description": "The file.", **_BINARY},
     206: {"description": "The bytes asked for.", **_BINARY},
-    304: {"description": "As you have it."},
+    304: {"description": "Not modified."},
     307: {
         "description": "The file is at the signed address in `Location`, for some minutes and without a key.",
         "headers": {"Location": {"schema": {"type": "string"}}},
@@ -36,7 +36,7 @@ ANSWERS: dict[int | str, dict[str, Any]] = {
 
 
 class Conditions:
-    """What a download may depend on; HEAD takes no part of it but ``If-None-Match``."""
+    """The conditions of a download; HEAD uses only ``If-None-Match``."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class Conditions:
         if_none_match: Annotated[str | None, Header()] = None,
         redirect: Annotated[
             bool,
-            Query(description="`false`: never to the store, also where this service sends clients there."),
+            Query(description="`false`: do not redirect to the store, even if this service usually does."),
         ] = True,
     ) -> None:
         self.range, self.if_range, self.if_none_match = range_, if_range, if_none_match
@@ -64,7 +64,7 @@ async def find_artifact(jobs: JobStore, job_id: str, name: str) -> Artifact:
 
 
 async def answer_with(service: Service, artifact: Artifact, asked: Conditions, *, reading: bool) -> Response:
-    """The answer to a GET (``reading``) or HEAD of the file."""
+    """The response to a GET (``reading``) or HEAD of the file."""
     etag = f'"{artifact.sha256}"'
     headers = _headers(artifact, etag)
     if not none_match(asked.if_none_match, etag):
@@ -73,9 +73,9 @@ async def answer_with(service: Service, artifact: Artifact, asked: Conditions, *
         valid_s = service.settings.storage_presign_s
         found = await service.stores.files.signed_urls("GET", [artifact.key], valid_s)
         if found is not None:
-            # Whoever keeps the answer must not keep the address longer than it is good.
-            seen = {"ETag": etag, "Repr-Digest": headers["Repr-Digest"], "Cache-Control": "no-store"}
-            return Response(status_code=307, headers={**seen, "Location": found[0]})
+            # A cache must not keep the address longer than it is valid.
+            validators = {"ETag": etag, "Repr-Digest": headers["Repr-Digest"], "Cache-Control": "no-store"}
+            return Response(status_code=307, headers={**validators, "Location": found[0]})
     part = byte_range(asked.range, asked.if_range, etag, artifact.size) if reading else None
     first, last = part or (0, artifact.size - 1)
     headers["Content-Length"] = str(last - first + 1)
@@ -89,7 +89,7 @@ async def answer_with(service: Service, artifact: Artifact, asked: Conditions, *
 
 
 async def _opened(service: Service, artifact: Artifact, start: int, end: int) -> AsyncIterator[bytes]:
-    """The byte stream, begun: a file that is gone makes a 404, not a broken answer."""
+    """The byte stream; a missing file raises before the response begins, so that it is a 404."""
     await service.stores.files.head(artifact.key)
     return service.stores.files.read(artifact.key, start, end)
 
@@ -103,10 +103,10 @@ def _headers(artifact: Artifact, etag: str) -> dict[str, str]:
     return {
         "ETag": etag,
         "Accept-Ranges": "bytes",
-        # Another preview will have the same name.
+        # The next preview has the same name.
         "Cache-Control": "no-cache" if artifact.preview else "private, max-age=31536000, immutable",
         "Repr-Digest": f"sha-256=:{digest}:",
-        # As an attachment always: what users sent must not run as a page of this origin.
+        # Always an attachment: what users sent must not run as a page of this origin.
         "Content-Disposition": f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(base, safe='')}",
         "X-Content-Type-Options": "nosniff",
     }

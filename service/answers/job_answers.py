@@ -1,4 +1,4 @@
-"""A job as an answer: body, entity tag, where it is, when to ask again."""
+"""A job as a response: body, ETag, Location and Retry-After."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def checked_key(idempotency_key: str | None) -> str | None:
 
 
 def job_etag(job: JobView) -> str:
-    """A weak tag of the job as it is."""
-    # Others move a queued job's place without touching the job.
+    """A weak ETag of the job's current state."""
+    # Other jobs change the position of a queued job but not its revision.
     return f'W/"{job.revision}-{job.queue_position or 0}"'
 
 
 def job_answer(
     job: JobView, *, status: int = 200, new: bool = True, headers: dict[str, str] | None = None
 ) -> Response:
-    """The job; ``new`` is False where an earlier request made it."""
+    """The response; ``new`` is False if an earlier request created the job."""
     made = {"ETag": job_etag(job), "Cache-Control": "no-cache"}
     if status == 202:
         made |= {"Location": job_url(job.id), "Retry-After": POLL_S}
@@ -45,13 +45,13 @@ def job_answer(
 
 
 def preferred_wait_s(prefer: str | None) -> float | None:
-    """How long the client is ready to wait (RFC 7240, `Prefer: wait=N`), as far as we are; none if it said nothing."""
+    """Seconds to wait by `Prefer: wait=N` (RFC 7240), at most `WAIT_MAX_S`; None without it."""
     found = _WAIT.search(prefer or "")
     return None if found is None else min(float(found[1]), WAIT_MAX_S)
 
 
 async def waited_for(jobs: JobStore, job_id: str, seconds: float, closing: asyncio.Event) -> JobView:
-    """The job when it is over, after so many seconds, or when the service stops."""
+    """The job once it has ended, after ``seconds``, or when the service stops."""
     waiting = asyncio.create_task(jobs.wait(job_id, timeout_s=seconds))
     try:
         await first_done(waiting, closing.wait())

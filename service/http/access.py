@@ -1,8 +1,8 @@
-"""Who calls, for whom, and what they may do.
+"""Authentication and scopes.
 
-Every request but those of `OPEN` is identified before anything of it is read (`Access`), so a route that
-forgets to ask is closed, not open. A route says with its parameter what it needs: `ReadCaller` (scope
-``read``), `DatasetWriter`, `JobWriter`, `Admin`.
+`Access` identifies every request, except those of `OPEN`, before its body is read, so a route that declares nothing
+is closed. A route's parameter declares the scope it needs: `ReadCaller` (``read``), `DatasetWriter`,
+`JobWriter`, `Admin`.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ from workers.webhooks.webhooks import WebhookStore
 
 log = logging.getLogger(__name__)
 
-# Health, the docs page and the schema say nothing of anybody; /metrics asks itself (`may_scrape`), and what is
-# shared was signed by us.
+# Health checks, docs and schema contain no user's data; /metrics checks for itself (`may_scrape`); shared links are
+# signed.
 OPEN = re.compile(r"/(livez|readyz|startupz|metrics|openapi\.json|docs(/.*)?|web/[^/]*|v1/shared/.*)?")
-# What any guarded operation may answer before it is reached.
+# Problems of any guarded operation before it is reached.
 REFUSALS = (
     *("missing_credentials", "invalid_api_key", "scope_required", "cross_site"),
     *("rate_limited", "database_unavailable"),
 )
-# Requests with no or a wrong key, of one address.
-STRANGERS_PER_S, STRANGERS_BURST = 1.0, 200
+# Requests from one address without a valid key.
+UNIDENTIFIED_PER_S, UNIDENTIFIED_BURST = 1.0, 200
 _BEARER = re.compile(r"Bearer +(\S+) *", re.IGNORECASE)
 _CHALLENGE = 'Bearer realm="biresnerf"'
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Whom a request acts for. ``key_id`` is none for whoever needs no key."""
+    """The tenant and the scopes of a request. ``key_id`` is None where no key is needed."""
 
     tenant: str
     scopes: frozenset[KeyScope]
@@ -62,9 +62,9 @@ class Identity:
 
 @dataclass(frozen=True)
 class Caller:
-    """The identified client of a request; its stores hold what belongs to its tenant, and nothing else.
+    """The identified client of a request; its stores are limited to its tenant.
 
-    ``client`` is what limits are counted by: the key, or the address where none is shown; none on loopback.
+    ``client`` is what limits are counted by: the key, or the address without one; None on loopback.
     """
 
     service: Service
@@ -73,16 +73,16 @@ class Caller:
 
     @property
     def tenant(self) -> str:
-        """Whose things the caller handles."""
+        """The tenant of the caller."""
         return self.identity.tenant
 
     @property
     def scopes(self) -> frozenset[KeyScope]:
-        """What the caller may do."""
+        """The scopes of the caller."""
         return self.identity.scopes
 
     def require(self, scope: KeyScope) -> None:
-        """Raises ``ProblemError`` (``scope_required``) where the caller may not do that."""
+        """Raises ``ProblemError`` (``scope_required``) if the caller lacks the scope."""
         if scope not in self.scopes:
             challenge = f'{_CHALLENGE}, error="insufficient_scope", scope="{scope}"'
             raise ProblemError(
@@ -90,8 +90,8 @@ class Caller:
             )
 
     def sending(self) -> AbstractContextManager[None]:
-        """A place to send files from; raises ``ProblemError`` (``too_many_uploads``) where all are taken."""
-        return self.service.sending.taken(self.client)
+        """Counts an upload while it runs; raises ``ProblemError`` (``too_many_uploads``) at the client's limit."""
+        return self.service.sending.counted(self.client)
 
     @property
     def jobs(self) -> JobStore:
@@ -115,12 +115,12 @@ class Caller:
 
 
 class Access:
-    """ASGI middleware: identifies the client of each request, before its body is read or its route sought."""
+    """ASGI middleware: identifies the client of each request before its body is read or its route is looked up."""
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self._app, self._settings = app, settings
         self._keys = Buckets("key", settings.key_requests_per_s, settings.key_requests_burst)
-        self._strangers = Buckets("address", STRANGERS_PER_S, STRANGERS_BURST)
+        self._unidentified = Buckets("address", UNIDENTIFIED_PER_S, UNIDENTIFIED_BURST)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or OPEN.fullmatch(scope["path"]):
@@ -128,8 +128,8 @@ class Access:
             return
         request = Request(scope)
         request.state.identity = identity = await self._identified(request)
-        nameless = None if on_loopback(self._settings.host) else _address(request)
-        request.state.client = client = identity.key_id or nameless
+        anonymous = None if on_loopback(self._settings.host) else _address(request)
+        request.state.client = client = identity.key_id or anonymous
         if client is None:
             await self._app(scope, receive, send)
             return
@@ -146,12 +146,12 @@ class Access:
     async def _identified(self, request: Request) -> Identity:
         try:
             return await identify(service_of(request), request)
-        except Unavailable as error:  # here, above the routes, nobody else makes a 503 of it
+        except Unavailable as error:  # above the routes: no exception handler responds with 503
             raise problem_of(error) from None
         except ProblemError as refusal:
-            # Who shows a key that holds is never stopped for what others send from the same address.
+            # A valid key is never limited by what others send from the same address.
             if refusal.status == 401:
-                _require_allowed(self._strangers.take(_address(request)))
+                _require_allowed(self._unidentified.take(_address(request)))
             raise
 
 
@@ -169,14 +169,14 @@ def _address(request: Request) -> str:
 
 
 async def identify(service: Service, request: Request) -> Identity:
-    """Whom the request acts for.
+    """The identity of the request.
 
     Raises:
         ProblemError: ``missing_credentials``, ``invalid_api_key``, ``cross_site``.
     """
     text = request.headers.get("authorization")
     if text is None:
-        return await _nameless(service, request)
+        return await _anonymous(service, request)
     bearer = _BEARER.fullmatch(text)
     if bearer is None:
         raise _unknown("The Authorization header is not of the form `Bearer brn_…`.")
@@ -188,24 +188,24 @@ async def identify(service: Service, request: Request) -> Identity:
     return Identity(key.tenant, scopes, key.id)
 
 
-async def _nameless(service: Service, request: Request) -> Identity:
-    """The identity of who shows no key, where none is needed."""
+async def _anonymous(service: Service, request: Request) -> Identity:
+    """The identity of a request without a key, where none is required."""
     mode = service.settings.auth
     if mode == "auto":
         if not on_loopback(service.settings.host) or await service.stores.keys.any_made():
             mode = "required"
         elif _is_public_name(request.url.hostname or ""):
-            # A page may have its own name point at this machine, and would then be of the same site.
+            # DNS rebinding: a page's own host name may resolve to this machine, and would then be of the same site.
             raise ProblemError(
                 "cross_site",
-                "Without an API key only requests to this machine by its own name are taken.",
+                "Without an API key only requests to this machine by its own name are accepted.",
                 where="Host",
                 hint="Use http://127.0.0.1 or localhost, or make a key: biresnerf keys create.",
             )
     if mode == "required":
         raise ProblemError(
             "missing_credentials",
-            "This service wants an API key.",
+            "This service requires an API key.",
             where="Authorization",
             hint="Send the header `Authorization: Bearer brn_…`; `biresnerf keys create` makes a key.",
             headers={"WWW-Authenticate": _CHALLENGE},
@@ -214,19 +214,21 @@ async def _nameless(service: Service, request: Request) -> Identity:
 
 
 def _is_public_name(host: str) -> bool:
-    """Whether somebody elsewhere could have this name point anywhere: it has a dot and is no loopback address."""
+    """Whether others control what the name resolves to: it has a dot and is no loopback address."""
     return "." in host.rstrip(".") and not on_loopback(host)
 
 
 async def log_access(service: Service) -> None:
-    """Logs at the start what an operator could otherwise find out too late."""
+    """Logs at startup who can access the service."""
     settings = service.settings
     if settings.auth == "off" and not on_loopback(settings.host):
-        log.warning("BIRESNERF_AUTH=off: whoever reaches %s may do everything", settings.host)
+        log.warning("BIRESNERF_AUTH=off: anyone who can reach %s has full access", settings.host)
     elif settings.auth == "required" or (settings.auth == "auto" and not on_loopback(settings.host)):
         with contextlib.suppress(Unavailable):
             if not await service.stores.keys.any_made():
-                log.warning("nobody can use this service yet; make a key: biresnerf keys create NAME")
+                log.warning(
+                    "no API key exists yet, so no client has access; create one: biresnerf keys create NAME"
+                )
 
 
 def on_loopback(host: str) -> bool:
@@ -240,9 +242,9 @@ def on_loopback(host: str) -> bool:
 
 
 async def may_scrape(service: Service, authorization: str) -> bool:
-    """Whether /metrics is for this client: it is the loopback's while no token is set, else the token's.
+    """Whether the client may read /metrics: with the token or an ``admin`` key; on loopback, also if no token is set.
 
-    A key with the scope ``admin`` opens it too. Asks the database only where nothing else says yes.
+    The database is asked only if nothing else allows it.
     """
     token = service.settings.metrics_token
     if token is None and on_loopback(service.settings.host):

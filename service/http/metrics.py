@@ -1,9 +1,8 @@
-"""Figures for Prometheus.
+"""Metrics for Prometheus.
 
-Two kinds. What this process alone knows (requests, streams) is counted in its own memory: each replica of the
-API is one process and a target of its own, so nothing is shared between processes. What is true of the whole
-installation (queue, jobs, stages, slots) is read from the database when it is asked for; every replica tells
-the same, and workers need no port that can be scraped.
+Requests and streams are counted in the memory of each web process: each replica is a scrape target of its own.
+Queue, jobs, stages and slots belong to the whole installation and are read from the database at each scrape; every
+replica reports the same, and workers need no port of their own.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from biresnerf.wire.jobs import EventType
 from workers.database.statistics import Statistics, Tally
 
 _ANSWER_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
-# Tally in the database -> metric, what its label is called, what it says.
+# Tally in the database -> metric, name of its label, help text.
 _COUNTERS = {
     "job_events": (
         "biresnerf_job_events",
@@ -40,7 +39,7 @@ _COUNTERS = {
     "stored_files": ("biresnerf_stored_files", "", "Files stored in datasets."),
     "stored_bytes": ("biresnerf_stored_bytes", "", "Bytes of the files stored in datasets."),
 }
-# Told before they first happen: a rate needs the zero that comes before the one.
+# Reported as 0 before they first happen: a rate needs the zero before the one.
 _FROM_ZERO: dict[str, tuple[str, ...]] = {
     "job_events": get_args(EventType),
     "job_failures": ("engine_error", "timeout", "too_many_crashes"),
@@ -55,7 +54,7 @@ _DURATIONS = {
 
 
 class WebMetrics:
-    """What one web process counts."""
+    """The metrics that one web process counts."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -78,18 +77,18 @@ class WebMetrics:
             "biresnerf_event_listeners", "Clients that follow a job's events.", registry=self.registry
         )
 
-    def _counter(self, name: str, says: str, *labels: str) -> Counter:
-        return Counter(name, says, labels, registry=self.registry)
+    def _counter(self, name: str, help_text: str, *labels: str) -> Counter:
+        return Counter(name, help_text, labels, registry=self.registry)
 
 
 class Exposition(Collector):
-    """One scrape: the process's own figures and the installation's; none where the database is away."""
+    """One scrape: the metrics of the process, and of the installation while the database answers."""
 
     def __init__(self, web: WebMetrics, installation: Statistics | None) -> None:
         self._web, self._installation = web, installation
 
     def collect(self) -> Iterable[Metric]:
-        """All families, by name."""
+        """All metric families."""
         yield InfoMetricFamily("biresnerf_build", "What runs here.", {"version": __version__})
         yield from self._web.registry.collect()
         answers = GaugeMetricFamily("biresnerf_database_up", "1 while the database answers this process.")
@@ -99,7 +98,7 @@ class Exposition(Collector):
             yield from _families(self._installation)
 
     def rendered(self, accept: str) -> tuple[bytes, str]:
-        """The text and its media type, in the form that the scraper asks for."""
+        """The text and its media type, in the format that the scraper accepts."""
         encode, media_type = choose_encoder(accept)
         registry = CollectorRegistry()
         registry.register(self)
@@ -120,27 +119,29 @@ def _families(now: Statistics) -> Iterator[Metric]:
     for slot in now.slots:
         slots.add_metric([slot.kind, str(slot.busy).lower()], slot.slots)
     yield slots
-    for tally, (name, label, says) in _COUNTERS.items():
-        counter = CounterMetricFamily(name, says, labels=[label] if label else [])
+    for tally, (name, label, help_text) in _COUNTERS.items():
+        counter = CounterMetricFamily(name, help_text, labels=[label] if label else [])
         found = {item.label: item.amount for item in now.tallies if item.name == tally}
         for value in sorted({*found, *_FROM_ZERO.get(tally, () if label else ("",))}):
             counter.add_metric([value] if label else [], found.get(value, 0.0))
         yield counter
-    for tally, (name, label, says) in _DURATIONS.items():
+    for tally, (name, label, help_text) in _DURATIONS.items():
         yield _histogram(
-            name, says, label, [item for item in now.tallies if item.name == tally], now.bounds_s
+            name, help_text, label, [item for item in now.tallies if item.name == tally], now.bounds_s
         )
 
 
-def _gauge(name: str, says: str, label: str, values: Mapping[Any, float]) -> Metric:
-    family = GaugeMetricFamily(name, says, labels=[label] if label else [])
+def _gauge(name: str, help_text: str, label: str, values: Mapping[Any, float]) -> Metric:
+    family = GaugeMetricFamily(name, help_text, labels=[label] if label else [])
     for key, value in values.items():
         family.add_metric([key] if label else [], value)
     return family
 
 
-def _histogram(name: str, says: str, label: str, tallies: list[Tally], bounds_s: tuple[float, ...]) -> Metric:
-    family = HistogramMetricFamily(name, says, labels=[label] if label else [])
+def _histogram(
+    name: str, help_text: str, label: str, tallies: list[Tally], bounds_s: tuple[float, ...]
+) -> Metric:
+    family = HistogramMetricFamily(name, help_text, labels=[label] if label else [])
     for value in sorted({item.label for item in tallies}):
         mine = [item for item in tallies if item.label == value]
         counts = {item.bucket: item.count for item in mine}

@@ -1,4 +1,4 @@
-"""Every request counted, timed and written into the log: who asked what, and how it was answered."""
+"""Counts, times and logs every request."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from service.http.metrics import WebMetrics
 
 logger = logging.getLogger("service.http.access")
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
-# Asked for every few seconds by machines; they would drown what people did.
+# Monitoring asks for these every few seconds: they are logged at debug level.
 _PROBES = {"/livez", "/readyz", "/startupz", "/metrics"}
-# As nginx has it: the client went away before the answer began.
+# nginx's status for a client that disconnected before the response began.
 _CLIENT_GONE = 499
 
 
@@ -50,12 +50,12 @@ class Observed:
 
 
 def is_probe(scope: Scope) -> bool:
-    """Whether a machine asks how we are."""
+    """Whether the request is a health check or a scrape."""
     return scope.get("path") in _PROBES
 
 
 class _Exchange:
-    """One request and what came of it."""
+    """One request and its response."""
 
     def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
         self.scope, self._receive, self._send = scope, receive, send
@@ -65,12 +65,12 @@ class _Exchange:
 
     @property
     def method(self) -> str:
-        """One of the known ones, so that strangers cannot make up series without end."""
+        """The method, or `other`: clients must not be able to create any number of time series."""
         return self.scope["method"] if self.scope["method"] in _METHODS else "other"
 
     @property
     def route(self) -> str:
-        """The path with its parameters' names in place of their values."""
+        """The path with the names of its parameters in place of their values."""
         route = self.scope.get("route")
         return getattr(route, "path_format", None) or getattr(route, "path", None) or "unmatched"
 
@@ -81,17 +81,17 @@ class _Exchange:
         return message
 
     async def send(self, message: Message) -> None:
-        """The next message of the answer."""
+        """The next message of the response."""
         if message["type"] == "http.response.start":
             self.status, self.answered_s = message["status"], time.perf_counter() - self._began
         self.sent += len(message.get("body", b""))
         await self._send(message)
 
     def fields(self) -> dict[str, object]:
-        """What the log tells beside the line itself."""
+        """The fields of the log line."""
         state, client = self.scope.get("state", {}), self.scope.get("client")
         identity = state.get("identity")
-        said: dict[str, object] = {
+        fields: dict[str, object] = {
             "request_id": state.get("request_id"),
             "tenant": getattr(identity, "tenant", None),
             "key": getattr(identity, "key_id", None),
@@ -101,4 +101,4 @@ class _Exchange:
             "sent": self.sent,
             "ms": round(1000 * (time.perf_counter() - self._began), 1),
         }
-        return {name: value for name, value in said.items() if value is not None}
+        return {name: value for name, value in fields.items() if value is not None}

@@ -1,7 +1,7 @@
-"""How many requests a client may send in a time: a bucket of tokens for each, kept by each web process alone.
+"""Rate limits: a token bucket per client, in the memory of each web process.
 
-With several replicas behind a proxy a client may have as many times the rate; what must hold exactly (jobs,
-bytes) is counted in the database.
+With n replicas behind a proxy a client may send n times as much. Limits that must be exact (jobs, bytes) are
+counted in the database.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 
-# Beyond so many clients those that were silent longest are forgotten, and begin with a full bucket again.
+# Beyond this the clients that were silent longest are forgotten; they start again with a full bucket.
 CLIENTS_MAX = 10_000
 
 
 @dataclass(frozen=True)
 class Allowance:
-    """What a client has left. ``wait_s`` is 0 where the request may pass, else when one may again."""
+    """What a client has left. ``wait_s`` is 0 if the request is allowed, else the seconds until the next one is."""
 
     policy: str
     limit: int
@@ -27,7 +27,7 @@ class Allowance:
     wait_s: int
 
     def headers(self) -> dict[str, str]:
-        """As draft-ietf-httpapi-ratelimit-headers has them."""
+        """The headers of draft-ietf-httpapi-ratelimit-headers."""
         window_s = max(1, self.full_in_s)
         return {
             "RateLimit-Policy": f'"{self.policy}";q={self.limit}',
@@ -45,7 +45,7 @@ class Buckets:
         self._levels: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, client: str) -> Allowance:
-        """Takes a token where there is one."""
+        """Takes a token, if there is one."""
         now = self._clock()
         level, at = self._levels.get(client, (float(self._burst), now))
         level = min(float(self._burst), level + (now - at) * self._rate)

@@ -1,4 +1,4 @@
-"""One id per request, in and out, and the last net below every handler."""
+"""Request ids, security headers, and a response to every error that no handler caught."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ logger = logging.getLogger(__name__)
 # A browser sends at most 8 KiB of cookies; a few long headers beside them fit in too.
 HEAD_BYTES_MAX = 32 * 2**10
 _SAFE = {"GET", "HEAD", "OPTIONS"}
-# No answer is a page but the docs, which have a policy of their own; none is for other sites to build in.
-_PRUDENT = {
+# Responses are not pages, except the docs, which set their own policy; other sites may embed none.
+_SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -38,7 +38,7 @@ def request_id(request: Request) -> str:
 
 
 def render(error: ProblemError, request: Request) -> Response:
-    """The answer that tells the problem."""
+    """The response that carries the problem."""
     body = error.problem(instance=quote(request.scope["path"]), request_id=request_id(request))
     return Response(
         body.model_dump_json(exclude_none=True),
@@ -49,7 +49,7 @@ def render(error: ProblemError, request: Request) -> Response:
 
 
 class RequestContext:
-    """ASGI middleware: request ids, no content sniffing, and a problem for what nobody caught."""
+    """ASGI middleware: request ids, security headers, and a problem for each uncaught error."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -69,7 +69,7 @@ class RequestContext:
                 started = True
                 headers = MutableHeaders(scope=message)
                 headers["X-Request-ID"] = request_id(request)
-                for name, value in _PRUDENT.items():
+                for name, value in _SECURITY_HEADERS.items():
                     headers.setdefault(name, value)
                 for name, value in scope.get("state", {}).get("extra_headers", {}).items():
                     headers.setdefault(name, value)
@@ -85,24 +85,24 @@ class RequestContext:
         except asyncio.CancelledError:
             if started or not _stopping(request):
                 raise
-            # What the server cuts off at its end was not served, and another one, or the next, can serve it.
+            # A request cut off by the shutdown was not served; another process can serve it.
             stopping = ProblemError("unavailable", "The service is stopping.")
             await render(stopping, request)(scope, receive, send_with_headers)
         except Exception as error:
             if started:
                 raise
-            await render(_last_net(error, request), request)(scope, receive, send_with_headers)
+            await render(_unexpected(error, request), request)(scope, receive, send_with_headers)
 
 
 def _refuse_ambiguous(request: Request) -> None:
-    """What the parser lets through, though a proxy before us may have read it differently."""
+    """Refuse what the parser accepts but a proxy before us may have read differently."""
     close = {"Connection": "close"}
     if request.scope["http_version"] not in {"1.0", "1.1"}:
         raise ProblemError("malformed_request", "This is not HTTP/1.", headers=close)
     if "content-length" in request.headers and "transfer-encoding" in request.headers:
         detail = "Content-Length and Transfer-Encoding exclude each other."
         raise ProblemError("malformed_request", detail, headers=close)
-    # The parser counts only while it waits for more; a head that came in one piece is counted here.
+    # The parser limits only a head that arrives in pieces; one that came whole is measured here.
     head = [request.scope["raw_path"], request.scope["query_string"], *sum(request.scope["headers"], ())]
     if sum(map(len, head)) > HEAD_BYTES_MAX:
         detail = f"The head of the request is larger than {HEAD_BYTES_MAX} bytes."
@@ -110,7 +110,7 @@ def _refuse_ambiguous(request: Request) -> None:
 
 
 def _refuse_other_sites(request: Request) -> None:
-    """Browsers send forms to any address, so any page could use a service on the reader's own machine."""
+    """Refuse requests of other sites' pages: a browser would send their forms to a service on this machine."""
     if request.method not in _SAFE and request.headers.get("sec-fetch-site") == "cross-site":
         raise ProblemError("cross_site", "Requests from pages of other sites are not taken.")
 
@@ -120,13 +120,11 @@ def _stopping(request: Request) -> bool:
     return service is not None and service.closing.is_set()
 
 
-def _last_net(error: Exception, request: Request) -> ProblemError:
+def _unexpected(error: Exception, request: Request) -> ProblemError:
     if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
         logger.error("no room left: %s", error)
         return ProblemError("storage_full", "The disk of the service is full.")
     logger.exception(
         "request %s %s %s failed", request_id(request), request.method, quote(request.scope["path"])
     )
-    return ProblemError(
-        "internal_error", "The request could not be served; the log of the service tells why."
-    )
+    return ProblemError("internal_error", "The request failed; the service's log says why.")

@@ -1,4 +1,4 @@
-"""HTTP/1.1 as this service takes it from the wire: faults answered as problems, and nobody waited for without end."""
+"""HTTP/1.1 connections with time limits, and with problems as the response to malformed requests."""
 
 from __future__ import annotations
 
@@ -16,72 +16,76 @@ from service.http.request_context import HEAD_BYTES_MAX
 
 logger = logging.getLogger(__name__)
 
-# Whoever opens a connection, or begins a request, has so long for its head.
-HEAD_S = 20.0
-# A client that takes nothing of its answer for so long holds memory and a file for nothing.
-READER_STALLS_S = 120.0
+# Time allowed to receive a request's headers.
+HEADERS_TIMEOUT_S = 20.0
+# A client that reads nothing for so long is disconnected: it holds memory and a file open.
+READER_TIMEOUT_S = 120.0
 _TOO_LARGE = 431
 
 
 class StrictHttp(H11Protocol):
-    """One connection. The framework behind it would answer faults in plain text and has no limits of time."""
+    """One connection. The base class responds to malformed requests in plain text and has no time limits."""
 
-    _head_due: asyncio.TimerHandle | None = None
-    _reader_due: asyncio.TimerHandle | None = None
+    _headers_timer: asyncio.TimerHandle | None = None
+    _reader_timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
-        """The time for the first head begins."""
+        """Starts the time limit for the first request's headers."""
         super().connection_made(transport)
-        self._watch_head()
+        self._time_headers()
 
     def data_received(self, data: bytes) -> None:
-        """Part of a head, or of a body; the time for a head ends with the head."""
+        """Stops the time limit once the headers are complete."""
         super().data_received(data)
-        self._watch_head()
+        self._time_headers()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """No clock outlives the connection."""
+        """Cancels all time limits."""
         super().connection_lost(exc)
-        _stop(self._head_due)
-        self._head_due = None
-        _stop(self._reader_due)
-        self._reader_due = None
+        _stop(self._headers_timer)
+        self._headers_timer = None
+        _stop(self._reader_timer)
+        self._reader_timer = None
 
     def pause_writing(self) -> None:
-        """The client does not take what was sent."""
+        """Starts the time limit of a client that does not read."""
         super().pause_writing()
-        self._reader_due = self._reader_due or self.loop.call_later(READER_STALLS_S, self.transport.abort)
+        self._reader_timer = self._reader_timer or self.loop.call_later(
+            READER_TIMEOUT_S, self.transport.abort
+        )
 
     def resume_writing(self) -> None:
-        """It does again."""
+        """The client reads again."""
         super().resume_writing()
-        _stop(self._reader_due)
-        self._reader_due = None
+        _stop(self._reader_timer)
+        self._reader_timer = None
 
     def send_400_response(self, msg: str) -> None:
-        """Called by the base class while it handles the fault that the parser found."""
-        fault = sys.exception()
-        if isinstance(fault, h11.RemoteProtocolError) and fault.error_status_hint == _TOO_LARGE:
+        """Called by the base class while it handles the parser's error."""
+        error = sys.exception()
+        if isinstance(error, h11.RemoteProtocolError) and error.error_status_hint == _TOO_LARGE:
             detail = f"The head of the request is larger than {HEAD_BYTES_MAX} bytes."
             self._refuse(ProblemError("headers_too_large", detail))
         else:
-            self._refuse(ProblemError("malformed_request", f"{fault or msg}."))
+            self._refuse(ProblemError("malformed_request", f"{error or msg}."))
 
-    def _watch_head(self) -> None:
-        head_is_due = self.cycle is None or self.cycle.response_complete
-        if not head_is_due or self.transport.is_closing():
-            _stop(self._head_due)
-            self._head_due = None
-        elif self._head_due is None:
-            self._head_due = self.loop.call_later(HEAD_S, self._head_is_late)
+    def _time_headers(self) -> None:
+        awaits_headers = self.cycle is None or self.cycle.response_complete
+        if not awaits_headers or self.transport.is_closing():
+            _stop(self._headers_timer)
+            self._headers_timer = None
+        elif self._headers_timer is None:
+            self._headers_timer = self.loop.call_later(HEADERS_TIMEOUT_S, self._headers_are_late)
 
-    def _head_is_late(self) -> None:
-        self._head_due = None
+    def _headers_are_late(self) -> None:
+        self._headers_timer = None
         if not self.transport.is_closing():
-            self._refuse(ProblemError("head_timeout", f"No whole request came within {HEAD_S:g} s."))
+            self._refuse(
+                ProblemError("head_timeout", f"No whole request came within {HEADERS_TIMEOUT_S:g} s.")
+            )
 
     def _refuse(self, error: ProblemError) -> None:
-        """Answers, where no answer has begun, and closes: what follows on this connection cannot be told apart."""
+        """Responds unless a response has begun, and closes: where the next request begins is unknown."""
         request_id = uuid.uuid4().hex
         logger.info("refused: %s", error, extra={"fields": {"request_id": request_id, "client": self.client}})
         if self.conn.our_state in {h11.IDLE, h11.SEND_RESPONSE}:

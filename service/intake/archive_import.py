@@ -1,4 +1,4 @@
-"""From what was uploaded to the files of a dataset."""
+"""Adds uploaded archives and files to a dataset."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ logger = logging.getLogger(__name__)
 
 RATIO_MAX = 200.0
 _CHUNK = 2**20
-_LOOK_S = 0.3  # between two looks at an upload that another process brings in
-# Python, zlib and the table of contents of an archive with as many entries as we take.
+_POLL_S = 0.3  # between two looks at an upload that another process stores
+# Python, zlib, and the table of contents of an archive with the largest number of entries.
 _UNPACK_MEMORY_BYTES = 1536 * 2**20
-# What stands for the whole input when it lies in the only folder of an archive.
+# A folder of this name is part of the dataset, even if it is the only one in the archive.
 _KEPT_FOLDERS = {"images"}
 
 
@@ -93,7 +93,7 @@ def _files_below(root: Path) -> list[Path]:
 
 
 def begin_taking(service: Service, upload_id: str) -> None:
-    """Brings a received upload into its dataset, in the background."""
+    """Adds a received upload to its dataset, in the background."""
 
     async def take() -> None:
         try:
@@ -105,26 +105,26 @@ def begin_taking(service: Service, upload_id: str) -> None:
 
 
 async def take_upload(service: Service, upload_id: str) -> None:
-    """Brings a received upload into its dataset unless somebody does so already; its state tells the outcome.
+    """Adds a received upload to its dataset unless another process does so; its state holds the outcome.
 
-    What is wrong on our side (storage away, disk full) is raised and leaves it received: it is tried again.
+    Errors of the service (storage unavailable, disk full) are raised; the upload stays received and is retried.
     """
     uploads, token = service.stores.uploads, uuid.uuid4()
     if not await retry_while_unavailable(lambda: uploads.take(upload_id, token)):
         return
     renewing = asyncio.create_task(_renew(service, upload_id, token))
-    wrong: JobError | None = None
+    failure: JobError | None = None
     try:
-        await _bring_in(service, await uploads.get(upload_id))
+        await _add_to_dataset(service, await uploads.get(upload_id))
     except NotFound:
         return  # deleted meanwhile
     except FaultError as error:
-        wrong = _clients_mistake(error)
-        if wrong is None:
+        failure = _client_error(error)
+        if failure is None:
             raise
     finally:
         renewing.cancel()
-    await retry_while_unavailable(lambda: uploads.conclude(upload_id, token, wrong))
+    await retry_while_unavailable(lambda: uploads.conclude(upload_id, token, failure))
 
 
 async def _renew(service: Service, upload_id: str, token: uuid.UUID) -> None:
@@ -134,14 +134,14 @@ async def _renew(service: Service, upload_id: str, token: uuid.UUID) -> None:
             await service.stores.uploads.take(upload_id, token)
 
 
-def _clients_mistake(error: FaultError) -> JobError | None:
+def _client_error(error: FaultError) -> JobError | None:
     """The upload's error where sending the same again would fail again; None where the service is at fault."""
     problem = problem_of(error)
     service_at_fault = problem.status >= 500 or (problem.retryable and problem.code != "quota_exhausted")
     return None if service_at_fault else JobError(**dict(problem.fault))
 
 
-async def _bring_in(service: Service, upload: Upload) -> None:
+async def _add_to_dataset(service: Service, upload: Upload) -> None:
     uploads, datasets = service.stores.uploads, service.stores.datasets
     if upload.path is not None:
         content = uploads.content(upload)
@@ -165,7 +165,7 @@ async def _bring_in(service: Service, upload: Upload) -> None:
 
 
 async def settle_uploads(service: Service, dataset_id: str) -> None:
-    """Waits until all that was received is in the dataset.
+    """Waits until everything received is in the dataset.
 
     Raises:
         ProblemError: ``dataset_not_complete`` where an upload is unfinished; what was wrong with another.
@@ -177,7 +177,7 @@ async def settle_uploads(service: Service, dataset_id: str) -> None:
             break
         for upload in received:
             await take_upload(service, upload.id)
-        await asyncio.sleep(_LOOK_S)
+        await asyncio.sleep(_POLL_S)
     for upload in pending:
         give_up = f"or give it up: DELETE /v1/uploads/{upload.id}"
         if upload.error is not None:

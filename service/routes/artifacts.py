@@ -26,7 +26,7 @@ REPORT = "report.json"
     responses=declared("not_found", "expired", "database_unavailable", "internal_error"),
 )
 async def list_artifacts(job_id: JobId, caller: ReadCaller) -> ArtifactList:
-    """All files of the result and of its exports. While the job runs, previews: the poses so far and a render."""
+    """All files of the result and of its exports. While the job runs: previews of poses and a render."""
     found = await caller.jobs.artifacts(job_id)
     items = [
         ArtifactView(
@@ -56,7 +56,7 @@ async def get_artifact(
 ) -> Response:
     """One file. Its strong ETag is the SHA-256 of its bytes.
 
-    Where files lie in a bucket and the operator says so, the answer is a redirection to the bucket.
+    If files are stored in a bucket and the operator has enabled it, the response is a redirect to the bucket.
     """
     artifact = await find_artifact(caller.jobs, job_id, name)
     return await answer_with(caller.service, artifact, asked, reading=request.method == "GET")
@@ -69,7 +69,7 @@ async def get_artifact(
     responses=declared("not_found", "expired", "result_not_ready", "database_unavailable", "internal_error"),
 )
 async def get_report(job_id: JobId, caller: ReadCaller) -> Response:
-    """The machine-readable account of a finished job (the artifact `report.json`)."""
+    """The machine-readable report of a finished job (the artifact `report.json`)."""
     artifact = await find_report(caller, job_id)
     content = await whole_file(caller, artifact)
     return Response(content, media_type="application/json", headers={"ETag": f'"{artifact.sha256}"'})
@@ -87,5 +87,5 @@ async def find_report(caller: Caller, job_id: str) -> Artifact:
 
 
 async def whole_file(caller: Caller, artifact: Artifact) -> bytes:
-    """All bytes of a file that is small."""
+    """The content of a small file."""
     return b"".join([chunk async for chunk in caller.service.stores.files.read(artifact.key)])

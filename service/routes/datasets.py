@@ -1,4 +1,4 @@
-"""Datasets: create, fill with files or an archive, finalize, look, delete."""
+"""Datasets: create, add files or an archive, finalize, list, delete."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from service.intake.json_body import JSON_BYTES_MAX, json_request, read_json
 from service.intake.uploads import capped, refuse_announced_excess, staging_folder, write_stream
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
-ENTRY_BYTES = 2048  # of a manifest, for each file that a dataset may have
+ENTRY_BYTES = 2048  # allowed in a manifest for each file that a dataset may have
 _ALWAYS = ("database_unavailable", "internal_error")
 _WRITES = ("cross_site", *_ALWAYS)
 _RAW_BODY: dict[str, Any] = {
@@ -60,9 +60,9 @@ async def _new_dataset(request: Request) -> NewDataset:
 async def create_dataset(
     caller: DatasetWriter, body: Annotated[NewDataset, Depends(_new_dataset)], response: Response
 ) -> DatasetView:
-    """A dataset to be filled. Of a manifest, `missing` in the answer is what has to be sent.
+    """Creates an empty dataset. With a manifest, `missing` in the response lists the files to send.
 
-    Files that were sent before (same size and SHA-256, with the same tenant's keys) are there already.
+    Files that the tenant has sent before (same size and SHA-256) are copied and need not be sent.
     """
     for entry in body.manifest:
         checked_path(entry.path)
@@ -90,7 +90,7 @@ async def list_datasets(
 
 @router.get("/{dataset_id}", operation_id="getDataset", responses=declared("not_found", *_ALWAYS))
 async def get_dataset(dataset_id: DatasetId, caller: ReadCaller) -> DatasetView:
-    """The dataset, with what the check found in it once it is final."""
+    """The dataset, with the report of its check once it is finalized."""
     return await caller.datasets.get(dataset_id)
 
 
@@ -101,7 +101,7 @@ async def get_dataset(dataset_id: DatasetId, caller: ReadCaller) -> DatasetView:
     responses=declared("not_found", "dataset_in_use", *_WRITES),
 )
 async def delete_dataset(dataset_id: DatasetId, caller: DatasetWriter) -> None:
-    """Deletes the dataset and its files. Its jobs, finished ones too, have to be deleted first."""
+    """Deletes the dataset and its files. All its jobs must be deleted first."""
     await caller.datasets.delete(dataset_id)
 
 
@@ -143,7 +143,7 @@ _TAKES = (
     operation_id="putFile",
     response_model=FileView,
     responses={
-        204: {"description": "The path was there; it has these bytes now."},
+        204: {"description": "The file existed; its content was replaced."},
         **declared("malformed_body", "file_exists", "digest_mismatch", *_TAKES, *_WRITES),
     },
     openapi_extra=_RAW_BODY,
@@ -155,9 +155,9 @@ async def put_file(
     caller: DatasetWriter,
     content_length: Annotated[int | None, Header(ge=0)] = None,
     repr_digest: Annotated[str | None, Header(description="`sha-256=:BASE64:`")] = None,
-    if_none_match: Annotated[str | None, Header(description="`*` forbids to replace a file.")] = None,
+    if_none_match: Annotated[str | None, Header(description="`*`: do not replace an existing file.")] = None,
 ) -> Response:
-    """One file, as raw bytes. The same request again changes nothing."""
+    """Uploads one file as raw bytes. Repeating the request changes nothing."""
     limit = caller.service.settings.max_file_bytes
     safe = checked_path(path)
     refuse_announced_excess(
@@ -211,9 +211,9 @@ def _announced_digest(header: str | None) -> str | None:
     },
 )
 async def upload_archive(dataset_id: DatasetId, request: Request, caller: DatasetWriter) -> DatasetView:
-    """All files of a zip, tar or tar.gz, as the raw body. Folders that merely wrap everything are dropped.
+    """Uploads all files of a zip, tar or tar.gz, sent as the raw body. A folder around everything is dropped.
 
-    All or nothing: where one entry is not acceptable, no file is taken.
+    If one entry is not acceptable, no file is added.
     """
     limit = caller.service.settings.max_archive_bytes
     refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.disk_budget)
@@ -231,19 +231,19 @@ async def upload_archive(dataset_id: DatasetId, request: Request, caller: Datase
     operation_id="finalizeDataset",
     response_model=DatasetView,
     responses={
-        202: {"model": DatasetView, "description": "Under way (asked for by `Prefer: respond-async`)."},
+        202: {"model": DatasetView, "description": "In progress (with `Prefer: respond-async`)."},
         **declared("not_found", "dataset_not_complete", "dataset_invalid", "name_collision", *_WRITES),
     },
 )
 async def finalize_dataset(
     dataset_id: DatasetId,
     caller: DatasetWriter,
-    prefer: Annotated[str, Header(description="`respond-async` answers at once.")] = "",
+    prefer: Annotated[str, Header(description="`respond-async`: respond at once.")] = "",
 ) -> Response:
     """Freezes the files and checks them: poses, intrinsics, names, and every pixel.
 
-    Answers when the check is done: 200 with a `ready` dataset, or 422 with what is wrong and how to fix it
-    (the dataset is then `rejected`, and takes neither files nor jobs).
+    Responds when the check is done: 200 with a `ready` dataset, or 422 with what is wrong and how to fix it
+    (the dataset is then `rejected` and accepts neither files nor jobs).
     """
     view = await begin_check(caller, dataset_id)
     if "respond-async" in prefer.lower() and view.state == "finalizing":

@@ -1,4 +1,4 @@
-"""What grows out of a job: its log and rows for each image, forks of its work, exports of its result."""
+"""What is made from a job: its log, the table of its images, forks and exports."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _BODY = ("malformed_json", "body_too_large", "unsupported_media", "body_timeout"
 LINES = "application/x-ndjson"
 _LOG: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "Lines, the oldest first. `Link: rel=next` leads to what comes after them, if more can come.",
+        "description": "Lines, the oldest first. `Link: rel=next` leads to the following lines, if there can be any.",
         "content": {
             LINES: {"schema": {"type": "string"}, "example": '{"n": 1, "attempt": 1, "text": "6 images"}\n'},
             "text/plain": {"schema": {"type": "string"}, "example": "6 images\n"},
@@ -47,8 +47,8 @@ async def get_job_log(
     ] = None,
     accept: Annotated[str, Header()] = "",
 ) -> Response:
-    """What the job's process has written so far, while it runs too."""
-    # The state first: what is written between the two looks is not missed.
+    """The log of the job's process, also while it runs."""
+    # Read the state first, so that lines written in between are not missed.
     job = await caller.jobs.get(job_id)
     lines = await caller.jobs.log(job_id, after=after, limit=limit)
     headers = {"Cache-Control": "no-cache"}
@@ -86,7 +86,7 @@ async def list_images(
     ] = "",
     limit: Annotated[int, Query(ge=1, le=100_000)] = 100_000,
 ) -> ImageList:
-    """What the report says of each image, in the set's order or sorted; what a column does not know comes last."""
+    """The report's rows of the images, in the dataset's order or sorted; unknown values come last."""
     column = sort.removeprefix("-")
     if column and column not in IMAGE_COLUMNS:
         detail = f"There is no column {column!r}; there are {', '.join(sorted(IMAGE_COLUMNS))}."
@@ -98,7 +98,7 @@ async def list_images(
 
 
 def _image_rows(report: dict[str, Any], column: str, *, descending: bool, limit: int) -> ImageList:
-    """The rows by a column of `IMAGE_COLUMNS`, or in the set's order; what is unknown comes last."""
+    """The rows sorted by a column of `IMAGE_COLUMNS`, or in the dataset's order; unknown values come last."""
     rows = [_row(image) for image in report["images"]]
     if column:
         known = [row for row in rows if getattr(row, column) is not None]
@@ -136,10 +136,10 @@ async def fork_job(
     request: Request,
     caller: JobWriter,
     idempotency_key: Annotated[
-        str | None, Header(description="The same key with the same request answers with the same job.")
+        str | None, Header(description="Repeating the request with the same key returns the same job.")
     ] = None,
 ) -> Response:
-    """Queues a job on the same dataset with other options, that takes over the work of a stage of this one."""
+    """Queues a job on the same dataset with other options, reusing the result of a stage of this one."""
     key = checked_key(idempotency_key)
     body = await read_json(request, ForkJob)
     changes = body.options.model_dump(mode="json", exclude_unset=True)
@@ -157,7 +157,7 @@ async def fork_job(
     tags=["results"],
     openapi_extra=json_request(NewExport, required=False),
     responses={
-        200: {"model": JobView, "description": "It was asked for before, and is there."},
+        200: {"model": JobView, "description": "The same export was requested before and is complete."},
         **declared(
             "result_not_ready",
             "state_conflict",
@@ -170,10 +170,10 @@ async def fork_job(
     },
 )
 async def export_job(job_id: JobId, request: Request, caller: JobWriter) -> Response:
-    """Writes the result in further forms; its files then stand among those of the job.
+    """Writes the result in additional formats; the files are then listed with those of the job.
 
-    The answer is a job of its own, to be followed and cancelled as any other. The same request finds the same
-    export.
+    The response is a job of its own, which can be followed and cancelled like any other. Repeating the request
+    returns the same export.
     """
     body = await read_json(request, NewExport)
     job, new = await _derived(caller).export(job_id, body.formats)

@@ -1,4 +1,4 @@
-"""Probes for whoever runs the service, and figures for Prometheus. Probes need no API key."""
+"""Health checks and metrics for Prometheus. Health checks need no API key."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ _LACKING = ("database_unavailable", "storage_unavailable", "queue_unavailable", 
 
 @router.get("/livez", operation_id="livez", responses=declared("internal_error"))
 async def livez() -> Health:
-    """The process runs and answers. Says nothing about what it needs: restarting it would not help."""
+    """The process runs and responds. Its dependencies are not checked: a restart would not repair them."""
     return Health()
 
 
 @router.get("/readyz", operation_id="readyz", responses=declared(*_LACKING, "internal_error"))
 async def readyz(service: CurrentService) -> Health:
-    """Database, file storage and queue answer: jobs can be taken. 503 as soon as the service is stopping."""
+    """Database, file storage and queue respond, so jobs can be submitted. 503 once the service is stopping."""
     await _require_everything(service)
     return Health()
 
 
 @router.get("/startupz", operation_id="startupz", responses=declared(*_LACKING, "internal_error"))
 async def startupz(service: CurrentService) -> Health:
-    """The service has been ready once since its start; from then on `readyz` tells how it is."""
+    """The service has been ready once since its start; after that use `readyz`."""
     if not service.started.is_set():
         await _require_everything(service)
     return Health()
@@ -64,7 +64,7 @@ async def _require_everything(service: Service) -> None:
     response_class=PlainTextResponse,
     responses={
         200: {
-            "description": "Prometheus' text form, or OpenMetrics where `Accept` asks for it.",
+            "description": "Prometheus' text format, or OpenMetrics if `Accept` asks for it.",
             "content": {
                 "text/plain": {"schema": {"type": "string"}, "example": "biresnerf_database_up 1.0\n"}
             },
@@ -79,7 +79,7 @@ async def get_metrics(
         str, Header(description="`Bearer` and BIRESNERF_METRICS_TOKEN, or an admin key.")
     ] = "",
 ) -> Response:
-    """Figures of this process and of the whole installation. Without the database: of this process alone."""
+    """Metrics of this process and of the installation; without the database only of this process."""
     await _require_scraper(service, authorization)
     try:
         installation = await service.stores.monitor.statistics()
@@ -90,7 +90,7 @@ async def get_metrics(
 
 
 async def _require_scraper(service: Service, authorization: str) -> None:
-    """Figures tell what goes on here, so they are not for everybody who can reach the port."""
+    """Metrics reveal what the service does, so not everyone who can reach the port may read them."""
     if not await may_scrape(service, authorization):
         raise ProblemError(
             "metrics_token_required",

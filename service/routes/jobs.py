@@ -1,4 +1,4 @@
-"""Jobs: submit, look, list, cancel, delete."""
+"""Jobs: submit, list, read, cancel, delete."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _BODY = {
     response_model=JobView,
     openapi_extra=_BODY,
     responses={
-        200: {"model": JobView, "description": "The job is over; only with `Prefer: wait`."},
+        200: {"model": JobView, "description": "The job has ended; only with `Prefer: wait`."},
         **declared(
             *("malformed_json", "bad_idempotency_key", "not_found", "dataset_not_ready", "body_too_large"),
             *(
@@ -86,12 +86,12 @@ async def submit_job(
     request: Request,
     caller: JobWriter,
     idempotency_key: Annotated[
-        str | None, Header(description="The same key with the same request answers with the same job.")
+        str | None, Header(description="Repeating the request with the same key returns the same job.")
     ] = None,
     prefer: Annotated[
         str | None,
         Header(
-            description="`wait=N` (60 at most): answer once the job is over, or as it is after N seconds.",
+            description="`wait=N` (at most 60): respond when the job has ended, or after N seconds.",
             examples=["wait=30"],
         ),
     ] = None,
@@ -152,7 +152,7 @@ def _label(text: str | None) -> tuple[str, str] | None:
         return None
     name, colon, value = text.partition(":")
     if not colon or "\0" in text:
-        detail = "A label is asked for as name:value."
+        detail = "The label must have the form name:value."
         raise ProblemError(
             "invalid_request", detail, errors=[FieldProblem(pointer="/query/label", detail=detail)]
         )
@@ -163,17 +163,17 @@ def _label(text: str | None) -> tuple[str, str] | None:
     "/{job_id}",
     operation_id="getJob",
     response_model=JobView,
-    responses={304: {"description": "As you have it."}, **declared("not_found", "invalid_request", *_ALWAYS)},
+    responses={304: {"description": "Not modified."}, **declared("not_found", "invalid_request", *_ALWAYS)},
 )
 async def get_job(
     job_id: JobId,
     caller: ReadCaller,
     wait: Annotated[
-        float, Query(ge=0, le=60, description="Answer when the job is over, or after so many seconds.")
+        float, Query(ge=0, le=60, description="Respond when the job has ended, or after this many seconds.")
     ] = 0,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """The job now: state, stage, step, loss, seconds left, place in the queue."""
+    """The current job: state, stage, step, loss, seconds left, position in the queue."""
     jobs = caller.jobs
     job = await (waited_for(jobs, job_id, wait, caller.service.closing) if wait else jobs.get(job_id))
     headers = {} if job.final else {"Retry-After": POLL_S}
@@ -188,12 +188,12 @@ async def get_job(
     response_model=JobView,
     openapi_extra=json_request(CancelJob, required=False),
     responses={
-        202: {"model": JobView, "description": "Asked for; the job ends within 10 seconds."},
+        202: {"model": JobView, "description": "Cancellation is requested; the job ends within 10 seconds."},
         **declared("not_found", *_JSON, *_WRITES),
     },
 )
 async def cancel_job(job_id: JobId, request: Request, caller: JobWriter) -> Response:
-    """Ends a job, with a partial result if the body asks for one. One that is over already stays as it is."""
+    """Cancels a job, with a partial result if requested. A job that has ended stays as it is."""
     body = CancelJob()
     if request.headers.get("content-type"):
         body = await read_json(request, CancelJob)
@@ -208,5 +208,5 @@ async def cancel_job(job_id: JobId, request: Request, caller: JobWriter) -> Resp
     responses=declared("not_found", "state_conflict", *_WRITES),
 )
 async def delete_job(job_id: JobId, caller: JobWriter) -> None:
-    """Deletes a job that is over, with its results and its exports."""
+    """Deletes a job that has ended, with its results and exports."""
     await caller.jobs.delete(job_id)

@@ -1,4 +1,4 @@
-"""What the service is, what may be asked for, and whether it is well."""
+"""Version and limits of the service, and the options of jobs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ARCHIVES = ["application/zip", "application/x-tar", "application/gzip"]
     "/v1/options",
     operation_id="getOptions",
     response_model=OptionsView,
-    responses={304: {"description": "As you have it."}, **declared("internal_error")},
+    responses={304: {"description": "Not modified."}, **declared("internal_error")},
 )
 async def get_options(
     response: Response, _: ReadCaller, if_none_match: Annotated[str | None, Header()] = None

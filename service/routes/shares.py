@@ -1,4 +1,4 @@
-"""Links to single files of a result, for people and programs without a key."""
+"""Signed links to single files of a result, for people and programs without a key."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ async def share_artifact(
     body: Annotated[NewShare, Depends(body_of(NewShare))],
     response: Response,
 ) -> ShareView:
-    """A link to one file that needs no key and is good for a time. Whoever has the link has the file."""
+    """Creates a link to one file that needs no key and expires. Anyone with the link can read the file."""
     artifact = await find_artifact(caller.jobs, job_id, body.name)
     expires = int(time.time()) + body.valid_s
     signed = _signature(caller.service.stores.share_key, job_id, artifact.name, expires)
@@ -72,22 +72,22 @@ async def get_shared(
     service: CurrentService,
     asked: Asked,
 ) -> Response:
-    """The file of a link made by `POST /v1/jobs/{id}/shares`. Needs no key."""
+    """The file of a link created by `POST /v1/jobs/{id}/shares`. Needs no key."""
     _require_signature(service.stores.share_key, job_id, name, expires, signed)
     artifact = await find_artifact(service.stores.jobs, job_id, name)
     return await answer_with(service, artifact, asked, reading=request.method == "GET")
 
 
 def _signature(key: bytes, job_id: str, name: str, expires: int) -> str:
-    """What only a holder of ``key`` can make for this file and time."""
+    """The signature of this file name and expiry time with ``key``."""
     message = "\n".join(["biresnerf share 1", job_id, str(expires), name]).encode()
     return base64.urlsafe_b64encode(hmac.digest(key, message, hashlib.sha256)).decode().rstrip("=")
 
 
 def _require_signature(key: bytes, job_id: str, name: str, expires: int, given: str) -> None:
-    """Raises ``ProblemError``: ``not_found`` for a link we never made, ``link_expired`` for an old one."""
+    """Raises ``ProblemError``: ``not_found`` for a wrong signature, ``link_expired`` after the expiry time."""
     made = _signature(key, job_id, name, expires)
     if not hmac.compare_digest(made.encode(), given.encode(errors="replace")):
-        raise ProblemError("not_found", "This service never gave out such a link.")
+        raise ProblemError("not_found", "This service did not create this link.")
     if expires < time.time():
-        raise ProblemError("link_expired", "The link was good for a time, which is over.")
+        raise ProblemError("link_expired", "The link has expired.")

@@ -1,4 +1,4 @@
-"""Files that clients send to the store themselves: signed addresses first, proof of what arrived after."""
+"""Files that clients send directly to the store: signed URLs first, then verification of what arrived."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ async def sign_uploads(
     caller: DatasetWriter,
     body: Annotated[NewSignedUploads, Depends(body_of(NewSignedUploads))],
 ) -> SignedUploads:
-    """An address at the store for each file. `PUT` the bytes there, then `POST …/complete` the upload here."""
+    """Creates a signed URL at the store for each file. `PUT` the bytes there, then `POST …/complete` here."""
     await caller.datasets.get(dataset_id)
     paths = [checked_path(file.path) for file in body.files]
     await _addresses(caller, [])  # refuse before anything is created
@@ -55,7 +55,7 @@ async def _addresses(caller: Caller, keys: list[str]) -> list[str]:
     if urls is None:
         raise ProblemError(
             "direct_upload_unavailable",
-            "This service takes files itself only.",
+            "This service accepts files only itself.",
             hint="Use PUT …/files/{path}, or a resumable upload.",
         )
     return list(urls)
@@ -74,9 +74,9 @@ def _key(upload: Upload) -> str:
     ),
 )
 async def complete_upload(upload_id: UploadId, caller: DatasetWriter) -> FileView:
-    """Verifies size and SHA-256 of what arrived at the store; only then it is a file of the dataset.
+    """Verifies size and SHA-256 of the bytes at the store, and adds them to the dataset as a file.
 
-    Where they are others (422), the bytes can be sent again. The same request again changes nothing.
+    If they differ (422), the bytes can be sent again. Repeating the request changes nothing.
     """
     upload = await caller.uploads.get(upload_id)
     path, sha256 = upload.path, upload.sha256

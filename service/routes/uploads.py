@@ -1,4 +1,4 @@
-"""Uploads that survive broken connections and restarts: tus 1.0 (core, creation, expiration, termination).
+"""Resumable uploads: tus 1.0 (core, creation, expiration, termination).
 
 https://tus.io/protocols/resumable-upload. This is the only file that knows the protocol.
 """
@@ -32,12 +32,12 @@ _DIGEST = re.compile(r"[0-9a-f]{64}")
 _ALWAYS = ("precondition_failed", "database_unavailable", "storage_unavailable", "internal_error")
 _METADATA = (
     "`name BASE64` pairs with commas between. `path`: the upload is this one file; without it, an archive. "
-    "`sha256`: what the whole must have, in hex."
+    "`sha256`: the digest of the whole upload, in hex."
 )
 
 
 def _speak_tus(request: Request) -> None:
-    """Every answer names the version, errors too."""
+    """Adds the protocol version to every response, errors included."""
     request.state.extra_headers = SPEAKS
 
 
@@ -71,7 +71,7 @@ def _where(upload: Upload) -> dict[str, str]:
     responses=declared("not_found", "internal_error"),
 )
 async def describe_uploads(dataset_id: DatasetId, caller: ReadCaller) -> Response:
-    """What of the tus protocol is spoken here."""
+    """Which parts of the tus protocol are supported."""
     headers = {
         "Tus-Version": VERSION,
         "Tus-Extension": "creation,expiration,termination",
@@ -94,12 +94,12 @@ async def describe_uploads(dataset_id: DatasetId, caller: ReadCaller) -> Respons
 async def create_upload(
     dataset_id: DatasetId,
     caller: DatasetWriter,
-    upload_length: Annotated[int, Header(ge=0, lt=2**62, description="Bytes that are going to be sent.")],
+    upload_length: Annotated[int, Header(ge=0, lt=2**62, description="Size of the upload in bytes.")],
     upload_metadata: Annotated[str, Header(description=_METADATA, max_length=8192)] = "",
 ) -> Response:
     """A new resumable upload of one archive (zip, tar, tar.gz) or one large file."""
-    said = _metadata(upload_metadata)
-    path, sha256 = said.get("path"), said.get("sha256")
+    metadata = _metadata(upload_metadata)
+    path, sha256 = metadata.get("path"), metadata.get("sha256")
     if sha256 is not None and not _DIGEST.fullmatch(sha256):
         raise ProblemError("invalid_request", "The value of sha256 is no SHA-256.", where="Upload-Metadata")
     await asyncio.to_thread(caller.service.disk_budget.require, upload_length)
@@ -117,16 +117,16 @@ async def create_upload(
 
 
 def _metadata(header: str) -> dict[str, str]:
-    said = {}
+    values = {}
     for pair in filter(None, (part.strip() for part in header.split(","))):
         name, _, value = pair.partition(" ")
         try:
-            said[name] = base64.b64decode(value.strip(), validate=True).decode()
+            values[name] = base64.b64decode(value.strip(), validate=True).decode()
         except (binascii.Error, UnicodeDecodeError):
             raise ProblemError(
                 "invalid_request", f"The value of {name[:50]!r} is no Base64 text.", where="Upload-Metadata"
             ) from None
-    return said
+    return values
 
 
 @router.head(
@@ -136,13 +136,13 @@ def _metadata(header: str) -> dict[str, str]:
     dependencies=[SameVersion],
 )
 async def head_upload(upload_id: UploadId, caller: ReadCaller) -> Response:
-    """At which byte the upload goes on (`Upload-Offset`)."""
+    """The offset at which the upload continues (`Upload-Offset`)."""
     return Response(status_code=200, headers=_where(await caller.uploads.get(upload_id)))
 
 
 @router.get("/uploads/{upload_id}", operation_id="getUpload", responses=declared("not_found", *_ALWAYS))
 async def get_upload(upload_id: UploadId, caller: ReadCaller) -> UploadView:
-    """How far the upload is, and once all is received, what became of it (`stored` or `rejected`)."""
+    """The progress of the upload, and its outcome (`stored` or `rejected`) once all bytes are received."""
     return await caller.uploads.get(upload_id)
 
 
@@ -169,12 +169,12 @@ async def append_upload(
     upload_id: UploadId,
     request: Request,
     caller: DatasetWriter,
-    upload_offset: Annotated[int, Header(ge=0, lt=2**62, description="Number of the first byte sent.")],
+    upload_offset: Annotated[int, Header(ge=0, lt=2**62, description="Offset of the first byte sent.")],
 ) -> Response:
-    """The next bytes. What arrived is kept however the connection ends; `HEAD` says how much that is.
+    """Appends bytes. Those that arrived are kept however the connection ends; `HEAD` returns how many.
 
-    With the last byte the upload is brought into the dataset: an archive is unpacked, all or nothing.
-    `POST …/finalize` waits for that, and tells where it went wrong.
+    After the last byte the upload is added to the dataset; an archive is unpacked completely or not at all.
+    `POST …/finalize` waits for that and reports errors.
     """
     if request.headers.get("content-type", "").partition(";")[0].strip() != CONTENT_TYPE:
         raise ProblemError("unsupported_media", f"The Content-Type must be {CONTENT_TYPE}.")
@@ -198,5 +198,5 @@ async def append_upload(
     dependencies=[SameVersion],
 )
 async def delete_upload(upload_id: UploadId, caller: DatasetWriter) -> None:
-    """Gives the upload up. What it has brought into the dataset already stays there."""
+    """Deletes the upload. Files that it has already added to the dataset stay."""
     await caller.uploads.delete(upload_id)

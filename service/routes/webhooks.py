@@ -1,4 +1,4 @@
-"""Webhooks: who is told of what over signed HTTP messages, and what became of each message."""
+"""Webhooks, their secrets, and the delivery of each message."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _BODY = ("malformed_json", "body_too_large", "unsupported_media", "body_timeout"
 async def create_webhook(
     caller: JobWriter, body: Annotated[NewWebhook, Depends(body_of(NewWebhook))], response: Response
 ) -> WebhookWithSecret:
-    """A webhook for all jobs and datasets. The secret in the answer is not told again."""
+    """Creates a webhook for all jobs and datasets. The secret is shown only in this response."""
     webhook, secret = await caller.webhooks.create(caller.tenant, body.url, body.events, body.description)
     response.headers["Location"] = webhook_url(webhook.id)
     return WebhookWithSecret(**dict(webhook), secret=secret)
@@ -50,12 +50,12 @@ async def list_webhooks(
     response: Response,
     caller: ReadCaller,
     job: Annotated[
-        str | None, Query(max_length=100, pattern="^[0-9A-Za-z_]*$", description="Those of this job alone.")
+        str | None, Query(max_length=100, pattern="^[0-9A-Za-z_]*$", description="Only those of this job.")
     ] = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     cursor: Annotated[str | None, Query(max_length=500)] = None,
 ) -> WebhookList:
-    """Webhooks for all jobs, or those sent along with one job; newest first."""
+    """Lists the webhooks for all jobs, or those of one job; newest first."""
     page = await caller.webhooks.list(job_id=job, limit=limit, cursor=cursor)
     response.headers.update(next_link(request, page.next_cursor))
     return WebhookList(items=page.items, next_cursor=page.next_cursor)
@@ -63,7 +63,7 @@ async def list_webhooks(
 
 @router.get("/{webhook_id}", operation_id="getWebhook", responses=declared("not_found", *_ALWAYS))
 async def get_webhook(webhook_id: WebhookId, caller: ReadCaller) -> WebhookView:
-    """The webhook, and whether it works."""
+    """The webhook, and since when its deliveries fail."""
     return await caller.webhooks.get(webhook_id)
 
 
@@ -76,7 +76,7 @@ async def get_webhook(webhook_id: WebhookId, caller: ReadCaller) -> WebhookView:
 async def change_webhook(
     caller: JobWriter, webhook_id: WebhookId, body: Annotated[WebhookChange, Depends(body_of(WebhookChange))]
 ) -> WebhookView:
-    """Changes what is given; switches it off or on again."""
+    """Changes the given fields; disables or enables the webhook."""
     return await caller.webhooks.change(webhook_id, **body.model_dump())
 
 
@@ -87,7 +87,7 @@ async def change_webhook(
     responses=declared("not_found", *_WRITES),
 )
 async def delete_webhook(webhook_id: WebhookId, caller: JobWriter) -> None:
-    """Deletes it with its deliveries; what waits is not sent."""
+    """Deletes the webhook with its deliveries; messages that wait are not sent."""
     await caller.webhooks.delete(webhook_id)
 
 
@@ -95,7 +95,7 @@ async def delete_webhook(webhook_id: WebhookId, caller: JobWriter) -> None:
     "/{webhook_id}/secret", operation_id="rotateWebhookSecret", responses=declared("not_found", *_WRITES)
 )
 async def rotate_secret(webhook_id: WebhookId, caller: JobWriter) -> WebhookWithSecret:
-    """A new secret. For 24 hours messages are signed with the one before too."""
+    """Creates a new secret. For 24 hours messages are also signed with the previous one."""
     webhook, secret = await caller.webhooks.rotate(webhook_id)
     return WebhookWithSecret(**dict(webhook), secret=secret)
 
@@ -107,7 +107,7 @@ async def rotate_secret(webhook_id: WebhookId, caller: JobWriter) -> WebhookWith
     responses=declared("not_found", "state_conflict", *_WRITES),
 )
 async def test_webhook(webhook_id: WebhookId, caller: JobWriter, response: Response) -> DeliveryView:
-    """Sends a message `webhook.test`; the delivery at `Location` tells what came of it."""
+    """Sends a message `webhook.test`; its delivery is at `Location`."""
     delivery = await caller.webhooks.test(webhook_id)
     response.headers["Location"] = delivery_path(delivery.webhook_id, delivery.id)
     return delivery
@@ -126,7 +126,7 @@ async def list_deliveries(
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     cursor: Annotated[str | None, Query(max_length=500)] = None,
 ) -> DeliveryList:
-    """What was sent and what waits, newest first, with every attempt's time and status."""
+    """Messages sent and waiting, newest first, with the time and status of every attempt."""
     page = await caller.webhooks.deliveries(webhook_id, limit=limit, cursor=cursor)
     response.headers.update(next_link(request, page.next_cursor))
     return DeliveryList(items=page.items, next_cursor=page.next_cursor)
@@ -149,5 +149,5 @@ async def get_delivery(webhook_id: WebhookId, delivery_id: DeliveryId, caller: R
     responses=declared("not_found", "state_conflict", *_WRITES),
 )
 async def redeliver(webhook_id: WebhookId, delivery_id: DeliveryId, caller: JobWriter) -> DeliveryView:
-    """Sends a message again at once, under the id it had, so that a receiver can tell."""
+    """Sends a message again at once, with its original id, so that receivers recognise it."""
     return await caller.webhooks.redeliver(webhook_id, delivery_id)

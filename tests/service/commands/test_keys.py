@@ -9,7 +9,7 @@ import httpx
 import pytest
 
 from biresnerf.client import Client, ServiceError
-from service.http.access import STRANGERS_BURST
+from service.http.access import UNIDENTIFIED_BURST
 from service.http.rate_limits import Buckets
 from tests.service.conftest import (
     Running,
@@ -171,7 +171,7 @@ def test_strangers_are_slowed_down_and_keys_from_the_same_address_are_not(
     closed: Running, tenants: tuple[Tenant, Tenant]
 ):
     with client_with(closed, "brn_wrong") as stranger:
-        answers = (stranger.get("/v1/jobs") for _ in range(20 * STRANGERS_BURST))
+        answers = (stranger.get("/v1/jobs") for _ in range(20 * UNIDENTIFIED_BURST))
         last = next(answer for answer in answers if answer.status_code != 401)
     assert int(last.headers["retry-after"]) >= 1
     assert problem(last, 429, "rate_limited")["retryable"]
