@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from biresnerf import __version__
 from biresnerf.data.formats.read_dataset import read_poses
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.pose_error import camera_errors, pose_error
@@ -187,8 +187,7 @@ def main() -> int:
         result = run_cell(folder, StopRequest())
     except Interrupted:
         return EXIT_STOPPED
-    with whole_file(folder / RESULT) as temporary:
-        temporary.write_text(result.model_dump_json(indent=1) + "\n", "utf-8")
+    write_text(folder / RESULT, result.model_dump_json(indent=1))
     return 0
 
 

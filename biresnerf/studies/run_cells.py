@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_text
 from biresnerf.errors import Interrupted
 from biresnerf.studies.cell import CELL, LOG, RESULT, RUN, Cell, CellResult
 
@@ -33,7 +33,7 @@ def run_in_child(cells: Path, cell: Cell) -> CellResult:
     folder = cells / cell.folder_name
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RESULT).unlink(missing_ok=True)
-    _write(folder / CELL, cell.model_dump_json(indent=1))
+    write_text(folder / CELL, cell.model_dump_json(indent=1))
     with (folder / LOG).open("wb") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "biresnerf.studies.run_cell", str(folder)],
@@ -55,7 +55,7 @@ def run_in_child(cells: Path, cell: Cell) -> CellResult:
     reason = f"killed by signal {-status}" if status < 0 else f"exit status {status}"
     failure = CellResult(cell=cell, error="\n".join([reason, *last_lines]))
     shutil.rmtree(folder / RUN, ignore_errors=True)
-    _write(folder / RESULT, failure.model_dump_json(indent=1))
+    write_text(folder / RESULT, failure.model_dump_json(indent=1))
     return failure
 
 
@@ -66,8 +66,3 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-
-
-def _write(path: Path, text: str) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text(text + "\n", "utf-8")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from biresnerf.data.show.renders import picture_stems, write_orbit, write_view
 from biresnerf.data.show.view_file import THUMBNAIL, ShownPictures, ShownView, ViewFile, write_view_file
 from biresnerf.data.show.view_pictures import write_contact_sheet, write_points, write_thumbnail
 from biresnerf.geometry.similarity import Similarity
-from biresnerf.progress import EXPORTING_FROM, Progress
+from biresnerf.progress import EXPORTING_FROM, Monitor, Progress
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.first_step import poses_in_input_frame
@@ -65,10 +65,8 @@ def write_result(folder: OutputFolder, stages: TwoStages, evaluation: Evaluation
             _, moved = _write_poses(path / REFINED, scene, refined_dataset, refined, report)
             poses = f"{REFINED}/{POSES}"
     # A run that is stopped must end soon: it leaves large exports out.
-    exports, should_stop = (
-        (optimiser.options.exports, stages.monitor.should_stop) if complete else ((), _never)
-    )
-    report, result = _write_poses(path, scene, returned_dataset, returned, report, exports, should_stop)
+    exports, monitor = (optimiser.options.exports, stages.monitor) if complete else ((), Monitor())
+    report, result = _write_poses(path, scene, returned_dataset, returned, report, exports, monitor)
     surface = evaluation.surface(optimiser.frame.unit_from_world, input_from_optimised)
     _write_view_file(path, scene, evaluation, moved or result, surface, poses)
     notes = write_report_html(path, report)
@@ -80,10 +78,6 @@ def write_result(folder: OutputFolder, stages: TwoStages, evaluation: Evaluation
         folder.clean_up()
         stages.monitor.report(Progress(stage="exporting", fraction=1.0, eta_s=0.0))
     return report
-
-
-def _never() -> bool:
-    return False
 
 
 class ResultPictures:
@@ -137,7 +131,7 @@ def _write_poses(
     world_from_cam: NDArray[np.float64],
     report: Report,
     exports: Sequence[str] = (),
-    should_stop: Callable[[], bool] = _never,
+    monitor: Monitor = Monitor(),  # noqa: B008 - frozen
 ) -> tuple[Report, RefinedSet]:
     """Write poses [n, 4, 4] in the formats of every result, in the input's own and in the exports.
 
@@ -147,7 +141,9 @@ def _write_poses(
     """
     refined = described(dataset, world_from_cam, report)
     refined = with_points_of(refined, dataset.source.colmap, scene.matches, scene.images)
-    notes = write_result_formats(refined, folder, exports, WriteContext(dataset, should_stop=should_stop))
+    notes = write_result_formats(
+        refined, folder, exports, WriteContext(dataset, should_stop=monitor.should_stop)
+    )
     notes += transforms_notes(dataset, world_from_cam)
     points = PointsReport(source=refined.points_source, count=len(refined.model.points))
     return report.model_copy(update={"points": points, "warnings": report.warnings + notes}), refined

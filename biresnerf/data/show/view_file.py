@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.json_document import read_model
 
 _FROZEN = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -85,8 +85,7 @@ class ViewFile(BaseModel):
 
 def write_view_file(view: ViewFile, folder: Path) -> None:
     """Writes the file into the result's ``folder``, whole or not at all."""
-    with whole_file(folder / VIEW) as temporary:
-        temporary.write_text(view.model_dump_json(indent=1) + "\n", "utf-8")
+    write_text(folder / VIEW, view.model_dump_json(indent=1))
 
 
 def read_view_file(folder: Path) -> ViewFile:

@@ -1,1 +1,1 @@
-"""The scene's frame, depth and overlap, as the cameras tell them. Nothing here is optimised."""
+"""The scene, and its frame, depth and overlap as the initial cameras give them. Nothing here is optimised."""

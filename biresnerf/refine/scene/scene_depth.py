@@ -1,4 +1,4 @@
-"""What feature matches tell of the scene: the rays of matched points, and how far away they lie."""
+"""The rays of matched points, and how far away the points are: for rigs whose axes do not meet."""
 
 from __future__ import annotations
 

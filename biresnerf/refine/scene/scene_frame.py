@@ -1,8 +1,8 @@
 """The unit frame: where the scene lies, how large it is, and what lies around it.
 
 One rule for all rigs: the inner box [-1, 1]^3 is centred on the point the cameras look at and as large as what a
-camera sees at that distance. A scene with a known background colour is taken to end there; another goes on
-outside, contracted.
+camera sees at that distance. A scene with a known background colour is assumed to end there; any other
+continues outside, contracted.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def scene_frame(poses: np.ndarray, images: ImageSet, depth: float | None = None)
     """The unit frame of a set, from its poses world_from_cam [n, 4, 4] (noisy ones will do) and images.
 
     Several sets of poses of the same images, one after the other, get a frame that suits them all. Where the optical
-    axes do not meet, the scene is taken to lie at ``depth`` before the cameras, in the poses' unit.
+    axes do not meet, the scene is assumed to lie at ``depth`` in front of the cameras, in the poses' unit.
     """
     centres = poses[:, :3, 3]
     focus = focus_point(poses)

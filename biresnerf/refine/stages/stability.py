@@ -1,4 +1,4 @@
-"""Error-stability detection, Algorithm 1 of Guo et al. 2023: when the coarse stage has given what it can.
+"""Error-stability detection, Algorithm 1 of Guo et al. 2023: when the coarse stage has converged.
 
 The paper gives no formula; three readings of it can be chosen. All see the error averaged over the blocks between
 checks, and all call it stable only once the floor is reached.
@@ -28,16 +28,12 @@ WINDOW = 10  # blocks
 SLOPE_DB = 0.15  # net change over the window that still counts as flat
 FLUCTUATION_DB = 0.35  # standard deviation about the line that still counts as calm
 CONFIRMATIONS: dict[DetectorName, int] = {"trend": 2, "counter": 1, "variance": 1}
-SURPLUS, RANGE = (
-    3,
-    0.05,
-)  # counter: most rises beyond falls, or the reverse; largest range of errors over their mean
-LONG_WINDOW, VARIATION = (
-    25,
-    0.03,
-)  # variance: blocks, and the largest standard deviation of errors over their mean
+# counter: most rises beyond falls, or the reverse; largest range of errors over their mean
+SURPLUS, RANGE = 3, 0.05
+# variance: blocks, and the largest standard deviation of errors over their mean
+LONG_WINDOW, VARIATION = 25, 0.03
 RISING_BLOCKS = 3  # blocks in a row with rising error that mean divergence
-# A rollback is dear, and a plateau's noise rises by itself half of the time: the rise over the window must stand out.
+# A rollback is costly, and a plateau's noise rises half of the time: the rise over the window must exceed the noise.
 RISE_DB, RISE_FLUCTUATIONS = 0.5, 4.0
 STILL_DEG = 0.05  # 90 % quantile of rotation change per block below which cameras have settled
 # Adam's steps have the size of the learning rate whatever the gradient: settled cameras still stagger by about
@@ -57,7 +53,7 @@ class DetectorState(BaseModel):
 
 @dataclass
 class StabilityDetector:
-    """Feed it the mean squared error of each block; `check` says what to do.
+    """Decides from the mean squared error of each block what to do next.
 
     Attributes:
         floor, cap: no switch before step `floor`; always at step `cap`.
@@ -99,7 +95,7 @@ class StabilityDetector:
         return "running"
 
     def signal(self) -> dict[str, float]:
-        """What it sees, for curves: the trend over the window and what of it counts as level, dB; checks in a row."""
+        """Its figures for curves: trend over the window and what counts as level, dB; confirmations in a row."""
         if len(self.decibels) < WINDOW:
             return {"confirmed": self.confirmed}
         change, fluctuation = self._trend()

@@ -2,7 +2,8 @@
 
 From one place the optimisation finds small baselines by itself (Lin et al. 2021, BARF, section 4.2). But a small
 baseline leaves a scene and its mirror image in depth nearly alike (the bas-relief ambiguity), so both are tried, and
-the one that predicts unseen photos better is kept. Cameras around a scene cannot be found this way: unseen photos tell.
+the one that predicts unseen photos better is kept. Cameras around a scene cannot be found this way; unseen photos
+show it.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ BETTER_DB, BETTER_DB_BOUNDED = 1.0, 2.0
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Poses world_from_cam [n, 4, 4] after a short run, and how well it predicts photos it was not shown (dB)."""
+    """Poses world_from_cam [n, 4, 4] after a short run, and its mean PSNR (dB) on unseen photos."""
 
     world_from_cam: NDArray[np.float64]
     psnr: float
@@ -53,7 +54,7 @@ def find_forward_facing(
 
     Raises:
         InputError: ``insufficient_overlap``: no poses were found that predict unseen photos.
-        Interrupted: ``should_stop`` said so.
+        Interrupted: ``should_stop`` returned true.
     """
     frame = scene_frame(np.tile(np.eye(4), (len(images), 1, 1)), images)
 
@@ -127,7 +128,7 @@ def _short_run(
     threads: int,
     should_stop: Callable[[], bool],
 ) -> Found:
-    """Stage 1 alone, from these poses; some views move their own pose and nothing else, and tell how good it is."""
+    """Stage 1 alone, from these poses; the views that score it move their own pose, but do not train the field."""
     unseen = trial_views(len(images))
     short = options.model_copy(
         update={

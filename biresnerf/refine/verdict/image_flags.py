@@ -1,4 +1,4 @@
-"""What single photos have against them: blur, another exposure, a pose that moved far."""
+"""Problems of single photos: blur, a different exposure, a pose that moved far."""
 
 from __future__ import annotations
 
@@ -17,11 +17,8 @@ BLURRED_BELOW = 0.3  # of the neighbours' sharpness: a blur of about one px of t
 GAIN_RAYS = 256  # of each photo
 EXPOSURE_OFF = 0.2  # log of the gain against the median photo's: a fifth, or a quarter of a stop
 DEVIATIONS = 5.0  # robust standard deviations that an outlier must stand out by as well
-FAR_TIMES, FAR_DEG, FAR_SHARE = (
-    4.0,
-    1.0,
-    0.02,
-)  # medians; and at least so many degrees, so much of the cameras' distance
+# A pose moved far by more than so many medians, and at least so many degrees or so much of the cameras' distance.
+FAR_TIMES, FAR_DEG, FAR_SHARE = 4.0, 1.0, 0.02
 MAD_TO_DEVIATION = 1.4826
 DARKEST = 0.02  # mean colour below which a photo has no gain
 

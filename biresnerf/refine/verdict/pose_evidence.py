@@ -24,7 +24,7 @@ from biresnerf.report import EpipolarEvidence, HeldOutEvidence
 
 Array = NDArray[np.float64]
 
-MATCHES_OF_IMAGE = 8  # an image with fewer says nothing
+MATCHES_OF_IMAGE = 8  # an image with fewer is not used
 LEAST_MATCHED = 4  # images
 LEAST_PX = 0.05  # errors below it are equal: matches are not that exact
 MOTION_GRID = 5  # points across and down
@@ -47,7 +47,7 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutComparison:
-    """What two trainings made of the unseen `views`."""
+    """Scores of the unseen `views` after two trainings."""
 
     views: list[int]
     before: TrialScores
@@ -73,14 +73,14 @@ def compare_on_unseen_views(
     device: torch.device,
     threads: int,
     should_stop: Callable[[], bool],
-    tell: Callable[[float], None] = lambda _share: None,
+    report: Callable[[float], None] = lambda _share: None,
 ) -> HeldOutComparison | None:
     """Train a field on either rig, held still, and score both on the same unseen views; None of too few images.
 
-    In small sets several times, with other views left out. ``tell`` is called with the share of the work that is done.
+    Small sets are trained several times, with other views left out. ``report`` is called with the share of work done.
 
     Raises:
-        Interrupted: ``should_stop`` said so.
+        Interrupted: ``should_stop`` returned true.
     """
     steps = options.trial_steps
     rounds = unseen_rounds(len(images), held_out, most=16)
@@ -92,7 +92,7 @@ def compare_on_unseen_views(
         trials = FrozenTrials(images, views, rigs, options, steps, device, threads, should_stop)
         for side, rig in zip(scores, (before, after), strict=True):
             side.append(trials.score(rig.world_from_cam, rig.lenses(images)))
-            tell(sum(map(len, scores)) / (2 * len(rounds)))
+            report(sum(map(len, scores)) / (2 * len(rounds)))
     old, new = (joined(side) for side in scores)
     seen = [view for views in rounds for view in views]
     evidence = HeldOutEvidence(

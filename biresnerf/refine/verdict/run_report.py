@@ -72,7 +72,7 @@ def run_report(
 
 
 def camera_reports(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[CameraReport, ...]:
-    """The set's cameras before and after."""
+    """The set's cameras before and after refinement."""
     used = [frame.camera for frame in dataset.frames]
     return tuple(
         CameraReport(
@@ -108,7 +108,7 @@ def _lost_warnings(dataset: Dataset, lost: list[int]) -> tuple[str, ...]:
 
 
 def unsure_warnings(dataset: Dataset, unsure_deg: np.ndarray) -> tuple[str, ...]:
-    """One that names the images whose `Judgement.unsure_deg` [n] is not zero; none of none."""
+    """A warning that names the images whose `Judgement.unsure_deg` [n] is not zero; empty where there is none."""
     unsure = np.flatnonzero(unsure_deg).tolist()
     if not unsure:
         return ()

@@ -1,7 +1,7 @@
-"""The decision: are the refined poses better than the input's? By fixed rules, by which the input has the doubt.
+"""The decision: are the refined poses better than the input's? Fixed rules; ties go to the input.
 
 docs/verdict.md explains them. Every comparison is paired and signed, positive where the refined poses are better, so
-that swapping the two sets of poses turns every finding round.
+that swapping the two sets of poses flips every finding.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ STUDENT = (
     12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131,
     2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
 )  # fmt: skip
-# What matters, and what chance cannot make: trainings on the same poses differ by less (docs/verdict.md).
+# Differences that matter and are larger than chance: trainings on the same poses differ by less (docs/verdict.md).
 PSNR_MATTERS, SSIM_MATTERS = 0.5, 0.01  # dB, and 1
 EPIPOLAR_MATTERS = 0.1  # log2: 7 % of the error
-SAME_WITHIN = 1.5  # times that: an interval inside it says that there is nothing to gain or lose
-MEASURABLE_PX = 0.1  # at working size: motion that no photo of that size tells
-# Feature matches that miss by more than this share of the image fit no scene: neither set of poses is to be trusted.
+SAME_WITHIN = 1.5  # times that: an interval inside it means no difference
+MEASURABLE_PX = 0.1  # at working size: less motion cannot be seen in photos of that size
+# Feature matches that miss by more than this share of the image fit no scene: neither set of poses can be trusted.
 FITS_BELOW = 0.02
-MOSTLY = 0.5  # share of cameras from which on a failing is that of the whole
-FAR_DEG, FAR_SHARE = 60.0, 0.5  # residuals (median) with which the result no longer lies in the input's frame
+MOSTLY = 0.5  # share of cameras; if more fail a check, the whole set fails it
+FAR_DEG, FAR_SHARE = 60.0, 0.5  # median residuals; beyond, the result is not in the input's frame
 
 
 @dataclass(frozen=True)
 class Findings:
-    """All that the decision rests on.
+    """All that the decision is based on.
 
     Attributes:
         failed: sentences on what is inconsistent; empty where all is well.
-        compared_with: whose the input's poses are.
+        compared_with: where the input's poses come from.
         grounded: whether the input's poses are given ones or come from matches, and are not mere guesses.
     """
 
@@ -148,8 +148,8 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
         )
     if speaks_for:
         return "improved", f"The refined poses are better by {speaks_for}."
-    said = [item.finding for item in _counted(f)]
-    if said and all(item == "same" for item in said):
+    findings = [item.finding for item in _counted(f)]
+    if findings and all(finding == "same" for finding in findings):
         return "kept_input", "The refined poses are no better than the input's by any measure."
     return "inconclusive", "The evidence is too weak to tell the refined poses from the input's."
 
@@ -184,21 +184,21 @@ def _against(f: Findings) -> str:
 
 def _sentences(f: Findings) -> list[str]:
     """The figures, in words."""
-    said = []
+    sentences = []
     if f.heldout is not None:
         p = f.heldout.psnr
-        said.append(
+        sentences.append(
             f"{p.count} unseen views: {p.before:.2f} dB with the input's poses, {p.after:.2f} dB with the refined ones"
             f"{_interval(p, 'dB')}."
         )
     if f.epipolar is not None:
         e = f.epipolar.error_px
         source = "" if f.epipolar.independent else ", which the start came from"
-        said.append(
+        sentences.append(
             f"{f.epipolar.matches} feature matches{source}: epipolar error {e.before:.2f} px with the input's poses, "
             f"{e.after:.2f} px with the refined ones{_interval(e, 'octaves')}."
         )
-    return said
+    return sentences
 
 
 def _interval(item: PairedDifference, unit: str) -> str:

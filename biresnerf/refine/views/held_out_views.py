@@ -19,17 +19,17 @@ def evenly_spread(views: Sequence[int], count: int) -> list[int]:
     return [views[int((i + 0.5) * len(views) / count)] for i in range(count)]
 
 
-def held_out_views(count: int, asked: int | Literal["auto"], sound: np.ndarray | None = None) -> list[int]:
+def held_out_views(count: int, asked: int | Literal["auto"], reliable: np.ndarray | None = None) -> list[int]:
     """Indices of the views kept from the field, evenly spread.
 
     Args:
         count: all views.
         asked: how many are wanted; auto: a tenth, at most 10, and none of fewer than 6.
-        sound: bool [count], views to choose from, where there are any: one whose own pose may be wrong proves nothing.
+        reliable: bool [count], views to choose from, where there are any: a view with a doubtful pose proves nothing.
     """
     usual = 0 if count < HOLD_OUT_FROM else max(1, min(HOLD_OUT_MOST, count // HOLD_OUT_ONE_IN))
     wanted = usual if asked == "auto" else asked
-    among = np.arange(count) if sound is None or not sound.any() else np.flatnonzero(sound)
+    among = np.arange(count) if reliable is None or not reliable.any() else np.flatnonzero(reliable)
     return evenly_spread(among.tolist(), min(wanted, max(0, count - 3), len(among)))
 
 

@@ -1,6 +1,8 @@
-"""Who sees what others see: exact on cameras and points placed by hand."""
+"""What several cameras see: where sampling may begin, and how much of a view others share."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +11,9 @@ import torch
 from biresnerf.data.model.dataset import Camera
 from biresnerf.data.synthetic.scene import synthetic_cameras
 from biresnerf.geometry.camera.camera import Intrinsics
-from biresnerf.refine.scene.shared_views import shared_shares
+from biresnerf.refine.scene.scene_frame import scene_frame
+from biresnerf.refine.scene.shared_views import FARTHEST, NEAREST, SPACING, nearest_shared, shared_shares
+from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set
 
 LENS = Camera("SIMPLE_PINHOLE", 20, 20, (20.0, 10.0, 10.0))  # half a unit to each side at a distance of one
 
@@ -53,3 +57,74 @@ def test_fisheyes_share_what_lies_beside_and_behind_them():
     lens = Camera("SIMPLE_RADIAL_FISHEYE", 20, 20, (5.0, 10.0, 10.0, 0.0))  # 115 degrees to each side
     beside = torch.tensor([[[50.0, 0.0, 0.0], [50.0, 0.0, -10.0], [50.0, 0.0, -100.0]]])
     assert shares(side_by_side(3), beside, [0], lens) == [pytest.approx(2 / 3)]
+
+
+def arc(count: int, apart_deg: float, distance: float = 5.0) -> np.ndarray:
+    """Cameras on an arc about the origin, looking at it."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for pose, angle in zip(poses, np.radians(apart_deg * np.arange(count)), strict=True):
+        forward = np.array([np.sin(angle), 0, np.cos(angle)])
+        pose[:3, :3] = np.stack([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], forward], 1)
+        pose[:3, 3] = -distance * forward
+    return poses
+
+
+def near_of(poses: np.ndarray, distance: float = 5.0) -> float:
+    camera = Camera("SIMPLE_PINHOLE", 20, 20, (20.0, 10.0, 10.0))
+    return nearest_shared(poses, Intrinsics.from_cameras([camera] * len(poses)), distance)
+
+
+def test_cameras_closer_together_may_see_nearer_things():
+    nears = [near_of(arc(12, apart)) for apart in (1, 4, 7)]
+    assert nears[0] == pytest.approx(NEAREST)
+    assert nears == sorted(nears)
+    assert nears[2] > nears[0]
+
+
+@pytest.mark.parametrize("apart", [4, 6])
+def test_where_sampling_begins_most_of_a_view_is_in_two_others(apart):
+    """By the geometry of the arc, in its plane: of the neighbours and theirs, two must have the point in view."""
+    near = near_of(arc(60, apart))
+    across = np.linspace(-0.5, 0.5, 200)  # half the angle of view is arctan 0.5
+
+    def seen(share: float) -> float:
+        x, z = 5 * share * across, np.full(200, 5 * share - 5)
+        views = []
+        for angle in np.radians(apart) * np.array([-2, -1, 1, 2]):
+            sideways = x * np.cos(angle) - z * np.sin(angle)
+            ahead = x * np.sin(angle) + z * np.cos(angle) + 5
+            views.append(np.abs(sideways) < 0.5 * ahead)
+        return float((np.sum(views, 0) >= 2).mean())
+
+    assert seen(near) >= 0.75
+    assert seen(near - SPACING) <= 0.85
+
+
+def test_scale_and_place_do_not_matter():
+    poses = arc(12, 6)
+    moved = poses.copy()
+    moved[:, :3, 3] = 100 * moved[:, :3, 3] + np.array([5.0, -7.0, 1e3])
+    assert near_of(moved, 500.0) == near_of(poses)
+
+
+def test_a_set_that_shares_little_is_sampled_from_as_near_as_ever():
+    assert near_of(arc(6, 60)) == NEAREST  # all around: only cameras across the scene look there
+
+
+def test_noise_never_moves_it_beyond_its_bound():
+    rng = np.random.default_rng(0)
+    poses = arc(12, 6)
+    poses[:, :3, 3] += rng.normal(0, 1.0, (12, 3))
+    assert NEAREST <= near_of(poses) <= FARTHEST
+
+
+def test_open_scenes_are_sampled_from_there_on_and_others_as_before(tmp_path):
+    dataset, images = tiny_set(tmp_path)
+    assert scene_frame(dataset.world_from_cam, images).near == 0.0
+    opened = replace(images, alpha=None, background=None)
+    optimiser = tiny_optimiser(dataset, opened, tiny_options())
+    optimiser.frame = replace(optimiser.frame, near=0.45)
+    optimiser.step_index, optimiser.switch = 39, 20
+    assert optimiser.marching(0.01).near == pytest.approx(0.45 * optimiser.frame.distance)
+    both = scene_frame(np.concatenate([dataset.world_from_cam] * 2), opened)
+    assert both.near == scene_frame(dataset.world_from_cam, opened).near
