@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.formats.read_poses import read_poses
+from biresnerf.data.formats.read_dataset import read_dataset, read_poses
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import load_images
 from biresnerf.field.backends import use_threads
@@ -63,7 +62,7 @@ def main() -> None:
             preset="fast", device="cpu", seed=seed, max_image_size=asked.size, trial_steps=asked.steps
         ).resolved("cpu")
         found = compare_on_unseen_views(
-            before, after, images, held_out_views(len(dataset), None), options, torch.device("cpu"),
+            before, after, images, held_out_views(len(dataset), "auto"), options, torch.device("cpu"),
             use_threads(0), lambda: False,
         )  # fmt: skip
         if found is None:

@@ -12,7 +12,7 @@ import numpy as np
 from biresnerf import RefineOptions
 from biresnerf.commands.poses.evaluate import matched_names
 from biresnerf.commands.settings_option import parse_settings
-from biresnerf.data.formats.read_poses import read_poses
+from biresnerf.data.formats.read_dataset import read_poses
 from biresnerf.errors import InputError
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.options.refine_options import parse_options

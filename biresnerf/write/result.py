@@ -131,7 +131,7 @@ def _write_poses(
     world_from_cam: NDArray[np.float64],
     report: Report,
     exports: Sequence[str] = (),
-    monitor: Monitor = Monitor(),  # noqa: B008 - frozen
+    monitor: Monitor = Monitor(),
 ) -> tuple[Report, RefinedSet]:
     """Write poses [n, 4, 4] in the formats of every result, in the input's own and in the exports.
 

@@ -68,8 +68,8 @@ class TwoStages:
         optimiser: JointOptimiser,
         scene: Scene,
         folder: Path,
-        origin: RunOrigin = RunOrigin(),  # noqa: B008 - frozen
-        monitor: Monitor = Monitor(),  # noqa: B008
+        origin: RunOrigin = RunOrigin(),
+        monitor: Monitor = Monitor(),
         observer: Observer = Observer(),
     ) -> None:
         self.optimiser, self.scene, self.folder, self.origin = optimiser, scene, folder, origin
