@@ -1,4 +1,4 @@
-"""What goes wrong between a client and its service."""
+"""The errors that a client raises."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from biresnerf.errors import BiresnerfError, FaultError
 from biresnerf.wire.jobs import JobView
 from biresnerf.wire.problems import FieldProblem, Problem
 
-# Answers that say: not now.
+# Statuses that ask to try again later.
 _LATER = frozenset({408, 429, 502, 503, 504, 507})
-# Of them, those with which the service has surely not done what was asked.
+# Those of them that mean that the service did nothing.
 _REFUSED = frozenset({408, 429, 503, 507})
 
 
@@ -22,8 +22,8 @@ class ServiceError(FaultError):
     """The service refused, failed, or could not be reached.
 
     Attributes:
-        code: the problem's stable code; the client's own are ``unreachable``, ``unexpected_answer``,
-            ``download_damaged`` and ``stopped``.
+        code: the problem's stable code; the client's own are ``bad_url``, ``unreachable``,
+            ``unexpected_answer``, ``file_changed`` and ``download_damaged``.
         detail: what is wrong, in one sentence.
         status: the HTTP status; 0 where there was no answer.
         where, hint: the file or field at fault, and what to do about it; empty where the service does not say.
@@ -56,7 +56,7 @@ class ServiceError(FaultError):
 
     @property
     def undone(self) -> bool:
-        """Whether the service has surely not done what was asked."""
+        """Whether the service certainly did nothing."""
         return self._untouched or self.status in _REFUSED
 
     @property
@@ -66,7 +66,7 @@ class ServiceError(FaultError):
 
     @classmethod
     def of_answer(cls, status: int, headers: Mapping[str, str], content: bytes) -> ServiceError:
-        """What an answer of 400 or more says."""
+        """The error in an answer of status 300 or more."""
         wait_s = retry_after_s(headers.get("retry-after"))
         try:
             problem = Problem.model_validate_json(content, extra="ignore")
@@ -84,19 +84,19 @@ class ServiceError(FaultError):
     def of_stranger(
         cls, status: int, *, request_id: str | None = None, retry_after_s: float | None = None
     ) -> ServiceError:
-        """An answer that no service of this project gives: of a proxy, a portal, another program."""
+        """An answer that did not come from a BiResNeRF service, but from a proxy or another program."""
         return cls(
             "unexpected_answer",
-            f"The answer has status {status} and is none that a BiResNeRF service gives.",
+            f"The answer has status {status} and does not come from a BiResNeRF service.",
             status=status,
-            hint="Look whether the address is right.",
+            hint="Check the address.",
             request_id=request_id,
             retry_after_s=retry_after_s,
         )
 
 
 class JobFailed(BiresnerfError):
-    """The job ended without the result that was waited for; ``job`` is how it ended."""
+    """The job failed, was cancelled or has expired; ``job`` is its final state."""
 
     def __init__(self, job: JobView) -> None:
         self.job = job
@@ -108,15 +108,15 @@ class JobFailed(BiresnerfError):
 
 
 class JobNotOver(BiresnerfError, TimeoutError):
-    """The job ``job_id`` was not over after ``timeout_s``. It goes on."""
+    """The job ``job_id`` was not over after ``timeout_s``. It continues."""
 
     def __init__(self, job_id: str, timeout_s: float) -> None:
         self.job_id, self.timeout_s = job_id, timeout_s
-        super().__init__(f"The job {job_id} is not over after {timeout_s:g} s; it goes on.")
+        super().__init__(f"The job {job_id} is not over after {timeout_s:g} s; it continues.")
 
 
 def retry_after_s(header: str | None) -> float | None:
-    """Seconds of a Retry-After header, which is a number of them or a date; none where it is neither."""
+    """The seconds in a Retry-After header, which holds a number or a date; None for anything else."""
     if header is None:
         return None
     if header.strip().isdecimal():

@@ -1,4 +1,4 @@
-"""What of a folder on this machine makes up the scene, and the names its files are sent under."""
+"""The files of a local folder that make up a scene, and the names they are sent under."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ TRANSFORMS = "transforms.json"
 
 @dataclass(frozen=True)
 class Scene:
-    """Files to send: name in the archive and path here, and their bytes together."""
+    """Files to send, as (name in the dataset, local path), and the sum of their bytes."""
 
     files: tuple[tuple[str, Path], ...]
     total_bytes: int
 
 
 def look_at(path: Path) -> Scene:
-    """The files that make up the input at ``path``: its poses, the images and masks that they name; or images alone.
+    """The files that make up the input at ``path``: poses with the images and masks they name, or images alone.
 
     Raises:
-        InputError: the input cannot be used, or an image lies outside of its folder.
+        InputError: the input cannot be used, or an image is outside its folder.
     """
     from biresnerf.data.formats.read_dataset import read_dataset
 
@@ -45,7 +45,7 @@ def look_at(path: Path) -> Scene:
 
 
 def _found_by_name(root: Path, path: Path, poses: list[tuple[str, Path]]) -> list[tuple[str, Path]]:
-    """The files, under names by which the service will read the same of them."""
+    """The files, renamed so that the service detects the same format."""
     from biresnerf.data.formats.folder import usual_name
 
     usual = usual_name(path)
@@ -54,12 +54,12 @@ def _found_by_name(root: Path, path: Path, poses: list[tuple[str, Path]]) -> lis
 
 def _name_below(root: Path, path: Path) -> str:
     try:
-        # Not resolved: a link inside the folder may lead to wherever its owner likes.
+        # Not resolved: a link inside the folder may point anywhere.
         name = Path(os.path.abspath(path)).relative_to(os.path.abspath(root)).as_posix()
     except ValueError:
         raise InputError(
             "image_outside",
-            "lies outside of the folder of the pose file, and cannot be sent with it.",
+            "is outside the folder of the pose file and cannot be sent with it.",
             where=str(path),
             hint="Move it below that folder, or run `biresnerf refine` on this machine.",
         ) from None

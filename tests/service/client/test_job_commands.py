@@ -155,7 +155,7 @@ def test_another_program_at_the_address_is_said_to_be_none_of_ours(service: Runn
     server.shutdown()
     server.server_close()
     assert (result.exit_code, result.stdout) == (exit_codes.INPUT, "")
-    assert "Look whether the address is right." in result.stderr
+    assert "Check the address." in result.stderr
     assert len(result.stderr.splitlines()) == 1
 
 
