@@ -6,9 +6,9 @@ import asyncio
 import contextlib
 import logging
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from typing import Any, LiteralString
+from typing import Any, Concatenate, LiteralString, ParamSpec, TypeVar
 
 import psycopg
 from psycopg.rows import DictRow, dict_row
@@ -37,6 +37,8 @@ LISTEN_CHANNEL = "biresnerf_jobs"
 RECONNECT_S = 1.0
 
 
+P = ParamSpec("P")
+T = TypeVar("T")
 Statement = LiteralString | bytes | SQL | Composed
 
 
@@ -81,6 +83,13 @@ class Database:
             raise Unavailable(
                 "database_unavailable", f"The database does not answer: {first_line(error)}"
             ) from error
+
+    async def run(
+        self, work: Callable[Concatenate[Connection, P], Awaitable[T]], *given: P.args, **named: P.kwargs
+    ) -> T:
+        """The answer of ``work`` in a transaction of its own; raises `Unavailable`."""
+        async with self.transaction() as connection:
+            return await work(connection, *given, **named)
 
     async def fetch(self, statement: Statement, *parameters: Any) -> list[DictRow]:
         """Rows of one statement in a transaction of its own."""

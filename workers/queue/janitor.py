@@ -80,8 +80,7 @@ class Janitor:
                 await fold_tallies(connection)
         if time.monotonic() >= self._upkeep_at:
             self._upkeep_at = time.monotonic() + UPKEEP_S
-            async with self._database.transaction() as connection:
-                await job_queue.delete_old_entries(connection)
+            await self._database.run(job_queue.delete_old_entries)
 
     def _distrust_after_a_pause(self, now_s: float) -> None:
         """After a machine slept or a database froze all workers were silent, though all live.

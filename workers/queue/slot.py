@@ -14,6 +14,7 @@ import shutil
 import signal
 import sys
 from collections.abc import AsyncIterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -113,12 +114,7 @@ class Slot:
     @contextlib.asynccontextmanager
     async def _registered(self, database: Database) -> AsyncIterator[int]:
         """This slot's id as a worker of the queue, which sends heartbeats until the end."""
-
-        async def register() -> int:
-            async with database.transaction() as connection:
-                return await job_queue.register_worker(connection)
-
-        worker_id = await retry_while_unavailable(register)
+        worker_id = await retry_while_unavailable(lambda: database.run(job_queue.register_worker))
         self._lock.remember(worker_id)
         await retry_while_unavailable(lambda: announce_slot(database, HOST, self._name, worker_id))
         # Time for a second try, on another connection, before a janitor takes the job back.
@@ -130,8 +126,7 @@ class Slot:
         finally:
             heartbeat.end()
             with contextlib.suppress(Unavailable):  # then a janitor does it
-                async with database.transaction() as connection:
-                    await job_queue.unregister_worker(connection, worker_id)
+                await database.run(job_queue.unregister_worker, worker_id)
 
     async def _work(self, database: Database, listener: Listener, worker_id: int) -> None:
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -140,8 +135,7 @@ class Slot:
             while not self._stop.is_set():
                 added.clear()
                 try:
-                    async with database.transaction() as connection:
-                        entry = await job_queue.take(connection, worker_id)
+                    entry = await database.run(job_queue.take, worker_id)
                 except Unavailable as error:
                     log.warning("no job can be taken: %s", error)
                     entry = None
@@ -160,12 +154,8 @@ class Slot:
             except Exception:  # our own failure must not end the slot
                 log.exception("the job goes back to the queue")
                 again_in_s = self._settings.stall_s / 4
-
-            async def acknowledge() -> bool:
-                async with database.transaction() as connection:
-                    return await job_queue.acknowledge(connection, entry.id, worker_id, again_in_s=again_in_s)
-
-            if not await retry_while_unavailable(acknowledge):
+            acknowledge = partial(job_queue.acknowledge, again_in_s=again_in_s)
+            if not await retry_while_unavailable(lambda: database.run(acknowledge, entry.id, worker_id)):
                 log.warning("queue entry %d is not ours any more", entry.id)
 
     async def _run_job(self, database: Database, listener: Listener, entry: Entry) -> float | None:

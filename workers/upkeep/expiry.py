@@ -70,8 +70,7 @@ class Expiry:
         return True
 
     async def _expire_jobs(self) -> int:
-        async with self._database.transaction() as connection:
-            return await expire_jobs(connection, BATCH)
+        return await self._database.run(expire_jobs, BATCH)
 
     async def _expire_datasets(self) -> int:
         rows = await self._database.fetch(
@@ -115,13 +114,11 @@ class Expiry:
 
     async def _forget(self) -> None:
         """Idempotency keys a while after their jobs; then the records of what expired, and of deliveries."""
-        async with self._database.transaction() as connection:
-            await forget_keys(connection, self._settings.keep_keys_hours * 3600)
+        await self._database.run(forget_keys, self._settings.keep_keys_hours * 3600)
         if not self._settings.keep_records_days:
             return
         old_s = self._settings.keep_records_days * DAY_S
-        async with self._database.transaction() as connection:
-            await delete_expired_jobs(connection, old_s)
+        await self._database.run(delete_expired_jobs, old_s)
         for sql in (
             "DELETE FROM datasets WHERE state = 'expired'"
             " AND expires_at < clock_timestamp() - make_interval(secs => %s)"
