@@ -35,10 +35,11 @@ class OutputFolder:
             return
         if not {path.name for path in self.path.iterdir()} - {CHECKPOINT.parent.name, HISTORY, PREVIEW}:
             return  # new, or killed before the first checkpoint
-        code, what = "output_not_empty", "is not empty, and nothing in it can be resumed."
+        where = str(self.path)
         if (self.path / REPORT).is_file():
-            code, what = "output_finished", "holds a finished result."
-        raise InputError(code, what, where=str(self.path), hint=OTHER_FOLDER)
+            raise InputError("output_finished", "holds a finished result.", where=where, hint=OTHER_FOLDER)
+        detail = "is not empty, and nothing in it can be resumed."
+        raise InputError("output_not_empty", detail, where=where, hint=OTHER_FOLDER)
 
     def remove_preview(self) -> None:
         """Remove previews, and the folder where it holds nothing else."""
