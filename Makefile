@@ -13,7 +13,7 @@ export PIP_CONSTRAINT := constraints.txt
 export PIP_BUILD_CONSTRAINT := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup web test test-fast lint format demo serve bench docs fuzz audit sbom compose-check
+.PHONY: help setup web test test-fast coverage lint format demo serve bench docs fuzz audit sbom compose-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -29,6 +29,10 @@ test: web  ## all tests; PYTEST="-k name" chooses
 
 test-fast: setup  ## within a minute: the tests that need no server and no browser and do not train
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 -m "not server and not browser and not slow" $(PYTEST)
+
+coverage: web  ## all tests with branch coverage, printed by file; in build/coverage as HTML
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile --cov --cov-report=term \
+	  --cov-report=html:build/coverage $(PYTEST)
 
 lint: setup  ## format, style, types and the direction of imports
 	$(BIN)/ruff format --check . && $(BIN)/ruff check .
