@@ -100,7 +100,7 @@ def test_ctrl_c_ends_a_call_at_once_and_the_client_goes_on() -> None:
         with pytest.raises(KeyboardInterrupt):
             client.job("job_1")
         thread.join()
-        assert ended.is_set()  # not left behind on the event loop
+        assert ended.wait(60)  # not left behind on the event loop
         client.delete_job("job_1")
 
 
