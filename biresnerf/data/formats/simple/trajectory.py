@@ -70,9 +70,7 @@ TIMES_OF_IMAGES = "rgb.txt"  # of TUM's sets
 MAX_POSES = 100_000
 MAX_TIME_APART_S = 0.02  # between an image and its pose, as in TUM's own tools
 _QUAT_LENGTH_ERROR = 1e-2
-_TUM_HEAD = (
-    "# timestamp tx ty tz qx qy qz qw: camera to world, OpenCV axes (x right, y down, z forward), the input's frame",
-)
+_HEAD = "# timestamp tx ty tz qx qy qz qw: camera to world, OpenCV axes (x right, y down, z forward), the input's frame"
 _COLUMNS: dict[int, str] = {8: "tum", 12: "kitti"}
 # What `refine` writes above its poses: which image was taken when.
 _NAMED_TIME = re.compile(r"#\s*([-+0-9.eE]+)\s+(\S.*\S|\S)\s*$")
@@ -103,7 +101,8 @@ class Trajectory:
                 raise _invalid(where, "holds a word that is no number.") from None
             if not np.isfinite(values).all():
                 raise _invalid(where, "NaN or an infinite number.", "pose_not_finite")
-            self.poses.append(_tum_pose(values, where) if columns == 8 else _kitti_pose(values, where))
+            rows = _tum_rows(values, where) if columns == 8 else values.reshape(3, 4)
+            self.poses.append(rigid_matrix(rows.tolist(), where)[0])
             self.lines.append(number)
             if len(self.poses) > MAX_POSES:
                 raise _invalid(where, f"more than {MAX_POSES} poses are not read.")
@@ -117,11 +116,9 @@ class Trajectory:
 
     def _note_name(self, line: str) -> None:
         match = _NAMED_TIME.match(line.strip())
-        if match:
-            try:
-                self.name_of_time[float(match[1])] = match[2]
-            except ValueError:
-                return
+        time = _number(match[1]) if match else None
+        if match and time is not None:
+            self.name_of_time[time] = match[2]
 
     def names(self) -> list[str]:
         """A name for each pose: the image's where the file says it, else the time, else the line's number from 0."""
@@ -143,11 +140,9 @@ def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
     trajectory = Trajectory(file)
     lens, camera_files = read_camera_file(root)
     times: Sequence[float | None] = trajectory.times_s or [None] * len(trajectory.poses)
+    rows = zip(trajectory.names(), trajectory.poses, trajectory.lines, times, strict=True)
     entries = [
-        PoseEntry(name, pose, f"{file.name} line {line}", lens, time)
-        for name, pose, line, time in zip(
-            trajectory.names(), trajectory.poses, trajectory.lines, times, strict=True
-        )
+        PoseEntry(name, pose, f"{file.name} line {line}", lens, time) for name, pose, line, time in rows
     ]
 
     def assign(names: Sequence[str]) -> Assignment:
@@ -160,7 +155,7 @@ def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
         ]
         return pairs, [f"{file.name}: images and poses were matched {how}"]
 
-    table = (path for path in (root / TIMES_OF_IMAGES,) if path.is_file())
+    table = [root / TIMES_OF_IMAGES] if (root / TIMES_OF_IMAGES).is_file() else []
     source = SourceFormat(trajectory.dialect, None, {}, np.eye(4), files=(file, *camera_files, *table))
     return ParsedPoses(source, tuple(entries), assign, named=False)
 
@@ -191,9 +186,8 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
         if len(nearest) >= (count if numbers else min(count, len(names)) / 2):
             return nearest, f"by time ({by}, at most {MAX_TIME_APART_S} s apart)"
         if numbers:
-            return {
-                names[int(time)]: i for i, time in enumerate(times)
-            }, "by number, in the order of the images' names"
+            by_number = {names[int(time)]: i for i, time in enumerate(times)}
+            return by_number, "by number, in the order of the images' names"
     if count == len(names):
         return {name: i for i, name in enumerate(names)}, "in the order of the images' names"
     raise InputError(
@@ -249,17 +243,13 @@ def _nearest(taken: dict[str, float], times: Sequence[float]) -> dict[str, int]:
     return {name: index for name, (_, index) in found.items()}
 
 
-def _tum_pose(values: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+def _tum_rows(values: NDArray[np.float64], where: str) -> NDArray[np.float64]:
     x, y, z, w = values[4:]
     length = float(np.linalg.norm(np.clip(values[4:], -9.0, 9.0)))  # a square overflows
     if abs(length - 1.0) > _QUAT_LENGTH_ERROR:
         raise _invalid(where, f"the quaternion has length {length:.3g}, not 1.", "pose_not_rotation")
     rotation = rotation_from_quat_wxyz(np.array([w, x, y, z]))
-    return rigid_matrix(np.column_stack([rotation, values[1:4]]).tolist(), where)[0]
-
-
-def _kitti_pose(values: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    return rigid_matrix(values.reshape(3, 4).tolist(), where)[0]
+    return np.column_stack([rotation, values[1:4]])
 
 
 def _invalid(where: str, what: str, code: str = "pose_file_invalid") -> InputError:
@@ -274,7 +264,7 @@ def write_tum(refined: RefinedSet, path: Path) -> None:
     at the top say which image each is.
     """
     times = refined.timestamps_s or tuple(float(i) for i in range(len(refined)))
-    lines = [*_TUM_HEAD]
+    lines = [_HEAD]
     lines += [f"# {time!r} {image.name}" for time, image in zip(times, refined.images, strict=True)]
     for time, pose in zip(times, refined.world_from_cam, strict=True):
         w, x, y, z = quat_wxyz_from_rotation(pose[:3, :3]).tolist()
