@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser

@@ -21,7 +21,8 @@ import numpy as np
 from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.model.dataset import Camera, Dataset
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.guessed_lens import guess_lens
 from biresnerf.data.photos.image_files import read_header
 from biresnerf.data.photos.images import load_images

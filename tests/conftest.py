@@ -25,6 +25,7 @@ MARKERS_OF_FIXTURES = {
 # Why a test may be skipped on a machine that has all that CI installs: any other skip fails `--unexpected-skips-fail`.
 EXPECTED_SKIPS = (
     r"torch finds none",
+    r"set BIRESNERF_TEST_PYCOLMAPS",
     r"set BIRESNERF_TEST_DATA to the folder that holds it",
     r"npm cannot install",
     r"all was sent before the signal came",

@@ -12,7 +12,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.dataset import Camera, Dataset, Frame, IntrinsicsSource, SourceFormat
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import Dataset, Frame, IntrinsicsSource, SourceFormat
 from biresnerf.data.model.pose_validation import refuse_coinciding
 from biresnerf.data.model.safe_names import refuse_outside
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note

@@ -12,7 +12,8 @@ from biresnerf.data.formats.colmap.format import COLMAP
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.simple.poses_json import POSES, PoseImage, matrix_of, read_poses_json
-from biresnerf.data.model.dataset import Camera, Dataset
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 
 SensorType = Literal["CAMERA", "IMU"]
 ModelForm = Literal["binary", "text"]

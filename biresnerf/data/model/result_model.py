@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
     NO_POINT,
     ColmapFrame,
@@ -21,7 +22,6 @@ from biresnerf.data.model.colmap_scene import (
     no_points,
 )
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation, rotation_from_quat_wxyz
-from biresnerf.data.model.dataset import Camera
 from biresnerf.geometry.rigid import rigid_inverse
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from biresnerf.data.model.dataset import Camera, IntrinsicsSource
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import IntrinsicsSource
 from biresnerf.data.photos.image_files import ImageHeader
 
 GUESSED_FOCAL = 1.2  # of the long side, as COLMAP guesses: a field of view of 45 degrees, a normal lens

@@ -10,7 +10,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.dataset import Camera, Dataset
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.background import uniform_background
 from biresnerf.data.photos.decode import decode

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from biresnerf.data.model.dataset import Camera, Dataset, Frame
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.photos.decode import as_stored
 from biresnerf.data.photos.image_files import DAMAGED, header_of, open_image, quiet_pillow, read_header
 from biresnerf.data.photos.orientation import same_shape, turned, turned_size

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from biresnerf.data.model.dataset import Camera, Dataset
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.image_order import natural_order, pose_distances
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_likeness import likeness

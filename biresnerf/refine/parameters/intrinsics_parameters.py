@@ -9,7 +9,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from biresnerf.data.model.dataset import Camera, Dataset, IntrinsicsSource
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import Dataset, IntrinsicsSource
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.field.adam_state import adam_state, load_adam_state
 from biresnerf.geometry.camera.camera import Intrinsics

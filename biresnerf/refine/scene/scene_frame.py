@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.focus import focus_point, rms_spread

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import Interrupted
 from biresnerf.options.refine_options import ResolvedOptions

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.feature_matches import FeatureMatches
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project

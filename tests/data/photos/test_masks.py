@@ -13,7 +13,8 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.model.dataset import Camera, Dataset, Frame, SourceFormat
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.photos.images import load_images
 from biresnerf.data.photos.masks import load_mask, refuse_unfit_mask, shrink_mask, write_masks
 from biresnerf.errors import InputError

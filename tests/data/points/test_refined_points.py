@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import NO_POINT, ColmapModel, ColmapPoints, no_points
-from biresnerf.data.model.dataset import Camera, Dataset, Frame, SourceFormat
+from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.refined_set import refined_set
 from biresnerf.data.model.result_model import model_of_poses, with_points
 from biresnerf.data.photos.images import ImageSet

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from biresnerf.data.model.dataset import Camera, Dataset, Frame, SourceFormat
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.image_order import pose_distances
 from biresnerf.data.seeding import cached_mapping as remembered_mapping
 from biresnerf.data.seeding import map_images

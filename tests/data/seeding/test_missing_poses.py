@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from biresnerf.data.model.dataset import Camera, Dataset, Frame, SourceFormat
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.image_order import natural_order, taken_along_a_path
 from biresnerf.data.photos.image_likeness import likeness
 from biresnerf.data.seeding.missing_poses import guess_missing

@@ -14,7 +14,8 @@ from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
-from biresnerf.data.model.dataset import Camera, Dataset
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding import colmap_process
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.data.synthetic.scene import synthetic_focal

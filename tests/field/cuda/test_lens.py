@@ -7,7 +7,7 @@ import torch
 
 pytest.importorskip("triton", reason="the CUDA backend's kernels need Triton, which exists for Linux only")
 
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 from biresnerf.field.cuda.lens import directions_in_cam
 from biresnerf.geometry.camera import camera
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.synthetic.scene import synthetic_cameras, synthetic_focal
 from biresnerf.field.radiance_field import Rendering
 from biresnerf.refine.lost.pose_certainty import unsure_deg

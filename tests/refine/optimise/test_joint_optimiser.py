@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.refine.views.evaluation import render_view
 from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.synthetic.scene import synthetic_cameras
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.lie import so3_exp

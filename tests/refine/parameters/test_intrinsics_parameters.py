@@ -10,7 +10,7 @@ import torch
 
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.refined_set import refined_set
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.synthetic.scene import render_synthetic, synthetic_cameras, synthetic_focal

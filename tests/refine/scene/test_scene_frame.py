@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.points.feature_matches import FeatureMatches
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.scene.scene_depth import matched_depth

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.synthetic.scene import synthetic_cameras
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refine.scene.scene_frame import scene_frame

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
     NO_POINT,
     ColmapFrame,
@@ -18,7 +19,6 @@ from biresnerf.data.model.colmap_scene import (
     RigidPose,
     SensorType,
 )
-from biresnerf.data.model.dataset import Camera
 from biresnerf.data.model.pose_validation import MAX_COORDINATE
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import MODEL_IDS, MODEL_PARAMETERS

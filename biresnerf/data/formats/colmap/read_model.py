@@ -16,6 +16,7 @@ import numpy as np
 from biresnerf.data.formats.colmap import read_binary as colmap_binary
 from biresnerf.data.formats.colmap import read_text as colmap_text
 from biresnerf.data.formats.colmap.model_checks import broken, check_images, check_rigs, check_tracks
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
     NO_POINT,
     ColmapFrame,
@@ -28,7 +29,6 @@ from biresnerf.data.model.colmap_scene import (
     no_points,
 )
 from biresnerf.data.model.conventions import rotation_from_quat_wxyz
-from biresnerf.data.model.dataset import Camera
 
 MAX_TABLE_BYTES = 2 * 2**30
 _SUFFIXES: dict[ModelForm, str] = {"binary": ".bin", "text": ".txt"}

@@ -22,6 +22,7 @@ from biresnerf.data.formats.colmap.model_checks import (
     sensor_type,
     supported_model,
 )
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
     ColmapFrame,
     ColmapImage,
@@ -31,7 +32,6 @@ from biresnerf.data.model.colmap_scene import (
     Sensor,
     no_points,
 )
-from biresnerf.data.model.dataset import Camera
 
 T = TypeVar("T")
 _MAX_ID = 2**63 - 1

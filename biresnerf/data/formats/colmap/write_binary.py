@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
     ColmapFrame,
     ColmapImage,
@@ -20,7 +21,6 @@ from biresnerf.data.model.colmap_scene import (
     RigidPose,
     Sensor,
 )
-from biresnerf.data.model.dataset import Camera
 from biresnerf.geometry.camera.camera_models import MODEL_IDS
 
 _SENSOR_TYPES = {"CAMERA": 0, "IMU": 1}

@@ -17,8 +17,9 @@ from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, in_order
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
 from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import ColmapModel
-from biresnerf.data.model.dataset import Camera, SourceFormat
+from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.text_file import read_text

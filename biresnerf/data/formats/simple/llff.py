@@ -13,7 +13,8 @@ from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, in_order
 from biresnerf.data.formats.codec import Codec, WriteContext
 from biresnerf.data.formats.simple.bundler import bundler_problem, refuse_lenses
 from biresnerf.data.model.atomic_file import whole_file
-from biresnerf.data.model.dataset import Camera, SourceFormat
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.errors import InputError

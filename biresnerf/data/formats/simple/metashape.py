@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntry
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
-from biresnerf.data.model.dataset import Camera, SourceFormat
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.text_file import read_text
 from biresnerf.data.photos.named_images import few_names

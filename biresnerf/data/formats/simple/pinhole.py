@@ -23,8 +23,9 @@ from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.simple.bundler import write_bundler
 from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import ColmapImage
-from biresnerf.data.model.dataset import Camera, Frame
+from biresnerf.data.model.dataset import Frame
 from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_files import quiet_pillow

@@ -15,8 +15,8 @@ import numpy as np
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.transforms.read_transforms import bind_transforms, parse_transforms
 from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.conventions import file_from_world_from_cam
-from biresnerf.data.model.dataset import Camera
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import COEFFICIENTS

@@ -6,7 +6,8 @@ import math
 from typing import Any, NamedTuple
 
 from biresnerf.data.formats.transforms.write_intrinsics import FOCAL_KEYS
-from biresnerf.data.model.dataset import Camera, IntrinsicsSource
+from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.dataset import IntrinsicsSource
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
 from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.errors import InputError

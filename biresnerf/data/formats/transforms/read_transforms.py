@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry
 from biresnerf.data.formats.transforms.older_nerfstudio import applied_transform_left_out
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.conventions import world_from_cam_of_file
-from biresnerf.data.model.dataset import Camera, Dataset, Frame, IntrinsicsSource, SourceFormat
+from biresnerf.data.model.dataset import Dataset, Frame, IntrinsicsSource, SourceFormat
 from biresnerf.data.model.json_document import read_json_object
 from biresnerf.data.model.pose_validation import ROTATION_WARNED, refuse_coinciding, rigid_matrix
 from biresnerf.data.photos.image_files import ImageHeader, read_header

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 
 FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 _OTHER_KEYS = ("cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.model.dataset import Camera
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.refined_set import refined_set
 from biresnerf.errors import InputError
 from tests.data.formats.simple import trajectories
