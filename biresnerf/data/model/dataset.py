@@ -5,18 +5,17 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import ColmapModel
-from biresnerf.report import PoseSource
+from biresnerf.report import IntrinsicsSource, PoseSource
 
 # Guesses from other images: worth trying, not worth believing.
 GUESSES: frozenset[PoseSource] = frozenset({"neighbours", "nearest-view"})
-IntrinsicsSource = Literal["given", "exif", "colmap", "guessed", "refined"]
 
 
 @dataclass(frozen=True, eq=False)

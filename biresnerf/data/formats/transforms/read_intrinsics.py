@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 from biresnerf.data.formats.transforms.write_intrinsics import FOCAL_KEYS
 from biresnerf.data.model.camera import Camera
-from biresnerf.data.model.dataset import IntrinsicsSource
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
 from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.errors import InputError
@@ -19,6 +18,7 @@ from biresnerf.geometry.camera.camera_models import (
     smallest_model,
 )
 from biresnerf.geometry.camera.lens import lens_problem
+from biresnerf.report import IntrinsicsSource
 
 _UNSUPPORTED = "camera_model_unsupported"
 # Keys of instant-ngp that mean a lens of neither family.

@@ -15,7 +15,7 @@ from biresnerf.data.formats.transforms.older_nerfstudio import applied_transform
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.conventions import world_from_cam_of_file
-from biresnerf.data.model.dataset import Dataset, Frame, IntrinsicsSource, SourceFormat
+from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.json_document import read_json_object
 from biresnerf.data.model.pose_validation import ROTATION_WARNED, refuse_coinciding, rigid_matrix
 from biresnerf.data.photos.image_files import ImageHeader, read_header
@@ -29,6 +29,7 @@ from biresnerf.data.photos.named_images import (
 )
 from biresnerf.data.photos.orientation import meant_orientations, orientation_notes, page_notes, turned_header
 from biresnerf.errors import InputError
+from biresnerf.report import IntrinsicsSource
 
 _NGP_KEYS = frozenset(
     {"aabb_scale", "scale", "offset", "is_fisheye", "sharpness", "x_fov", "enable_depth_loading"}
