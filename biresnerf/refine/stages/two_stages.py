@@ -123,7 +123,7 @@ class TwoStages:
         if self.monitor.should_stop():
             self._save()
             self.monitor.report(self._progress(CHECKPOINT.as_posix()))
-            raise Interrupted(f"stopped at step {optimiser.step_index}; run again to continue")
+            raise Interrupted(f"stopped at step {optimiser.step_index}; run again to go on")
         started, stage = time.monotonic(), self.stage
         result = optimiser.step()
         # Without the check: the time of a repair within it says nothing about the steps to come.

@@ -77,7 +77,7 @@ def _evaluate(stages: TwoStages, pictures: Pictures) -> Evaluation:
     started = time.monotonic()
 
     def report(done: int) -> None:
-        monitor.raise_if_stopped("stopped while the result was measured; run again to continue")
+        monitor.raise_if_stopped("stopped while the result was measured; run again to go on")
         share, spent = done / max(1, work), time.monotonic() - started
         monitor.report(
             Progress(
