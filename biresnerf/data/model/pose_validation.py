@@ -13,7 +13,7 @@ from biresnerf.errors import InputError
 ROTATION_REFUSED = 1e-2  # a singular value farther than this from 1 is a scaling or a shear, not rounding
 ROTATION_WARNED = 1e-4  # files with 5 to 6 digits stay below it
 MAX_COORDINATE = 1e9  # map coordinates in millimetres fit; beyond it float32 maths says nothing
-_REFLECTION_MEND = "Flip whole axes of the world instead (a rotation), or export with another axis setting."
+_REFLECTION_HINT = "Flip whole axes of the world instead (a rotation), or export with another axis setting."
 
 
 def _numbers(value: Any, where: str) -> NDArray[np.float64]:
@@ -94,7 +94,7 @@ def _nearest_rotation(block: NDArray[np.float64], where: str) -> tuple[NDArray[n
         raise InputError("pose_not_rotation", what, where=where, hint=hint)
     if np.linalg.det(block) < 0.0:
         raise InputError(
-            "pose_not_rotation", "the rotation mirrors (determinant -1).", where=where, hint=_REFLECTION_MEND
+            "pose_not_rotation", "the rotation mirrors (determinant -1).", where=where, hint=_REFLECTION_HINT
         )
     return u @ vt, deviation
 

@@ -29,7 +29,7 @@ LEAST_REGISTERED = 0.4  # of images of which none has a pose; from fewer, the re
 # Median likeness of all pairs of photos: from nearly one place 0.56 (LLFF's horns) to 0.87, around a scene 0.1 to 0.66.
 FACING_ALIKE = 0.4
 MATCHED: dict[str, PoseSource] = {"incremental": "matches-incremental", "global": "matches-global"}
-OVERLAP_MEND = (
+OVERLAP_HINT = (
     "Take sharp photos that overlap by more than half, of something with texture, from many places; "
     "or give approximate poses."
 )
@@ -220,7 +220,7 @@ def _from_scratch(given: _Given, mapping: Mapping, start: StartPoses) -> Seeding
     if placed < least:
         what = f"COLMAP could place {placed} of {len(dataset)} images; at least {least} are needed"
         if start == "colmap":
-            raise InputError("seed_failed", f"{what}.", where=dataset.root.name, hint=OVERLAP_MEND)
+            raise InputError("seed_failed", f"{what}.", where=dataset.root.name, hint=OVERLAP_HINT)
         return _facing_forward(given, what)
     best = models[0]
     dataset = with_found_lenses(dataset, [best])
@@ -258,7 +258,7 @@ def _facing_forward(given: _Given, what: str) -> Seeding:
             "insufficient_overlap",
             f"{what}, and the photos are too different to have been taken from nearly one place.",
             where=dataset.root.name,
-            hint=OVERLAP_MEND,
+            hint=OVERLAP_HINT,
         )
     warning = f"{what}: all cameras begin at one place, looking the same way, and find their poses without features."
     noted = replace(dataset, warnings=(*dataset.warnings, warning))

@@ -43,10 +43,10 @@ _ALL_MODELS = (
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
     *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
 )
-_MEND = "Export the model again with COLMAP, or copy it again: it may be cut off."
+_HINT = "Export the model again with COLMAP, or copy it again: it may be cut off."
 
 
-def broken(where: str, what: str, code: str = "pose_file_invalid", hint: str = _MEND) -> InputError:
+def broken(where: str, what: str, code: str = "pose_file_invalid", hint: str = _HINT) -> InputError:
     """The error for a model that says ``what`` at ``where``."""
     return InputError(code, f"{what}.", where=where, hint=hint)
 

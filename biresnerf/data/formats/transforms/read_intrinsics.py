@@ -23,7 +23,7 @@ from biresnerf.report import IntrinsicsSource
 _UNSUPPORTED = "camera_model_unsupported"
 # Keys of instant-ngp that mean a lens of neither family.
 _OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
-_MODEL_MEND = (
+_MODEL_HINT = (
     f"Supported are {', '.join(MODEL_IDS)}; undistort the images to one of them "
     "(for example with COLMAP's image_undistorter)."
 )
@@ -143,7 +143,7 @@ def _declared_lens(fields: Fields) -> tuple[str | None, bool]:
 
 
 def _unsupported(fields: Fields, key: str, what: str, also: str = "") -> InputError:
-    return InputError(_UNSUPPORTED, what, where=fields.where(key), hint=_MODEL_MEND + also)
+    return InputError(_UNSUPPORTED, what, where=fields.where(key), hint=_MODEL_HINT + also)
 
 
 def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int, int, list[str]]:
