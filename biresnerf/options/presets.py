@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 ComputeDevice = Literal["cpu", "cuda"]
 PresetName = Literal["fast", "balanced", "quality", "paper"]
@@ -11,85 +11,31 @@ MethodName = Literal["biresnerf", "biresnerf-paper", "baa-ngp", "nerfacc-barf", 
 # A GPU affords larger batches and images at the same number of steps; `paper` is made for one and stays as it is.
 CUDA_SCALE = {"samples_per_step": 4, "max_image_size": 2}
 
+# Each option's value in the presets, in the order of `PresetName`. The last column, `paper`, is Guo et al., Appl. Sci.
+# 2023, 13(24), 13333: Table 1 for the encodings; steps, period and floor inferred from its timing tables; rates and
+# loss inherited from BAA-NGP, which it builds on.
+_BY_PRESET: dict[str, tuple[float, float, float, float]] = {
+    "max_image_size": (128, 200, 400, 400),
+    "steps": (3000, 8000, 20_000, 40_000),
+    "coarse_steps_min": (600, 1600, 3000, 5000),
+    "coarse_steps_max": (1200, 3200, 8000, 16_000),
+    "check_every": (50, 100, 200, 200),
+    "samples_per_step": (2**15, 2**16, 2**17, 2**18),
+    "pose_rate": (5e-3, 5e-3, 5e-3, 5e-3),
+    "pose_rate_final": (1e-4, 5e-5, 2e-5, 1e-5),
+    "field_rate": (1e-2, 1e-2, 1e-2, 1e-2),
+    "field_rate_final": (1e-3, 5e-4, 2e-4, 1e-4),
+    "warmup_steps": (200, 400, 800, 1000),
+    "reconstruction_levels": (8, 12, 16, 16),
+    "reconstruction_resolution_max": (1024, 2048, 4096, 4096),
+    "table_size_log2": (16, 17, 19, 19),
+    "trial_steps": (200, 500, 1000, 1000),
+    "orbit_frames": (24, 48, 96, 96),
+    "shown_views": (6, 8, 12, 12),
+}
 PRESETS: dict[PresetName, dict[str, Any]] = {
-    "fast": {
-        "max_image_size": 128,
-        "steps": 3000,
-        "coarse_steps_min": 600,
-        "coarse_steps_max": 1200,
-        "check_every": 50,
-        "samples_per_step": 2**15,
-        "pose_rate": 5e-3,
-        "pose_rate_final": 1e-4,
-        "field_rate": 1e-2,
-        "field_rate_final": 1e-3,
-        "warmup_steps": 200,
-        "reconstruction_levels": 8,
-        "reconstruction_resolution_max": 1024,
-        "table_size_log2": 16,
-        "trial_steps": 200,
-        "orbit_frames": 24,
-        "shown_views": 6,
-    },
-    "balanced": {
-        "max_image_size": 200,
-        "steps": 8000,
-        "coarse_steps_min": 1600,
-        "coarse_steps_max": 3200,
-        "check_every": 100,
-        "samples_per_step": 2**16,
-        "pose_rate": 5e-3,
-        "pose_rate_final": 5e-5,
-        "field_rate": 1e-2,
-        "field_rate_final": 5e-4,
-        "warmup_steps": 400,
-        "reconstruction_levels": 12,
-        "reconstruction_resolution_max": 2048,
-        "table_size_log2": 17,
-        "trial_steps": 500,
-        "orbit_frames": 48,
-        "shown_views": 8,
-    },
-    "quality": {
-        "max_image_size": 400,
-        "steps": 20_000,
-        "coarse_steps_min": 3000,
-        "coarse_steps_max": 8000,
-        "check_every": 200,
-        "samples_per_step": 2**17,
-        "pose_rate": 5e-3,
-        "pose_rate_final": 2e-5,
-        "field_rate": 1e-2,
-        "field_rate_final": 2e-4,
-        "warmup_steps": 800,
-        "reconstruction_levels": 16,
-        "reconstruction_resolution_max": 4096,
-        "table_size_log2": 19,
-        "trial_steps": 1000,
-        "orbit_frames": 96,
-        "shown_views": 12,
-    },
-    # Guo et al., Appl. Sci. 2023, 13(24), 13333: Table 1 for the encodings; steps, period and floor inferred
-    # from its timing tables; rates and loss inherited from BAA-NGP, which it builds on.
-    "paper": {
-        "max_image_size": 400,
-        "steps": 40_000,
-        "coarse_steps_min": 5000,
-        "coarse_steps_max": 16_000,
-        "check_every": 200,
-        "samples_per_step": 2**18,
-        "pose_rate": 5e-3,
-        "pose_rate_final": 1e-5,
-        "field_rate": 1e-2,
-        "field_rate_final": 1e-4,
-        "warmup_steps": 1000,
-        "reconstruction_levels": 16,
-        "reconstruction_resolution_max": 4096,
-        "table_size_log2": 19,
-        "trial_steps": 1000,
-        "orbit_frames": 96,
-        "shown_views": 12,
-    },
+    preset: {key: values[column] for key, values in _BY_PRESET.items()}
+    for column, preset in enumerate(get_args(PresetName))
 }
 
 # These keep their proportion to `steps`.
@@ -103,25 +49,18 @@ COMMON_VALUES: dict[str, Any] = {
     "double_pose_step": False,
 }
 
-_BAA_NGP = {
+_PUBLISHED = {
     "exposure": "none",
     "start": "given",
-    "double_pose_step": True,
     "pose_rate": 1e-3,
     "pose_rate_final": 1e-5,
     "field_rate": 1e-2,
     "field_rate_final": 1e-4,
 }
-_BARF = {
-    "exposure": "none",
-    "start": "given",
-    "pose_rate": 1e-3,
-    "pose_rate_final": 1e-5,
-    "field_rate": 5e-4,
-    "field_rate_final": 1e-4,
-}
+_BAA_NGP = {**_PUBLISHED, "double_pose_step": True}
+_BARF = {**_PUBLISHED, "field_rate": 5e-4}
 
-# What a method takes instead of the preset's values, whatever the preset: its published rates and grid.
+# Values that a method sets in every preset: its published rates and grid.
 METHOD_VALUES: dict[MethodName, dict[str, Any]] = {
     "biresnerf": {},
     "biresnerf-paper": _BAA_NGP,
@@ -135,7 +74,8 @@ METHOD_VALUES: dict[MethodName, dict[str, Any]] = {
     "barf": _BARF,
 }
 
-# And in the preset `paper`: its published length and batch (1024 rays of 128 samples; pruned, of about 32).
+# Values that it sets in the preset `paper` alone: its published length and batch (1024 rays of 128 samples, or of about
+# 32 where empty space is skipped).
 METHOD_PAPER_VALUES: dict[MethodName, dict[str, Any]] = {
     "biresnerf": {},
     "biresnerf-paper": {},

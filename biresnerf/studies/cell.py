@@ -12,15 +12,19 @@ from biresnerf.geometry.pose_error import PoseError
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.report import SwitchReason
 
-_FROZEN = ConfigDict(frozen=True, extra="forbid")
 LOST_FROM_DEG = 1.0  # a camera this far off after a run counts as not found
+EXIT_STOPPED = 143  # of the process of a cell that was stopped
 CELL, RESULT, LOG, RUN = "cell.json", "result.json", "log.txt", "run"  # in the folder of a cell
 
 
-class Perturbation(BaseModel):
-    """How the start poses of a run are made from the true ones."""
+class Record(BaseModel):
+    """Data that does not change and has no unknown keys."""
 
-    model_config = _FROZEN
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Perturbation(Record):
+    """How the start poses of a run are made from the true ones."""
 
     kind: Literal["noise", "identity"] = "noise"
     noise: float = Field(0.15, ge=0, le=2, description="BARF's sigma.")
@@ -39,10 +43,8 @@ class Perturbation(BaseModel):
         return ", ".join(parts)
 
 
-class Scene(BaseModel):
+class Scene(Record):
     """A set of true poses. ``digest`` is of its transforms files: other poses make another scene."""
-
-    model_config = _FROZEN
 
     name: str
     file: Path = Field(description="Transforms file with true poses.")
@@ -52,20 +54,16 @@ class Scene(BaseModel):
     test_views: int = Field(0, ge=0, description="At most this many views of the test file are rendered.")
 
 
-class EqualTime(BaseModel):
+class EqualTime(Record):
     """How the number of steps was chosen for a run that was given another's time."""
-
-    model_config = _FROZEN
 
     seconds: float = Field(description="What the first variant took to optimise.")
     calibration_steps: int
     calibration_ms_per_step: float
 
 
-class Cell(BaseModel):
+class Cell(Record):
     """One run of a comparison."""
-
-    model_config = _FROZEN
 
     scene: Scene
     start: Perturbation
@@ -88,10 +86,8 @@ class Cell(BaseModel):
         return f"{self.scene.name}-{self.key}"
 
 
-class CameraResult(BaseModel):
+class CameraResult(Record):
     """Rotation error of one camera after an alignment that is robust to lost cameras."""
-
-    model_config = _FROZEN
 
     name: str
     displaced: bool = Field(description="Was turned or lost on purpose, on top of the noise.")
@@ -99,10 +95,8 @@ class CameraResult(BaseModel):
     after_deg: float
 
 
-class ViewQuality(BaseModel):
+class ViewQuality(Record):
     """Means over views the field never saw, their poses fitted to it first (BARF's test-time refinement)."""
-
-    model_config = _FROZEN
 
     kind: Literal["held out", "test"]
     count: int
@@ -112,10 +106,8 @@ class ViewQuality(BaseModel):
     lpips_absent: str | None = Field(None, description="Why there is no LPIPS.")
 
 
-class Outcome(BaseModel):
+class Outcome(Record):
     """The result of a completed run."""
-
-    model_config = _FROZEN
 
     version: str
     options: ResolvedOptions = Field(description="As used, with all values filled in.")
@@ -141,10 +133,8 @@ class Outcome(BaseModel):
         return sum(camera.after_deg > LOST_FROM_DEG for camera in self.cameras)
 
 
-class CellResult(BaseModel):
+class CellResult(Record):
     """``result.json`` of a cell: its outcome, or the error."""
-
-    model_config = _FROZEN
 
     cell: Cell
     outcome: Outcome | None = None

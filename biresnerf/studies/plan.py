@@ -45,12 +45,7 @@ class Plan:
         without feature matches, renders no orbit, returns the refined poses without a verdict, and holds out no
         views of a scene that has test views. Raises `InputError`.
         """
-        defaults: dict[str, Any] = {
-            "seed": start.seed,
-            "start": "given",
-            "orbit_frames": 0,
-            "verdict": False,
-        }
+        defaults: dict[str, Any] = {"seed": start.seed, "start": "given", "orbit_frames": 0, "verdict": False}
         if scene.test_file is not None:
             defaults["holdout"] = 0
         options = parse_options({**defaults, **self.settings, **variant.settings})

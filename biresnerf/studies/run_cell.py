@@ -28,11 +28,19 @@ from biresnerf.refine.stages.checkpoint import CHECKPOINT
 from biresnerf.refine.stages.two_stages import Observer
 from biresnerf.refine.views.image_metrics import psnr, ssim
 from biresnerf.report import Report
-from biresnerf.studies.cell import CELL, RESULT, RUN, CameraResult, Cell, CellResult, Outcome, ViewQuality
+from biresnerf.studies.cell import (
+    CELL,
+    EXIT_STOPPED,
+    RESULT,
+    RUN,
+    CameraResult,
+    Cell,
+    CellResult,
+    Outcome,
+    ViewQuality,
+)
 from biresnerf.studies.novel_views import lpips_absent, lpips_vgg, render_test_views
 from biresnerf.studies.scenes import StartingRig, read_scene, read_test_views, starting_rig, with_poses
-
-EXIT_STOPPED = 143
 
 
 class StopRequest:

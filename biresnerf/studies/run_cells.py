@@ -9,9 +9,8 @@ from pathlib import Path
 
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.errors import Interrupted
-from biresnerf.studies.cell import CELL, LOG, RESULT, RUN, Cell, CellResult
+from biresnerf.studies.cell import CELL, EXIT_STOPPED, LOG, RESULT, RUN, Cell, CellResult
 
-EXIT_STOPPED = 143  # of a cell's process that was asked to stop
 LAST_LINES = 12  # of a failed process's output
 STOPPING_S = 60.0  # for a process to write its checkpoint
 

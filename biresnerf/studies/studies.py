@@ -78,10 +78,6 @@ STUDIES = {
         settings=_same_switch,
     ),
     "noise": Study(
-        about="noise of the given poses",
-        swept=None,
-        variants=(),
-        noises=NOISES,
-        settings=lambda given: given,
+        about="noise of the given poses", swept=None, variants=(), noises=NOISES, settings=lambda given: given
     ),
 }

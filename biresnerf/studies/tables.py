@@ -6,12 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from biresnerf.studies.cell import Outcome
+from biresnerf.studies.cell import Outcome, Record
 from biresnerf.studies.plan import Entry
-
-_FROZEN = ConfigDict(frozen=True, extra="forbid")
 
 
 @dataclass(frozen=True)
@@ -53,10 +51,8 @@ METRICS = (
 )
 
 
-class Row(BaseModel):
+class Row(Record):
     """One variant on one scene from one kind of start, over the seeds: means; for max and memory the largest."""
-
-    model_config = _FROZEN
 
     scene: str
     start: str
@@ -66,10 +62,8 @@ class Row(BaseModel):
     values: dict[str, float | None]
 
 
-class Summary(BaseModel):
+class Summary(Record):
     """One variant from one kind of start over the scenes: mean and median of the rows."""
-
-    model_config = _FROZEN
 
     start: str
     variant: str
@@ -78,10 +72,8 @@ class Summary(BaseModel):
     median: dict[str, float | None]
 
 
-class PairedTest(BaseModel):
+class PairedTest(Record):
     """A two-sided Wilcoxon signed-rank test of ``other - first``."""
-
-    model_config = _FROZEN
 
     pairs: int = Field(description="n: scenes x starts x seeds that both variants finished.")
     differing: int = Field(description="Pairs that differ; the test ignores the others.")
@@ -92,10 +84,8 @@ class PairedTest(BaseModel):
     median_difference: float = Field(description="Median of other - first.")
 
 
-class Difference(BaseModel):
+class Difference(Record):
     """The test of one metric between the first variant and another, over all scenes, starts and seeds."""
-
-    model_config = _FROZEN
 
     metric: str
     first: str
@@ -103,8 +93,8 @@ class Difference(BaseModel):
     test: PairedTest
 
 
-class Failure(BaseModel):
-    model_config = _FROZEN
+class Failure(Record):
+    """A run that ended with an error."""
 
     scene: str
     start: str
@@ -113,10 +103,8 @@ class Failure(BaseModel):
     error: str
 
 
-class Tables(BaseModel):
+class Tables(Record):
     """``tables.json``."""
-
-    model_config = _FROZEN
 
     variants: dict[str, dict[str, object]] = Field(description="Settings of each, over the shared ones.")
     settings: dict[str, object] = Field(description="Settings that all variants share.")

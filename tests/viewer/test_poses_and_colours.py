@@ -13,7 +13,7 @@ import pytest
 import hatch_build
 from biresnerf.data.show.renders import ramp_colours
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.geometry.pose_interpolation import interpolate_pose
+from biresnerf.geometry.rigid import interpolate_pose
 
 ROOT = Path(__file__).resolve().parents[2]
 ESBUILD = ROOT / "node_modules" / "esbuild" / "bin" / "esbuild"

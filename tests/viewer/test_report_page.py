@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from biresnerf.geometry.pose_interpolation import interpolate_pose
+from biresnerf.geometry.rigid import interpolate_pose
 from biresnerf.viewer.report_html import write_report_html
 from tests.viewer.conftest import ARGUMENTS, CHROMIUM, HOSTILE, HOSTILE_IMAGE, SCREENSHOTS, VIEWS, open_report
 

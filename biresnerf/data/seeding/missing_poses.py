@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.image_order import natural_order, taken_along_a_path
-from biresnerf.geometry.pose_interpolation import interpolate_pose
+from biresnerf.geometry.rigid import interpolate_pose
 from biresnerf.report import PoseSource
 
 WIDEST_GAP = 6  # images from one known pose to the next that are still taken for a path

@@ -12,14 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from biresnerf.field.cpu.matrix_blocks import (
-    BLOCK,
-    STRIDE,
-    copy_in,
-    copy_out,
-    exponential,
-    gather_in,
-)
+from biresnerf.field.cpu.matrix_blocks import BLOCK, STRIDE, copy_in, copy_out, exponential, gather_in
 from biresnerf.field.cpu.network import (
     COLOUR_INPUTS,
     HIDDEN,

@@ -17,13 +17,7 @@ from numba.extending import intrinsic
 config.CPU_NAME = llvmlite.binding.get_host_cpu_name()
 config.CPU_FEATURES = llvmlite.binding.get_host_cpu_features().flatten() + ",-prefer-256-bit"
 
-KERNEL = {
-    "nogil": True,
-    "fastmath": True,
-    "boundscheck": False,
-    "error_model": "numpy",
-    "cache": True,
-}
+KERNEL = {"nogil": True, "fastmath": True, "boundscheck": False, "error_model": "numpy", "cache": True}
 PARALLEL_KERNEL = {"parallel": True, **KERNEL}
 
 

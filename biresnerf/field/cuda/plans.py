@@ -24,11 +24,7 @@ def marching(w: Workspace) -> list[Any]:
     b = w.buffers
     return [
         _per_ray_block(
-            rays.march,
-            w,
-            side=w.capacity.side,
-            most=w.capacity.most,
-            ray_capacity=w.capacity.rays,
+            rays.march, w, side=w.capacity.side, most=w.capacity.most, ray_capacity=w.capacity.rays
         ),
         lambda: torch.cumsum(b["count"], 0, dtype=torch.int32, out=b["ray_offset"][1:]),
     ]

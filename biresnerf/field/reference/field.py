@@ -43,10 +43,7 @@ class ReferenceField(GridField):
         grid, table = self.shape.reconstruction_grid, self.reconstruction_table
         high = reference.encode(passed, table, grid, gradient.reconstruction_smoothing)
         if self.shape.wiring == "residual":
-            return [
-                (low, self.networks),
-                (high, [self.reconstruction_columns, *self.reconstruction_head]),
-            ]
+            return [(low, self.networks), (high, [self.reconstruction_columns, *self.reconstruction_head])]
         first = torch.cat([self.networks[0], self.reconstruction_columns], 1)
         return [(torch.cat([low, high], 1), [first, *self.networks[1:]])]
 

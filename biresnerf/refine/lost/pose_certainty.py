@@ -125,7 +125,4 @@ class _Probe:
         weakest = torch.linalg.eigh(turn - both @ made_up)[1][:, :, :1]
         following = -(made_up @ weakest)
         alone = torch.zeros_like(following)
-        return (
-            torch.cat([weakest, following], 1)[:, :, 0],
-            torch.cat([weakest, alone], 1)[:, :, 0],
-        )
+        return torch.cat([weakest, following], 1)[:, :, 0], torch.cat([weakest, alone], 1)[:, :, 0]

@@ -53,10 +53,7 @@ def _counted(values: np.ndarray, images: ImageSet, index: int) -> np.ndarray:
 
 
 def outliers(
-    errors: Tensor,
-    held_out: Tensor,
-    deviations: float = DEVIATIONS,
-    untrained: float = STANDS_OUT_UNTRAINED,
+    errors: Tensor, held_out: Tensor, deviations: float = DEVIATIONS, untrained: float = STANDS_OUT_UNTRAINED
 ) -> Tensor:
     """Mask [n] of the errors [n] that stand out.
 

@@ -10,18 +10,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from biresnerf.field.backends import make_field
 from biresnerf.field.grid_levels import GridLevels, grid_levels
 from biresnerf.field.radiance_field import FieldShape, RadianceField
 from biresnerf.options.presets import MethodName
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.refine.optimise.loss import Loss, half_squared_error
 from biresnerf.refine.optimise.schedule import Schedule
 from biresnerf.refine.scene.scene_frame import SceneFrame
 
 DENSE_TABLE_LOG2 = 22  # the pose-estimation module is stored densely up to 159 cells a side, hashed beyond
 
+# (colour [rays, 3], target [rays, 3]) -> [rays, 3]. Training takes the mean, with a weight for each camera;
+# the repair of lost cameras takes the sum.
+Loss = Callable[[Tensor, Tensor], Tensor]
 # Options, unit frame, device, threads -> the field at its first step.
 BuildField = Callable[[ResolvedOptions, SceneFrame, torch.device, int], RadianceField]
 
@@ -55,6 +58,16 @@ class Method:
     large_network: bool = False
     pruned: bool = True
     rays_least: int = 256
+
+
+def half_squared_error(colour: Tensor, target: Tensor) -> Tensor:
+    """Half the squared difference: smooth L1 with beta 1, as no two colours in 0..1 differ by more than 1."""
+    return 0.5 * (colour - target) ** 2
+
+
+def squared_error(colour: Tensor, target: Tensor) -> Tensor:
+    """BARF's loss."""
+    return (colour - target) ** 2
 
 
 def two_grids(

@@ -9,10 +9,7 @@ from biresnerf.field.adam_state import adam_state, load_adam_state
 from biresnerf.refine.parameters.parametrisations import Parametrisation
 
 EPSILON = 1e-12
-SECOND_EPSILON, SECOND_DECAY = (
-    1e-15,
-    1e-6,
-)  # BAA-NGP: its optimiser of the field moves the poses too
+SECOND_EPSILON, SECOND_DECAY = 1e-15, 1e-6  # BAA-NGP: its optimiser of the field moves the poses too
 
 
 class PoseParameters:

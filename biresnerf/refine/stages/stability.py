@@ -99,11 +99,7 @@ class StabilityDetector:
         if len(self.decibels) < WINDOW:
             return {"confirmed": self.confirmed}
         change, fluctuation = self._trend()
-        return {
-            "trend_db": change,
-            "level_db": max(SLOPE_DB, fluctuation),
-            "confirmed": self.confirmed,
-        }
+        return {"trend_db": change, "level_db": max(SLOPE_DB, fluctuation), "confirmed": self.confirmed}
 
     def _flat(self) -> bool:
         """Whether the last window shows neither trend nor unrest, as the chosen reading has it."""

@@ -12,8 +12,14 @@ from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldRates, FieldShape, PositionGradient, RadianceField
 from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.refine.optimise.loss import half_squared_error, squared_error
-from biresnerf.refine.optimise.methods import BuildField, Method, reconstruction_levels, two_grids
+from biresnerf.refine.optimise.methods import (
+    BuildField,
+    Method,
+    half_squared_error,
+    reconstruction_levels,
+    squared_error,
+    two_grids,
+)
 from biresnerf.refine.optimise.schedule import EMPTY_LOOKED_AT, NEAR_SHARES, POSE_DIP, Schedule, smooth_ramp
 from biresnerf.refine.scene.scene_frame import SceneFrame
 from biresnerf.studies.baselines.mlp_field import MlpField

@@ -9,7 +9,7 @@ import torch
 from torch.nn.functional import mse_loss, smooth_l1_loss
 
 from biresnerf.refine.lost import lost_cameras
-from biresnerf.refine.optimise.loss import half_squared_error, squared_error
+from biresnerf.refine.optimise.methods import half_squared_error, squared_error
 from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from biresnerf.geometry.pose_error import rotation_angle_deg
-from biresnerf.geometry.pose_interpolation import interpolate_pose
+from biresnerf.geometry.rigid import interpolate_pose
 
 
 def pose(rotation: Rotation, centre) -> np.ndarray:
