@@ -1,14 +1,14 @@
-"""A COLMAP model that lacks half of the images; half_registered.md walks through it.
+"""A COLMAP model that lacks half of the images; half_registered.md explains the steps.
 
-The notebook is made of this file (`make docs`).
+The notebook is generated from this file (`make docs`).
 """
 
 # %% [markdown]
 # # COLMAP gave up half of the images
 #
-# A COLMAP model often holds fewer images than the folder. The others are kept: matches complete the model in its own
-# frame, names and likeness guess what matches cannot place, and the optimisation does the rest. Here the model covers the
-# first half of a walk around a table; the other half has to be found from there.
+# A COLMAP model often holds fewer images than the folder. The others are kept. Matches complete the model in its own
+# frame, images that matches cannot place get a pose guessed from their neighbours or from similar images, and the
+# optimisation refines all of them. Here the model covers the first half of a walk around a table.
 
 # %%
 from collections import Counter
@@ -25,7 +25,7 @@ print(pose_table(here.truth, given=here.scene))
 # %% [markdown]
 # ## Refine
 #
-# Every image of the folder gets a pose. `pose_source` says who found the one that the optimisation began with.
+# Every image of the folder gets a pose. `pose_source` is the origin of its initial pose.
 
 # %%
 report = refine_poses(here.scene, here.refined, here.options, show_progress)

@@ -1,14 +1,14 @@
-"""A phone's capture whose tracking drifted; phone_capture.md walks through it.
+"""A phone's capture with drifting tracking; phone_capture.md explains the steps.
 
-The notebook is made of this file (`make docs`).
+The notebook is generated from this file (`make docs`).
 """
 
 # %% [markdown]
 # # A phone's capture
 #
-# Capture apps write the poses that the phone's tracking had: level, since gravity holds them, but with a heading and a
-# position that drift, a jitter in each photo, and a focal length that is not quite the lens's. We make such a capture,
-# with the truth beside it, and take the errors out again.
+# Capture apps write the poses of the phone's tracking. They are level, thanks to gravity, but heading and position
+# drift, each photo jitters, and the focal length is slightly wrong. This script makes such a capture with known true
+# poses, and removes the errors again.
 
 # %%
 from walk import arguments, in_words, pose_table, show_progress
@@ -23,8 +23,8 @@ print(pose_table(here.truth, given=here.scene))
 # %% [markdown]
 # ## Refine
 #
-# Feature matches check the poses first; then the two stages move poses and field together, and the verdict says whether
-# the refined poses predict unseen photos better than the phone's.
+# Feature matches check the poses first. Then the two stages refine poses and field together, and the verdict says
+# whether the refined poses predict unseen photos better than the phone's.
 
 # %%
 report = refine_poses(here.scene, here.refined, here.options, show_progress)

@@ -1,13 +1,13 @@
-"""A plain vase with rough poses; vase.md walks through it.
+"""A plain vase with rough poses; vase.md explains the steps.
 
-The notebook is made of this file (`make docs`).
+The notebook is generated from this file (`make docs`).
 """
 
 # %% [markdown]
 # # A plain vase
 #
-# A glazed vase gives features next to nothing to hold on to. But the poses are roughly known, from a turntable or a rig,
-# and outline, light and the slow change of colour are enough for a field.
+# A glazed vase has hardly any features. But the poses are roughly known, from a turntable or a rig, and outline, light
+# and slow changes of colour are enough for a field.
 
 # %%
 from walk import arguments, in_words, pose_table, show_progress
@@ -22,7 +22,7 @@ print(pose_table(here.truth, given=here.scene))
 # %% [markdown]
 # ## Refine
 #
-# The few matches there are may mislead; a trial on unseen views decides whether to begin from them.
+# The few matches may mislead. A trial on unseen views decides whether to start from them.
 
 # %%
 report = refine_poses(here.scene, here.refined, here.options, show_progress)

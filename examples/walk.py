@@ -1,4 +1,4 @@
-"""What the walks share: their arguments, and the poses before and after against the true ones."""
+"""Shared by the walks: their arguments, and pose errors before and after against the true poses."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from biresnerf.report import Report
 
 @dataclass(frozen=True)
 class Arguments:
-    """What a walk is run with.
+    """Arguments of a walk.
 
     Attributes:
         output: a new folder for all of its files.
-        of: the user's own set, taken for true; None to have one made.
-        views, size: of the made set; size is the images' width (px).
+        of: the user's own set, with poses taken as true; None to make a set.
+        views, size: number of images of the made set, and their width (px).
         options: of the refinement.
     """
 
@@ -54,10 +54,10 @@ class Arguments:
 
 
 def arguments(name: str, *, views: int, size: int, **settings: object) -> Arguments:
-    """The walk's own values, with those of the command line in their place; in a notebook there is none."""
+    """The walk's defaults, overridden by the command line; a notebook has none."""
     parser = argparse.ArgumentParser(prog=f"{name}.py")
     parser.add_argument("--output", type=Path, default=Path(name), help=f"new folder (default: {name})")
-    parser.add_argument("--of", type=Path, help="your own images and poses, taken for true")
+    parser.add_argument("--of", type=Path, help="your own images and poses, taken as true")
     parser.add_argument("--views", type=int, default=views)
     parser.add_argument("--size", type=int, default=size, help="width of the images, px")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE")
@@ -70,18 +70,18 @@ def arguments(name: str, *, views: int, size: int, **settings: object) -> Argume
 
 
 def show_progress(progress: Progress) -> None:
-    """One line that changes."""
+    """Print one line that updates in place."""
     print(f"\r{progress.stage:<10} {100 * progress.fraction:3.0f} %", end="", file=sys.stderr, flush=True)
 
 
 def in_words(report: Report) -> str:
-    """The verdict and the warnings, a line each, below the line of progress."""
+    """The verdict and the warnings, a line each, below the progress line."""
     verdict = report.verdict.in_words() if report.verdict else ()
     return "\n".join(["", *verdict, *(f"warning: {warning}" for warning in report.warnings)])
 
 
 def pose_table(truth: Path, **sets: Path) -> str:
-    """Rotation (deg) and centre (% of the cameras' distance) errors of each set, after robust alignment."""
+    """Table of rotation (deg) and centre (% of the cameras' distance) errors of each set, after robust alignment."""
     true = read_poses(truth)
     lines = [
         f"{'':<10}{'poses':>8}{'rotation: median':>18}{'largest':>10}{'position: median':>18}{'largest':>10}"
