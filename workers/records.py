@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from datetime import datetime
 from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel, Field
 
 from biresnerf.wire.base import Record
 from biresnerf.wire.datasets import FileView, UploadView
-from biresnerf.wire.jobs import EventType, JobEvent, JobView, PriorityName
+from biresnerf.wire.jobs import JobEvent, JobView, PriorityName
 from biresnerf.wire.results import ResultFile
+from workers.database.ids import cursor_after, cursor_place, cursor_time
 
 PRIORITIES: dict[PriorityName, int] = {"low": -1, "normal": 0, "high": 1}
 
-LOG_NAME, POSES_NAME, REPORT_NAME = (
-    "log.txt",
-    "poses.json",
-    "report.json",
-)  # files of a result that the engine knows
+# Files of a result that the engine knows.
+LOG_NAME, POSES_NAME, REPORT_NAME = "log.txt", "poses.json", "report.json"
 THUMBNAIL_NAME = "thumbnail.jpg"
 PREVIEW_FOLDER = "preview"  # of files that show how far a job is
 
-FINAL_EVENTS: frozenset[EventType] = frozenset({"succeeded", "failed", "cancelled", "expired"})
-
 
 def priority_name(number: int) -> PriorityName:
-    """As clients say it."""
+    """The priority's name in the API."""
     return next(name for name, value in PRIORITIES.items() if value == number)
 
 
@@ -69,6 +66,30 @@ class Page(Record, Generic[T]):
 
     items: tuple[T, ...]
     next_cursor: str | None = None
+
+
+# The end of a query for one page, newest first; its parameters come from `newest_first`.
+NEWEST_FIRST = (
+    " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s)) ORDER BY created_at DESC, id DESC LIMIT %s"
+)
+
+
+def newest_first(cursor: str | None, limit: int) -> tuple[datetime | str | int | None, ...]:
+    """Parameters of `NEWEST_FIRST`: one row more than the page holds; raises `InputError` (``bad_cursor``)."""
+    created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
+    after = cursor_time(created) if created else None
+    return after, after, last_id, limit + 1
+
+
+def page_of(found: Iterable[T], limit: int, order: tuple[str, ...] = ("created_at", "id")) -> Page[T]:
+    """The first ``limit`` of the records; where there are more, the cursor holds the last one's ``order`` fields."""
+    items = tuple(found)
+    shown = items[:limit]
+    more = len(items) > limit
+    return Page(
+        items=shown,
+        next_cursor=cursor_after(*(getattr(shown[-1], name) for name in order)) if more else None,
+    )
 
 
 def record_from_row(model: type[Model], row: Mapping[str, Any], **others: Any) -> Model:

@@ -8,14 +8,15 @@ import logging
 import re
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from typing import Any, Concatenate, LiteralString, ParamSpec, TypeVar
+from copy import copy
+from typing import Any, Concatenate, LiteralString, ParamSpec, Self, TypeVar
 
 import psycopg
 from psycopg.rows import DictRow, dict_row
 from psycopg.sql import SQL, Composed
 from psycopg_pool import AsyncConnectionPool, PoolClosed, PoolTimeout
 
-from workers.settings.errors import SetupError, Unavailable
+from workers.settings.errors import NotFound, SetupError, Unavailable
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +49,19 @@ class Connection(psycopg.AsyncConnection[DictRow]):
     async def row(self, statement: Statement, *parameters: Any) -> DictRow | None:
         """The first row of a statement, if there is one."""
         return await (await self.execute(statement, parameters)).fetchone()
+
+    async def only_row(self, statement: Statement, *parameters: Any) -> DictRow:
+        """The row of a statement that always gives one (an aggregate, RETURNING, a locked row)."""
+        row = await self.row(statement, *parameters)
+        assert row is not None, statement
+        return row
+
+    async def required_row(self, missing: str, statement: Statement, *parameters: Any) -> DictRow:
+        """The first row of a statement; raises `NotFound` with the message ``missing`` where there is none."""
+        row = await self.row(statement, *parameters)
+        if row is None:
+            raise NotFound(missing)
+        return row
 
     async def value(self, statement: Statement, *parameters: Any) -> Any:
         """The first value of the first row; none where there is no row."""
@@ -96,6 +110,20 @@ class Database:
         async with self.transaction() as connection:
             cursor = await connection.execute(statement, parameters)
             return await cursor.fetchall() if cursor.description else []
+
+
+class OwnedStore:
+    """Base of stores whose rows belong to tenants: as opened it sees those of all tenants, as the operator does."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._tenant: str | None = None
+
+    def for_tenant(self, tenant: str | None) -> Self:
+        """The store limited to this tenant, who cannot tell another tenant's rows from none; None: all tenants."""
+        bound = copy(self)
+        bound._tenant = tenant
+        return bound
 
 
 @asynccontextmanager

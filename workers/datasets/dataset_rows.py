@@ -8,7 +8,7 @@ from biresnerf.errors import InputError
 from biresnerf.wire.datasets import DatasetState
 from workers.database.database import Connection
 from workers.records import DatasetFile
-from workers.settings.errors import Conflict, LimitReached, NotFound
+from workers.settings.errors import Conflict, LimitReached
 from workers.settings.settings import Settings
 from workers.store.files import StoredFile
 
@@ -76,16 +76,12 @@ async def require_place(
 
     Raises `Conflict` (``file_exists``), `LimitReached` (``too_many_files``, ``body_too_large``).
     """
-    row = await connection.row(
+    row = await connection.only_row(
         "SELECT count(*) FILTER (WHERE path <> %s) AS files, count(*) FILTER (WHERE path = %s) AS same,"
         " coalesce(sum(size) FILTER (WHERE path <> %s), 0)::bigint AS bytes"
         " FROM dataset_files WHERE dataset_id = %s",
-        path,
-        path,
-        path,
-        dataset_id,
+        *(path, path, path, dataset_id),
     )
-    assert row is not None, "an aggregate gives a row"
     if row["same"] and not overwrite:
         raise Conflict("file_exists", f"{path} is there already.")
     if row["files"] >= settings.max_files:
@@ -98,9 +94,7 @@ async def require_place(
 async def lock_dataset(connection: Connection, dataset_id: str, tenant: str | None) -> DatasetState:
     """The state of the dataset, which stays as it is until the transaction ends; raises `NotFound`."""
     sql = f"SELECT state FROM datasets WHERE id = %s AND {MINE} FOR UPDATE"
-    row = await connection.row(sql, dataset_id, tenant)
-    if row is None:
-        raise NotFound(f"No dataset {dataset_id}.")
+    row = await connection.required_row(f"No dataset {dataset_id}.", sql, dataset_id, tenant)
     state: DatasetState = row["state"]
     return state
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncIterable, Awaitable, Callable, Sequence
-from copy import copy
 from typing import Any
 
 from psycopg.types.json import Jsonb
 
 from biresnerf.errors import InputError
 from biresnerf.wire.datasets import DatasetState, DatasetView, ManifestEntry
-from workers.database.database import Connection, Database
-from workers.database.ids import cursor_after, cursor_place, cursor_time, new_id
+from workers.database.database import Connection, Database, OwnedStore
+from workers.database.ids import cursor_place, new_id
 from workers.datasets.dataset_check import Checker
 from workers.datasets.dataset_rows import (
     DATASET,
@@ -28,7 +27,7 @@ from workers.datasets.dataset_rows import (
 from workers.jobs.job_rows import jobs_of_dataset
 from workers.jobs.quotas import require_byte_quota
 from workers.process.waiting import retry_while_unavailable
-from workers.records import DatasetFile, Page, record_from_row
+from workers.records import NEWEST_FIRST, DatasetFile, Page, newest_first, page_of, record_from_row
 from workers.settings.errors import Conflict, Expired, LimitReached, NotFound
 from workers.settings.settings import Settings
 from workers.store.files import FileStore, StoredFile
@@ -38,24 +37,16 @@ COPIES_AT_ONCE = 8
 FILE = "SELECT path, key, size, sha256, created_at FROM dataset_files"
 
 
-class DatasetStore:
+class DatasetStore(OwnedStore):
     """Datasets in the database and the file store. Get one from `workers.engine.open_stores`.
 
-    As opened it sees everybody's datasets; `for_tenant` gives it as one tenant sees it, to whom a dataset of another
-    is as unknown as one that never was. Every method raises `Unavailable` (``database_unavailable``) where
-    the database does not answer.
+    Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
     """
 
     def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:
-        self._database, self._files, self._settings = database, files, settings
+        super().__init__(database)
+        self._files, self._settings = files, settings
         self._checker = Checker(database, files, settings)
-        self._tenant: str | None = None
-
-    def for_tenant(self, tenant: str | None) -> DatasetStore:
-        """The store as this tenant sees it; none: as the operator does."""
-        bound = copy(self)
-        bound._tenant = tenant
-        return bound
 
     async def create(self, name: str, manifest: Sequence[ManifestEntry] = ()) -> DatasetView:
         """An empty dataset in state ``open``; raises `LimitReached` (``too_many_files``)."""
@@ -83,20 +74,11 @@ class DatasetStore:
         self, *, state: DatasetState | None = None, limit: int = 50, cursor: str | None = None
     ) -> Page[DatasetView]:
         """Datasets, newest first; raises `InputError` (``bad_cursor``)."""
-        created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
         rows = await self._database.fetch(
-            DATASET + f" WHERE {MINE} AND (%s::text IS NULL OR state = %s)"
-            " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
-            " ORDER BY created_at DESC, id DESC LIMIT %s",
-            *(self._tenant, state, state),
-            *((cursor_time(created),) * 2 if created else (None, None)),
-            *(last_id, limit + 1),
+            DATASET + f" WHERE {MINE} AND (%s::text IS NULL OR state = %s)" + NEWEST_FIRST,
+            *(self._tenant, state, state, *newest_first(cursor, limit)),
         )
-        items = tuple(record_from_row(DatasetView, row) for row in rows[:limit])
-        more = len(rows) > limit
-        return Page(
-            items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
-        )
+        return page_of((record_from_row(DatasetView, row) for row in rows), limit)
 
     async def add_file(
         self,
@@ -215,14 +197,14 @@ class DatasetStore:
 
     async def file(self, dataset_id: str, path: str) -> DatasetFile:
         """One file; raises `NotFound`."""
-        rows = await self._database.fetch(
+        missing = f"Dataset {dataset_id} has no file {path}."
+        sql = (
             FILE + " WHERE dataset_id = %s AND path = %s"
-            f" AND EXISTS (SELECT 1 FROM datasets WHERE id = dataset_files.dataset_id AND {MINE})",
-            *(dataset_id, path, self._tenant),
+            f" AND EXISTS (SELECT 1 FROM datasets WHERE id = dataset_files.dataset_id AND {MINE})"
         )
-        if not rows:
-            raise NotFound(f"Dataset {dataset_id} has no file {path}.")
-        return DatasetFile.model_validate(rows[0])
+        async with self._database.transaction() as connection:
+            row = await connection.required_row(missing, sql, dataset_id, path, self._tenant)
+        return DatasetFile.model_validate(row)
 
     async def files(
         self, dataset_id: str, *, limit: int = 1000, cursor: str | None = None
@@ -232,14 +214,9 @@ class DatasetStore:
         async with self._database.transaction() as connection:
             if (await self._required(connection, dataset_id)).state == "expired":
                 raise Expired(f"The files of dataset {dataset_id} were not used for long and are gone.")
-            rows = await connection.rows(
-                FILE + " WHERE dataset_id = %s AND path > %s ORDER BY path LIMIT %s",
-                dataset_id,
-                after,
-                limit + 1,
-            )
-        items = tuple(DatasetFile.model_validate(row) for row in rows[:limit])
-        return Page(items=items, next_cursor=cursor_after(items[-1].path) if len(rows) > limit else None)
+            sql = FILE + " WHERE dataset_id = %s AND path > %s ORDER BY path LIMIT %s"
+            rows = await connection.rows(sql, dataset_id, after, limit + 1)
+        return page_of(map(DatasetFile.model_validate, rows), limit, ("path",))
 
     async def finalize(self, dataset_id: str) -> DatasetView:
         """Freeze the content: ``open`` becomes ``finalizing`` (other states come back as they are).
@@ -289,7 +266,5 @@ class DatasetStore:
 
     async def _required(self, connection: Connection, dataset_id: str) -> DatasetView:
         sql = DATASET + f" WHERE datasets.id = %s AND {MINE}"
-        row = await connection.row(sql, dataset_id, self._tenant)
-        if row is None:
-            raise NotFound(f"No dataset {dataset_id}.")
+        row = await connection.required_row(f"No dataset {dataset_id}.", sql, dataset_id, self._tenant)
         return record_from_row(DatasetView, row)

@@ -10,13 +10,12 @@ import contextlib
 import secrets
 import uuid
 from collections.abc import AsyncIterable, AsyncIterator, Iterator
-from copy import copy
 
 from psycopg.types.json import Jsonb
 
 from biresnerf.wire.datasets import UploadKind
 from biresnerf.wire.problems import JobError
-from workers.database.database import Connection, Database
+from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import new_id
 from workers.datasets.dataset_rows import MINE, file_key, require_open
 from workers.jobs.quotas import require_byte_quota
@@ -35,23 +34,16 @@ EXPIRE_BATCH = 100
 _UPLOAD = "SELECT uploads.* FROM uploads JOIN datasets ON datasets.id = uploads.dataset_id"
 
 
-class UploadStore:
+class UploadStore(OwnedStore):
     """Uploads in the database, their pieces in the file store. Get one from `workers.engine.open_stores`.
 
-    As opened it sees everybody's uploads; `for_tenant` gives it as one tenant sees it. Every method raises
-    `Unavailable` where database or store does not answer.
+    Every method raises `Unavailable` where database or store does not answer.
     """
 
     def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:
-        self._database, self._files, self._settings = database, files, settings
-        self._appending = [0]  # shared by the views of all tenants
-        self._tenant: str | None = None
-
-    def for_tenant(self, tenant: str | None) -> UploadStore:
-        """The store as this tenant sees it; none: as the operator does."""
-        bound = copy(self)
-        bound._tenant = tenant
-        return bound
+        super().__init__(database)
+        self._files, self._settings = files, settings
+        self._appending = [0]  # a list, which the stores of all tenants share
 
     async def create(
         self,
@@ -246,9 +238,7 @@ class UploadStore:
 
     async def _required(self, connection: Connection, upload_id: str) -> Upload:
         sql = _UPLOAD + f" WHERE uploads.id = %s AND {MINE}"
-        row = await connection.row(sql, upload_id, self._tenant)
-        if row is None:
-            raise NotFound(f"No upload {upload_id}.")
+        row = await connection.required_row(f"No upload {upload_id}.", sql, upload_id, self._tenant)
         return record_from_row(Upload, row)
 
 

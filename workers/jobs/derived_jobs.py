@@ -31,8 +31,8 @@ class DerivedJobs(JobStore):
     """The same jobs, and how to derive others from them. Every method raises `NotFound` as well."""
 
     def __init__(self, jobs: JobStore, files: FileStore) -> None:
-        super().__init__(jobs._database, jobs._listener, jobs._settings, jobs._tenant)
-        self._files = files
+        super().__init__(jobs._database, jobs._listener, jobs._settings)
+        self._files, self._tenant = files, jobs._tenant
 
     async def fork(
         self,

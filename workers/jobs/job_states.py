@@ -39,9 +39,7 @@ async def insert_job(connection: Connection, values: Mapping[str, Any]) -> dict[
     statement = sql.SQL("INSERT INTO jobs ({}) VALUES ({}) RETURNING id, queue_order, held").format(
         sql.SQL(", ").join(map(sql.Identifier, row)), sql.SQL(", ").join([sql.Placeholder()] * len(row))
     )
-    added = await connection.row(statement, *row.values())
-    assert added is not None, "RETURNING"
-    return added
+    return await connection.only_row(statement, *row.values())
 
 
 async def queue_job(connection: Connection, job: Mapping[str, Any]) -> None:
@@ -57,14 +55,13 @@ async def _enqueue(connection: Connection, job: Mapping[str, Any]) -> None:
 
 async def start_attempt(connection: Connection, job_id: str, token: uuid.UUID) -> dict[str, Any]:
     """Begin one more attempt, which owns the job from now on; returns the row."""
-    row = await connection.row(
+    row = await connection.only_row(
         "UPDATE jobs SET state = 'running', attempt = attempt + 1, run_token = %s, fraction = 0,"
         " step = 0, stage = NULL, eta_s = NULL, message = '',"
         " started_at = coalesce(started_at, clock_timestamp()) WHERE id = %s RETURNING *",
         token,
         job_id,
     )
-    assert row is not None, "the row is locked"
     await add_event(connection, job_id, "started", {"resumed": row["checkpoint"] is not None})
     return row
 
@@ -213,8 +210,7 @@ async def finish_cancelled(
         keep: the attempt's name.
         stall_s: how long a worker may be silent; nothing is deleted before twice that.
     """
-    row = await connection.row("SELECT keep_partial, previews FROM jobs WHERE id = %s", job_id)
-    assert row is not None, "the row is locked"
+    row = await connection.only_row("SELECT keep_partial, previews FROM jobs WHERE id = %s", job_id)
     logs = [item for item in artifacts if item.name == LOG_NAME]
     kept, shown = list(artifacts), None
     if row["keep_partial"] and not _is_whole(kept) and row["previews"] is not None:

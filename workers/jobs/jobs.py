@@ -13,8 +13,8 @@ from psycopg.types.json import Jsonb
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.jobs import JobEvent, JobState, JobView, LogLine, PriorityName
 from biresnerf.wire.webhooks import JobWebhook
-from workers.database.database import Connection, Database
-from workers.database.ids import cursor_after, cursor_place, cursor_time, new_id
+from workers.database.database import Connection, Database, OwnedStore
+from workers.database.ids import new_id
 from workers.jobs.job_rows import (
     JOB,
     MINE,
@@ -28,31 +28,32 @@ from workers.jobs.job_rows import (
 from workers.jobs.job_states import delete_job, insert_job, queue_job, request_cancel
 from workers.jobs.job_updates import JobListener, follow
 from workers.jobs.quotas import require_room, submitting_for
-from workers.records import LOG_NAME, PRIORITIES, Artifact, JobUpdate, Page
-from workers.settings.errors import Conflict, Expired, NotFound
+from workers.records import (
+    LOG_NAME,
+    NEWEST_FIRST,
+    PRIORITIES,
+    Artifact,
+    JobUpdate,
+    Page,
+    newest_first,
+    page_of,
+)
+from workers.settings.errors import Conflict, Expired
 from workers.settings.settings import Settings
 from workers.settings.traces import traced
 from workers.tenants.tenants import LOCAL_TENANT
 from workers.webhooks.webhooks import add_job_webhook, request_with
 
 
-class JobStore:
+class JobStore(OwnedStore):
     """Jobs in the database. Get one from `workers.engine.open_stores`.
 
-    As opened it sees everybody's jobs; `for_tenant` gives it as one tenant sees it, to whom a job of another is as
-    unknown as one that never was. Every method raises `Unavailable` (``database_unavailable``) where the
-    database does not answer.
+    Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
     """
 
-    def __init__(
-        self, database: Database, listener: JobListener, settings: Settings, tenant: str | None = None
-    ) -> None:
-        self._database, self._listener, self._settings = database, listener, settings
-        self._tenant = tenant
-
-    def for_tenant(self, tenant: str | None) -> JobStore:
-        """The store as this tenant sees it; none: as the operator does."""
-        return JobStore(self._database, self._listener, self._settings, tenant)
+    def __init__(self, database: Database, listener: JobListener, settings: Settings) -> None:
+        super().__init__(database)
+        self._listener, self._settings = listener, settings
 
     @traced("submit")
     async def submit(
@@ -133,27 +134,19 @@ class JobStore:
         cursor: str | None = None,
     ) -> Page[JobView]:
         """Refinements, newest first; raises `InputError` (``bad_cursor``)."""
-        created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
         rows = await self._database.fetch(
             f"WITH page AS MATERIALIZED (SELECT * FROM jobs WHERE kind = 'refine' AND {MINE}"
             " AND (%s::timestamptz IS NULL OR created_at > %s)"
             " AND (%s::text IS NULL OR state = %s) AND (%s::jsonb IS NULL OR labels @> %s)"
-            " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
-            f" ORDER BY created_at DESC, id DESC LIMIT %s), {PLACES}"
+            f"{NEWEST_FIRST}), {PLACES}"
             " SELECT page.*, places.queue_position FROM page"
             " LEFT JOIN places ON page.state = 'queued' AND places.queue_id = page.queue_id"
             " ORDER BY page.created_at DESC, page.id DESC",
             *(self._tenant, created_after, created_after, state, state),
             *((Jsonb({label[0]: label[1]}),) * 2 if label else (None, None)),
-            *((cursor_time(created),) * 2 if created else (None, None)),
-            last_id,
-            limit + 1,
+            *newest_first(cursor, limit),
         )
-        items = tuple(job_from_row(row) for row in rows[:limit])
-        more = len(rows) > limit
-        return Page(
-            items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
-        )
+        return page_of(map(job_from_row, rows), limit)
 
     async def cancel(self, job_id: str, *, keep_partial: bool = False) -> JobView:
         """Ask for the end of a job: a queued one is cancelled at once, a running one within seconds.
@@ -168,11 +161,8 @@ class JobStore:
     async def delete(self, job_id: str) -> None:
         """Delete a final job with its files; raises `NotFound`, `Conflict` (``state_conflict``)."""
         async with self._database.transaction() as connection:
-            row = await connection.row(
-                f"SELECT state FROM jobs WHERE id = %s AND {MINE} FOR UPDATE", job_id, self._tenant
-            )
-            if row is None:
-                raise NotFound(f"No job {job_id}.")
+            sql = f"SELECT state FROM jobs WHERE id = %s AND {MINE} FOR UPDATE"
+            row = await connection.required_row(f"No job {job_id}.", sql, job_id, self._tenant)
             if row["state"] in ("queued", "running"):
                 raise Conflict("state_conflict", f"Job {job_id} is {row['state']}; cancel it first.")
             busy = await connection.row(
@@ -254,7 +244,5 @@ class JobStore:
         return await self._listener.database_answers(2.0)
 
     async def _required(self, connection: Connection, job_id: str) -> dict[str, Any]:
-        row = await connection.row(JOB + f" WHERE id = %s AND {MINE}", job_id, self._tenant)
-        if row is None:
-            raise NotFound(f"No job {job_id}.")
-        return row
+        sql = JOB + f" WHERE id = %s AND {MINE}"
+        return await connection.required_row(f"No job {job_id}.", sql, job_id, self._tenant)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from workers.database.database import Connection
-from workers.settings.errors import Conflict, LimitReached, NotFound
+from workers.settings.errors import Conflict, LimitReached
 
 
 async def submitting_for(connection: Connection, dataset_id: str, seen_by: str | None) -> str:
@@ -16,11 +16,9 @@ async def submitting_for(connection: Connection, dataset_id: str, seen_by: str |
     """
     # The dataset before the tenant, as uploads lock them.
     sql = "SELECT tenant FROM datasets WHERE id = %s AND tenant = coalesce(%s, tenant) FOR SHARE"
-    tenant = await connection.value(sql, dataset_id, seen_by)
-    if tenant is None:
-        raise NotFound(f"No dataset {dataset_id}.")
-    await _lock_tenant(connection, tenant)
-    return str(tenant)
+    row = await connection.required_row(f"No dataset {dataset_id}.", sql, dataset_id, seen_by)
+    await _lock_tenant(connection, row["tenant"])
+    return str(row["tenant"])
 
 
 async def require_room(connection: Connection, dataset_id: str, priority: int, max_queued: int) -> None:
@@ -30,9 +28,7 @@ async def require_room(connection: Connection, dataset_id: str, priority: int, m
     (``queue_full``: ``max_queued`` jobs wait already; ``quota_exhausted``).
     """
     sql = "SELECT state, tenant FROM datasets WHERE id = %s FOR SHARE"
-    dataset = await connection.row(sql, dataset_id)
-    if dataset is None:  # deleted a moment ago
-        raise NotFound(f"No dataset {dataset_id}.")
+    dataset = await connection.required_row(f"No dataset {dataset_id}.", sql, dataset_id)
     if dataset["state"] != "ready":
         raise Conflict("dataset_not_ready", f"Dataset {dataset_id} is {dataset['state']}, not ready.")
     queued = await connection.value("SELECT count(*) FROM jobs WHERE state = 'queued'")
@@ -67,9 +63,7 @@ async def require_byte_quota(connection: Connection, dataset_id: str, size: int)
 async def _limits(connection: Connection, tenant: str) -> dict[str, int]:
     await _lock_tenant(connection, tenant)
     sql = "SELECT top_priority, max_queued, max_stored_bytes FROM tenant_limits WHERE id = %s"
-    row = await connection.row(sql, tenant)
-    assert row is not None, "referenced by what the tenant owns"
-    return row
+    return await connection.only_row(sql, tenant)
 
 
 async def _lock_tenant(connection: Connection, tenant: str) -> None:

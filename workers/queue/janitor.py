@@ -62,13 +62,12 @@ class Janitor:
 
     async def _round(self) -> None:
         async with self._database.transaction() as connection:
-            row = await connection.row(
+            row = await connection.only_row(
                 "SELECT pg_try_advisory_xact_lock(%s) AS mine,"
                 " extract(epoch FROM now() - pg_postmaster_start_time())::float8 AS database_age_s,"
                 " extract(epoch FROM clock_timestamp())::float8 AS now_s",
                 JANITOR_LOCK,
             )
-            assert row is not None, "a SELECT without FROM gives a row"
             self._distrust_after_a_pause(row["now_s"])
             if self._healthy_since is None:
                 self._healthy_since = time.monotonic()

@@ -16,7 +16,7 @@ from biresnerf.errors import InputError
 from biresnerf.wire.base import Record
 from workers.database.database import Database
 from workers.database.ids import CROCKFORD, new_id
-from workers.settings.errors import NotFound
+from workers.records import record_from_row
 from workers.tenants.tenants import ensure_tenant
 
 Scope = Literal["read", "datasets:write", "jobs:write", "admin"]
@@ -74,18 +74,11 @@ class KeyStore:
         text = f"{prefix}_{secrets.token_urlsafe(32)}"
         async with self._database.transaction() as connection:
             await ensure_tenant(connection, tenant)
-            row = await connection.row(
+            row = await connection.only_row(
                 "INSERT INTO api_keys (id, tenant, name, prefix, sha256, scopes, expires_at)"
                 " VALUES (%s, %s, %s, %s, %s, %s, clock_timestamp() + %s::interval) RETURNING *",
-                new_id("key"),
-                tenant,
-                name,
-                prefix,
-                _digest(text),
-                wanted,
-                lives,
+                *(new_id("key"), tenant, name, prefix, _digest(text), wanted, lives),
             )
-            assert row is not None, "the inserted row"
             return _key(row), text
 
     async def recognise(self, text: str) -> ApiKey:
@@ -125,14 +118,9 @@ class KeyStore:
 
     async def revoke(self, key_id: str) -> ApiKey:
         """End a key for good, from the next request on; raises `NotFound`."""
-        rows = await self._database.fetch(
-            "UPDATE api_keys SET revoked_at = coalesce(revoked_at, clock_timestamp()) WHERE id = %s"
-            " RETURNING *",
-            key_id,
-        )
-        if not rows:
-            raise NotFound(f"No key {key_id}.")
-        return _key(rows[0])
+        sql = "UPDATE api_keys SET revoked_at = coalesce(revoked_at, clock_timestamp()) WHERE id = %s RETURNING *"
+        async with self._database.transaction() as connection:
+            return _key(await connection.required_row(f"No key {key_id}.", sql, key_id))
 
 
 def _digest(text: str) -> bytes:
@@ -141,4 +129,4 @@ def _digest(text: str) -> bytes:
 
 
 def _key(row: dict[str, Any]) -> ApiKey:
-    return ApiKey(**{name: row[name] for name in ApiKey.model_fields})
+    return record_from_row(ApiKey, row)

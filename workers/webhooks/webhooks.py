@@ -11,17 +11,11 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from biresnerf.wire.webhooks import (
-    DeliveryView,
-    JobWebhook,
-    WebhookEvent,
-    WebhookView,
-    new_secret,
-)
-from workers.database.database import Connection, Database
-from workers.database.ids import cursor_after, cursor_place, cursor_time, new_id
-from workers.records import Page, record_from_row
-from workers.settings.errors import Conflict, LimitReached, NotFound
+from biresnerf.wire.webhooks import DeliveryView, JobWebhook, WebhookEvent, WebhookView, new_secret
+from workers.database.database import Connection, Database, OwnedStore
+from workers.database.ids import new_id
+from workers.records import NEWEST_FIRST, Page, newest_first, page_of, record_from_row
+from workers.settings.errors import Conflict, LimitReached
 from workers.settings.settings import Settings
 from workers.webhooks.outbound import Policy, checked_url
 
@@ -34,18 +28,15 @@ _DELIVERY = """
     FROM webhook_deliveries"""
 
 
-class WebhookStore:
+class WebhookStore(OwnedStore):
     """Webhooks in the database. Get one from `workers.engine.open_stores`.
 
-    `for_tenant` gives it as one tenant sees it. Every method raises `Unavailable` where the database is away.
+    Every method raises `Unavailable` where the database does not answer.
     """
 
-    def __init__(self, database: Database, settings: Settings, tenant: str | None = None) -> None:
-        self._database, self._settings, self._tenant = database, settings, tenant
-
-    def for_tenant(self, tenant: str | None) -> WebhookStore:
-        """The store as this tenant sees it; none: as the operator does."""
-        return WebhookStore(self._database, self._settings, tenant)
+    def __init__(self, database: Database, settings: Settings) -> None:
+        super().__init__(database)
+        self._settings = settings
 
     async def create(
         self, tenant: str, url: str, events: Sequence[WebhookEvent], description: str = ""
@@ -63,18 +54,12 @@ class WebhookStore:
                 raise LimitReached(
                     "too_many_webhooks", f"There are {self._settings.max_webhooks} webhooks already."
                 )
-            return _webhook(
-                await connection.row(
-                    "INSERT INTO webhooks (id, tenant, url, events, description, secret)"
-                    " VALUES (%s, %s, %s, %s, %s, %s) RETURNING *",
-                    new_id("wh"),
-                    tenant,
-                    target,
-                    list(dict.fromkeys(events)),
-                    description,
-                    secret,
-                )
-            ), secret
+            row = await connection.only_row(
+                "INSERT INTO webhooks (id, tenant, url, events, description, secret)"
+                " VALUES (%s, %s, %s, %s, %s, %s) RETURNING *",
+                *(new_id("wh"), tenant, target, list(dict.fromkeys(events)), description, secret),
+            )
+            return _webhook(row), secret
 
     async def get(self, webhook_id: str) -> WebhookView:
         """The webhook; raises `NotFound`."""
@@ -85,20 +70,11 @@ class WebhookStore:
         self, *, job_id: str | None = None, limit: int = 50, cursor: str | None = None
     ) -> Page[WebhookView]:
         """Webhooks, newest first: those for all jobs, or those of one; raises `InputError` (``bad_cursor``)."""
-        created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
         rows = await self._database.fetch(
-            f"SELECT * FROM webhooks WHERE {_MINE} AND job_id IS NOT DISTINCT FROM %s"
-            " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
-            " ORDER BY created_at DESC, id DESC LIMIT %s",
-            *(self._tenant, job_id),
-            *((cursor_time(created),) * 2 if created else (None, None)),
-            *(last_id, limit + 1),
+            f"SELECT * FROM webhooks WHERE {_MINE} AND job_id IS NOT DISTINCT FROM %s" + NEWEST_FIRST,
+            *(self._tenant, job_id, *newest_first(cursor, limit)),
         )
-        items = tuple(_webhook(row) for row in rows[:limit])
-        more = len(rows) > limit
-        return Page(
-            items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
-        )
+        return page_of(map(_webhook, rows), limit)
 
     async def change(
         self,
@@ -116,7 +92,7 @@ class WebhookStore:
         target = None if url is None else str(checked_url(url, Policy.of(self._settings)))
         async with self._database.transaction() as connection:
             await self._required(connection, webhook_id, lock=True)
-            row = await connection.row(
+            row = await connection.only_row(
                 "UPDATE webhooks SET url = coalesce(%s, url), events = coalesce(%s, events),"
                 " description = coalesce(%s, description), enabled = coalesce(%s, enabled),"
                 " disabled_why = CASE WHEN %s::boolean IS NULL THEN disabled_why END,"
@@ -133,24 +109,18 @@ class WebhookStore:
         secret = new_secret()
         async with self._database.transaction() as connection:
             await self._required(connection, webhook_id, lock=True)
-            return _webhook(
-                await connection.row(
-                    "UPDATE webhooks SET previous_secret = secret, secret = %s,"
-                    " previous_until = clock_timestamp() + make_interval(hours => %s)"
-                    " WHERE id = %s RETURNING *",
-                    secret,
-                    ROTATION_HOURS,
-                    webhook_id,
-                )
-            ), secret
+            row = await connection.only_row(
+                "UPDATE webhooks SET previous_secret = secret, secret = %s,"
+                " previous_until = clock_timestamp() + make_interval(hours => %s) WHERE id = %s RETURNING *",
+                *(secret, ROTATION_HOURS, webhook_id),
+            )
+            return _webhook(row), secret
 
     async def delete(self, webhook_id: str) -> None:
         """Delete it with its deliveries; what waits is not sent. Raises `NotFound`."""
-        rows = await self._database.fetch(
-            f"DELETE FROM webhooks WHERE id = %s AND {_MINE} RETURNING id", webhook_id, self._tenant
-        )
-        if not rows:
-            raise NotFound(f"No webhook {webhook_id}.")
+        sql = f"DELETE FROM webhooks WHERE id = %s AND {_MINE} RETURNING id"
+        async with self._database.transaction() as connection:
+            await connection.required_row(f"No webhook {webhook_id}.", sql, webhook_id, self._tenant)
 
     async def test(self, webhook_id: str) -> DeliveryView:
         """Queue a message ``webhook.test``; raises `NotFound`, `Conflict` (``state_conflict``)."""
@@ -173,21 +143,12 @@ class WebhookStore:
         self, webhook_id: str, *, limit: int = 50, cursor: str | None = None
     ) -> Page[DeliveryView]:
         """What was sent or is to be, newest first; raises `NotFound`, `InputError` (``bad_cursor``)."""
-        created, last_id = cursor_place(cursor, 2) if cursor else (None, None)
+        place = newest_first(cursor, limit)
         async with self._database.transaction() as connection:
             await self._required(connection, webhook_id)
-            rows = await connection.rows(
-                _DELIVERY + " WHERE webhook_id = %s"
-                " AND (%s::timestamptz IS NULL OR (created_at, id) < (%s, %s))"
-                " ORDER BY created_at DESC, id DESC LIMIT %s",
-                *(webhook_id, *((cursor_time(created),) * 2 if created else (None, None))),
-                *(last_id, limit + 1),
-            )
-        items = tuple(_delivery_record(row) for row in rows[:limit])
-        more = len(rows) > limit
-        return Page(
-            items=items, next_cursor=cursor_after(items[-1].created_at, items[-1].id) if more else None
-        )
+            sql = _DELIVERY + " WHERE webhook_id = %s" + NEWEST_FIRST
+            rows = await connection.rows(sql, webhook_id, *place)
+        return page_of(map(_delivery_record, rows), limit)
 
     async def delivery(self, webhook_id: str, delivery_id: str) -> DeliveryView:
         """One message; raises `NotFound`."""
@@ -221,12 +182,8 @@ class WebhookStore:
         self, connection: Connection, webhook_id: str, *, lock: bool = False
     ) -> dict[str, Any]:
         end = " FOR NO KEY UPDATE" if lock else ""
-        row = await connection.row(
-            f"SELECT * FROM webhooks WHERE id = %s AND {_MINE}{end}".encode(), webhook_id, self._tenant
-        )
-        if row is None:
-            raise NotFound(f"No webhook {webhook_id}.")
-        return row
+        sql = f"SELECT * FROM webhooks WHERE id = %s AND {_MINE}{end}".encode()
+        return await connection.required_row(f"No webhook {webhook_id}.", sql, webhook_id, self._tenant)
 
 
 async def add_job_webhook(
@@ -253,14 +210,12 @@ async def drop_pending(connection: Connection, webhook_id: str) -> None:
 
 
 async def _delivery(connection: Connection, webhook_id: str, delivery_id: str) -> DeliveryView:
-    row = await connection.row(_DELIVERY + " WHERE id = %s AND webhook_id = %s", delivery_id, webhook_id)
-    if row is None:
-        raise NotFound(f"Webhook {webhook_id} has no delivery {delivery_id}.")
-    return _delivery_record(row)
+    missing = f"Webhook {webhook_id} has no delivery {delivery_id}."
+    sql = _DELIVERY + " WHERE id = %s AND webhook_id = %s"
+    return _delivery_record(await connection.required_row(missing, sql, delivery_id, webhook_id))
 
 
-def _webhook(row: dict[str, Any] | None) -> WebhookView:
-    assert row is not None, "RETURNING gives the row that was written"
+def _webhook(row: dict[str, Any]) -> WebhookView:
     rotating = row["previous_until"] is not None and row["previous_until"] > datetime.now(UTC)
     return record_from_row(
         WebhookView, row, previous_secret_until=row["previous_until"] if rotating else None

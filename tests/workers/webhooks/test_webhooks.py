@@ -129,7 +129,7 @@ async def test_an_inside_address_is_not_sent_to_whatever_the_row_says(
 async def test_a_tenant_has_so_many_webhooks_and_no_more(settings: Settings, stores: Stores):
     few = settings.model_copy(update={"max_webhooks": 2})
     async with open_database(settings.require_database_url(), connections=2) as database:
-        store = type(stores.webhooks)(database, few, "local")
+        store = type(stores.webhooks)(database, few).for_tenant("local")
         for _ in range(2):
             await store.create("local", "http://127.0.0.1:9999/", ["job.failed"])
         with pytest.raises(LimitReached) as told:
