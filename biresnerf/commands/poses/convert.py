@@ -70,7 +70,7 @@ def _document(
     places: dict[str, Path], images: int, left_out: tuple[str, ...], warnings: list[str]
 ) -> dict[str, Any]:
     return {
-        "forms": {name: str(place) for name, place in places.items()},
+        "formats": {name: str(place) for name, place in places.items()},
         "images": images,
         "left_out": left_out,
         "warnings": warnings,

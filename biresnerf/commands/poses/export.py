@@ -45,4 +45,4 @@ def export_command(
         if not as_json:
             click.echo(f"{name} written to {folder}")
     if as_json:
-        print_json({"folder": str(folder), "forms": list(names)})
+        print_json({"folder": str(folder), "formats": list(names)})

@@ -57,7 +57,7 @@ def contents(dataset: Dataset) -> dict[str, Any]:
     taken = Counter(frame.camera for frame in dataset.frames)
     return {
         "folder": str(dataset.root),
-        "form": dataset.source.dialect,
+        "format": dataset.source.dialect,
         "pose_files": [str(file) for file in dataset.source.files or filter(None, [dataset.source.file])],
         "images": len(dataset),
         "with_pose": int(dataset.posed.sum()),
@@ -129,7 +129,7 @@ def start_in_words(dataset: Dataset, options: ResolvedOptions) -> str:
 
 
 def _lines(found: dict[str, Any]) -> list[str]:
-    lines = [f"{found['folder']}: {found['images']} images, {found['form']}"]
+    lines = [f"{found['folder']}: {found['images']} images, {found['format']}"]
     lines += [f"  poses from {file}" for file in found["pose_files"][:5]]
     without = found["without_pose"]
     lines.append(f"  {found['with_pose']} with a pose" + (f", {len(without)} without" if without else ""))

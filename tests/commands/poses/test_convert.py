@@ -81,7 +81,7 @@ def test_there_and_back_keeps_poses_and_names(tmp_path_factory, form: str, seed:
     write_set(folder / "given", seed, count, 0.0 if form == "llff" else 0.01)
     given_set = read_dataset(folder / "given")
     there = converted(folder / "given", folder / "there", "--to", form, *(BOUNDS if form == "llff" else ()))
-    assert there["forms"] == {form: str(folder / "there" / PLACES[form])}
+    assert there["formats"] == {form: str(folder / "there" / PLACES[form])}
     between = read_dataset(folder / "there" / PLACES[form])
     assert_same(between, given_set)
     converted(folder / "there" / PLACES[form], folder / "back", "--to", "transforms")
@@ -101,7 +101,7 @@ def test_every_form_that_is_read_becomes_every_form_that_is_written(tmp_path: Pa
     forms = [name for name in FORMS if form in fitting.get(name, (form,))]
     wanted = [word for name in forms for word in ("--to", name)]
     done = converted(scene, tmp_path / "all", *wanted, "--photos", "copy")
-    assert list(done["forms"]) == forms
+    assert list(done["formats"]) == forms
     assert done["images"] == 4
     for place in (PLACES[name] for name in forms if name in PLACES):
         assert_same(read_dataset(tmp_path / "all" / place), given_set)

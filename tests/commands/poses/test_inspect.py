@@ -27,7 +27,7 @@ def test_a_model_with_masks_and_unregistered_images_is_told_as_it_is(tmp_path: P
     trajectories.colmap_set(tmp_path, registered=3)
     write_image(tmp_path / "masks/a.png.png", mode="L")
     found = inspected(tmp_path, "--preset", "fast", "--set", "max_image_size=16", "--set", "steps=100")
-    assert (found["form"], found["images"], found["with_pose"], found["masks"]) == ("colmap", 4, 3, 1)
+    assert (found["format"], found["images"], found["with_pose"], found["masks"]) == ("colmap", 4, 3, 1)
     assert [Path(name).name for name in found["without_pose"]] == ["d.png"]
     lens = found["cameras"][0]
     assert (lens["model"], lens["width"], lens["height"], lens["images"]) == ("PINHOLE", 20, 16, 4)
@@ -52,7 +52,7 @@ def test_photos_alone_are_told_where_their_poses_would_come_from(
 ) -> None:
     trajectories.write_images(tmp_path)
     found = inspected(tmp_path, "--set", f"start={start}")
-    assert (found["form"], found["with_pose"]) == ("images", 0)
+    assert (found["format"], found["with_pose"]) == ("images", 0)
     assert said in found["plan"]["start"]
 
 
