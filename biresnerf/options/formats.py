@@ -37,7 +37,7 @@ class Format:
         gives: what reading it gives, for the docs.
         checked_against: what its reader was tested with, for the docs.
         in_set: where `convert` writes it in its folder; empty for formats that it does not write.
-        in_result: where it lies in the folder of a result; empty for formats that results do not have.
+        in_result: where it lies in the folder of a result; the same place where left out.
         always: every result has it.
         needs: ``photos``: the input's photos; ``lens file``: a camera.json beside it, as it has no lenses;
             ``bounds``: depths of the nearest and farthest point; ``input``: the input's own file.
@@ -66,6 +66,9 @@ class Format:
     hint: str = ""
     downloads: str = ""
     module: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "in_result", self.in_result or self.in_set)
 
     @property
     def on_request(self) -> bool:

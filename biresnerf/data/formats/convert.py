@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tempfile
@@ -16,7 +15,7 @@ from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.transforms.write_intrinsics import lens_values
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import refined_set
 from biresnerf.data.photos.mask_files import mask_beside
@@ -75,8 +74,7 @@ def convert(
             assert codec.write is not None, f"{name} is declared with a place in a set"
             codec.write(refined, staging / codec.format.in_set, context)
         if any("lens file" in formats()[name].needs for name in names) and len(chosen.cameras) == 1:
-            with whole_file(staging / CAMERA) as temporary:
-                temporary.write_text(json.dumps(lens_values(chosen.cameras[0]), indent=2) + "\n", "utf-8")
+            write_json(staging / CAMERA, lens_values(chosen.cameras[0]))
         if photos != "none":
             _bring_photos(chosen, staging, photos)
     places = {name: folder / formats()[name].in_set for name in names}

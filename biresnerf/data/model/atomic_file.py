@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 @contextmanager
@@ -29,9 +31,14 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text and a line feed, UTF-8, whole or not at all."""
+    """Write a text and a line feed in UTF-8, whole or not at all."""
     with whole_file(path) as temporary:
         temporary.write_text(text + "\n", "utf-8")
+
+
+def write_json(path: Path, document: Any, indent: int = 2) -> None:
+    """Write a JSON document, whole or not at all. Raises ValueError for NaN and infinity."""
+    write_text(path, json.dumps(document, indent=indent, ensure_ascii=False, allow_nan=False))
 
 
 def _umask() -> int:

@@ -1,4 +1,4 @@
-"""Strict reading of a JSON file from anybody: bounded, finite, without duplicate keys."""
+"""Strict reading of JSON files of unknown origin: bounded, finite, without duplicate keys."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from biresnerf.data.model.text_file import read_text
 from biresnerf.errors import InputError
 
 Model = TypeVar("Model", bound=BaseModel)
 
 MAX_JSON_BYTES = 64 * 2**20  # some 100 000 frames; a larger file is no pose file
-_CODE = "pose_file_invalid"
 
 
 class _DuplicateKeyError(ValueError):
@@ -54,41 +54,34 @@ def read_json_object(path: Path) -> dict[str, Any]:
 
     Raises:
         InputError: ``pose_file_invalid`` for a file that cannot be read, is larger than ``MAX_JSON_BYTES``,
-            is no
-            JSON, holds NaN, Infinity or a key twice, is nested too deeply, or is not an object.
+            is not JSON, has a key twice, is nested too deeply, or is not an object; ``pose_not_finite`` for NaN and
+            Infinity.
     """
-    where = path.name
-    text = _read_text(path)
+
+    def invalid(what: str, hint: str) -> InputError:
+        return InputError("pose_file_invalid", what, where=path.name, hint=hint)
+
+    text = read_text(path, MAX_JSON_BYTES)
     try:
         document = json.loads(text, object_pairs_hook=_object)
         not_finite = first_non_finite(document)
     except _DuplicateKeyError as error:
-        raise InputError(_CODE, str(error), where=where, hint="Remove one of the two.") from None
+        raise invalid(str(error), "Remove one of the two.") from None
     except json.JSONDecodeError as error:
-        raise InputError(
-            _CODE,
-            f"not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}.",
-            where=where,
-            hint="The file may be cut off; export or copy it again.",
-        ) from None
+        what = f"not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}."
+        raise invalid(what, "The file may be cut off; export or copy it again.") from None
     except RecursionError:
-        raise InputError(_CODE, "nested too deeply.", where=where, hint="Export the poses again.") from None
+        raise invalid("nested too deeply.", "Export the poses again.") from None
     except ValueError as error:  # numbers of thousands of digits
-        raise InputError(
-            _CODE, f"not readable: {error}.", where=where, hint="Export the poses again."
-        ) from None
+        raise invalid(f"not readable: {error}.", "Export the poses again.") from None
     if not isinstance(document, dict):
-        raise InputError(
-            _CODE,
-            f"holds a {type(document).__name__}, not an object with `frames`.",
-            where=where,
-            hint="Give a transforms.json as nerfstudio, instant-ngp or Blender write it.",
-        )
+        what = f"holds a {type(document).__name__}, not an object with `frames`."
+        raise invalid(what, "Give a transforms.json as nerfstudio, instant-ngp or Blender write it.")
     if not_finite is not None:
         raise InputError(
             "pose_not_finite",
             "NaN or an infinite number.",
-            where=f"{where} {not_finite}",
+            where=f"{path.name} {not_finite}",
             hint="Remove the frame, or its transform_matrix, or export it again.",
         )
     return document
@@ -106,27 +99,3 @@ def read_model(model: type[Model], path: Path, *, code: str, hint: str) -> Model
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
         raise InputError(code, f"{first['msg']}.", where=f"{path.name} {field}", hint=hint) from None
-
-
-def _read_text(path: Path) -> str:
-    try:
-        size = path.stat().st_size
-        if size > MAX_JSON_BYTES:
-            raise InputError(
-                _CODE,
-                f"{size / 2**20:.0f} MiB is more than a pose file may have ({MAX_JSON_BYTES // 2**20} MiB).",
-                where=path.name,
-                hint="Leave out what does not describe cameras, or split the set.",
-            )
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(
-            _CODE,
-            f"cannot be read: {error.strerror}.",
-            where=path.name,
-            hint="Check the path and its permissions.",
-        ) from None
-    except UnicodeDecodeError:
-        raise InputError(
-            _CODE, "is not UTF-8 text.", where=path.name, hint="Save it as JSON in UTF-8."
-        ) from None

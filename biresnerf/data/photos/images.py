@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.area_resize import area_resize
-from biresnerf.data.photos.background import uniform_background
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_files import quiet_pillow
 from biresnerf.data.photos.masks import load_mask, shrink_mask
@@ -25,6 +25,11 @@ _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 _DECODERS = 4
 _DECODING_BYTES = 2**30  # for all threads together
 _DECODING_BYTES_PER_PX = 24  # RGBA as bytes and as floats, and the float copy being shrunk
+# A set of opaque images shows its scene before plain black or white:
+BLACK_BELOW = 24  # of 255: sensors and JPEG leave some light in black
+WHITE_ABOVE = 250  # of 255: bright walls and skies stay below it or vary
+BORDER_SHARE = 0.75  # of an image's border pixels that must show the colour; a pedestal may cover one side
+IMAGE_SHARE = 0.9  # of the images that must agree; the others may have the object cut by the border
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +37,8 @@ class ImageSet:
     """All images at working size. Colours are as stored (sRGB values, not linear light), 0 to 255.
 
     Attributes:
-        pixels: uint8 [total_px, 3], image after image, row by row; composited on the background where there
-            is
-            transparency.
+        pixels: uint8 [total_px, 3], image after image, row by row; composited on the background where
+            there is transparency.
         alpha: uint8 [total_px], or None where every pixel is opaque.
         offsets: int64 [n + 1]; image i has the pixels from offsets[i] to offsets[i + 1].
         widths, heights: int32 [n], px.
@@ -143,6 +147,37 @@ def _with_background(images: ImageSet, background: Background, behind: tuple[flo
     else:
         colour = np.array(behind, dtype=np.float32)
     return replace(images, background=colour)
+
+
+def uniform_background(
+    images: Sequence[NDArray[np.uint8]], counts: Sequence[NDArray[np.bool_] | None]
+) -> NDArray[np.float32] | None:
+    """Black or white, float32 [3] of 0 or 1, where nearly all borders of ``images`` [h, w, 3] show it.
+
+    Only pixels that count are looked at; images whose border is masked have no say.
+    """
+    black, white, asked = 0, 0, 0
+    for image, counting in zip(images, counts, strict=True):
+        border = _border(image)
+        if counting is not None:
+            border = border[_border(counting)]
+        if len(border) == 0:
+            continue
+        asked += 1
+        black += bool((border.max(axis=1) < BLACK_BELOW).mean() >= BORDER_SHARE)
+        white += bool((border.min(axis=1) > WHITE_ABOVE).mean() >= BORDER_SHARE)
+    if asked == 0:
+        return None
+    needed = IMAGE_SHARE * asked
+    if black >= needed:
+        return np.zeros(3, dtype=np.float32)
+    if white >= needed:
+        return np.ones(3, dtype=np.float32)
+    return None
+
+
+def _border(image: NDArray[T]) -> NDArray[T]:
+    return np.concatenate((image[0], image[-1], image[:, 0], image[:, -1]))
 
 
 def _shrink(

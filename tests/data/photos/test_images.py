@@ -7,8 +7,7 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.photos.background import uniform_background
-from biresnerf.data.photos.images import load_images, working_size
+from biresnerf.data.photos.images import load_images, uniform_background, working_size
 from biresnerf.errors import InputError
 from tests.data.scenes import (
     HEIGHT,

@@ -17,6 +17,7 @@ from biresnerf.data.model.colmap_scene import (
     ColmapPoints,
     ColmapRig,
     RigidPose,
+    Sensor,
     SensorType,
 )
 from biresnerf.data.model.pose_validation import MAX_COORDINATE
@@ -30,16 +31,8 @@ QUAT_LENGTH_ERROR = 1e-2
 _SENSOR_TYPES: dict[int, SensorType] = {0: "CAMERA", 1: "IMU"}
 # Of COLMAP 4.2 (src/colmap/sensor/models.h), to name in a message what is not supported.
 _ALL_MODELS = (
-    *(
-        "SIMPLE_PINHOLE",
-        "PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "OPENCV",
-        "OPENCV_FISHEYE",
-        "FULL_OPENCV",
-        "FOV",
-    ),
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
+    "FOV",
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
     *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
 )
@@ -62,6 +55,15 @@ def sensor_type(kind: int, where: str) -> SensorType:
     if kind not in _SENSOR_TYPES:
         raise broken(where, f"{kind} is no type of sensor")
     return _SENSOR_TYPES[kind]
+
+
+def rig_of_sensors(number: int, sensors: Sequence[tuple[Sensor, RigidPose | None]], where: str) -> ColmapRig:
+    """The rig of these sensors with ``sensor_from_rig``; the first is the reference. Each may be listed once."""
+    names = [sensor for sensor, _ in sensors]
+    for index, (kind, sensor_id) in enumerate(names):
+        if (kind, sensor_id) in names[:index]:
+            raise broken(where, f"the sensor {kind} {sensor_id} is listed twice")
+    return ColmapRig(number, names[0] if names else None, dict(sensors[1:]))
 
 
 def model_name_of_id(model_id: int, where: str) -> str:

@@ -18,6 +18,7 @@ from biresnerf.data.formats.colmap.model_checks import (
     model_name_of_id,
     points_of_records,
     refuse_repeated,
+    rig_of_sensors,
     rigid_pose,
     sensor_type,
 )
@@ -170,19 +171,16 @@ def parse_rigs(data: bytes, file: str) -> dict[int, ColmapRig]:
         where = f"{file} rig {number}"
         if sensors * _SENSOR.size > source.left:
             raise broken(where, f"names {sensors} sensors, but only {source.left} bytes follow")
-        reference = _sensor(source, where) if sensors else None
-        others: dict[Sensor, RigidPose | None] = {}
+        listed: list[tuple[Sensor, RigidPose | None]] = [(_sensor(source, where), None)] if sensors else []
         for _ in range(sensors - 1):
             sensor = _sensor(source, where)
             (has_pose,) = source.take(_U8, f"a sensor of rig {number}")
             if has_pose > 1:
                 raise broken(where, "a yes or no is neither")
             pose = rigid_pose(source.take(_POSE, f"a pose of rig {number}"), where) if has_pose else None
-            if sensor in others or sensor == reference:
-                raise broken(where, f"the sensor {sensor[0]} {sensor[1]} is listed twice")
-            others[sensor] = pose
+            listed.append((sensor, pose))
         refuse_repeated(rigs, number, f"{file} rig")
-        rigs[number] = ColmapRig(number, reference, others)
+        rigs[number] = rig_of_sensors(number, listed, where)
     source.finish()
     return rigs
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, by_name, dataset_of
-from biresnerf.data.formats.colmap.read_model import ColmapModel, read_colmap_model, world_from_cam_of
+from biresnerf.data.formats.colmap.read_model import read_colmap_model, world_from_cam_of
+from biresnerf.data.model.colmap_scene import ColmapModel
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.photos.image_files import read_header
 from biresnerf.data.photos.named_images import IMAGE_FOLDER, few_names, images_beside, refuse_no_images

@@ -36,18 +36,6 @@ _SUFFIXES: dict[ModelForm, str] = {"binary": ".bin", "text": ".txt"}
 # the distance.
 _SAME_POSE = 1e-3
 
-__all__ = [
-    "NO_POINT",
-    "ColmapFrame",
-    "ColmapImage",
-    "ColmapModel",
-    "ColmapPoints",
-    "ColmapRig",
-    "RigidPose",
-    "model_forms",
-    "read_colmap_model",
-]
-
 
 def model_forms(folder: Path) -> tuple[ModelForm, ...]:
     """The forms in which ``folder`` holds a model, binary first, as COLMAP reads them."""

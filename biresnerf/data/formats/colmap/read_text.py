@@ -18,6 +18,7 @@ from biresnerf.data.formats.colmap.model_checks import (
     image_name,
     points_of_records,
     refuse_repeated,
+    rig_of_sensors,
     rigid_pose,
     sensor_type,
     supported_model,
@@ -205,17 +206,14 @@ def parse_rigs(text: str, file: str) -> dict[int, ColmapRig]:
 
     def rig(words: _Words) -> tuple[int, ColmapRig]:
         number, sensors = words.integer("the rig's id"), words.integer("the number of sensors")
-        reference = _sensor(words) if sensors else None
-        others: dict[Sensor, RigidPose | None] = {}
+        listed: list[tuple[Sensor, RigidPose | None]] = [(_sensor(words), None)] if sensors else []
         for _ in range(min(sensors, len(words.words)) - 1):
             sensor = _sensor(words)
             has_pose = words.word("whether a sensor has a pose")
             if has_pose not in ("0", "1"):
                 raise broken(words.where, "a yes or no is neither")
-            if sensor in others or sensor == reference:
-                raise broken(words.where, f"the sensor {sensor[0]} {sensor[1]} is listed twice")
-            others[sensor] = _pose(words, "a sensor's pose") if has_pose == "1" else None
-        return number, ColmapRig(number, reference, others)
+            listed.append((sensor, _pose(words, "a sensor's pose") if has_pose == "1" else None))
+        return number, rig_of_sensors(number, listed, words.where)
 
     return _table(text, file, rig)
 

@@ -11,16 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from biresnerf.data.model.atomic_file import whole_file
-from biresnerf.data.model.camera import Camera
-from biresnerf.data.model.colmap_scene import (
-    ColmapFrame,
-    ColmapImage,
-    ColmapModel,
-    ColmapPoints,
-    ColmapRig,
-    RigidPose,
-    Sensor,
-)
+from biresnerf.data.model.colmap_scene import ColmapModel, RigidPose, Sensor
 from biresnerf.geometry.camera.camera_models import MODEL_IDS
 
 _SENSOR_TYPES = {"CAMERA": 0, "IMU": 1}
@@ -37,25 +28,25 @@ def write_colmap_binary(model: ColmapModel, folder: Path) -> None:
     """
     if any("\0" in image.name or not image.name for image in model.images.values()):
         raise ValueError("image names must not be empty and not hold NUL")
-    _write(folder / "points3D.bin", _points(model.points))
-    _write(folder / "cameras.bin", _cameras(model.cameras))
-    _write(folder / "images.bin", _images(model.images))
+    _write(folder / "points3D.bin", _points(model))
+    _write(folder / "cameras.bin", _cameras(model))
+    _write(folder / "images.bin", _images(model))
     if model.rigs:
-        _write(folder / "rigs.bin", _rigs(model.rigs))
-        _write(folder / "frames.bin", _frames(model.frames))
+        _write(folder / "rigs.bin", _rigs(model))
+        _write(folder / "frames.bin", _frames(model))
 
 
-def _cameras(cameras: dict[int, Camera]) -> bytes:
-    parts = [struct.pack("<Q", len(cameras))]
-    for number, camera in cameras.items():
+def _cameras(model: ColmapModel) -> bytes:
+    parts = [struct.pack("<Q", len(model.cameras))]
+    for number, camera in model.cameras.items():
         parts.append(struct.pack("<IiQQ", number, MODEL_IDS[camera.model], camera.width, camera.height))
         parts.append(struct.pack(f"<{len(camera.params)}d", *camera.params))
     return b"".join(parts)
 
 
-def _images(images: dict[int, ColmapImage]) -> bytes:
-    parts = [struct.pack("<Q", len(images))]
-    for number, image in images.items():
+def _images(model: ColmapModel) -> bytes:
+    parts = [struct.pack("<Q", len(model.images))]
+    for number, image in model.images.items():
         parts.append(
             struct.pack("<I", number) + _pose(image.cam_from_world) + struct.pack("<I", image.camera_id)
         )
@@ -67,7 +58,8 @@ def _images(images: dict[int, ColmapImage]) -> bytes:
     return b"".join(parts)
 
 
-def _points(points: ColmapPoints) -> bytes:
+def _points(model: ColmapModel) -> bytes:
+    points = model.points
     parts = [struct.pack("<Q", len(points))]
     tracks = np.stack([points.track_image_ids, points.track_point2d_indices], axis=1).astype("<u4")
     for k in range(len(points)):
@@ -77,9 +69,9 @@ def _points(points: ColmapPoints) -> bytes:
     return b"".join(parts)
 
 
-def _rigs(rigs: dict[int, ColmapRig]) -> bytes:
-    parts = [struct.pack("<Q", len(rigs))]
-    for number, rig in rigs.items():
+def _rigs(model: ColmapModel) -> bytes:
+    parts = [struct.pack("<Q", len(model.rigs))]
+    for number, rig in model.rigs.items():
         if rig.reference is None:
             parts.append(struct.pack("<II", number, 0))
             continue
@@ -91,9 +83,9 @@ def _rigs(rigs: dict[int, ColmapRig]) -> bytes:
     return b"".join(parts)
 
 
-def _frames(frames: dict[int, ColmapFrame]) -> bytes:
-    parts = [struct.pack("<Q", len(frames))]
-    for number, frame in frames.items():
+def _frames(model: ColmapModel) -> bytes:
+    parts = [struct.pack("<Q", len(model.frames))]
+    for number, frame in model.frames.items():
         parts.append(struct.pack("<II", number, frame.rig_id) + _pose(frame.rig_from_world))
         parts.append(struct.pack("<I", len(frame.data_ids)))
         parts += [_sensor(sensor) + struct.pack("<Q", data_id) for sensor, data_id in frame.data_ids]

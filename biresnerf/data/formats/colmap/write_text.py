@@ -13,28 +13,21 @@ from biresnerf.data.model.colmap_scene import ColmapModel, RigidPose, Sensor
 from biresnerf.errors import InputError
 
 
-def colmap_text_problem(model: ColmapModel) -> str | None:
-    """Why the text tables cannot hold the model, or None where it can."""
-    for image in model.images.values():
-        if len(image.name.split()) != 1 or image.name.startswith("#"):
-            return f"the name {image.name!r} has a space in it, and every reader of the text tables cuts it there"
-    return None
-
-
 def write_colmap_text(model: ColmapModel, folder: Path) -> None:
     """Writes cameras.txt, images.txt, points3D.txt and, where the model has them, rigs.txt and frames.txt.
 
     Raises:
         InputError: ``export_not_possible``: a name that the tables cannot hold.
     """
-    problem = colmap_text_problem(model)
-    if problem is not None:
-        raise InputError(
-            "export_not_possible",
-            f"COLMAP's text tables cannot hold this model: {problem}.",
-            where="colmap-text",
-            hint="Use the binary model in colmap/sparse/0, or rename the image.",
-        )
+    for image in model.images.values():
+        if len(image.name.split()) != 1 or image.name.startswith("#"):
+            raise InputError(
+                "export_not_possible",
+                f"COLMAP's text tables cannot hold this model: the name {image.name!r} has a space in it, and every "
+                "reader of the text tables cuts it there.",
+                where="colmap-text",
+                hint="Use the binary model in colmap/sparse/0, or rename the image.",
+            )
     _write(folder / "points3D.txt", _points(model))
     _write(folder / "cameras.txt", _cameras(model))
     _write(folder / "images.txt", _images(model))

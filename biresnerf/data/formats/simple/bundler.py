@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, in_order
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.camera import Camera
-from biresnerf.data.model.colmap_scene import ColmapModel
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
@@ -42,7 +41,6 @@ BUNDLER = Format(
     hint="Bundler format: File › Import › Import Cameras",
     downloads="bundler/",
 )
-
 
 LIST_NAMES = ("list.txt", "bundle/list.txt")
 MAX_CAMERAS = 100_000
@@ -220,24 +218,16 @@ def write_bundler(refined: RefinedSet, folder: Path) -> None:
     for index, cam_from_world in enumerate(refined.cam_from_world):
         full = refined.camera_of(index).full()
         lines.append(f"{full.fx!r} {full.k1!r} {full.k2!r}")
-        rotation, translation = (
-            _OPENCV_FROM_OPENGL @ cam_from_world[:3, :3],
-            _OPENCV_FROM_OPENGL @ cam_from_world[:3, 3],
-        )
-        lines += [
-            " ".join(repr(value) for value in row) for row in [*rotation.tolist(), translation.tolist()]
-        ]
+        rows = _OPENCV_FROM_OPENGL @ cam_from_world[:3]
+        lines += [" ".join(map(repr, row)) for row in [*rows[:, :3].tolist(), rows[:, 3].tolist()]]
     lines += _point_lines(refined)
-    with whole_file(folder / "list.txt") as temporary:
-        names = [" ".join(image.file_name.splitlines()) for image in refined.images]
-        temporary.write_text("\n".join(names) + "\n", "utf-8")
-    with whole_file(folder / "bundle.out") as temporary:
-        temporary.write_text("\n".join(lines) + "\n", "utf-8")
+    names = [" ".join(image.file_name.splitlines()) for image in refined.images]
+    write_text(folder / "list.txt", "\n".join(names))
+    write_text(folder / "bundle.out", "\n".join(lines))
 
 
 def _point_lines(refined: RefinedSet) -> list[str]:
-    model: ColmapModel = refined.model
-    points = model.points
+    model, points = refined.model, refined.model.points
     row_of_id = {number: row for row, number in enumerate(refined.image_ids)}
     lines = []
     for k in range(len(points)):
@@ -250,8 +240,7 @@ def _point_lines(refined: RefinedSet) -> list[str]:
             camera = refined.camera_of(row)
             x, y = model.images[image_id].points2d_px[keypoint].tolist()
             views.append(f"{row} {keypoint} {x - camera.width / 2!r} {camera.height / 2 - y!r}")
-        lines.append(" ".join(repr(value) for value in points.xyz[k].tolist()))
-        lines.append(" ".join(str(value) for value in points.rgb[k].tolist()))
+        lines += [" ".join(map(repr, row)) for row in (points.xyz[k].tolist(), points.rgb[k].tolist())]
         lines.append(" ".join([str(len(views)), *views]))
     return lines
 

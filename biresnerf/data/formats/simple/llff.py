@@ -29,7 +29,6 @@ LLFF = Format(
     gives="poses, one focal length an image",
     checked_against="two real sets, against their transforms.json",
     in_set="poses_bounds.npy",
-    in_result="poses_bounds.npy",
     needs=("bounds",),
     loses=("names", "some lenses", "distortion", "rigs", "points", "mask paths"),
     heading="For LLFF",

@@ -7,7 +7,6 @@ that 3DGS would shift each picture; ours goes by the exact rays that poses were 
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -22,7 +21,7 @@ from PIL import Image
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.simple.bundler import write_bundler
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import whole_file, write_json
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import ColmapImage
 from biresnerf.data.model.dataset import Frame
@@ -39,14 +38,12 @@ PINHOLE = Format(
     title="undistorted photos with a PINHOLE model",
     rank=15,
     in_set="pinhole",
-    in_result="pinhole",
     needs=("photos",),
     loses=("rigs", "masks"),
     heading="For 3D Gaussian splatting, gsplat, OpenMVS",
     hint="Photos without distortion, with PINHOLE cameras and points",
     downloads="pinhole/",
 )
-
 
 WIDEST_TANGENT = 1.75  # 60 degrees from the axis: beyond it a flat picture is all stretch
 _JPEG = {"quality": 95, "subsampling": 0}
@@ -125,9 +122,8 @@ def write_pinhole(refined: RefinedSet, folder: Path, should_stop: Callable[[], b
     undistorted_set = _as_pinhole(refined, cameras, names)
     write_colmap_binary(undistorted_set.model, folder / "sparse" / "0")
     write_bundler(undistorted_set, folder)
-    with whole_file(folder / "names.json") as temporary:
-        named = dict(zip(names, (image.name for image in refined.images), strict=True))
-        temporary.write_text(json.dumps(named, indent=1, ensure_ascii=False) + "\n", "utf-8")
+    named = dict(zip(names, (image.name for image in refined.images), strict=True))
+    write_json(folder / "names.json", named, indent=1)
 
 
 def _names(refined: RefinedSet) -> list[str]:

@@ -5,7 +5,6 @@ With the COLMAP model it loses nothing, so the other formats of a result can be 
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.data.formats.codec import Codec
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.json_document import read_model
 from biresnerf.data.model.refined_set import PointsSource, RefinedSet
 from biresnerf.options.formats import Format
@@ -24,13 +23,11 @@ POSES_JSON = Format(
     title="poses.json",
     rank=90,
     in_set="poses.json",
-    in_result="poses.json",
     always=True,
     loses=("rigs", "points"),
     heading="For your own programs",
     hint="Each pose before and after, in full precision",
 )
-
 
 POSES = POSES_JSON.in_result
 _FROZEN = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -129,9 +126,7 @@ def write_poses_json(refined: RefinedSet, path: Path) -> None:
         points_source=refined.points_source,
         timestamps_s=refined.timestamps_s,
     )
-    with whole_file(path) as temporary:
-        text = json.dumps(document.model_dump(), indent=1, ensure_ascii=False, allow_nan=False)
-        temporary.write_text(text + "\n", "utf-8")
+    write_json(path, document.model_dump(), indent=1)
 
 
 def read_poses_json(path: Path) -> PosesDocument:

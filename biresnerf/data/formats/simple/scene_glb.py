@@ -27,13 +27,11 @@ SCENE = Format(
     title="scene.glb",
     rank=40,
     in_set="scene.glb",
-    in_result="scene.glb",
     always=True,
     loses=("lenses", "rigs"),
     heading="For Blender",
     hint="Cameras before and after, and points: File › Import › glTF",
 )
-
 
 GREY = (150, 150, 150)
 TURN_AT_TOP_DEG = 10.0  # that the brightest colour stands for, in every file

@@ -15,7 +15,7 @@ from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntr
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.simple.camera_file import read_camera_file
 from biresnerf.data.formats.simple.llff import rows_by_name
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
@@ -46,7 +46,6 @@ TUM = Format(
     title="TUM trajectory",
     rank=81,
     in_set="tum.txt",
-    in_result="tum.txt",
     always=True,
     needs=("lens file",),
     loses=("lenses", "rigs", "points", "mask paths"),
@@ -58,13 +57,11 @@ KITTI = Format(
     title="KITTI trajectory",
     rank=82,
     in_set="kitti.txt",
-    in_result="kitti.txt",
     needs=("lens file",),
     loses=("names", "lenses", "rigs", "points", "mask paths"),
     heading="For odometry tools",
     hint="A trajectory in KITTI format",
 )
-
 
 TIMES_OF_IMAGES = "rgb.txt"  # of TUM's sets
 MAX_POSES = 100_000
@@ -283,9 +280,7 @@ def write_kitti(refined: RefinedSet, path: Path) -> None:
 
 def _write_lines(path: Path, lines: list[str]) -> None:
     # A name may hold anything but what ends a line.
-    plain = [" ".join(line.splitlines()) for line in lines]
-    with whole_file(path) as temporary:
-        temporary.write_text("\n".join(plain) + "\n", "utf-8")
+    write_text(path, "\n".join(" ".join(line.splitlines()) for line in lines))
 
 
 CODECS = (

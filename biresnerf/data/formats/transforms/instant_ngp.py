@@ -6,7 +6,6 @@ the matrices. Images are named by their path relative to the caller's folder: pu
 
 from __future__ import annotations
 
-import json
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.transforms.read_transforms import bind_transforms, parse_transforms
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.model.refined_set import RefinedSet
@@ -32,13 +31,11 @@ INSTANT_NGP = Format(
     gives="poses and intrinsics, as a transforms.json",
     checked_against="files that `convert` and `export` wrote",
     in_set="transforms_ngp.json",
-    in_result="transforms_ngp.json",
     loses=("rigs", "points", "mask paths"),
     lacks="FULL_OPENCV; WebP and TIFF images",
     heading="For instant-ngp",
     hint="Put it into the folder of the photos and open it in instant-ngp",
 )
-
 
 LARGEST_AABB = 128  # the loader's bound; powers of two only
 INNER_SHARE = 0.9  # of the unit cube, for what the cameras look at
@@ -72,9 +69,7 @@ def write_transforms_ngp(refined: RefinedSet, path: Path) -> None:
         }
         for image, matrix in zip(refined.images, matrices, strict=True)
     ]
-    with whole_file(path) as temporary:
-        text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)
-        temporary.write_text(text + "\n", "utf-8")
+    write_json(path, document)
 
 
 def _lens(camera: Camera) -> dict[str, Any]:

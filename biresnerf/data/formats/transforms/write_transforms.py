@@ -1,18 +1,37 @@
-"""Refined poses out as transforms.json: in the caller's own dialect, frame, names and order."""
+"""transforms.json as a format: written in the input's own dialect, frame, names and order."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.formats.codec import Codec, WriteContext
+from biresnerf.data.formats.transforms.read_transforms import bind_transforms, parse_transforms
 from biresnerf.data.formats.transforms.write_intrinsics import family, lens_values, put_lens, says_lens
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.options.formats import Format
+
+TRANSFORMS = Format(
+    name="transforms",
+    title="transforms.json (nerfstudio, instant-ngp, Blender)",
+    rank=10,
+    found_as=("transforms.json", "transforms_train.json"),
+    suffixes=(".json",),
+    gives="poses (also for some images only), shared or per-frame intrinsics, masks",
+    checked_against="hand-made files of each dialect; published sets",
+    in_set="transforms.json",
+    always=True,
+    needs=("input",),
+    loses=("rigs", "points"),
+    heading="For nerfstudio",
+    hint="Replaces the transforms.json of the photos; then: ns-train nerfacto --data FOLDER",
+)
 
 
 def write_transforms(dataset: Dataset, world_from_cam: NDArray[np.float64], path: Path) -> None:
@@ -44,10 +63,7 @@ def write_transforms(dataset: Dataset, world_from_cam: NDArray[np.float64], path
         document = _with_intrinsics(document, dataset)
     else:
         _put_found(document, dataset)
-    with whole_file(path) as temporary:
-        temporary.write_text(
-            json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n", "utf-8"
-        )
+    write_json(path, document)
 
 
 def transforms_notes(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> tuple[str, ...]:
@@ -114,3 +130,11 @@ def _put_found(document: dict[str, Any], dataset: Dataset) -> None:
             continue
         own = says_lens(row) or len(shared) > 1
         put_lens(row if own else document, dataset.cameras[frame.camera])
+
+
+def _write(refined: RefinedSet, path: Path, context: WriteContext) -> None:
+    if context.dataset is not None:
+        write_transforms(context.dataset, refined.world_from_cam, path)
+
+
+CODECS = (Codec(TRANSFORMS, parse=parse_transforms, bind=bind_transforms, write=_write),)

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from biresnerf.data.formats.colmap.read_model import ColmapModel, read_colmap_model
+from biresnerf.data.formats.colmap.read_model import read_colmap_model
+from biresnerf.data.model.colmap_scene import ColmapModel
 from biresnerf.errors import InputError
 from tests.data.formats.colmap.colmap_files import TINY_TEXT, image_record, tiny_tables, write_tables
 from tests.data.scenes import assert_complete, refused_at_once

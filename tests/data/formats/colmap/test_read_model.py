@@ -10,13 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from biresnerf.data.formats.colmap.read_model import (
-    ColmapModel,
-    model_forms,
-    read_colmap_model,
-    world_from_cam_of,
-)
-from biresnerf.data.model.colmap_scene import RigidPose
+from biresnerf.data.formats.colmap.read_model import model_forms, read_colmap_model, world_from_cam_of
+from biresnerf.data.model.colmap_scene import ColmapModel, RigidPose
 from biresnerf.geometry.camera.camera_models import MODEL_IDS
 from tests.data.formats.colmap.colmap_files import (
     TINY_TEXT,
