@@ -1,1 +1,1 @@
-"""What `make bench` runs: speed and memory as ratios against a named reference in the same run."""
+"""Measurements: of speed (`make bench`), of the method, of the service, under load and under chaos."""

@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from benchmarks import encodings, machine, scaling, training_step
-from benchmarks.clock import CLOCKS
+from benchmarks.speed import encodings, machine, scaling, training_step
+from benchmarks.speed.clock import CLOCKS
 from biresnerf.field.backends import use_threads
 from biresnerf.field.cpu.compile_kernels import compile_kernels
 
@@ -101,7 +101,7 @@ def main() -> None:
         )
         _print_steps(result["steps"])
         if torch.cuda.is_available():
-            from benchmarks import cuda_step
+            from benchmarks.speed import cuda_step
 
             result["cuda_steps"] = cuda_step.run(8 * arguments.rays, arguments.rounds)
             _print_cuda(result["cuda_steps"])

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import scene
-from benchmarks.torch_forms import (
+from benchmarks.speed import scene
+from benchmarks.speed.torch_forms import (
     UnrolledField,
     VectorisedField,
     encode_unrolled,
     encode_vectorised,
     march_at_once,
 )
-from benchmarks.yardstick import build_yardstick, check_yardstick
+from benchmarks.speed.yardstick import build_yardstick, check_yardstick
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays
 from biresnerf.field.reference import operations as reference

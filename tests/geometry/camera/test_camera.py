@@ -27,26 +27,10 @@ from biresnerf.geometry.camera.camera_models import (
     FISHEYE_MODELS,
     MODEL_IDS,
     MODEL_PARAMETERS,
-    FullParameters,
     full_parameters,
-    smallest_model,
 )
 from biresnerf.geometry.camera.lens import lens_problem
-
-WIDTH, HEIGHT = 640, 480
-
-CAMERAS = {
-    "SIMPLE_PINHOLE": (500.0, 320.0, 240.0),
-    "PINHOLE": (500.0, 510.0, 321.0, 238.5),
-    "SIMPLE_RADIAL": (500.0, 320.0, 240.0, -0.12),
-    "RADIAL": (480.0, 318.0, 243.0, 0.08, -0.03),
-    "OPENCV": (500.0, 505.0, 322.0, 236.0, -0.15, 0.04, 0.002, -0.0015),
-    "OPENCV_FISHEYE": (300.0, 302.0, 322.0, 236.0, -0.02, 0.004, -0.0015, 0.0002),
-    # A depth camera's calibration, whose large terms nearly cancel.
-    "FULL_OPENCV": (505.0, 505.0, 320.0, 240.0, 0.52, -2.69, 0.0006, -0.0002, 1.5, 0.4, -2.5, 1.43),
-    "SIMPLE_RADIAL_FISHEYE": (280.0, 320.0, 240.0, 0.01),
-    "RADIAL_FISHEYE": (290.0, 318.0, 243.0, -0.03, 0.003),
-}
+from tests.geometry.camera.lenses import CAMERAS, HEIGHT, WIDTH
 
 # zlib first: pycolmap's wheels carry their own, and Python's must be bound before (double free otherwise).
 PYCOLMAP = """
@@ -248,33 +232,6 @@ def test_shapes_that_do_not_fit_are_refused():
         directions_in_cam(intrinsics, torch.zeros(3, dtype=torch.int64), torch.zeros(4, 2))
     with pytest.raises(ValueError, match="need one image index"):
         project(intrinsics, torch.zeros(4, dtype=torch.int64), torch.zeros(4, 2))
-
-
-@pytest.mark.parametrize("model", CAMERAS)
-def test_the_smallest_model_gives_the_parameters_back(model):
-    assert smallest_model(full_parameters(model, CAMERAS[model]), model) == (model, CAMERAS[model])
-
-
-def test_a_model_that_cannot_hold_the_camera_is_left_for_one_that_can():
-    assert smallest_model(FullParameters(500, 501, 320, 240), "SIMPLE_PINHOLE")[0] == "PINHOLE"
-    assert smallest_model(FullParameters(500, 501, 320, 240, k1=0.1), "SIMPLE_RADIAL")[0] == "OPENCV"
-    assert smallest_model(FullParameters(500, 500, 320, 240, p1=0.1), "RADIAL")[0] == "OPENCV"
-    assert smallest_model(FullParameters(500, 500, 320, 240, k3=0.1), "OPENCV")[0] == "FULL_OPENCV"
-    assert smallest_model(FullParameters(500, 500, 320, 240), None)[0] == "PINHOLE"
-    fisheye = FullParameters(500, 501, 320, 240, k1=0.1, fisheye=True)
-    assert smallest_model(fisheye, "RADIAL_FISHEYE")[0] == "OPENCV_FISHEYE"
-    assert smallest_model(fisheye, "OPENCV")[0] == "OPENCV_FISHEYE"
-    assert smallest_model(fisheye, None)[0] == "OPENCV_FISHEYE"
-    with pytest.raises(ValueError, match="fisheye"):
-        smallest_model(fisheye._replace(p1=0.1), None)
-
-
-def test_unknown_models_and_wrong_counts_are_refused():
-    with pytest.raises(ValueError, match="OPENCV_FISHEYE"):
-        full_parameters("THIN_PRISM_FISHEYE", (1.0,) * 12)
-    for model, names in MODEL_PARAMETERS.items():
-        with pytest.raises(ValueError, match="parameters"):
-            full_parameters(model, (1.0,) * (len(names) + 1))
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"])

@@ -15,7 +15,7 @@ import anyio.from_thread
 import httpx
 import pytest
 
-from benchmarks.upload import Relay
+from benchmarks.service.upload import Relay
 from biresnerf.client import AsyncClient, Client, JobNotOver, Sending, ServiceError, StreamEvent
 from biresnerf.errors import InputError
 from biresnerf.wire.jobs import JobView

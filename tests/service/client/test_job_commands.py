@@ -20,7 +20,7 @@ import httpx
 import pytest
 from click.testing import CliRunner, Result
 
-from benchmarks.upload import Relay
+from benchmarks.service.upload import Relay
 from biresnerf.client import Client, ServiceError
 from biresnerf.commands import exit_codes
 from biresnerf.commands.jobs.download import download_command

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from benchmarks.upload import Relay
+from benchmarks.service.upload import Relay
 from biresnerf.client import Client, LocalFile, ServiceError
 from tests.service.conftest import MIB, Running
 

@@ -1,4 +1,4 @@
-"""What the page weighs, and how soon it can be used: `python -m benchmarks.web_page [--runs N]`.
+"""What the page weighs, and how soon it can be used: `python -m benchmarks.service.web_page [--runs N]`.
 
 Starts a service, runs one small job on it, and opens the list and the job's page in Chromium, each time with an empty
 cache: on this machine's own network, and on a line of 1.6 Mbit/s with 150 ms to and fro. A page can be used from when

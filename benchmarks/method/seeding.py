@@ -1,4 +1,4 @@
-"""What seeding makes of a set of known poses: `python -m benchmarks.seeding SET [--missing 0.2] [--size 200]`.
+"""What seeding makes of a set of known poses: `python -m benchmarks.method.seeding SET [--missing 0.2] [--size 200]`.
 
 Without options all poses and lenses are taken away, as if SET were a folder of images. With `--missing`, that share
 of the poses is (`numpy.random.default_rng(0)`), and the others get BARF's noise (seed 1); lenses stay. Errors are

@@ -1,4 +1,4 @@
-"""What jobs on one machine take from each other: ``python -m benchmarks.side_by_side [--jobs 2] [--rounds 3]``.
+"""What jobs on one machine take from each other: ``python -m benchmarks.service.side_by_side [--jobs 2] [--rounds 3]``.
 
 Refinements of the same scene run at the same time, each with all cores, and one alone; the kernels' threads either
 sleep while they wait, as here, or spin first, as libgomp has them do by itself.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import gc
 from typing import Any
 
-from benchmarks import scene
-from benchmarks.clock import Clock, interleave, resident_mib, summary
+from benchmarks.speed import scene
+from benchmarks.speed.clock import Clock, interleave, resident_mib, summary
 
 RAYS = (256, 512, 1024, 2048, 4096, 8192)
 IMAGES = (25, 100, 400, 1000)

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.upload`: a large set through broken connections and killed servers, with constant memory.
+"""A large set through broken connections and killed servers, in constant memory: `python -m benchmarks.service.upload`.
 
 Sends it twice through a relay that cuts the connections at fixed shares of the way, and kills the API process
 (SIGKILL) at others: once as one archive over a resumable upload, once file by file. Then reads every file back
@@ -270,7 +270,7 @@ def run(total_bytes: int, folder: Path) -> list[dict[str, Any]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.upload", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.service.upload", description=__doc__)
     parser.add_argument("--bytes", type=int, default=2_000_000_000)
     parser.add_argument(
         "--folder", type=Path, help="where to work; needs five times the bytes (default: /tmp)"

@@ -1,4 +1,4 @@
-"""Which loss refines poses best: ``python -m benchmarks.loss SCENE... [--losses squared,huber:0.1]``.
+"""Which loss refines poses best: ``python -m benchmarks.method.loss SCENE... [--losses squared,huber:0.1]``.
 
 Each SCENE holds true poses, which are made wrong by BARF's noise and refined with every loss in turn. Prints one JSON
 line per run, with errors after BARF's alignment.

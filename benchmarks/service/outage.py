@@ -1,4 +1,4 @@
-"""The database goes away in mid job, at production's timings: ``python -m benchmarks.outage --seconds 45``.
+"""The database goes away in mid job, at production's timings: ``python -m benchmarks.service.outage --seconds 45``.
 
 Exit status 0 where the job was started once and succeeded, with the right result.
 """

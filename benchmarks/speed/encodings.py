@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from benchmarks.clock import Clock, interleave, ratio, summary
-from benchmarks.torch_forms import encode_unrolled, encode_vectorised
-from benchmarks.yardstick import Yardstick, build_yardstick, check_yardstick
+from benchmarks.speed.clock import Clock, interleave, ratio, summary
+from benchmarks.speed.torch_forms import encode_unrolled, encode_vectorised
+from benchmarks.speed.yardstick import Yardstick, build_yardstick, check_yardstick
 from biresnerf.field.cpu import encoding
 from biresnerf.field.cpu.field import tasks
 from biresnerf.field.cpu.segments_backward import add_position_gradient

@@ -1,4 +1,4 @@
-"""How long real jobs take to end once they are cancelled, in every stage: `python -m benchmarks.cancelling`.
+"""How long real jobs take to end once they are cancelled, in every stage: `python -m benchmarks.service.cancelling`.
 
 Each job is cancelled as it reaches its stage, with a partial result asked for, and timed until it is over.
 """

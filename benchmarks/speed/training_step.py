@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks import scene
-from benchmarks.clock import Clock, interleave, peak_memory, ratio, summary, timed
-from benchmarks.torch_forms import UnrolledField, VectorisedField
+from benchmarks.speed import scene
+from benchmarks.speed.clock import Clock, interleave, peak_memory, ratio, summary, timed
+from benchmarks.speed.torch_forms import UnrolledField, VectorisedField
 from biresnerf.field.cpu import field as cpu_field
 from biresnerf.field.reference.field import ReferenceField
 from biresnerf.refine.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from benchmarks.clock import Clock
+from benchmarks.speed.clock import Clock
 from biresnerf.field.cpu.matrix_blocks import BLOCK, STRIDE, product
 
 ACCESSES = 1 << 22

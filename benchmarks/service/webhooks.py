@@ -1,4 +1,4 @@
-"""How fast webhooks are sent: ``python -m benchmarks.webhooks [--messages 2000] [--tenants 4] [--each 2]``.
+"""How fast webhooks are sent: ``python -m benchmarks.service.webhooks [--messages 2000] [--tenants 4] [--each 2]``.
 
 A dispatcher, a process of its own, sends messages that wait already to a receiver on this machine, which checks every
 signature. Exit status 0 where each message came once.

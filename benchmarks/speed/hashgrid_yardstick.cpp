@@ -1,6 +1,6 @@
 // The yardstick for the Numba encodings: the same operations in C++ with OpenMP. Only measured against, never shipped.
 // Layouts are those of biresnerf/field/cpu/encoding.py: x [n][3], table [entries][2], features [2 levels][n],
-// jacobian [levels][6][n]. Built by benchmarks/yardstick.py with g++ -O3 -march=native -ffast-math -fopenmp.
+// jacobian [levels][6][n]. Built by benchmarks/speed/yardstick.py with g++ -O3 -march=native -ffast-math -fopenmp.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

@@ -1,0 +1,40 @@
+"""Camera models: the smallest that holds a lens, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from biresnerf.geometry.camera.camera_models import (
+    MODEL_PARAMETERS,
+    FullParameters,
+    full_parameters,
+    smallest_model,
+)
+from tests.geometry.camera.lenses import CAMERAS
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_the_smallest_model_gives_the_parameters_back(model):
+    assert smallest_model(full_parameters(model, CAMERAS[model]), model) == (model, CAMERAS[model])
+
+
+def test_a_model_that_cannot_hold_the_camera_is_left_for_one_that_can():
+    assert smallest_model(FullParameters(500, 501, 320, 240), "SIMPLE_PINHOLE")[0] == "PINHOLE"
+    assert smallest_model(FullParameters(500, 501, 320, 240, k1=0.1), "SIMPLE_RADIAL")[0] == "OPENCV"
+    assert smallest_model(FullParameters(500, 500, 320, 240, p1=0.1), "RADIAL")[0] == "OPENCV"
+    assert smallest_model(FullParameters(500, 500, 320, 240, k3=0.1), "OPENCV")[0] == "FULL_OPENCV"
+    assert smallest_model(FullParameters(500, 500, 320, 240), None)[0] == "PINHOLE"
+    fisheye = FullParameters(500, 501, 320, 240, k1=0.1, fisheye=True)
+    assert smallest_model(fisheye, "RADIAL_FISHEYE")[0] == "OPENCV_FISHEYE"
+    assert smallest_model(fisheye, "OPENCV")[0] == "OPENCV_FISHEYE"
+    assert smallest_model(fisheye, None)[0] == "OPENCV_FISHEYE"
+    with pytest.raises(ValueError, match="fisheye"):
+        smallest_model(fisheye._replace(p1=0.1), None)
+
+
+def test_unknown_models_and_wrong_counts_are_refused():
+    with pytest.raises(ValueError, match="OPENCV_FISHEYE"):
+        full_parameters("THIN_PRISM_FISHEYE", (1.0,) * 12)
+    for model, names in MODEL_PARAMETERS.items():
+        with pytest.raises(ValueError, match="parameters"):
+            full_parameters(model, (1.0,) * (len(names) + 1))
