@@ -1,7 +1,7 @@
-"""Uploads under way: bytes arrive in pieces, over as many connections, processes and hosts as it takes.
+"""Uploads in progress: bytes arrive in pieces, over any number of connections, processes and hosts.
 
-Each piece is stored, then counted by one fenced UPDATE: of two connections that write at the same place, one wins.
-What was counted survives the death of connection, process and host; nothing is kept in memory or on local disk.
+Each piece is stored, then counted by one conditional UPDATE: of two connections that write at the same offset, one
+wins. Counted bytes survive a failure of connection, process or host: none are held in memory or on local disk.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from workers.settings.errors import Conflict, LimitReached, NotFound
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
 
-# Memory of all uploads of this process together, before their pieces are stored; the more uploads, the smaller
-# the pieces of each.
+# Memory for unstored pieces of all uploads of this process: the more uploads, the smaller the pieces of each.
 PIECES_BYTES = 256 * 2**20
 PIECE_MAX_BYTES = 4 * 2**20
 PIECE_MIN_BYTES = 2**18
@@ -54,7 +53,7 @@ class UploadStore(OwnedStore):
         path: str | None = None,
         sha256: str | None = None,
     ) -> Upload:
-        """A new upload of ``size`` bytes, of which none has arrived.
+        """A new, empty upload of ``size`` bytes.
 
         Raises `NotFound`, `Conflict` (``dataset_not_open``), `LimitReached` (``body_too_large``,
         ``too_many_files``), `InputError` (``unsafe_path``).
@@ -91,7 +90,7 @@ class UploadStore(OwnedStore):
             return await self._required(connection, upload_id)
 
     async def of_dataset(self, dataset_id: str) -> tuple[Upload, ...]:
-        """The dataset's uploads that are not stored yet, oldest first."""
+        """The dataset's uploads that are not yet stored, oldest first."""
         rows = await self._database.fetch(
             _UPLOAD + f" WHERE dataset_id = %s AND {MINE} AND uploads.state <> 'stored' ORDER BY uploads.id",
             *(dataset_id, self._tenant),
@@ -99,11 +98,11 @@ class UploadStore(OwnedStore):
         return tuple(record_from_row(Upload, row) for row in rows)
 
     async def append(self, upload_id: str, start: int, chunks: AsyncIterable[bytes]) -> Upload:
-        """Store what comes from byte ``start`` on; ``received`` of the answer says how far it got.
+        """Append the stream at byte ``start``; returns the upload with its new ``received``.
 
-        Where the stream breaks, what had arrived is kept before the error goes on.
+        If the stream breaks, the bytes that arrived are kept and the error is raised.
 
-        Raises `NotFound`, `Conflict` (``offset_mismatch``: the next byte is another, or another connection
+        Raises `NotFound`, `Conflict` (``offset_mismatch``: ``start`` is not the next byte, or another connection
         was faster), `LimitReached` (``body_too_large``, ``storage_full``).
         """
         upload = await self.get(upload_id)
@@ -140,7 +139,7 @@ class UploadStore(OwnedStore):
         start, end = upload.received, upload.received + len(piece)
         # A unique name: a slower connection never touches the piece of a faster one.
         key = f"{upload.folder}/{start:014d}-{secrets.token_hex(4)}"
-        await self._files.put(key, _once(piece), limit_bytes=len(piece))
+        await self._files.put_bytes(key, piece)
         async with self._database.transaction() as connection:
             cursor = await connection.execute(
                 "UPDATE uploads SET received = %s, state = CASE WHEN size = %s THEN 'received' ELSE state END,"
@@ -158,7 +157,7 @@ class UploadStore(OwnedStore):
         raise _elsewhere(await self.get(upload.id))
 
     async def content(self, upload: Upload) -> AsyncIterator[bytes]:
-        """The bytes received, from the first to the last.
+        """All bytes received, in order.
 
         Raises `Conflict` (``upload_incomplete``) where the store has lost some, as after a restore.
         """
@@ -173,7 +172,7 @@ class UploadStore(OwnedStore):
                 raise Conflict("upload_incomplete", "Bytes of the upload are lost; send it again.") from None
 
     async def take(self, upload_id: str, token: uuid.UUID) -> bool:
-        """Take or renew the right to bring a received upload into its dataset. A lease: a dead taker loses it."""
+        """Take or renew the lease to add a received upload to its dataset; it expires if the process dies."""
         rows = await self._database.fetch(
             "UPDATE uploads SET take_token = %s, take_until = clock_timestamp() + make_interval(secs => %s)"
             " WHERE id = %s AND state = 'received'"
@@ -198,7 +197,7 @@ class UploadStore(OwnedStore):
                 await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (row["folder"],))
 
     async def conclude_signed(self, upload_id: str, late_s: float) -> None:
-        """A file that went to the store itself is in its dataset. Its address is still good for ``late_s``."""
+        """Mark a file stored that the client sent to the bucket; its signed address stays valid for ``late_s``."""
         await self._database.fetch(
             "WITH done AS (UPDATE uploads SET state = 'stored', received = size"
             " WHERE id = %s AND kind = 'signed' AND state = 'receiving' RETURNING folder)"
@@ -208,7 +207,7 @@ class UploadStore(OwnedStore):
         )
 
     async def untaken(self) -> tuple[str, ...]:
-        """Ids of received uploads that no process is bringing into their dataset."""
+        """Ids of received uploads that no process is adding to their dataset."""
         rows = await self._database.fetch(
             "SELECT id FROM uploads WHERE state = 'received'"
             " AND coalesce(take_until < clock_timestamp(), true) ORDER BY created_at"
@@ -216,7 +215,7 @@ class UploadStore(OwnedStore):
         return tuple(row["id"] for row in rows)
 
     async def delete(self, upload_id: str) -> None:
-        """Give an upload up, in any state; raises `NotFound`. What it brought into the dataset stays."""
+        """Delete an upload in any state; raises `NotFound`. Files it added to the dataset stay."""
         async with self._database.transaction() as connection:
             await self._required(connection, upload_id)
             await connection.execute(
@@ -226,7 +225,7 @@ class UploadStore(OwnedStore):
             )
 
     async def expire(self) -> int:
-        """Give up uploads that did not go on for ``upload_expiry_s``; returns how many."""
+        """Delete uploads that received nothing for ``upload_expiry_s``; returns how many."""
         rows = await self._database.fetch(
             "WITH gone AS (DELETE FROM uploads WHERE id IN (SELECT id FROM uploads"
             " WHERE expires_at < clock_timestamp() AND state <> 'received' ORDER BY expires_at LIMIT %s"
@@ -244,7 +243,3 @@ class UploadStore(OwnedStore):
 
 def _elsewhere(upload: Upload) -> Conflict:
     return Conflict("offset_mismatch", f"The upload goes on at byte {upload.received}, state {upload.state}.")
-
-
-async def _once(content: bytes) -> AsyncIterator[bytes]:
-    yield content

@@ -1,4 +1,4 @@
-"""Ends a process whose event loop hangs: a process that ended is started again, one that hangs is not."""
+"""Runs an engine process, and ends one whose event loop hangs: only a process that ended is started again."""
 
 from __future__ import annotations
 
@@ -7,8 +7,13 @@ import contextlib
 import faulthandler
 import logging
 import os
+import sys
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
+
+from workers.settings.errors import SetupError
+from workers.settings.logs import set_up_logging
+from workers.settings.settings import Settings
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +34,23 @@ async def end_if_hung(stuck_s: float = STUCK_S) -> AsyncIterator[None]:
     finally:
         watchdog.end.set()
         ticking.cancel()
+
+
+def run_process(name: str, work: Callable[[Settings], Awaitable[None]]) -> int:
+    """Run ``work`` with the settings of the environment; returns the exit status, 2 after a `SetupError`."""
+    settings = Settings()
+    set_up_logging(name, settings)
+
+    async def watched() -> None:
+        async with end_if_hung():
+            await work(settings)
+
+    try:
+        asyncio.run(watched())
+    except SetupError as error:
+        sys.stderr.write(f"{error.detail}\n")
+        return 2
+    return 0
 
 
 class _Watchdog(threading.Thread):

@@ -26,12 +26,12 @@ from workers.database.statistics import announce_slot
 from workers.jobs.claim import Claim, Fenced, cancel_requested, claim_job, input_bytes
 from workers.process.disk_space import job_disk_budget
 from workers.process.waiting import first_done, retry_while_unavailable
-from workers.process.watchdog import end_if_hung
+from workers.process.watchdog import run_process
 from workers.queue.heartbeat import Heartbeat
 from workers.queue.janitor import Janitor, release_worker
 from workers.run.attempt import Attempt
 from workers.settings.errors import LimitReached, SetupError, Unavailable
-from workers.settings.logs import log_context, set_up_logging
+from workers.settings.logs import log_context
 from workers.settings.settings import Settings
 from workers.settings.traces import set_up_traces, span
 from workers.store.files import open_files
@@ -84,19 +84,15 @@ class Slot:
 
     async def run(self) -> None:
         """Until SIGTERM or SIGINT. A running job then writes a checkpoint and goes back to the queue."""
-        shutil.rmtree(
-            self._scratch, ignore_errors=True
-        )  # left by a predecessor, which the lock shows to be gone
+        # Left by a predecessor, which the lock shows to be gone.
+        shutil.rmtree(self._scratch, ignore_errors=True)
         self._scratch.mkdir(parents=True)
-        async with (
-            end_if_hung(),
-            open_database(
-                self._settings.require_database_url(),
-                connections=5,
-                silence_s=self._settings.stall_s,
-                answer_s=self._settings.answer_s,
-            ) as database,
-        ):
+        async with open_database(
+            self._settings.require_database_url(),
+            connections=5,
+            silence_s=self._settings.stall_s,
+            answer_s=self._settings.answer_s,
+        ) as database:
             if (predecessor := self._lock.predecessor) is not None:
                 await retry_while_unavailable(lambda: release_worker(database, predecessor))
             await require_same_store(database, self._files)
@@ -224,16 +220,13 @@ def main() -> int:
     """`python -m workers.queue.slot --slot NAME`, settings from the environment."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--slot", default="cpu0")
-    arguments = parser.parse_args()
-    settings = Settings()
-    set_up_logging(arguments.slot, settings)
-    try:
-        set_up_traces(arguments.slot, settings)
-        asyncio.run(Slot(settings, arguments.slot).run())
-    except SetupError as error:
-        sys.stderr.write(f"{error.detail}\n")
-        return 2
-    return 0
+    name = parser.parse_args().slot
+
+    async def work(settings: Settings) -> None:
+        set_up_traces(name, settings)
+        await Slot(settings, name).run()
+
+    return run_process(name, work)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
-# IANA's special-purpose registries, written out: what `ipaddress` calls global differs between versions of
-# Python, and it takes multicast and one cloud's metadata service for global.
+# From IANA's special-purpose registries: `ipaddress.is_global` differs between Python versions, and includes
+# multicast and one cloud's metadata service.
 _NOT_PUBLIC_4 = tuple(
     map(
         ipaddress.IPv4Network,
@@ -22,8 +22,8 @@ _NOT_PUBLIC_4 = tuple(
         ),
     )
 )
-# Of IPv6 only what is given out for the public Internet (2000::/3), less the special parts of it: protocol
-# assignments with Teredo (2001::/23), documentation, 6to4.
+# Of IPv6 only global unicast (2000::/3), without its special ranges: protocol assignments with Teredo
+# (2001::/23), documentation, 6to4.
 _PUBLIC_6 = ipaddress.IPv6Network("2000::/3")
 _NOT_PUBLIC_6 = tuple(
     map(
@@ -31,9 +31,9 @@ _NOT_PUBLIC_6 = tuple(
         ("2001::/23", "2001:db8::/32", "2002::/16", "2620:4f:8000::/48", "3fff::/20"),
     )
 )
-# An IPv4 address in the clothes of IPv6, which a host or a translator (NAT64) undresses: judged by what is inside.
+# IPv4 addresses written as IPv6 (mapped, NAT64): the embedded IPv4 address is checked.
 _WRAPPERS = (ipaddress.IPv6Network("::ffff:0:0/96"), ipaddress.IPv6Network("64:ff9b::/96"))
-# Interface ids that hosts with ISATAP take for an IPv4 address.
+# Interface ids under which ISATAP embeds an IPv4 address.
 _ISATAP = (0x0000_5EFE, 0x0200_5EFE)
 
 

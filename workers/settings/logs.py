@@ -1,7 +1,6 @@
-"""How every process of the service logs: one line per record, plain or JSON, with what it is about.
+"""Logging of every process: one line per record, plain or JSON, with its context.
 
-Nothing that a stranger sends can begin a line of its own or move the cursor of a terminal, and nothing that
-looks like a secret is written.
+Client input is escaped, so it can neither start a line nor control a terminal; secrets are masked.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from pydantic import SecretStr
 from workers.settings.settings import Settings
 
 _CONTEXT: ContextVar[Mapping[str, str]] = ContextVar("log_context", default={})  # noqa: B039 - never changed
-# Controls, line and paragraph separators, and the marks that turn the direction of text around.
+# Control characters, line and paragraph separators, and marks that change the text direction.
 _UNPRINTABLE = re.compile(
     r"[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 )
@@ -45,7 +44,7 @@ _QUIET = {"httpx": logging.WARNING, "httpcore": logging.WARNING, "psycopg.pool":
 
 @contextlib.contextmanager
 def log_context(**what: str | None) -> Iterator[None]:
-    """Every record logged in the block, in this task and those it starts, carries ``what`` (none is left out)."""
+    """Every record logged in the block, in this task and those it starts, carries ``what``, less empty values."""
     token = _CONTEXT.set({**_CONTEXT.get(), **{name: text for name, text in what.items() if text}})
     try:
         yield
@@ -78,7 +77,7 @@ def _with_context(record: logging.LogRecord) -> bool:
 
 
 def _secret_values(settings: Settings) -> tuple[str, ...]:
-    """What the operator gave as a secret, to be kept out of the log wherever it turns up."""
+    """Values of secret settings, which are masked in every log line."""
     fields = Settings.model_fields
     values = [(value, fields[name].repr) for name, value in settings]
     found = {value.get_secret_value() for value, _ in values if isinstance(value, SecretStr)}
@@ -117,10 +116,10 @@ class _Lines(logging.Formatter):
 
 
 class PlainLines(_Lines):
-    """For people: time, process, level, message, and in brackets what it is about."""
+    """For people: time, process, level, message, and the context in brackets."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as a line; an exception follows, indented, so that no line of it passes for a record."""
+        """The record as a line; an exception follows, indented, so that its lines cannot look like records."""
         line = f"{self._time(record)} {self._process} {record.levelname} {self._safe(record.getMessage())}"
         context = " ".join(f"{name}={value}" for name, value in self._context(record).items())
         lines = [escaped(f"{line} [{context}]" if context else line)]
@@ -129,7 +128,7 @@ class PlainLines(_Lines):
 
 
 class JsonLines(_Lines):
-    """For machines: one JSON object a line; JSON's own escapes keep it on one."""
+    """For machines: one JSON object per line."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The record as one line of JSON."""

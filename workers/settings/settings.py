@@ -19,7 +19,7 @@ GIB = 2**30
 
 
 def default_data_dir() -> Path:
-    """Where data lies if nobody says: a system folder for root, the XDG data folder for everybody else."""
+    """The default data folder: a system folder for root, the XDG data folder for other users."""
     if hasattr(os, "geteuid") and os.geteuid() == 0:
         return Path("/var/lib/biresnerf")
     return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share") / "biresnerf"
@@ -39,8 +39,8 @@ class Settings(BaseSettings):
     port: int = Field(8000, ge=0, le=65535, description="Its port; 0 takes a free one.")
     auth: Literal["auto", "required", "off"] = Field(
         "auto",
-        description="Who needs an API key: auto lets everybody in while the service listens on loopback only "
-        "and no key was ever made; required: every caller; off: nobody, on whatever address.",
+        description="Who needs an API key. auto: no caller while the service listens on loopback only and no key "
+        "was ever made; required: every caller; off: no caller, on any address.",
     )
 
     key_requests_per_s: float = Field(
@@ -52,7 +52,7 @@ class Settings(BaseSettings):
     )
     log_format: Literal["plain", "json"] = Field("plain", description="Lines for people, or JSON lines.")
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = Field(
-        "INFO", description="What is logged at the least."
+        "INFO", description="Lowest level logged."
     )
     metrics_token: SecretStr | None = Field(
         None, description="Bearer token of /metrics; without one it answers on loopback only."
@@ -77,7 +77,7 @@ class Settings(BaseSettings):
         False,
         description="Clients get signed addresses of the bucket, to download and upload files there themselves.",
     )
-    storage_presign_s: int = Field(900, ge=10, le=604_800, description="How long such an address is good.")
+    storage_presign_s: int = Field(900, ge=10, le=604_800, description="Seconds a signed address is valid.")
     share_key: str | None = Field(
         None,
         min_length=16,
@@ -86,20 +86,18 @@ class Settings(BaseSettings):
     )
 
     slots: int = Field(1, ge=0, le=64, description="Jobs that run at the same time on this machine.")
-    beat_s: float = Field(10.0, gt=0, description="Seconds between two signs of life of a worker.")
-    stall_s: float = Field(60.0, gt=0, description="A worker silent for so long is taken for dead.")
-    answer_s: float = Field(
-        20.0, gt=0, description="A database that does not answer for so long is taken for away."
+    beat_s: float = Field(10.0, gt=0, description="Seconds between two heartbeats of a worker.")
+    stall_s: float = Field(
+        60.0, gt=0, description="A worker without heartbeat for so many seconds counts as dead."
     )
-    poll_s: float = Field(2.0, gt=0, description="Seconds between two looks where a notification was lost.")
+    answer_s: float = Field(20.0, gt=0, description="Seconds a database transaction may take.")
+    poll_s: float = Field(
+        2.0, gt=0, description="Seconds between two polls, in case a notification was lost."
+    )
     janitor_s: float = Field(5.0, gt=0, description="Seconds between two rounds of the janitor.")
-    stop_grace_s: float = Field(
-        20.0, gt=0, description="Seconds a job may take to write a checkpoint and exit."
-    )
+    stop_grace_s: float = Field(20.0, gt=0, description="Seconds a job has to write a checkpoint and exit.")
     cancel_grace_s: float = Field(
-        6.0,
-        gt=0,
-        description="Seconds a cancelled job may take to write the partial result that was asked for.",
+        6.0, gt=0, description="Seconds a cancelled job has to write a partial result."
     )
     job_timeout_s: float = Field(2 * 3600, gt=0, description="Longest run of one attempt.")
     check_timeout_s: float = Field(900, gt=0, description="Longest validation of one dataset.")
@@ -118,46 +116,42 @@ class Settings(BaseSettings):
     max_unpacked_bytes: int = Field(20 * GIB, ge=1, description="Size of all that comes out of an archive.")
 
     keep_results_days: float = Field(
-        7.0, ge=0, description="Files of a job that is over are kept for so long; 0: for ever."
+        7.0, ge=0, description="Days to keep files of a finished job; 0: no limit."
     )
     keep_datasets_days: float = Field(
-        7.0, ge=0, description="Datasets are kept for so long after their last use; 0: for ever."
+        7.0, ge=0, description="Days to keep a dataset after its last use; 0: no limit."
     )
     keep_records_days: float = Field(
-        90.0,
-        ge=0,
-        description="Records of what expired, and of deliveries, are kept for so long; 0: for ever.",
+        90.0, ge=0, description="Days to keep records of expired items and of deliveries; 0: no limit."
     )
     keep_keys_hours: float = Field(
-        24.0, gt=0, description="An Idempotency-Key is known for so long after its job is over."
+        24.0, gt=0, description="Hours to remember an Idempotency-Key after its job has ended."
     )
-    expiry_s: float = Field(30.0, gt=0, description="Seconds between two looks for what has expired.")
+    expiry_s: float = Field(30.0, gt=0, description="Seconds between two searches for expired items.")
 
-    webhook_timeout_s: float = Field(
-        10.0, gt=0, le=60, description="Longest delivery of one webhook message."
-    )
+    webhook_timeout_s: float = Field(10.0, gt=0, le=60, description="Seconds to deliver one webhook message.")
     webhook_retry_s: float = Field(
-        5.0, gt=0, description="Pause after the first failed delivery; then it grows."
+        5.0, gt=0, description="Seconds until a failed delivery is first repeated; then longer."
     )
-    webhook_http: bool = Field(False, description="Take webhook addresses with http too.")
+    webhook_http: bool = Field(False, description="Accept webhook addresses with http, too.")
     webhook_ports: tuple[int, ...] = Field(
-        (443,), description="Ports that webhook addresses may have; [] takes any."
+        (443,), description="Ports that webhook addresses may have; []: any port."
     )
     webhook_networks: tuple[Network, ...] = Field(
         (), description="Networks that are not public but may receive webhooks, for example 10.0.0.0/8."
     )
     webhook_give_up_days: float = Field(
-        5.0, gt=0, description="A webhook that only failed for so long is switched off."
+        5.0, gt=0, description="Days without success until a failing webhook is disabled."
     )
     max_webhooks: int = Field(20, ge=0, description="Webhooks of one tenant.")
 
     disk_reserve_bytes: int = Field(
         GIB,
         ge=0,
-        description="Stays free on local disks: uploads are refused (507) and jobs wait before that is used.",
+        description="Kept free on local disks: uploads are refused (507) and jobs wait before it is used.",
     )
     upload_expiry_s: float = Field(
-        24 * 3600, gt=0, description="An upload that does not go on for so long is given up."
+        24 * 3600, gt=0, description="Seconds without data until an upload is abandoned."
     )
 
     job_command: tuple[str, ...] = Field(

@@ -1,7 +1,7 @@
 """Settings from files: ``BIRESNERF_X_FILE`` names a file that holds the value of ``BIRESNERF_X``.
 
-That is how containers are given secrets: an environment is shown by every tool that lists containers and is
-handed on to every child, a file is not.
+Containers receive secrets this way: tools that list containers show the environment, and every child process
+inherits it; neither holds for a file.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ SUFFIX = "_file"
 
 
 class FileSettingsSource(EnvSettingsSource):
-    """Reads every setting whose variable, with ``_FILE`` behind it, names a file."""
+    """Reads each setting for which a variable with the suffix ``_FILE`` names a file."""
 
     def __init__(self, settings_class: type[BaseSettings]) -> None:
-        """Reads the files; raises `SetupError` for one that cannot be read or stands beside the setting itself."""
+        """Reads the files; raises `SetupError` for an unreadable file, or a setting that is also given directly."""
         super().__init__(settings_class)
         given, self.env_vars = self.env_vars, {}
         for name in settings_class.model_fields:
@@ -38,13 +38,13 @@ class FileSettingsSource(EnvSettingsSource):
 
 
 def environment_with(variables: Mapping[str, str]) -> dict[str, str]:
-    """This process's environment for a child, with these variables, and without files that name them again."""
+    """The environment for a child process: ours and ``variables``, without their ``_FILE`` forms."""
     files = {f"{name}{SUFFIX.upper()}" for name in variables}
     return {**{name: value for name, value in os.environ.items() if name not in files}, **variables}
 
 
 def _content(variable: str, path: Path) -> str:
-    """The file's text without the line break that editors and ``echo`` put behind it."""
+    """The file's text without trailing line breaks."""
     try:
         text = path.read_text().rstrip("\r\n")
     except (OSError, UnicodeDecodeError) as error:

@@ -13,6 +13,7 @@ import hashlib
 from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 import obstore
 from obstore.exceptions import BaseError
@@ -22,6 +23,9 @@ from biresnerf.wire.base import Record
 from workers.settings.errors import EngineError, LimitReached, NotFound, Unavailable
 from workers.settings.settings import Settings
 from workers.store.file_places import Bucket, BucketPlace, LocalPlace, Method, Place
+
+if TYPE_CHECKING:
+    from obstore import ObjectMeta
 
 CHUNK_BYTES = 2**20
 PART_BYTES = 8 * 2**20
@@ -91,6 +95,14 @@ class FileStore:
             raise
         return (await self.head(key)).model_copy(update={"sha256": incoming.sha256})
 
+    async def put_bytes(self, key: str, content: bytes) -> StoredFile:
+        """Store these bytes; raises `LimitReached` (``storage_full``)."""
+
+        async def chunks() -> AsyncIterator[bytes]:
+            yield content
+
+        return await self.put(key, chunks(), limit_bytes=len(content))
+
     async def put_path(self, key: str, path: Path, media_type: str | None = None) -> StoredFile:
         """Store a local file. The file is opened once, so a writer that renames over it does not disturb."""
         with path.open("rb") as file:
@@ -118,12 +130,7 @@ class FileStore:
                 meta = await obstore.head_async(self._store, _checked(key))
         except FileNotFoundError:
             raise NotFound(f"No file {key}.") from None
-        return StoredFile(
-            key=key,
-            size=meta["size"],
-            etag=(meta["e_tag"] or "").strip('"'),
-            modified_at=meta["last_modified"],
-        )
+        return _stored(key, meta)
 
     async def read(self, key: str, start: int = 0, end: int | None = None) -> AsyncIterator[bytes]:
         """The bytes ``[start, end)`` of a file, in chunks; ``end`` none is the file's end.
@@ -148,15 +155,7 @@ class FileStore:
         found: list[StoredFile] = []
         with _told(f"Cannot list {prefix}"):
             async for batch in obstore.list(self._store, prefix=_checked(prefix.rstrip("/"))):
-                found += [
-                    StoredFile(
-                        key=meta["path"],
-                        size=meta["size"],
-                        etag=(meta["e_tag"] or "").strip('"'),
-                        modified_at=meta["last_modified"],
-                    )
-                    for meta in batch
-                ]
+                found += [_stored(meta["path"], meta) for meta in batch]
         return sorted(found, key=lambda file: file.key)
 
     async def delete(self, key: str) -> None:
@@ -286,6 +285,11 @@ def _told(what: str) -> Iterator[None]:
         if _FULL in str(error):
             raise LimitReached("storage_full", f"{what}: the disk is full.") from error
         raise Unavailable("storage_unavailable", f"{what}: {str(error).splitlines()[0]}") from error
+
+
+def _stored(key: str, meta: ObjectMeta) -> StoredFile:
+    etag = (meta["e_tag"] or "").strip('"')
+    return StoredFile(key=key, size=meta["size"], etag=etag, modified_at=meta["last_modified"])
 
 
 def _checked(key: str) -> str:

@@ -7,7 +7,6 @@ job misses its images.
 from __future__ import annotations
 
 import uuid
-from collections.abc import AsyncIterator
 
 from workers.database.database import Database
 from workers.settings.errors import NotFound, SetupError, Unavailable
@@ -27,7 +26,7 @@ async def require_same_store(database: Database, files: FileStore) -> None:
             known, found = None if row is None else row["id"], await _mark(files)
             if found is None and known is None:
                 found = known = uuid.uuid4().hex
-                await files.put(MARK_KEY, _once(known.encode()), limit_bytes=MARK_BYTES)
+                await files.put_bytes(MARK_KEY, known.encode())
                 await connection.execute("INSERT INTO file_store (id) VALUES (%s)", (known,))
             elif known is None:
                 # A store with a past under a new database: a restore, or a second schema. Its keys never collide.
@@ -51,7 +50,3 @@ async def _mark(files: FileStore) -> str | None:
     except NotFound:
         return None
     return content.decode(errors="replace").strip()
-
-
-async def _once(content: bytes) -> AsyncIterator[bytes]:
-    yield content

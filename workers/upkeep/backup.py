@@ -1,6 +1,6 @@
-"""Makes a backup while the service runs: all files, then the database as it is at one moment with what it names since.
+"""Makes a backup while the service runs: all files, then a database snapshot and the files added since.
 
-So little time passes between that moment and the last copy, in which a running job could replace a checkpoint.
+This keeps the time short in which a running job could replace a checkpoint that the snapshot names.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ _STEPS = "SELECT name FROM schema_steps ORDER BY name"
 
 
 async def make_backup(settings: Settings, url: str, folder: Path) -> BackupIndex:
-    """Bring ``folder`` up to date with the database at ``url`` and its files; returns what it holds then.
+    """Update the backup in ``folder`` from the database at ``url`` and its files; returns its index.
 
-    ``gone`` of the result are files that were deleted while the backup was made. Raises `SetupError`,
-    `Unavailable` (the store), `OSError` (the folder); the backup that was there before is then still whole.
+    ``gone`` of the index lists files deleted during the backup. Raises `SetupError`, `Unavailable` (the
+    store), `OSError` (the folder); the previous backup then stays complete.
     """
     _prepare(folder)
     before = {file.key: file for file in read_index(folder).files} if (folder / INDEX_NAME).exists() else {}
     store = open_files(settings)
     saved: dict[str, SavedFile] = {}
     for found in await _stored(store):
-        with contextlib.suppress(NotFound):  # deleted since it was listed
+        with contextlib.suppress(NotFound):  # deleted after it was listed
             saved[found.key] = await _save(store, found, folder, before.get(found.key))
     async with await psycopg.AsyncConnection.connect(url, connect_timeout=10) as connection:
         await connection.set_isolation_level(psycopg.IsolationLevel.REPEATABLE_READ)
@@ -82,9 +82,9 @@ async def _rows(connection: psycopg.AsyncConnection, sql: str) -> list[tuple[Any
 
 
 def _prepare(folder: Path) -> None:
-    """The folder, for nobody else: a backup holds everything that the service guards.
+    """Create the folder, readable by its owner alone: a backup holds all the service's data.
 
-    Only one that was made for backups is taken: what a backup does not know is deleted from it.
+    An existing folder must be a backup's: files that a backup does not know are deleted from it.
     """
     marker = folder / MARKER_NAME
     if folder.exists() and any(folder.iterdir()) and not marker.exists():
@@ -130,7 +130,7 @@ def _write_whole(path: Path, content: bytes) -> None:
 
 
 def _prune(folder: Path, index: BackupIndex) -> None:
-    """What the service has deleted goes from the backup too, as do older dumps."""
+    """Delete older dumps, and files that the service has deleted."""
     keep = {path_in(folder, file.key) for file in index.files}
     root = folder / FILES_NAME
     for path in sorted(root.rglob("*"), reverse=True):

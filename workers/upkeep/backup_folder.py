@@ -1,7 +1,7 @@
-"""What a backup is on disk: a dump of the database, a copy of every file, and what says which belong together.
+"""A backup on disk: a database dump, a copy of every file, and an index of what belongs together.
 
-``backup.json`` is written last and replaced in one step, so a folder holds the last whole backup or none. Files
-are copied once: their keys are never written twice, so the next backup into the folder takes what is new.
+``backup.json`` is written last and replaced atomically, so a folder holds one complete backup or none. Files never
+change under their key, so the next backup into the folder copies only new ones.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class BackupIndex(Record):
 
 
 def read_index(folder: Path) -> BackupIndex:
-    """What lies in ``folder``; raises `SetupError` where it holds no whole backup."""
+    """The index of the backup in ``folder``; raises `SetupError` if there is no complete one."""
     try:
         return BackupIndex.model_validate_json((folder / INDEX_NAME).read_bytes())
     except (OSError, ValidationError) as error:
@@ -61,7 +61,7 @@ def read_index(folder: Path) -> BackupIndex:
 
 
 def path_in(folder: Path, key: str) -> Path:
-    """Where a file of the store lies in the backup; raises `SetupError` for a key that leads out of it."""
+    """The path of a stored file in the backup; raises `SetupError` for a key that leads out of it."""
     parts = key.split("/")
     if any(part in ("", ".", "..") or "\0" in part for part in parts):
         raise SetupError("no_backup", f"The backup in {folder} names the file {key!r}.")
@@ -82,7 +82,9 @@ def run_postgres_program(settings: Settings, url: str, name: str, *arguments: st
             "no_pg_dump", f"There is no {program}. Set BIRESNERF_PG_BIN to a folder that has it."
         )
     parts: dict[str, Any] = conninfo_to_dict(url)
-    password = parts.pop("password", None)  # not on the command line, which everybody can read
+    password = parts.pop(
+        "password", None
+    )  # not on the command line, which every user of the machine can read
     variables = {} if password is None else {"PGPASSWORD": str(password)}
     ended = subprocess.run(
         [str(program), *arguments, f"--dbname={make_conninfo(**parts)}"],

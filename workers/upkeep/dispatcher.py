@@ -14,9 +14,7 @@ import sys
 from workers.database.database import open_database
 from workers.database.notifications import Listener
 from workers.process.waiting import first_done
-from workers.process.watchdog import end_if_hung
-from workers.settings.errors import SetupError
-from workers.settings.logs import set_up_logging
+from workers.process.watchdog import run_process
 from workers.settings.settings import Settings
 from workers.upkeep.expiry import Expiry
 from workers.webhooks.outbound import Outbound, Policy
@@ -28,11 +26,9 @@ WEBHOOK_CHANNEL = "biresnerf_webhooks"
 
 
 async def dispatch(settings: Settings, stop: asyncio.Event) -> None:
-    """Work until ``stop``, then finish what is under way; raises `SetupError`."""
-    async with (
-        end_if_hung(),
-        open_database(settings.require_database_url(), connections=4, silence_s=settings.stall_s) as database,
-    ):
+    """Work until ``stop``, then finish the current deliveries; raises `SetupError`."""
+    url = settings.require_database_url()
+    async with open_database(url, connections=4, silence_s=settings.stall_s) as database:
         listener = Listener(database, settings.poll_s, WEBHOOK_CHANNEL)
         listening = asyncio.create_task(listener.run())
         sender = WebhookSender(database, listener, Outbound(Policy.of(settings)), settings)
@@ -40,7 +36,7 @@ async def dispatch(settings: Settings, stop: asyncio.Event) -> None:
         working = [asyncio.create_task(duty.run(stop)) for duty in (sender, expiry)]
         try:
             log.info("dispatcher is ready")
-            await first_done(*working)  # before `stop` only by a fault of ours
+            await first_done(*working)  # before `stop` only if one of them failed
             stop.set()
             await asyncio.gather(*working)
         finally:
@@ -48,7 +44,7 @@ async def dispatch(settings: Settings, stop: asyncio.Event) -> None:
                 task.cancel()
 
 
-async def _until_told(settings: Settings) -> None:
+async def _until_signalled(settings: Settings) -> None:
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
@@ -57,14 +53,7 @@ async def _until_told(settings: Settings) -> None:
 
 def main() -> int:
     """`python -m workers.upkeep.dispatcher`, settings from the environment; SIGTERM ends it within a delivery."""
-    settings = Settings()
-    set_up_logging("dispatcher", settings)
-    try:
-        asyncio.run(_until_told(settings))
-    except SetupError as error:
-        sys.stderr.write(f"{error.detail}\n")
-        return 2
-    return 0
+    return run_process("dispatcher", _until_signalled)
 
 
 if __name__ == "__main__":

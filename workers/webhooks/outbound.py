@@ -1,7 +1,7 @@
-"""The only way out: one POST to an address that a user named, without being led anywhere else.
+"""All outgoing requests: one POST to an address given by a user, protected against request forgery (SSRF).
 
-The name is resolved once, every address it has is judged, and the connection goes to a judged address; TLS
-and the Host header keep the name. Redirects are not followed, the answer's body is not read.
+The host name is resolved once, all its addresses are checked, and the connection uses a checked address; TLS and
+the Host header keep the name. Redirects are not followed, and the response body is not read.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from workers.settings.addresses import Network, may_connect, parsed
 from workers.settings.settings import Settings
 
 URL_MAX = 2000
-# More names than this being resolved at once wait for each other.
+# Names resolved at the same time; more have to wait.
 RESOLVER_THREADS = 32
 _HOST = re.compile(rb"(?=.{1,253}$)([A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?\.)*[A-Za-z0-9-]{1,63}\.?")
 _LOCAL_SUFFIXES = (".localhost", ".local", ".internal", ".home.arpa")
@@ -50,12 +50,12 @@ class Policy:
 
     @classmethod
     def of(cls, settings: Settings) -> Policy:
-        """As the operator set it."""
+        """The policy of the settings."""
         return cls(settings.webhook_http, settings.webhook_ports, settings.webhook_networks)
 
 
 def checked_url(text: str, policy: Policy) -> httpx.URL:
-    """An address that may be given to `Outbound.post`; its name is judged again whenever it is resolved.
+    """The parsed address, if `Outbound.post` may use it; its host is checked again at each resolution.
 
     Raises `InputError` (``webhook_url_refused``).
     """
@@ -97,13 +97,13 @@ def _literal(host: bytes) -> ipaddress.IPv4Address | ipaddress.IPv6Address | Non
 
 
 def _looks_like_a_number(host: bytes) -> bool:
-    """Old spellings of IPv4 addresses, which resolvers take: 0x7f.1, 2130706433, 0177.0.0.1."""
+    """Old spellings of IPv4 addresses that resolvers accept: 0x7f.1, 2130706433, 0177.0.0.1."""
     last = host.rstrip(b".").rpartition(b".")[2]
     return last.isdigit() or bool(re.fullmatch(rb"0[xX][0-9a-fA-F]*", last))
 
 
 class SystemResolver:
-    """Asks the system, in threads of its own, so that names that take long to fail hold up nothing else."""
+    """The system's resolver, in its own threads, so that slow failures block nothing else."""
 
     def __init__(self) -> None:
         self._threads = ThreadPoolExecutor(RESOLVER_THREADS, "resolve")
@@ -115,8 +115,8 @@ class SystemResolver:
         return list(dict.fromkeys(str(entry[4][0]) for entry in found))
 
 
-class _JudgedBackend(httpcore.AsyncNetworkBackend):
-    """Connects to no address that was not judged. TLS is told the name afterwards, by the caller."""
+class _CheckedBackend(httpcore.AsyncNetworkBackend):
+    """Connects to checked addresses only. The caller passes the host name to TLS."""
 
     def __init__(self, policy: Policy, resolve: Resolve) -> None:
         self._policy, self._resolve = policy, resolve
@@ -134,7 +134,7 @@ class _JudgedBackend(httpcore.AsyncNetworkBackend):
             addresses = [parsed(text) for text in await self._resolve(host, port)]
         except (OSError, UnicodeError) as error:
             raise Refused("name_not_found") from error
-        # One bad address is enough: a name that leads inside now and then leads inside.
+        # One forbidden address is enough to refuse the name: the answer may change at each resolution.
         if not addresses or not all(may_connect(item, self._policy.networks) for item in addresses):
             raise Refused("address_refused" if addresses else "name_not_found")
         for number, address in enumerate(addresses):
@@ -148,14 +148,14 @@ class _JudgedBackend(httpcore.AsyncNetworkBackend):
 
 @dataclass(frozen=True)
 class Answer:
-    """What came back: the status and when to try again (`Retry-After`), never a body."""
+    """The response: its status and its `Retry-After`, without a body."""
 
     status: int
     retry_after: str | None
 
 
 class Outbound:
-    """Sends to addresses that users named."""
+    """Sends to addresses given by users."""
 
     def __init__(
         self,
@@ -165,8 +165,8 @@ class Outbound:
         tls: ssl.SSLContext | None = None,
     ) -> None:
         self._policy = policy
-        self._backend = _JudgedBackend(policy, resolve or SystemResolver())
-        # Honours SSL_CERT_FILE and SSL_CERT_DIR, for installations with an authority of their own.
+        self._backend = _CheckedBackend(policy, resolve or SystemResolver())
+        # Honours SSL_CERT_FILE and SSL_CERT_DIR, for installations with a private certificate authority.
         self._tls = tls or httpx.create_ssl_context()
 
     async def post(
@@ -174,19 +174,19 @@ class Outbound:
     ) -> Answer:
         """POST ``body`` and return the first answer, whatever its status.
 
-        Raises `Refused`, `TimeoutError` (all of it took longer than ``timeout_s``), and httpcore's
+        Raises `Refused`, `TimeoutError` (``timeout_s`` for the whole exchange), and httpcore's
         `NetworkError` and `ProtocolError`.
         """
         try:
             url = checked_url(address, self._policy)
         except InputError:
             raise Refused("url_refused") from None
-        # From the parts that were checked: a second parser may read the same text otherwise.
+        # Built from the checked parts: a second parser might read the same text differently.
         target = httpcore.URL(
             scheme=url.raw_scheme, host=url.raw_host, port=url.port, target=url.raw_path or b"/"
         )
         wire = [(b"Host", url.netloc), *((key.encode(), value.encode()) for key, value in headers.items())]
-        # A connection for each message: one that is kept would outlive the judgement of its address.
+        # A new connection for each message, so that each one uses a freshly checked address.
         pool = httpcore.AsyncConnectionPool(
             ssl_context=self._tls, network_backend=self._backend, max_connections=1
         )
