@@ -24,7 +24,7 @@ Directions = Callable[[Intrinsics, Tensor, Tensor], Tensor]
 
 
 def choose_device(device: Device) -> torch.device:
-    """The torch device asked for; `auto` takes CUDA where it can be used, and logs why where it cannot.
+    """The requested torch device. `auto` selects CUDA if it is usable and logs the reason if it is not.
 
     Raises `InputError` for CUDA that cannot be used.
     """

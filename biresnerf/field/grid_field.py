@@ -153,15 +153,18 @@ class GridField(RadianceField):
     def _learnt(self) -> list[Tensor]:
         return [self._first, *self.networks[1:]]
 
-    def state(self) -> dict[str, Tensor]:
-        state = {"pose_table": self.pose_table, "reconstruction_table": self.reconstruction_table}
+    def _tensors(self) -> dict[str, Tensor]:
+        """Tables, weights and the tables' moments, shared."""
+        tensors = {"pose_table": self.pose_table, "reconstruction_table": self.reconstruction_table}
         for name, (first, second) in self.moments.items():
-            state[f"{name}_moment1"], state[f"{name}_moment2"] = first, second
-        for i, weight in enumerate(self._learnt()):
-            state[f"network{i}"] = weight.detach()
-        state["reconstruction_columns"] = self.reconstruction_columns.detach()
-        for i, weight in enumerate(self.reconstruction_head):
-            state[f"reconstruction_head{i}"] = weight.detach()
+            tensors[f"{name}_moment1"], tensors[f"{name}_moment2"] = first, second
+        tensors |= {f"network{i}": weight.detach() for i, weight in enumerate(self._learnt())}
+        tensors["reconstruction_columns"] = self.reconstruction_columns.detach()
+        head = enumerate(self.reconstruction_head)
+        return tensors | {f"reconstruction_head{i}": weight.detach() for i, weight in head}
+
+    def state(self) -> dict[str, Tensor]:
+        state = self._tensors()
         state.update(adam_state("adam_networks", self._networks_adam))
         state.update(adam_state("adam_columns", self._columns_adam))
         counters = [self.steps["pose"], self.steps["reconstruction"], int(self.reconstructing)]
@@ -170,16 +173,8 @@ class GridField(RadianceField):
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         with torch.no_grad():
-            self.pose_table.copy_(state["pose_table"])
-            self.reconstruction_table.copy_(state["reconstruction_table"])
-            for name, (first, second) in self.moments.items():
-                first.copy_(state[f"{name}_moment1"])
-                second.copy_(state[f"{name}_moment2"])
-            for i, weight in enumerate(self._learnt()):
-                weight.copy_(state[f"network{i}"])
-            self.reconstruction_columns.copy_(state["reconstruction_columns"])
-            for i, weight in enumerate(self.reconstruction_head):
-                weight.copy_(state[f"reconstruction_head{i}"])
+            for name, tensor in self._tensors().items():
+                tensor.copy_(state[name])
         pose, reconstruction, reconstructing = state["counters"].tolist()
         self.steps = {"pose": pose, "reconstruction": reconstruction}
         self.reconstructing = bool(reconstructing)

@@ -1,7 +1,7 @@
 """Which cells of the scene hold anything: the grid that lets ray marching skip empty space.
 
 As NerfAcc and BAA-NGP: a running maximum of density times step, decaying by 0.95 per update; a cell is occupied
-above min(mean, 0.01). Everything counts as occupied until `prune` is first asked for.
+above min(mean, 0.01). Everything counts as occupied until the first update with `prune`.
 """
 
 from __future__ import annotations

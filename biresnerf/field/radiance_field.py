@@ -1,4 +1,4 @@
-"""The radiance field's contract: what it is asked for, and in which terms."""
+"""The radiance field's contract: its operations, inputs and outputs."""
 
 from __future__ import annotations
 

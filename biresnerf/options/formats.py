@@ -1,7 +1,7 @@
 """The file formats that poses are read from and written to, as each format's own module declares them.
 
 Options, the client and the web process need a format's name and properties, but must not load its reader, which needs
-NumPy. A declaration therefore has literal values only, and is taken from the module's source without importing it.
+NumPy. A declaration therefore has literal values only, and is read from the module's source without importing it.
 `biresnerf.data.formats.registry` adds the functions that read and write.
 """
 
@@ -33,7 +33,7 @@ class Format:
         rank: its place in lists, and in the order in which a folder is searched for poses; unique.
         found_as: names (or a pattern with ``*``) under which a folder holds it, the preferred one first; empty for
             formats that are not read.
-        suffixes: of files that are taken for this format when they are named as the input.
+        suffixes: of files that are read as this format when given as the input.
         gives: what reading it gives, for the docs.
         checked_against: what its reader was tested with, for the docs.
         in_set: where `convert` writes it in its folder; empty for formats that it does not write.
@@ -72,7 +72,7 @@ class Format:
 
     @property
     def on_request(self) -> bool:
-        """Whether a result is written in it when that is asked for: all that it needs can be had at any time."""
+        """Whether a result can be written in it on request: everything it needs is always available."""
         return bool(self.in_result) and not self.always and not {"input", "bounds"} & set(self.needs)
 
 

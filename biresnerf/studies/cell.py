@@ -55,7 +55,7 @@ class Scene(Record):
 
 
 class EqualTime(Record):
-    """How the number of steps was chosen for a run that was given another's time."""
+    """How the number of steps was chosen for a run that gets the time of the first variant."""
 
     seconds: float = Field(description="What the first variant took to optimise.")
     calibration_steps: int

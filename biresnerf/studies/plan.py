@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -99,10 +99,7 @@ class Runner:
 
 def run_plan(plan: Plan, run: Callable[[Cell, str], CellResult]) -> list[Entry]:
     """Every cell of the plan, in the order scene, start, variant."""
-    return list(_entries(plan, run))
-
-
-def _entries(plan: Plan, run: Callable[[Cell, str], CellResult]) -> Iterator[Entry]:
+    entries = []
     for scene, start in product(plan.scenes, plan.starts):
         first: CellResult | None = None
         for variant in plan.variants:
@@ -113,7 +110,8 @@ def _entries(plan: Plan, run: Callable[[Cell, str], CellResult]) -> Iterator[Ent
             else:
                 result = run(cell, title)
             first = first or result
-            yield Entry(scene.name, start, variant.name, result)
+            entries.append(Entry(scene.name, start, variant.name, result))
+    return entries
 
 
 def _run_in_same_time(

@@ -72,7 +72,7 @@ class SeedingPreview:
 
     def __init__(self, dataset: Dataset, folder: OutputFolder, monitor: Monitor) -> None:
         self._dataset, self._folder, self._monitor = dataset, folder, monitor
-        self._found: SeedingProgress | None = None  # as long as COLMAP is not asked
+        self._found: SeedingProgress | None = None  # until COLMAP reports
 
     def __enter__(self) -> SeedingPreview:
         return self
@@ -94,7 +94,7 @@ class SeedingPreview:
         self._show(found, poses, message)
 
     def show_candidate(self, seeding: Seeding) -> None:
-        """The first poses to start from, where COLMAP was asked: others may be tried before they move."""
+        """Show the first candidate, if COLMAP ran; others may be tried before any pose moves."""
         if self._found is None:
             return
         first = seeding.candidates[0]

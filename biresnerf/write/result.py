@@ -1,4 +1,4 @@
-"""The result of a run: poses in all forms asked for, pictures, view.json, and the report."""
+"""The result of a run: poses in all requested formats, pictures, view.json, and the report."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class Buffers:
         self._held: dict[str, np.ndarray] = {}
 
     def take(self, name: str, *shape: int, dtype: Any = f4) -> np.ndarray:
-        """An uninitialised array of this shape; valid until the same name is taken again."""
+        """An uninitialised array of this shape; valid until the same name is requested again."""
         size = int(np.prod(shape))
         held = self._held.get(name)
         if held is None or held.size < size or held.dtype != dtype:

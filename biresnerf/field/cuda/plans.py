@@ -1,4 +1,4 @@
-"""Which kernels run in which order: one function for each thing the field is asked for."""
+"""Which kernels run in which order: one function for each operation of the field."""
 
 from __future__ import annotations
 

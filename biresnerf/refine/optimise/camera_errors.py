@@ -21,7 +21,7 @@ MAD_TO_DEVIATION = 1.4826
 OWN_YARDSTICK_FROM = 4  # held-out views
 IN_A_ROW = 2  # blocks
 COVERAGE = 0.1  # of the photo's foreground share: a camera that renders less no longer sees the scene
-DOUBTED_WEIGHT = 0.1  # of a camera whose pose is a guess, until it agrees with the field
+DOUBTED_WEIGHT = 0.1  # of a camera with a guessed pose, until it agrees with the field
 SMOOTHING = 0.5  # share of the newest block in the moving average
 BACKGROUND_TOLERANCE = 0.05  # colours nearer to the background than this count as background
 LEAST_FOREGROUND = 0.02
@@ -192,8 +192,6 @@ class CameraErrors:
         }
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        self.errors.copy_(state["errors"])
-        self._stood_out.copy_(state["stood_out"])
-        self._sums.copy_(state["sums"])
-        self.doubted.copy_(state["doubted"])
+        for name, tensor in self.state().items():
+            tensor.copy_(state[name])
         self._weigh()

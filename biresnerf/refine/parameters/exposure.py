@@ -39,7 +39,7 @@ def brightness_spread(images: ImageSet) -> float:
 
 
 def compensates(images: ImageSet, choice: ExposureChoice) -> bool:
-    """Whether exposures are optimised: as asked; `auto` where opaque photos differ in brightness."""
+    """Whether exposures are optimised: as requested; `auto` where opaque photos differ in brightness."""
     if choice == "auto":
         return images.alpha is None and brightness_spread(images) >= AUTO_FROM
     return choice == "on"

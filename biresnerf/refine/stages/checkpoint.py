@@ -27,7 +27,7 @@ from biresnerf.refine.stages.stability import DetectorState
 from biresnerf.report import SwitchReason
 
 CHECKPOINT = Path("checkpoint") / "latest.safetensors"
-SEEDING = CHECKPOINT.with_name("seeding.json")  # COLMAP's answer; every checkpoint carries a copy
+SEEDING = CHECKPOINT.with_name("seeding.json")  # COLMAP's result; every checkpoint carries a copy
 MATCHES = CHECKPOINT.with_name(KEPT)  # feature matches; every checkpoint carries them, too
 COARSE = CHECKPOINT.with_name("coarse.safetensors")  # the state at the end of stage 1, for runs that share it
 FORMAT = "4"
@@ -43,7 +43,7 @@ class RunOrigin(BaseModel):
     Attributes:
         fingerprint: of photos, given poses and options.
         stage_1_fingerprint: the same without the options that do not affect stage 1.
-        seeding: COLMAP's answer where it was asked: it would not answer quite the same again.
+        seeding: COLMAP's result, if it ran: it would differ slightly in another run.
     """
 
     model_config = _FROZEN

@@ -52,7 +52,7 @@ class Estimate:
         self._fraction = STAGES_FROM
 
     def stepped(self, stage: StageName, seconds: float) -> None:
-        """One step was taken."""
+        """Add the time of one step."""
         mean = self.step_seconds[stage]
         self.step_seconds[stage] = seconds if mean == 0 else MEMORY * mean + (1 - MEMORY) * seconds
 

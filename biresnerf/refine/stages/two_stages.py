@@ -46,7 +46,7 @@ class Observer:
 
     Attributes:
         at_check: what it returns at each check joins that check's line of the history.
-        at_end: called once, when all steps are taken and the run's own views are scored.
+        at_end: called once, after the last step and the scoring of the run's own views.
         write_preview: shows the state of the run in files, and returns these relative to the output folder.
     """
 

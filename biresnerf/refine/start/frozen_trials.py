@@ -2,7 +2,7 @@
 
 Everything but the poses (and the lenses, where they were refined too) is the same in each: photos, unseen views, scene
 box, steps, samples and random seed. Unseen views are rendered from the poses as they stand, fitted to no field: a fit
-would forgive what is asked about. Each set is scored within its own field, so it need not share its frame's last
+would hide the errors under comparison. Each set is scored within its own field, so it need not share its frame's last
 digits with the others.
 """
 
@@ -58,10 +58,10 @@ class FrozenTrials:
     Args:
         images: photos at working size.
         unseen: indices of the views that no field is trained on.
-        rigs: sets of poses [n, 4, 4] that the scene box is taken from, all of them alike; in one frame.
+        rigs: sets of poses [n, 4, 4] that together define the scene box; in one frame.
         options: the field's sizes and rates.
         steps: of each training; an open scene takes `OPEN_STEPS` times as many.
-        should_stop: asked after every step.
+        should_stop: called after every step.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class FrozenTrials:
             cameras: of each image at working size; the photos' own where left out.
 
         Raises:
-            Interrupted: ``should_stop`` said so.
+            Interrupted: ``should_stop`` returned true.
         """
         images = self.images if cameras is None else replace(self.images, cameras=cameras)
         poses = self.frame.unit_from_world.apply_to_poses(world_from_cam)

@@ -1,6 +1,6 @@
 """The published methods that ours is compared with: their fields, schedules and losses.
 
-All schedules are shares of the steps asked for, so short runs keep the proportions.
+All schedules are shares of the requested steps, so short runs keep the proportions.
 """
 
 from __future__ import annotations

@@ -23,7 +23,6 @@ from biresnerf.errors import InputError
 from biresnerf.options.presets import PRESETS
 
 if TYPE_CHECKING:
-    from biresnerf.studies.cell import Perturbation
     from biresnerf.studies.plan import Entry, Plan, Variant
 
 TABLES_MARKDOWN, TABLES_JSON, CELLS = "tables.md", "tables.json", "cells"
@@ -127,6 +126,7 @@ def make_plan(
     given: dict[str, Any], variants: Sequence[Variant], settings: dict[str, Any], noises: Sequence[float]
 ) -> Plan:
     """The plan of a command line; scenes and options are validated before anything runs."""
+    from biresnerf.studies.cell import Perturbation
     from biresnerf.studies.plan import Plan, Variant
     from biresnerf.studies.scenes import find_scene
 
@@ -135,25 +135,21 @@ def make_plan(
         raise InputError(
             "invalid_options", "two scenes have the same name.", where="SCENES", hint="Rename one's folder."
         )
-    starts = tuple(_start(given, noise, seed) for noise, seed in product(noises, given["seeds"]))
+    starts = tuple(
+        Perturbation(
+            kind=given["start"],
+            noise=0.0 if given["start"] == "identity" else noise,
+            seed=seed,
+            turn_one_deg=given["turn_one"],
+            lose_share=given["lose"],
+        )
+        for noise, seed in product(noises, given["seeds"])
+    )
     chosen = tuple(variants) or (Variant("default", {}),)
     plan = Plan(scenes, starts, chosen, settings, given["equal_time"])
     for scene, start, variant in product(scenes, starts, chosen):
         plan.options(variant, scene, start)
     return plan
-
-
-def _start(given: dict[str, Any], noise: float, seed: int) -> Perturbation:
-    from biresnerf.studies.cell import Perturbation
-
-    identity = given["start"] == "identity"
-    return Perturbation(
-        kind=given["start"],
-        noise=0.0 if identity else noise,
-        seed=seed,
-        turn_one_deg=given["turn_one"],
-        lose_share=given["lose"],
-    )
 
 
 def run_and_write(plan: Plan, given: dict[str, Any]) -> list[Entry]:
