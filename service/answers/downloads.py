@@ -10,7 +10,7 @@ from urllib.parse import quote
 from fastapi import Depends, Header, Query
 from fastapi.responses import Response, StreamingResponse
 
-from service.http.dependencies import Service
+from service.http.dependencies import IfNoneMatch, Service
 from service.http.http_conditionals import byte_range, none_match
 from service.http.problems import ProblemError, declared
 from workers.jobs.jobs import JobStore
@@ -29,8 +29,9 @@ ANSWERS: dict[int | str, dict[str, Any]] = {
         "headers": {"Location": {"schema": {"type": "string"}}},
     },
     **declared(
+        # Signed links need no key, so the codes of guarded operations are not theirs.
         *("bad_range", "not_found", "expired", "range_not_satisfiable"),
-        *("database_unavailable", "storage_unavailable", "internal_error"),
+        *("database_unavailable", "storage_unavailable"),
     ),
 }
 
@@ -42,7 +43,7 @@ class Conditions:
         self,
         range_: Annotated[str | None, Header(alias="Range", description="`bytes=first-last`")] = None,
         if_range: Annotated[str | None, Header()] = None,
-        if_none_match: Annotated[str | None, Header()] = None,
+        if_none_match: IfNoneMatch = None,
         redirect: Annotated[
             bool,
             Query(description="`false`: do not redirect to the store, even if this service usually does."),

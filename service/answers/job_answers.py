@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import re
+from typing import Annotated
 
+from fastapi import Header
 from fastapi.responses import JSONResponse, Response
+from pydantic import AfterValidator
 
 from biresnerf.wire.jobs import JobView, job_url
 from service.http.problems import ProblemError
@@ -18,11 +21,17 @@ _KEY = re.compile(r"^[\x21-\x7e]{1,255}$")
 _WAIT = re.compile(r"(?:^|[,;])\s*wait\s*=\s*\"?(\d{1,6})\"?\s*(?=$|[,;])", re.IGNORECASE)
 
 
-def checked_key(idempotency_key: str | None) -> str | None:
-    """The key; raises `ProblemError` ``bad_idempotency_key``."""
-    if idempotency_key is not None and not _KEY.match(idempotency_key):
+def _checked_key(key: str | None) -> str | None:
+    if key is not None and not _KEY.match(key):
         raise ProblemError("bad_idempotency_key", "The key must be 1 to 255 visible ASCII characters.")
-    return idempotency_key
+    return key
+
+
+IdempotencyKey = Annotated[
+    str | None,
+    Header(description="Repeating the request with the same key returns the same job."),
+    AfterValidator(_checked_key),
+]
 
 
 def job_etag(job: JobView) -> str:

@@ -40,9 +40,9 @@ _LINKS: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     "submitJob": ("202", {**_by_path("getJob", "job_id"), **_by_path("cancelJob", "job_id")}),
 }
-# Problems with which a request may be refused before it reaches its operation.
+# Problems of every operation, and of those with a JSON body; `REFUSALS` are those of guarded operations.
 _ANY = ("malformed_request", "head_timeout", "headers_too_large", "internal_error")
-_ANYWHERE, _GUARDED = declared(*_ANY), declared(*_ANY, *REFUSALS)
+_JSON_BODY = ("malformed_json", "body_too_large", "unsupported_media", "body_timeout", "invalid_request")
 # FastAPI's own 422, which this service never sends.
 _UNUSED = ("HTTPValidationError", "ValidationError")
 
@@ -57,8 +57,7 @@ def describe(app: FastAPI, routers: Sequence[APIRouter]) -> None:
         document = generate()
         for path in document["paths"].values():
             for method, operation in path.items():
-                early = _GUARDED if operation.get("security") else _ANYWHERE
-                operation["responses"] = _answers(operation["responses"], early)
+                operation["responses"] = _answers(operation["responses"], _common_problems(operation))
                 if method == "head":
                     operation["responses"]["200"].pop("content", None)
                 status, links = _LINKS.get(operation["operationId"], ("", {}))
@@ -75,6 +74,13 @@ def describe(app: FastAPI, routers: Sequence[APIRouter]) -> None:
     app.openapi = openapi  # type: ignore[method-assign]
 
 
+def _common_problems(operation: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
+    """The problems of all operations of this kind, which routes need not declare."""
+    guarded = bool(operation.get("security"))
+    takes_json = "application/json" in operation.get("requestBody", {}).get("content", {})
+    return declared(*_ANY, *(REFUSALS if guarded else ()), *(_JSON_BODY if takes_json else ()))
+
+
 def _models(routers: Sequence[APIRouter]) -> set[type[BaseModel]]:
     """The models of all responses."""
     routes = [route for router in routers for route in router.routes if isinstance(route, APIRoute)]
@@ -82,17 +88,17 @@ def _models(routers: Sequence[APIRouter]) -> set[type[BaseModel]]:
     return {model for model in (*(route.response_model for route in routes), *declared) if model is not None}
 
 
-def _answers(responses: dict[str, Any], early: dict[int | str, dict[str, Any]]) -> dict[str, Any]:
-    """The responses by status, problems in their media type, with those given before the operation is reached."""
+def _answers(responses: dict[str, Any], common: dict[int | str, dict[str, Any]]) -> dict[str, Any]:
+    """The responses by status, with the ``common`` problems; problems have their own media type."""
     complete: dict[str, Any] = {}
-    for status, response in sorted({**{str(key): {} for key in early}, **responses}.items()):
+    for status, response in sorted({**{str(key): {} for key in common}, **responses}.items()):
         if int(status) < 400:
             complete[status] = response
             continue
         # Without examples it is FastAPI's own 422, which it declares wherever there are parameters.
         examples = dict(response.get("content", {}).get(MEDIA_TYPE, {}).get("examples", {}))
-        if int(status) in early:
-            examples |= early[int(status)]["content"][MEDIA_TYPE]["examples"]
+        if int(status) in common:
+            examples |= common[int(status)]["content"][MEDIA_TYPE]["examples"]
         if examples:
             complete[status] = {
                 "description": f"{HTTPStatus(int(status)).phrase}: `{'`, `'.join(examples)}`",

@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 # Health checks, docs and schema contain no user's data; /metrics checks for itself (`may_scrape`); shared links are
 # signed.
 OPEN = re.compile(r"/(livez|readyz|startupz|metrics|openapi\.json|docs(/.*)?|web/[^/]*|v1/shared/.*)?")
-# Problems of any guarded operation before it is reached.
+# Problems of every guarded operation; its route need not declare them.
 REFUSALS = (
     *("missing_credentials", "invalid_api_key", "scope_required", "cross_site"),
     *("rate_limited", "database_unavailable"),

@@ -1,4 +1,4 @@
-"""What routes depend on: the running process, ids in paths, and the header of a next page."""
+"""What routes depend on: the running process, ids in paths, and pages of listings."""
 
 from __future__ import annotations
 
@@ -9,20 +9,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
-from fastapi import Depends, Request
+from fastapi import Depends, Header, Query, Request, Response
 from fastapi import Path as PathParameter
+from pydantic import AfterValidator, BaseModel
 
 from service.http.metrics import WebMetrics
 from service.http.problems import ProblemError
 from workers.engine import Stores
 from workers.process.disk_space import DiskBudget, upload_disk_budget
 from workers.process.turns import Turns
+from workers.records import Page
 from workers.settings.settings import Settings
 
 # Archives that one process unpacks at a time; each takes a core and memory.
 UNPACKED_AT_ONCE = 4
+Listing = TypeVar("Listing", bound=BaseModel)
 _ID = re.compile(r"^[a-z]{2,3}_[0-9A-Za-z]{1,40}$", re.ASCII)
 
 
@@ -100,39 +103,19 @@ CurrentService = Annotated[Service, Depends(service_of)]
 
 
 def _checked_id(identity: str) -> str:
-    # No id has another form, and such bytes must not reach the database.
+    # Every id has this form; other bytes must not reach the database.
     if not _ID.match(identity):
         raise ProblemError("not_found", f"There is no {identity[:60]!r}.")
     return identity
 
 
-def _job_id(job_id: Annotated[str, PathParameter(examples=["job_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])]) -> str:
-    return _checked_id(job_id)
-
-
-def _dataset_id(dataset_id: Annotated[str, PathParameter(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])]) -> str:
-    return _checked_id(dataset_id)
-
-
-def _upload_id(upload_id: Annotated[str, PathParameter(examples=["up_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])]) -> str:
-    return _checked_id(upload_id)
-
-
-def _webhook_id(webhook_id: Annotated[str, PathParameter(examples=["wh_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])]) -> str:
-    return _checked_id(webhook_id)
-
-
-def _delivery_id(
-    delivery_id: Annotated[str, PathParameter(examples=["msg_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])],
-) -> str:
-    return _checked_id(delivery_id)
-
-
-JobId = Annotated[str, Depends(_job_id)]
-DatasetId = Annotated[str, Depends(_dataset_id)]
-WebhookId = Annotated[str, Depends(_webhook_id)]
-DeliveryId = Annotated[str, Depends(_delivery_id)]
-UploadId = Annotated[str, Depends(_upload_id)]
+_ID_FORM = AfterValidator(_checked_id)
+JobId = Annotated[str, PathParameter(examples=["job_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
+DatasetId = Annotated[str, PathParameter(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
+UploadId = Annotated[str, PathParameter(examples=["up_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
+WebhookId = Annotated[str, PathParameter(examples=["wh_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
+DeliveryId = Annotated[str, PathParameter(examples=["msg_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
+IfNoneMatch = Annotated[str | None, Header()]
 
 
 def next_link(request: Request, cursor: str | None) -> dict[str, str]:
@@ -141,3 +124,25 @@ def next_link(request: Request, cursor: str | None) -> dict[str, str]:
         return {}
     url = request.url.include_query_params(cursor=cursor)
     return {"Link": f'<{url.path}?{url.query}>; rel="next"'}
+
+
+class Paging:
+    """The part of a listing that was asked for, and the response with it."""
+
+    def __init__(
+        self,
+        request: Request,
+        response: Response,
+        limit: Annotated[int, Query(ge=1, le=200)] = 50,
+        cursor: Annotated[str | None, Query(max_length=500)] = None,
+    ) -> None:
+        self.limit, self.cursor = limit, cursor
+        self._request, self._response = request, response
+
+    def answer(self, model: type[Listing], page: Page[Any]) -> Listing:
+        """The page as ``model``, with the `Link` header to the next one."""
+        self._response.headers.update(next_link(self._request, page.next_cursor))
+        return model.model_validate({"items": page.items, "next_cursor": page.next_cursor})
+
+
+Paged = Annotated[Paging, Depends()]

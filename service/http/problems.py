@@ -138,8 +138,16 @@ def problem_of(error: FaultError) -> ProblemError:
     return ProblemError.of(error.fault)
 
 
+def wrong_field(pointer: str, detail: str) -> ProblemError:
+    """``invalid_request`` for one field, parameter or header."""
+    return ProblemError("invalid_request", detail, errors=[FieldProblem(pointer=pointer, detail=detail)])
+
+
 def declared(*codes: str) -> dict[int | str, dict[str, Any]]:
-    """The OpenAPI `responses` of a route that may respond with these codes."""
+    """The OpenAPI `responses` of a route that may respond with these codes.
+
+    `service.docs.api_description` adds the codes of every route, of guarded routes, and of JSON bodies.
+    """
     by_status: dict[int, list[str]] = {}
     for code in codes:
         by_status.setdefault(CATALOGUE[code][0], []).append(code)

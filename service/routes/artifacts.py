@@ -23,7 +23,7 @@ REPORT = "report.json"
 @router.get(
     "/artifacts",
     operation_id="listArtifacts",
-    responses=declared("not_found", "expired", "database_unavailable", "internal_error"),
+    responses=declared("not_found", "expired"),
 )
 async def list_artifacts(job_id: JobId, caller: ReadCaller) -> ArtifactList:
     """All files of the result and of its exports. While the job runs: previews of poses and a render."""
@@ -66,7 +66,7 @@ async def get_artifact(
     "/report",
     operation_id="getReport",
     response_model=Report,
-    responses=declared("not_found", "expired", "result_not_ready", "database_unavailable", "internal_error"),
+    responses=declared("not_found", "expired", "result_not_ready"),
 )
 async def get_report(job_id: JobId, caller: ReadCaller) -> Response:
     """The machine-readable report of a finished job (the artifact `report.json`)."""

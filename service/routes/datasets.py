@@ -21,7 +21,7 @@ from biresnerf.wire.datasets import (
 )
 from biresnerf.wire.safe_paths import checked_path
 from service.http.access import DatasetWriter, ReadCaller
-from service.http.dependencies import DatasetId, next_link, service_of
+from service.http.dependencies import DatasetId, Paged, next_link, service_of
 from service.http.problems import ProblemError, declared
 from service.intake.archive_import import take_archive
 from service.intake.dataset_finalize import begin_check, finish_check
@@ -30,8 +30,6 @@ from service.intake.uploads import capped, refuse_announced_excess, staging_fold
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 ENTRY_BYTES = 2048  # allowed in a manifest for each file that a dataset may have
-_ALWAYS = ("database_unavailable", "internal_error")
-_WRITES = ("cross_site", *_ALWAYS)
 _RAW_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
@@ -51,10 +49,7 @@ async def _new_dataset(request: Request) -> NewDataset:
     status_code=201,
     operation_id="createDataset",
     response_model=DatasetView,
-    responses=declared(
-        *("malformed_json", "body_too_large", "unsupported_media", "unsafe_path", "body_timeout"),
-        *("quota_exhausted", *_WRITES),
-    ),
+    responses=declared("unsafe_path", "quota_exhausted"),
     openapi_extra=json_request(NewDataset),
 )
 async def create_dataset(
@@ -73,22 +68,14 @@ async def create_dataset(
     return dataset
 
 
-@router.get("", operation_id="listDatasets", responses=declared("bad_cursor", "invalid_request", *_ALWAYS))
-async def list_datasets(
-    request: Request,
-    response: Response,
-    caller: ReadCaller,
-    state: DatasetState | None = None,
-    limit: Annotated[int, Query(ge=1, le=200)] = 50,
-    cursor: Annotated[str | None, Query(max_length=500)] = None,
-) -> DatasetList:
+@router.get("", operation_id="listDatasets", responses=declared("bad_cursor", "invalid_request"))
+async def list_datasets(caller: ReadCaller, paging: Paged, state: DatasetState | None = None) -> DatasetList:
     """Datasets, newest first."""
-    page = await caller.datasets.list(state=state, limit=limit, cursor=cursor)
-    response.headers.update(next_link(request, page.next_cursor))
-    return DatasetList(items=page.items, next_cursor=page.next_cursor)
+    page = await caller.datasets.list(state=state, limit=paging.limit, cursor=paging.cursor)
+    return paging.answer(DatasetList, page)
 
 
-@router.get("/{dataset_id}", operation_id="getDataset", responses=declared("not_found", *_ALWAYS))
+@router.get("/{dataset_id}", operation_id="getDataset", responses=declared("not_found"))
 async def get_dataset(dataset_id: DatasetId, caller: ReadCaller) -> DatasetView:
     """The dataset, with the report of its check once it is finalized."""
     return await caller.datasets.get(dataset_id)
@@ -98,7 +85,7 @@ async def get_dataset(dataset_id: DatasetId, caller: ReadCaller) -> DatasetView:
     "/{dataset_id}",
     status_code=204,
     operation_id="deleteDataset",
-    responses=declared("not_found", "dataset_in_use", *_WRITES),
+    responses=declared("not_found", "dataset_in_use"),
 )
 async def delete_dataset(dataset_id: DatasetId, caller: DatasetWriter) -> None:
     """Deletes the dataset and its files. All its jobs must be deleted first."""
@@ -108,7 +95,7 @@ async def delete_dataset(dataset_id: DatasetId, caller: DatasetWriter) -> None:
 @router.get(
     "/{dataset_id}/files",
     operation_id="listFiles",
-    responses=declared("bad_cursor", "not_found", "expired", "invalid_request", *_ALWAYS),
+    responses=declared("bad_cursor", "not_found", "expired", "invalid_request"),
 )
 async def list_files(
     dataset_id: DatasetId,
@@ -125,15 +112,8 @@ async def list_files(
 
 
 _TAKES = (
-    "body_timeout",
-    "not_found",
-    "dataset_not_open",
-    "body_too_large",
-    "too_many_files",
-    "unsafe_path",
-    "storage_full",
-    "quota_exhausted",
-    "too_many_uploads",
+    *("body_timeout", "not_found", "dataset_not_open", "body_too_large", "too_many_files"),
+    *("unsafe_path", "storage_full", "quota_exhausted", "too_many_uploads"),
 )
 
 
@@ -144,7 +124,7 @@ _TAKES = (
     response_model=FileView,
     responses={
         204: {"description": "The file existed; its content was replaced."},
-        **declared("malformed_body", "file_exists", "digest_mismatch", *_TAKES, *_WRITES),
+        **declared("malformed_body", "file_exists", "digest_mismatch", *_TAKES),
     },
     openapi_extra=_RAW_BODY,
 )
@@ -198,7 +178,7 @@ def _announced_digest(header: str | None) -> str | None:
     "/{dataset_id}/archive",
     operation_id="uploadArchive",
     responses=declared(
-        "archive_too_large", "archive_rejected", "name_collision", "validation_timeout", *_TAKES, *_WRITES
+        "archive_too_large", "archive_rejected", "name_collision", "validation_timeout", *_TAKES
     ),
     openapi_extra={
         "requestBody": {
@@ -232,7 +212,7 @@ async def upload_archive(dataset_id: DatasetId, request: Request, caller: Datase
     response_model=DatasetView,
     responses={
         202: {"model": DatasetView, "description": "In progress (with `Prefer: respond-async`)."},
-        **declared("not_found", "dataset_not_complete", "dataset_invalid", "name_collision", *_WRITES),
+        **declared("not_found", "dataset_not_complete", "dataset_invalid", "name_collision"),
     },
 )
 async def finalize_dataset(

@@ -9,19 +9,17 @@ from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import Response
 
 from biresnerf.wire.jobs import ForkJob, JobList, JobView, LogLine, NewExport, job_url
-from biresnerf.wire.problems import FieldProblem
 from biresnerf.wire.results import IMAGE_COLUMNS, ImageList, ImageRow
-from service.answers.job_answers import POLL_S, checked_key, job_answer
+from service.answers.job_answers import POLL_S, IdempotencyKey, job_answer
 from service.http.access import Caller, JobWriter, ReadCaller
 from service.http.dependencies import JobId
-from service.http.problems import ProblemError, declared
+from service.http.problems import declared, wrong_field
 from service.intake.json_body import json_request, read_json
 from service.routes.artifacts import find_report, whole_file
 from workers.jobs.derived_jobs import DerivedJobs
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
-_ALWAYS = ("not_found", "expired", "invalid_request", "database_unavailable", "internal_error")
-_BODY = ("malformed_json", "body_too_large", "unsupported_media", "body_timeout")
+_ALWAYS = ("not_found", "expired", "invalid_request")
 LINES = "application/x-ndjson"
 _LOG: dict[int | str, dict[str, Any]] = {
     200: {
@@ -90,9 +88,7 @@ async def list_images(
     column = sort.removeprefix("-")
     if column and column not in IMAGE_COLUMNS:
         detail = f"There is no column {column!r}; there are {', '.join(sorted(IMAGE_COLUMNS))}."
-        raise ProblemError(
-            "invalid_request", detail, errors=[FieldProblem(pointer="/query/sort", detail=detail)]
-        )
+        raise wrong_field("/query/sort", detail)
     report = json.loads(await whole_file(caller, await find_report(caller, job_id)))
     return _image_rows(report, column, descending=sort.startswith("-"), limit=limit)
 
@@ -120,31 +116,21 @@ def _row(image: dict[str, Any]) -> ImageRow:
     response_model=JobView,
     openapi_extra=json_request(ForkJob, required=False),
     responses=declared(
-        *(
-            "fork_not_possible",
-            "dataset_not_ready",
-            "invalid_options",
-            "queue_full",
-            "quota_exhausted",
-            "bad_idempotency_key",
-        ),
-        *("idempotency_key_reused", "storage_unavailable", "storage_full", *_BODY, *_ALWAYS),
+        *("fork_not_possible", "dataset_not_ready", "invalid_options", "queue_full", "quota_exhausted"),
+        *("bad_idempotency_key", "idempotency_key_reused", "storage_unavailable", "storage_full", *_ALWAYS),
     ),
 )
 async def fork_job(
     job_id: JobId,
     request: Request,
     caller: JobWriter,
-    idempotency_key: Annotated[
-        str | None, Header(description="Repeating the request with the same key returns the same job.")
-    ] = None,
+    idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """Queues a job on the same dataset with other options, reusing the result of a stage of this one."""
-    key = checked_key(idempotency_key)
     body = await read_json(request, ForkJob)
     changes = body.options.model_dump(mode="json", exclude_unset=True)
     job, new = await _derived(caller).fork(
-        job_id, changes, body.from_stage, labels=body.labels, idempotency_key=key
+        job_id, changes, body.from_stage, labels=body.labels, idempotency_key=idempotency_key
     )
     return job_answer(job, status=202, new=new)
 
@@ -159,13 +145,7 @@ async def fork_job(
     responses={
         200: {"model": JobView, "description": "The same export was requested before and is complete."},
         **declared(
-            "result_not_ready",
-            "state_conflict",
-            "queue_full",
-            "quota_exhausted",
-            "storage_full",
-            *_BODY,
-            *_ALWAYS,
+            *("result_not_ready", "state_conflict", "queue_full", "quota_exhausted", "storage_full", *_ALWAYS)
         ),
     },
 )

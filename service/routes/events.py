@@ -10,29 +10,27 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Query
 from fastapi.responses import StreamingResponse
 
-from biresnerf.wire.problems import FieldProblem
 from service.http.access import ReadCaller
 from service.http.dependencies import JobId
 from service.http.metrics import WebMetrics
-from service.http.problems import ProblemError, declared
+from service.http.problems import declared, wrong_field
 from workers.records import JobUpdate
 from workers.settings.errors import NotFound, Unavailable
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
 KEEP_ALIVE_S = 15.0
 _RETRY_MS = 2000
-# Another process may be there already; the job goes on.
-_GOODBYE = ": this process is stopping; connect again with the last event's id\nretry: 500\n\n"
+# Another web process may be running already; the job continues.
+_GOODBYE = ": this process is stopping; reconnect with the id of the last event\nretry: 500\n\n"
 _STREAM: dict[int | str, dict[str, Any]] = {
     200: {
         "description": (
             "Events `queued`, `started`, `stage`, `checkpoint`, `preview`, `attempt_crashed`, "
-            "`retried_smaller`, `requeued`, `cancel_requested`, `succeeded`, `failed`, `cancelled` carry an `id` "
-            "and are never lost; "
-            "`progress` carries the job as it is now, at most once a second. Comments keep the connection "
-            "alive. The stream ends after the job."
+            "`retried_smaller`, `requeued`, `cancel_requested`, `succeeded`, `failed`, `cancelled` have an `id` "
+            "and are never lost; `progress` contains the current job, at most once a second. "
+            "Comments keep the connection alive. The stream ends when the job does."
         ),
-        # OpenAPI 3.1 has no word for a stream: this is one event of it.
+        # OpenAPI 3.1 cannot describe a stream; this is one of its events.
         "content": {
             "text/event-stream": {
                 "schema": {
@@ -40,7 +38,10 @@ _STREAM: dict[int | str, dict[str, Any]] = {
                     "required": ["event", "data"],
                     "properties": {
                         "event": {"type": "string"},
-                        "id": {"type": "string", "description": "Send it back as Last-Event-ID."},
+                        "id": {
+                            "type": "string",
+                            "description": "To resume the stream, send it as Last-Event-ID.",
+                        },
                         "data": {"type": "string", "description": "JSON: a JobEvent, or the job (progress)."},
                     },
                 },
@@ -63,7 +64,7 @@ class EventStream(StreamingResponse):
     response_class=EventStream,
     responses={
         **_STREAM,
-        **declared("not_found", "invalid_request", "database_unavailable", "internal_error"),
+        **declared("not_found", "invalid_request"),
     },
 )
 async def follow_job(
@@ -74,10 +75,10 @@ async def follow_job(
     ] = None,
     last_event_id: Annotated[str | None, Header(description="Sent by browsers when they reconnect.")] = None,
 ) -> EventStream:
-    """Follows a job from its first event, or from after the one named by `after` or `Last-Event-ID`."""
+    """Streams the events of a job: all, or those after the event `after` or `Last-Event-ID`."""
     start = _start(after, last_event_id)
     updates = caller.jobs.subscribe(job_id, after=start, heartbeat_s=KEEP_ALIVE_S)
-    # The first update before the answer begins: a missing job is a 404, not an empty stream.
+    # Read the first update before the response begins, so that a missing job is a 404, not an empty stream.
     first = await anext(updates, None)
     headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
     events = _counted(_stream(first, updates, caller.service.closing), caller.service.metrics)
@@ -85,19 +86,16 @@ async def follow_job(
 
 
 def _start(after: int | None, last_event_id: str | None) -> int:
-    # The header is what a browser knows last, so it wins over the address it was opened with.
+    # A browser that reconnects sends the header with the URL it first opened, so the header is newer.
     if last_event_id is None or last_event_id == "":
         return after or 0
     if not last_event_id.isdecimal() or len(last_event_id) > 9:
-        detail = "The id must be a number from this stream."
-        raise ProblemError(
-            "invalid_request", detail, errors=[FieldProblem(pointer="/header/Last-Event-ID", detail=detail)]
-        )
+        raise wrong_field("/header/Last-Event-ID", "The id must be a number from this stream.")
     return int(last_event_id)
 
 
 async def _counted(events: AsyncGenerator[str], metrics: WebMetrics) -> AsyncIterator[str]:
-    """The events, with one listener more for as long as somebody follows them."""
+    """The events; counts one listener while they are read."""
     with metrics.listeners.track_inprogress():
         async with contextlib.aclosing(events):
             async for event in events:
@@ -111,20 +109,20 @@ async def _stream(
     update: JobUpdate | None = first
     async with contextlib.aclosing(updates):
         while True:
-            yield ": still here\n\n" if update is None else _written(update)
+            yield ": still here\n\n" if update is None else _as_text(update)
             if update is not None and update.job.final:
                 return
             try:
                 update = await _next_or_closing(updates, closing)
             except (_Ended, NotFound, Unavailable):
-                # Deleted meanwhile, or the database is away: the client comes back and is told which.
+                # The job was deleted or the database is unavailable: the client reconnects and gets the error.
                 if closing.is_set():
                     yield _GOODBYE
                 return
 
 
 class _Ended(Exception):
-    """There is nothing more to follow."""
+    """The stream has no more updates."""
 
 
 async def _next(updates: AsyncGenerator[JobUpdate | None]) -> JobUpdate | None:
@@ -137,23 +135,23 @@ async def _next_or_closing(
     updates: AsyncGenerator[JobUpdate | None], closing: asyncio.Event
 ) -> JobUpdate | None:
     """The next update; ends the iteration when the server shuts down."""
-    coming = asyncio.ensure_future(_next(updates))
+    update = asyncio.ensure_future(_next(updates))
     end = asyncio.ensure_future(closing.wait())
     try:
-        await asyncio.wait({coming, end}, return_when=asyncio.FIRST_COMPLETED)
-        if coming.done():
-            return coming.result()
+        await asyncio.wait({update, end}, return_when=asyncio.FIRST_COMPLETED)
+        if update.done():
+            return update.result()
         raise _Ended
     finally:
-        for waiting in (coming, end):
+        for waiting in (update, end):
             if not waiting.done():
                 waiting.cancel()
                 with contextlib.suppress(asyncio.CancelledError):
                     await waiting
 
 
-def _written(update: JobUpdate) -> str:
-    """The update on the wire: its events with ids, and how far the job is (before the event that ends it)."""
+def _as_text(update: JobUpdate) -> str:
+    """The update as text: its events with their ids, and the progress (before the event that ends the job)."""
     parts = [
         f"id: {event.seq}\nevent: {event.type}\ndata: {event.model_dump_json()}\n\n"
         for event in update.events

@@ -9,26 +9,22 @@ from fastapi.responses import Response
 from pydantic import AwareDatetime
 
 from biresnerf.wire.jobs import CancelJob, JobList, JobState, JobView, NewJob
-from biresnerf.wire.problems import FieldProblem
 from service.answers.job_answers import (
     POLL_S,
-    checked_key,
+    IdempotencyKey,
     job_answer,
     job_etag,
     preferred_wait_s,
     waited_for,
 )
 from service.http.access import JobWriter, ReadCaller
-from service.http.dependencies import JobId, next_link
+from service.http.dependencies import IfNoneMatch, JobId, Paged
 from service.http.http_conditionals import none_match
-from service.http.problems import ProblemError, declared
+from service.http.problems import ProblemError, declared, wrong_field
 from service.intake.json_body import json_content, json_request, read_json
 from service.routes.one_shot import submit_form
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
-_ALWAYS = ("database_unavailable", "internal_error")
-_WRITES = ("cross_site", *_ALWAYS)
-_JSON = ("malformed_json", "invalid_request", "body_too_large", "unsupported_media", "body_timeout")
 _TEXTS = json_content(NewJob)["schema"]["properties"]
 _FORM: dict[str, Any] = {
     "schema": {
@@ -62,32 +58,16 @@ _BODY = {
     responses={
         200: {"model": JobView, "description": "The job has ended; only with `Prefer: wait`."},
         **declared(
-            *("malformed_json", "bad_idempotency_key", "not_found", "dataset_not_ready", "body_too_large"),
-            *(
-                "unsupported_media",
-                "invalid_options",
-                "idempotency_key_reused",
-                "archive_rejected",
-                "queue_full",
-            ),
-            *(
-                "storage_full",
-                "too_many_uploads",
-                "body_timeout",
-                "webhook_url_refused",
-                "priority_not_allowed",
-                "quota_exhausted",
-                *_WRITES,
-            ),
+            *("bad_idempotency_key", "not_found", "dataset_not_ready", "invalid_options"),
+            *("idempotency_key_reused", "archive_rejected", "queue_full", "storage_full", "too_many_uploads"),
+            *("webhook_url_refused", "priority_not_allowed", "quota_exhausted"),
         ),
     },
 )
 async def submit_job(
     request: Request,
     caller: JobWriter,
-    idempotency_key: Annotated[
-        str | None, Header(description="Repeating the request with the same key returns the same job.")
-    ] = None,
+    idempotency_key: IdempotencyKey = None,
     prefer: Annotated[
         str | None,
         Header(
@@ -97,7 +77,6 @@ async def submit_job(
     ] = None,
 ) -> Response:
     """Queues a refinement of a ready dataset, or of the archive in a multipart form."""
-    idempotency_key = checked_key(idempotency_key)
     kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
     if kind == "multipart/form-data":
         job, new = await submit_form(caller, request, idempotency_key)
@@ -125,26 +104,26 @@ async def submit_job(
     return job_answer(job, status=200 if job.final else 202, new=new, headers=applied)
 
 
-@router.get("", operation_id="listJobs", responses=declared("bad_cursor", "invalid_request", *_ALWAYS))
+@router.get("", operation_id="listJobs", responses=declared("bad_cursor", "invalid_request"))
 async def list_jobs(
-    request: Request,
-    response: Response,
     caller: ReadCaller,
+    paging: Paged,
     state: JobState | None = None,
     label: Annotated[str | None, Query(max_length=201, description="`name:value`")] = None,
     created_after: Annotated[
         AwareDatetime | None,
         Query(description="RFC 3339, with an offset.", examples=["2026-01-31T12:00:00Z"]),
     ] = None,
-    limit: Annotated[int, Query(ge=1, le=200)] = 50,
-    cursor: Annotated[str | None, Query(max_length=500)] = None,
 ) -> JobList:
     """Refinements, newest first."""
     page = await caller.jobs.list(
-        state=state, label=_label(label), created_after=created_after, limit=limit, cursor=cursor
+        state=state,
+        label=_label(label),
+        created_after=created_after,
+        limit=paging.limit,
+        cursor=paging.cursor,
     )
-    response.headers.update(next_link(request, page.next_cursor))
-    return JobList(items=page.items, next_cursor=page.next_cursor)
+    return paging.answer(JobList, page)
 
 
 def _label(text: str | None) -> tuple[str, str] | None:
@@ -152,10 +131,7 @@ def _label(text: str | None) -> tuple[str, str] | None:
         return None
     name, colon, value = text.partition(":")
     if not colon or "\0" in text:
-        detail = "The label must have the form name:value."
-        raise ProblemError(
-            "invalid_request", detail, errors=[FieldProblem(pointer="/query/label", detail=detail)]
-        )
+        raise wrong_field("/query/label", "The label must have the form name:value.")
     return name, value
 
 
@@ -163,7 +139,7 @@ def _label(text: str | None) -> tuple[str, str] | None:
     "/{job_id}",
     operation_id="getJob",
     response_model=JobView,
-    responses={304: {"description": "Not modified."}, **declared("not_found", "invalid_request", *_ALWAYS)},
+    responses={304: {"description": "Not modified."}, **declared("not_found", "invalid_request")},
 )
 async def get_job(
     job_id: JobId,
@@ -171,7 +147,7 @@ async def get_job(
     wait: Annotated[
         float, Query(ge=0, le=60, description="Respond when the job has ended, or after this many seconds.")
     ] = 0,
-    if_none_match: Annotated[str | None, Header()] = None,
+    if_none_match: IfNoneMatch = None,
 ) -> Response:
     """The current job: state, stage, step, loss, seconds left, position in the queue."""
     jobs = caller.jobs
@@ -189,7 +165,7 @@ async def get_job(
     openapi_extra=json_request(CancelJob, required=False),
     responses={
         202: {"model": JobView, "description": "Cancellation is requested; the job ends within 10 seconds."},
-        **declared("not_found", *_JSON, *_WRITES),
+        **declared("not_found"),
     },
 )
 async def cancel_job(job_id: JobId, request: Request, caller: JobWriter) -> Response:
@@ -205,7 +181,7 @@ async def cancel_job(job_id: JobId, request: Request, caller: JobWriter) -> Resp
     "/{job_id}",
     status_code=204,
     operation_id="deleteJob",
-    responses=declared("not_found", "state_conflict", *_WRITES),
+    responses=declared("not_found", "state_conflict"),
 )
 async def delete_job(job_id: JobId, caller: JobWriter) -> None:
     """Deletes a job that has ended, with its results and exports."""

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated
 
-from fastapi import APIRouter, Header, Response
+from fastapi import APIRouter, Response
 
 from biresnerf import __version__
 from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.service import Info, OptionsView, SizeLimits
 from service.http.access import ReadCaller
+from service.http.dependencies import IfNoneMatch
 from service.http.http_conditionals import none_match
-from service.http.problems import declared
 from service.intake.archive_import import RATIO_MAX
 
 router = APIRouter(tags=["service"])
@@ -24,10 +23,10 @@ ARCHIVES = ["application/zip", "application/x-tar", "application/gzip"]
     "/v1/options",
     operation_id="getOptions",
     response_model=OptionsView,
-    responses={304: {"description": "Not modified."}, **declared("internal_error")},
+    responses={304: {"description": "Not modified."}},
 )
 async def get_options(
-    response: Response, _: ReadCaller, if_none_match: Annotated[str | None, Header()] = None
+    response: Response, _: ReadCaller, if_none_match: IfNoneMatch = None
 ) -> OptionsView | Response:
     """JSON Schema of the options, and the presets with every value filled in."""
     view = OptionsView(
@@ -43,7 +42,10 @@ async def get_options(
     return view
 
 
-@router.get("/v1/info", operation_id="getInfo", responses=declared("internal_error", "database_unavailable"))
+@router.get(
+    "/v1/info",
+    operation_id="getInfo",
+)
 async def get_info(caller: ReadCaller) -> Info:
     """Version and limits of this service, your share of it, and how many of your jobs are in each state."""
     limits = {

@@ -9,9 +9,8 @@ from pathlib import Path
 from fastapi import Request
 
 from biresnerf.wire.jobs import JobTexts, JobView
-from biresnerf.wire.problems import FieldProblem
 from service.http.access import Caller
-from service.http.problems import ProblemError
+from service.http.problems import wrong_field
 from service.intake.archive_import import file_sha256, take_archive
 from service.intake.dataset_finalize import begin_check, finish_check
 from service.intake.json_body import load_json, validate
@@ -48,10 +47,7 @@ async def _taken(
         form = Form("archive", TEXTS, archive, limit, caller.service.disk_budget)
         await form.read(request.headers["content-type"], request.stream())
         if not form.has_file:
-            detail = "The form has no file field `archive`."
-            raise ProblemError(
-                "invalid_request", detail, errors=[FieldProblem(pointer="#/archive", detail=detail)]
-            )
+            raise wrong_field("#/archive", "The form has no file field `archive`.")
         texts = _texts(form)
         digest = await asyncio.to_thread(file_sha256, archive)
         if idempotency_key is not None:

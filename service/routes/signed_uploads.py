@@ -16,8 +16,6 @@ from workers.records import Upload
 from workers.settings.errors import NotFound
 
 router = APIRouter(prefix="/v1", tags=["uploads"])
-_BODY = ("malformed_json", "unsupported_media", "body_timeout", "invalid_request")
-_ALWAYS = ("not_found", "cross_site", "database_unavailable", "storage_unavailable", "internal_error")
 
 
 @router.post(
@@ -25,8 +23,8 @@ _ALWAYS = ("not_found", "cross_site", "database_unavailable", "storage_unavailab
     status_code=201,
     operation_id="signUploads",
     responses=declared(
-        *("direct_upload_unavailable", "dataset_not_open", "body_too_large", "too_many_files"),
-        *("unsafe_path", "quota_exhausted", *_BODY, *_ALWAYS),
+        *("direct_upload_unavailable", "not_found", "dataset_not_open", "too_many_files"),
+        *("unsafe_path", "quota_exhausted", "storage_unavailable"),
     ),
     openapi_extra=json_request(NewSignedUploads),
 )
@@ -69,8 +67,8 @@ def _key(upload: Upload) -> str:
     "/uploads/{upload_id}/complete",
     operation_id="completeUpload",
     responses=declared(
-        *("upload_incomplete", "state_conflict", "dataset_not_open", "digest_mismatch"),
-        *("body_too_large", "too_many_files", "quota_exhausted", *_ALWAYS),
+        *("upload_incomplete", "not_found", "state_conflict", "dataset_not_open", "digest_mismatch"),
+        *("body_too_large", "too_many_files", "quota_exhausted", "storage_unavailable"),
     ),
 )
 async def complete_upload(upload_id: UploadId, caller: DatasetWriter) -> FileView:

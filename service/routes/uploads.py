@@ -29,7 +29,7 @@ VERSION = "1.0.0"
 CONTENT_TYPE = "application/offset+octet-stream"
 SPEAKS = {"Tus-Resumable": VERSION}
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_ALWAYS = ("precondition_failed", "database_unavailable", "storage_unavailable", "internal_error")
+_ALWAYS = ("precondition_failed", "storage_unavailable")
 _METADATA = (
     "`name BASE64` pairs with commas between. `path`: the upload is this one file; without it, an archive. "
     "`sha256`: the digest of the whole upload, in hex."
@@ -68,7 +68,7 @@ def _where(upload: Upload) -> dict[str, str]:
     "/datasets/{dataset_id}/uploads",
     status_code=204,
     operation_id="describeUploads",
-    responses=declared("not_found", "internal_error"),
+    responses=declared("not_found"),
 )
 async def describe_uploads(dataset_id: DatasetId, caller: ReadCaller) -> Response:
     """Which parts of the tus protocol are supported."""
@@ -87,7 +87,7 @@ async def describe_uploads(dataset_id: DatasetId, caller: ReadCaller) -> Respons
     response_model=UploadView,
     responses=declared(
         *("not_found", "dataset_not_open", "invalid_request", "unsafe_path", "body_too_large"),
-        *("too_many_files", "storage_full", "quota_exhausted", "cross_site", *_ALWAYS),
+        *("too_many_files", "storage_full", "quota_exhausted", *_ALWAYS),
     ),
     dependencies=[SameVersion],
 )
@@ -160,7 +160,7 @@ _APPENDS: dict[str, Any] = {
     operation_id="appendUpload",
     responses=declared(
         *("not_found", "offset_mismatch", "body_too_large", "unsupported_media", "invalid_request"),
-        *("body_timeout", "storage_full", "too_many_uploads", "cross_site", *_ALWAYS),
+        *("body_timeout", "storage_full", "too_many_uploads", *_ALWAYS),
     ),
     dependencies=[SameVersion],
     openapi_extra=_APPENDS,
@@ -194,7 +194,7 @@ async def append_upload(
     "/uploads/{upload_id}",
     status_code=204,
     operation_id="deleteUpload",
-    responses=declared("not_found", "cross_site", *_ALWAYS),
+    responses=declared("not_found", *_ALWAYS),
     dependencies=[SameVersion],
 )
 async def delete_upload(upload_id: UploadId, caller: DatasetWriter) -> None:

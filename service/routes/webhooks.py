@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Response
 
 from biresnerf.wire.webhooks import (
     DeliveryList,
@@ -18,14 +18,11 @@ from biresnerf.wire.webhooks import (
     webhook_url,
 )
 from service.http.access import JobWriter, ReadCaller
-from service.http.dependencies import DeliveryId, WebhookId, next_link
+from service.http.dependencies import DeliveryId, Paged, WebhookId
 from service.http.problems import declared
 from service.intake.json_body import body_of, json_request
 
 router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
-_ALWAYS = ("database_unavailable", "internal_error")
-_WRITES = ("cross_site", *_ALWAYS)
-_BODY = ("malformed_json", "body_too_large", "unsupported_media", "body_timeout", "invalid_request")
 
 
 @router.post(
@@ -33,7 +30,7 @@ _BODY = ("malformed_json", "body_too_large", "unsupported_media", "body_timeout"
     status_code=201,
     operation_id="createWebhook",
     openapi_extra=json_request(NewWebhook),
-    responses=declared(*_BODY, "webhook_url_refused", "too_many_webhooks", *_WRITES),
+    responses=declared("webhook_url_refused", "too_many_webhooks"),
 )
 async def create_webhook(
     caller: JobWriter, body: Annotated[NewWebhook, Depends(body_of(NewWebhook))], response: Response
@@ -44,24 +41,20 @@ async def create_webhook(
     return WebhookWithSecret(**dict(webhook), secret=secret)
 
 
-@router.get("", operation_id="listWebhooks", responses=declared("bad_cursor", "invalid_request", *_ALWAYS))
+@router.get("", operation_id="listWebhooks", responses=declared("bad_cursor", "invalid_request"))
 async def list_webhooks(
-    request: Request,
-    response: Response,
     caller: ReadCaller,
+    paging: Paged,
     job: Annotated[
         str | None, Query(max_length=100, pattern="^[0-9A-Za-z_]*$", description="Only those of this job.")
     ] = None,
-    limit: Annotated[int, Query(ge=1, le=200)] = 50,
-    cursor: Annotated[str | None, Query(max_length=500)] = None,
 ) -> WebhookList:
     """Lists the webhooks for all jobs, or those of one job; newest first."""
-    page = await caller.webhooks.list(job_id=job, limit=limit, cursor=cursor)
-    response.headers.update(next_link(request, page.next_cursor))
-    return WebhookList(items=page.items, next_cursor=page.next_cursor)
+    page = await caller.webhooks.list(job_id=job, limit=paging.limit, cursor=paging.cursor)
+    return paging.answer(WebhookList, page)
 
 
-@router.get("/{webhook_id}", operation_id="getWebhook", responses=declared("not_found", *_ALWAYS))
+@router.get("/{webhook_id}", operation_id="getWebhook", responses=declared("not_found"))
 async def get_webhook(webhook_id: WebhookId, caller: ReadCaller) -> WebhookView:
     """The webhook, and since when its deliveries fail."""
     return await caller.webhooks.get(webhook_id)
@@ -71,7 +64,7 @@ async def get_webhook(webhook_id: WebhookId, caller: ReadCaller) -> WebhookView:
     "/{webhook_id}",
     operation_id="changeWebhook",
     openapi_extra=json_request(WebhookChange),
-    responses=declared("not_found", *_BODY, "webhook_url_refused", *_WRITES),
+    responses=declared("not_found", "webhook_url_refused"),
 )
 async def change_webhook(
     caller: JobWriter, webhook_id: WebhookId, body: Annotated[WebhookChange, Depends(body_of(WebhookChange))]
@@ -84,16 +77,14 @@ async def change_webhook(
     "/{webhook_id}",
     status_code=204,
     operation_id="deleteWebhook",
-    responses=declared("not_found", *_WRITES),
+    responses=declared("not_found"),
 )
 async def delete_webhook(webhook_id: WebhookId, caller: JobWriter) -> None:
     """Deletes the webhook with its deliveries; messages that wait are not sent."""
     await caller.webhooks.delete(webhook_id)
 
 
-@router.post(
-    "/{webhook_id}/secret", operation_id="rotateWebhookSecret", responses=declared("not_found", *_WRITES)
-)
+@router.post("/{webhook_id}/secret", operation_id="rotateWebhookSecret", responses=declared("not_found"))
 async def rotate_secret(webhook_id: WebhookId, caller: JobWriter) -> WebhookWithSecret:
     """Creates a new secret. For 24 hours messages are also signed with the previous one."""
     webhook, secret = await caller.webhooks.rotate(webhook_id)
@@ -104,7 +95,7 @@ async def rotate_secret(webhook_id: WebhookId, caller: JobWriter) -> WebhookWith
     "/{webhook_id}/test",
     status_code=202,
     operation_id="testWebhook",
-    responses=declared("not_found", "state_conflict", *_WRITES),
+    responses=declared("not_found", "state_conflict"),
 )
 async def test_webhook(webhook_id: WebhookId, caller: JobWriter, response: Response) -> DeliveryView:
     """Sends a message `webhook.test`; its delivery is at `Location`."""
@@ -116,26 +107,22 @@ async def test_webhook(webhook_id: WebhookId, caller: JobWriter, response: Respo
 @router.get(
     "/{webhook_id}/deliveries",
     operation_id="listDeliveries",
-    responses=declared("bad_cursor", "not_found", "invalid_request", *_ALWAYS),
+    responses=declared("bad_cursor", "not_found", "invalid_request"),
 )
 async def list_deliveries(
     webhook_id: WebhookId,
-    request: Request,
-    response: Response,
     caller: ReadCaller,
-    limit: Annotated[int, Query(ge=1, le=200)] = 50,
-    cursor: Annotated[str | None, Query(max_length=500)] = None,
+    paging: Paged,
 ) -> DeliveryList:
     """Messages sent and waiting, newest first, with the time and status of every attempt."""
-    page = await caller.webhooks.deliveries(webhook_id, limit=limit, cursor=cursor)
-    response.headers.update(next_link(request, page.next_cursor))
-    return DeliveryList(items=page.items, next_cursor=page.next_cursor)
+    page = await caller.webhooks.deliveries(webhook_id, limit=paging.limit, cursor=paging.cursor)
+    return paging.answer(DeliveryList, page)
 
 
 @router.get(
     "/{webhook_id}/deliveries/{delivery_id}",
     operation_id="getDelivery",
-    responses=declared("not_found", *_ALWAYS),
+    responses=declared("not_found"),
 )
 async def get_delivery(webhook_id: WebhookId, delivery_id: DeliveryId, caller: ReadCaller) -> DeliveryView:
     """One message and its attempts."""
@@ -146,7 +133,7 @@ async def get_delivery(webhook_id: WebhookId, delivery_id: DeliveryId, caller: R
     "/{webhook_id}/deliveries/{delivery_id}/redeliver",
     status_code=202,
     operation_id="redeliver",
-    responses=declared("not_found", "state_conflict", *_WRITES),
+    responses=declared("not_found", "state_conflict"),
 )
 async def redeliver(webhook_id: WebhookId, delivery_id: DeliveryId, caller: JobWriter) -> DeliveryView:
     """Sends a message again at once, with its original id, so that receivers recognise it."""
