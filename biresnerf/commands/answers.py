@@ -33,6 +33,14 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def show(answer: BaseModel | dict[str, Any] | Sequence[BaseModel], text: str, *, as_json: bool) -> None:
+    """Print the answer as one JSON document, or else the text."""
+    if as_json:
+        print_json(answer)
+    elif text:
+        click.echo(text)
+
+
 def with_code(error: Exception) -> str:
     """The error's message and its code, under which docs/troubleshooting.md lists it."""
     code = getattr(error, "code", None)

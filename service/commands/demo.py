@@ -41,7 +41,7 @@ def run_demo(scene: Path | None, output: Path, options: RefineOptions, views: in
     """Runs the demo; all its files are in ``output`` afterwards. Raises `BiresnerfError`."""
     output = output.resolve()
     if scene is not None:
-        look_at(scene)  # raises before anything starts
+        look_at(scene)  # raises if the scene cannot be used
     _clear(output)
     given = scene or _make_scene(output / "scene", views, size)
     result = output / "result"
@@ -71,7 +71,7 @@ def _make_scene(scene: Path, views: int, size: int) -> Path:
 
 
 def _biresnerf(*arguments: object) -> str:
-    """Runs another command in a process of its own, as it loads torch; returns its output."""
+    """The output of another command, run in its own process because it loads torch."""
     command = [sys.executable, "-m", "biresnerf.command_line", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode != 0:
@@ -83,13 +83,13 @@ def _biresnerf(*arguments: object) -> str:
 def _service() -> Iterator[str]:
     """Runs a service on a free port, with a private database; deletes both at the end."""
     home = Path(tempfile.mkdtemp(prefix="biresnerf-demo-"))
-    home.chmod(0o711)  # the database runs as another user where root starts it
+    home.chmod(0o711)  # if root starts the database, it runs as another user
     environment = {name: value for name, value in os.environ.items() if not name.startswith("BIRESNERF_")}
     environment["BIRESNERF_DATA_DIR"] = str(home / "data")
     log = home / "service.log"
     command = [sys.executable, "-m", "biresnerf.command_line", "up", "--port", "0", "--slots", "1"]
     with log.open("wb") as errors:
-        # In a session of its own, Ctrl-C does not reach it. It ends by itself if this process is killed.
+        # In its own session it does not receive Ctrl-C; `dying_with_parent` ends it if this process is killed.
         process = subprocess.Popen(
             dying_with_parent(command, signal_number=signal.SIGINT),
             env=environment,
@@ -129,7 +129,7 @@ def _send_and_fetch(url: str, scene: Path, target: Path, options: RefineOptions)
 
 
 def _print_outcome(result: Path, scene: Path, truth: Path | None) -> None:
-    """Prints the pose errors before and after, or how far the poses moved where the truth is not known."""
+    """Prints the pose errors before and after, or how far the poses moved if the truth is unknown."""
     report = Report.model_validate_json((result / "report.json").read_bytes())
     click.echo()
     for line in report.verdict.in_words() if report.verdict is not None else []:

@@ -20,11 +20,11 @@ _CONNECT_S = 10
 
 
 def database() -> Found:
-    """The database that is configured answers, or a private PostgreSQL starts."""
+    """The configured database responds, or a private PostgreSQL starts."""
     try:
         settings = Settings()
     except ValidationError as error:
-        return Found("settings", "broken", f"{error.error_count()} are wrong", "`biresnerf up` says which.")
+        return Found("settings", "broken", f"{error.error_count()} are invalid", "`biresnerf up` lists them.")
     try:
         if settings.database_url is not None:
             return _configured(settings.require_database_url())
@@ -40,7 +40,7 @@ def _configured(url: str) -> Found:
 
 def _embedded() -> Found:
     home = Path(tempfile.mkdtemp(prefix="biresnerf-doctor-"))
-    home.chmod(0o711)  # the database runs as another user where root starts it
+    home.chmod(0o711)  # if root starts the database, it runs as another user
     postgres = EmbeddedPostgres(home / "postgres")
     try:
         with psycopg.connect(postgres.start(), connect_timeout=_CONNECT_S) as connection:
@@ -55,25 +55,25 @@ def _version(connection: psycopg.Connection) -> str:
 
 
 def disk() -> Found:
-    """What uploads and jobs may still take."""
+    """The disk space that uploads and jobs may still use."""
     try:
         settings = Settings()
     except ValidationError:
-        return Found("service disk", "missing", "not looked at, for wrong settings")
+        return Found("service disk", "missing", "not checked: the settings are invalid")
     free = DiskBudget((settings.data_dir,), settings.disk_reserve_bytes).free_bytes()
     detail = f"{free / 2**30:.1f} GiB may be used in {settings.data_dir}"
     if free > 0:
         return Found("service disk", "good", detail)
-    return Found("service disk", "broken", detail, "Make room, or name another folder in BIRESNERF_DATA_DIR.")
+    return Found(
+        "service disk", "broken", detail, "Free some space, or set BIRESNERF_DATA_DIR to another folder."
+    )
 
 
 def page() -> Found:
     """The page at `/`."""
     if (FOLDER / "index.html").is_file():
         return Found("web page", "good", "built")
-    return Found(
-        "web page", "missing", "is not built: the service answers at /docs and /v1 alone", "make web"
-    )
+    return Found("web page", "missing", "is not built: only /docs and /v1 are available", "make web")
 
 
 CHECKS: tuple[Check, ...] = (database, disk, page)

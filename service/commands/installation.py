@@ -1,4 +1,4 @@
-"""The settings and the database of this installation, for the commands of its operator."""
+"""The settings and the database of this installation, for the operator's commands."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def settings_with(**given: Any) -> Settings:
 
 @contextmanager
 def setup_problems() -> Iterator[None]:
-    """Turns wrong settings into an `InputError`."""
+    """Turns invalid settings into an `InputError`."""
     from pydantic import ValidationError
 
     from workers.settings.errors import SetupError

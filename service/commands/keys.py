@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.answers import json_option, print_json, show
 from biresnerf.errors import InputError
 from service.commands.installation import data_dir_option, with_database
 
@@ -87,11 +87,7 @@ def list_command(tenant: str | None, as_json: bool, data_dir: Path | None) -> No
     from workers.tenants.api_keys import KeyStore
 
     found = with_database(data_dir, lambda database: KeyStore(database).list(tenant))
-    if as_json:
-        print_json(found)
-        return
-    for key in found:
-        click.echo(_line(key))
+    show(found, "\n".join(map(_line, found)), as_json=as_json)
 
 
 @keys_command.command("revoke")
@@ -107,10 +103,7 @@ def revoke_command(key_id: str, as_json: bool, data_dir: Path | None) -> None:
         key = with_database(data_dir, lambda database: KeyStore(database).revoke(key_id))
     except NotFound as error:
         raise InputError.of(error.fault, hint="`biresnerf keys list` shows the ids.") from None
-    if as_json:
-        print_json(key)
-    else:
-        click.echo(_line(key))
+    show(key, _line(key), as_json=as_json)
 
 
 def _line(key: ApiKey) -> str:

@@ -1,4 +1,4 @@
-"""Commands that run the service's processes. Imports happen when one runs."""
+"""Commands that run the service's processes; each imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 
 import click
 
-from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.settings_option import settings_option
 from service.commands.installation import settings_with, setup_problems
 
 
 def free_port() -> int:
-    """A port that nothing listens on at the moment."""
+    """A free port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -117,29 +117,20 @@ def migrate_command(as_json: bool) -> None:
 
     with setup_problems():
         applied = migrate(settings_with().require_database_url())
-    if as_json:
-        print_json({"applied": applied})
-    else:
-        click.echo("\n".join(f"applied {name}" for name in applied) or "The database is up to date.")
+    lines = [f"applied {name}" for name in applied] or ["The database is up to date."]
+    show({"applied": applied}, "\n".join(lines), as_json=as_json)
 
 
 @click.command("demo")
 @click.option("--scene", type=click.Path(path_type=Path), help="Your own folder or transforms.json.")
 @click.option(
-    "--output",
-    type=click.Path(path_type=Path),
-    default=Path("demo-output"),
-    show_default=True,
+    "--output", type=click.Path(path_type=Path), default=Path("demo-output"), show_default=True,
     help="Folder for all files.",
-)
+)  # fmt: skip
 @click.option("--preset", default="fast", show_default=True, help="fast, balanced, quality or paper.")
 @click.option(
-    "--views",
-    type=click.IntRange(6, 400),
-    default=60,
-    show_default=True,
-    help="Images of the synthetic scene.",
-)
+    "--views", type=click.IntRange(6, 400), default=60, show_default=True, help="Images of the synthetic scene."
+)  # fmt: skip
 @click.option(
     "--size", type=click.IntRange(32, 800), default=100, show_default=True, help="Width of its images, px."
 )

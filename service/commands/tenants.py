@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.answers import json_option, show
 from service.commands.installation import data_dir_option, with_database
 
 if TYPE_CHECKING:
@@ -32,11 +32,7 @@ def list_command(as_json: bool, data_dir: Path | None) -> None:
     from workers.tenants.tenants import TenantStore
 
     found = with_database(data_dir, lambda database: TenantStore(database).shares())
-    if as_json:
-        print_json(found)
-        return
-    for share in found:
-        click.echo(_line(share))
+    show(found, "\n".join(map(_line, found)), as_json=as_json)
 
 
 @tenants_command.command("set")
@@ -57,10 +53,7 @@ def set_command(name: str, as_json: bool, data_dir: Path | None, **changes: Any)
     from workers.tenants.tenants import TenantStore
 
     share = with_database(data_dir, lambda database: TenantStore(database).set(name, **changes))
-    if as_json:
-        print_json(share)
-    else:
-        click.echo(_line(share))
+    show(share, _line(share), as_json=as_json)
 
 
 def _line(share: TenantShare) -> str:

@@ -1,4 +1,4 @@
-"""Commands for webhooks and backups. Imports happen when one runs."""
+"""The commands `dispatcher`, `backup` and `restore`; each imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.answers import json_option, show
 from service.commands.installation import data_dir_option, settings_with, setup_problems
 
 if TYPE_CHECKING:
     from workers.upkeep.backup_folder import BackupIndex
-
-MIB = 2**20
 
 
 @click.command("dispatcher")
@@ -49,7 +47,7 @@ def backup_command(folder: Path, data_dir: Path | None, as_json: bool) -> None:
         settings = settings_with(data_dir=data_dir)
         with reached_database(settings) as url:
             index = asyncio.run(make_backup(settings, url, folder))
-    _tell(index, as_json)
+    _show_backup(index, as_json)
     if index.gone and not as_json:
         click.echo(f"Deleted by the service meanwhile: {len(index.gone)} files.")
 
@@ -70,16 +68,16 @@ def restore_command(folder: Path, data_dir: Path | None, as_json: bool) -> None:
 
     with setup_problems():
         settings = settings_with(data_dir=data_dir)
-        read_index(folder)  # before a database is made for it
+        read_index(folder)  # raises before a database is created
         with reached_database(settings, migrated=False) as url:
             index = asyncio.run(restore_backup(settings, url, folder))
-    _tell(index, as_json)
+    _show_backup(index, as_json)
 
 
-def _tell(index: BackupIndex, as_json: bool) -> None:
-    made_at, files, gone = index.made_at, len(index.files), len(index.gone)
-    if as_json:
-        print_json({"made_at": made_at.isoformat(), "files": files, "bytes": index.bytes, "gone": gone})
-    else:
-        size = f"{index.bytes / MIB:.1f} MiB"
-        click.echo(f"Backup of {made_at:%Y-%m-%d %H:%M:%S} UTC: database and {files} files, {size}.")
+def _show_backup(index: BackupIndex, as_json: bool) -> None:
+    made_at, files, size = index.made_at, len(index.files), f"{index.bytes / 2**20:.1f} MiB"
+    document = {
+        "made_at": made_at.isoformat(), "files": files, "bytes": index.bytes, "gone": len(index.gone),
+    }  # fmt: skip
+    text = f"Backup of {made_at:%Y-%m-%d %H:%M:%S} UTC: database and {files} files, {size}."
+    show(document, text, as_json=as_json)

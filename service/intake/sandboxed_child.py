@@ -1,7 +1,7 @@
-"""Child programs that read what strangers sent: the parent waits with limits, the child confines itself.
+"""Child programs that parse untrusted files, with limits on time, memory and disk.
 
-The web process never parses an archive or an image. A child takes one JSON request as its argument and
-answers with one JSON line: ``{"result": ...}`` or ``{"error": a fault}``.
+The web process never parses an archive or an image. A child reads one JSON request from standard input and
+writes one JSON line: ``{"result": ...}`` or ``{"error": a fault}``.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ async def run_confined(module: str, request: BaseModel, limits: Limits) -> dict[
     """Runs ``python -m module`` on the request and returns its result.
 
     Raises:
-        ProblemError: what the child found wrong; ``validation_timeout``; ``validation_resources`` where
-            it died by memory or by a signal.
+        ProblemError: the child's error; ``validation_timeout``; ``validation_resources`` if it ran out of
+            memory or was killed.
     """
     command = [sys.executable, "-P", "-m", module, limits.model_dump_json()]
     child = await asyncio.create_subprocess_exec(
@@ -54,7 +54,7 @@ async def run_confined(module: str, request: BaseModel, limits: Limits) -> dict[
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
         start_new_session=True,
-        # It reads what strangers sent: no address of the database, no secret.
+        # The child parses untrusted files, so it gets no database URL and no secret.
         env={**{k: v for k, v in os.environ.items() if not k.startswith("BIRESNERF_")}, **_ONE_THREAD},
         limit=_ANSWER_BYTES_MAX,
     )
@@ -87,17 +87,17 @@ def _read_answer(module: str, answer: bytes, log: bytes, status: int | None) -> 
     logger.error("%s ended with status %s: %s", module, status, log[-2000:].decode(errors="replace"))
     raise ProblemError(
         "validation_resources",
-        "Reading the files took more memory than is allowed, or broke the reader.",
-        hint="Look for damaged or enormous files among what was sent.",
+        "Reading the files exceeded the memory limit or crashed the reader.",
+        hint="Check for damaged or very large files.",
     )
 
 
 def run_child(work: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
-    """The child's side: sets its limits, works, answers. Called under ``if __name__ == "__main__"``."""
+    """Runs ``work`` in the child, with its limits. Call it under ``if __name__ == "__main__"``."""
     limits = Limits.model_validate_json(sys.argv[1])
     _confine(limits)
     request = json.loads(sys.stdin.buffer.read())
-    # Whatever libraries print must not mix with the answer.
+    # Output that libraries print must not mix with the answer.
     answer_to = os.dup(1)
     os.dup2(2, 1)
     try:
@@ -116,6 +116,6 @@ def _confine(limits: Limits) -> None:
         (resource.RLIMIT_CPU, int(limits.seconds) + 1),
         (resource.RLIMIT_CORE, 0),
     ):
-        _, most = resource.getrlimit(kind)
-        wanted = amount if most == resource.RLIM_INFINITY else min(amount, most)
-        resource.setrlimit(kind, (wanted, wanted))
+        _, hard = resource.getrlimit(kind)
+        limit = amount if hard == resource.RLIM_INFINITY else min(amount, hard)
+        resource.setrlimit(kind, (limit, limit))

@@ -1,6 +1,6 @@
-"""Child program: unpacks one uploaded archive (zip, tar, tar.gz) into a fresh folder, or says why not.
+"""Child program that unpacks one uploaded archive (zip, tar, tar.gz) into an empty folder.
 
-Nothing the archive says about itself is believed: bytes and files are counted as they come out.
+Sizes and counts in the archive's headers are not trusted: bytes and files are counted as they are unpacked.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from biresnerf.wire.safe_paths import NameSet, checked_path, is_litter
 from service.intake.sandboxed_child import run_child
 
 _CHUNK = 2**20
-# Small archives of text may shrink far more than photos do; below this size the ratio says nothing.
+# Text compresses far better than photos, so the ratio is not checked below this size.
 RATIO_FREE_BYTES = 16 * 2**20
 _METHODS = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
 _ENCRYPTED = 0x1 | 0x40
 _TAR_BLOCK = 512
-_MEND_PACK = "Pack plain files and folders only, as zip, tar or tar.gz."
+_PACK_HINT = "Pack plain files and folders only, as zip, tar or tar.gz."
 
 
 class UnpackRequest(BaseModel):
-    """What to unpack, where to, and how much may come out."""
+    """An archive, the target folder, and the limits."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     archive: Path
-    into: Path = Field(description="An empty folder of our own.")
+    into: Path = Field(description="An empty folder of this process.")
     files_max: int
     bytes_max: int = Field(description="Bytes of all files together.")
     file_bytes_max: int = Field(description="Bytes of one file.")
@@ -63,7 +63,7 @@ def unpack(request: UnpackRequest) -> dict[str, Any]:
             elif head[257:262] == b"ustar":
                 _unpack_tar(file, sink)
             else:
-                raise _rejected("This is no zip, tar or tar.gz archive.", hint=_MEND_PACK)
+                raise _rejected("This is not a zip, tar or tar.gz archive.", hint=_PACK_HINT)
     except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise _rejected(f"The archive is broken: {error}.", where=sink.current) from None
     except (NotImplementedError, ValueError, OverflowError) as error:
@@ -80,7 +80,7 @@ def unpack(request: UnpackRequest) -> dict[str, Any]:
 
 
 class _Sink:
-    """Writes entries under the folder and keeps the counts."""
+    """Writes entries into the folder, within the limits."""
 
     def __init__(self, request: UnpackRequest) -> None:
         self.request = request
@@ -93,10 +93,10 @@ class _Sink:
         self._by_ratio = self.budget < request.bytes_max
 
     def entry(self, name: str) -> str | None:
-        """The safe path of an entry about to be read; None for what desktops add by themselves."""
+        """The safe path of the next entry; None for files that an operating system added."""
         self.current = name.encode("unicode_escape").decode()[:300]
         self._entries += 1
-        # Folders count too: they cost inodes just as files do.
+        # Folders count too: they also use inodes.
         if self._entries > 2 * self.request.files_max + 64:
             raise self._too_many()
         path = checked_path(name)
@@ -130,7 +130,7 @@ class _Sink:
             raise self.over_budget()
 
     def over_budget(self) -> InputError:
-        """More came out than may."""
+        """The error for an archive that unpacks to more than is allowed."""
         what = f"The archive unpacks to more than {self.budget} bytes."
         if self._by_ratio:
             what = f"The archive unpacks to more than {self.request.ratio_max:g} times its size."
@@ -148,7 +148,7 @@ class _Sink:
 def _unpack_zip(file: IO[bytes], sink: _Sink) -> None:
     with zipfile.ZipFile(file) as archive:
         for info in archive.infolist():
-            # zipfile cuts names at NUL and turns separators; the original tells what was meant.
+            # zipfile truncates names at NUL and replaces separators; check the original name.
             path = sink.entry(info.orig_filename.removesuffix("/") if info.is_dir() else info.orig_filename)
             mode = info.external_attr >> 16
             if info.flag_bits & _ENCRYPTED:
@@ -156,7 +156,7 @@ def _unpack_zip(file: IO[bytes], sink: _Sink) -> None:
                     "The entry is encrypted.", where=sink.current, hint="Pack without a password."
                 )
             if stat.S_IFMT(mode) not in {0, stat.S_IFREG, stat.S_IFDIR}:
-                raise _rejected("The entry is a link or a device.", where=sink.current, hint=_MEND_PACK)
+                raise _rejected("The entry is a link or a device.", where=sink.current, hint=_PACK_HINT)
             if info.is_dir() or path is None:
                 continue
             if info.compress_type not in _METHODS:
@@ -178,16 +178,16 @@ def _unpack_tar(plain: IO[bytes] | gzip.GzipFile, sink: _Sink) -> None:
                 continue
             if not member.isreg() or member.issparse():
                 raise _rejected(
-                    "The entry is a link, a device or sparse.", where=sink.current, hint=_MEND_PACK
+                    "The entry is a link, a device or sparse.", where=sink.current, hint=_PACK_HINT
                 )
             if member.size < 0:
-                raise _rejected("The entry has a size below nothing.", where=sink.current)
+                raise _rejected("The entry has a negative size.", where=sink.current)
             content = archive.extractfile(member)
             if content is None:
                 raise _rejected("The entry has no content.", where=sink.current)
             if path is not None:
                 sink.write(path, content)
-    # tarfile takes any end of the file for the end of the archive; a whole archive ends in zero blocks.
+    # tarfile accepts a truncated archive; a complete one ends with blocks of zeros.
     while counted.read(_CHUNK):
         pass
     if counted.tail.strip(b"\0") or len(counted.tail) < _TAR_BLOCK:
@@ -196,16 +196,16 @@ def _unpack_tar(plain: IO[bytes] | gzip.GzipFile, sink: _Sink) -> None:
 
 def _members(archive: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
     while (member := archive.next()) is not None:
-        # A streamed archive keeps all members otherwise: memory that grows with the archive.
+        # tarfile would keep all members of a stream, so memory would grow with the archive.
         archive.members = []  # type: ignore[attr-defined]
-        # `.` itself is what `tar czf x.tgz .` begins with.
+        # `tar czf x.tgz .` begins with an entry for `.` itself.
         if member.isdir() and member.name in {".", "./"}:
             continue
         yield member
 
 
 class _CountedReader:
-    """Bytes of a tar as they come out of the decompressor, headers and padding included, with a cap."""
+    """The decompressed bytes of a tar, headers and padding included, up to a limit."""
 
     def __init__(self, plain: IO[bytes] | gzip.GzipFile, sink: _Sink) -> None:
         self._plain, self._sink = plain, sink
@@ -222,7 +222,7 @@ class _CountedReader:
 
 
 def _rejected(
-    what: str, *, where: str = "", hint: str = "Pack the archive anew and send it again."
+    what: str, *, where: str = "", hint: str = "Create the archive again and resend it."
 ) -> InputError:
     return InputError("archive_rejected", what, where=where, hint=hint)
 

@@ -1,4 +1,4 @@
-"""Request bodies on their way to disk: counted as they come, never gathered in memory."""
+"""Streams request bodies to disk, within limits, without holding them in memory."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from workers.process.disk_space import DiskBudget
 _FIELD_BYTES_MAX = 256 * 1024
 _HEADER_BYTES_MAX = 8 * 1024
 _LOCK = ".in-use"
-# A client that sends nothing for so long holds a connection and a folder for nothing.
+# A client that sends nothing for this long only occupies a connection and a folder.
 IDLE_S = 60.0
-_LOOK_BYTES = 16 * 2**20  # between two looks at the disk
+_CHECK_EVERY_BYTES = 16 * 2**20  # between two checks of the free disk space
 
 
 def too_large(limit_bytes: int) -> ProblemError:
-    """The answer to a body beyond the limit."""
+    """The error for a body beyond the limit."""
     return ProblemError(
         "body_too_large",
         f"The body is larger than {limit_bytes} bytes.",
@@ -40,7 +40,7 @@ def too_large(limit_bytes: int) -> ProblemError:
 def refuse_announced_excess(
     content_length: str | None, limit_bytes: int, room: DiskBudget | None = None
 ) -> None:
-    """Refuses by Content-Length before a byte is read; the count while reading holds in any case."""
+    """Refuses a body by its Content-Length before it is read; `capped` counts what really arrives."""
     if content_length is not None and content_length.isdigit():
         if int(content_length) > limit_bytes:
             raise too_large(limit_bytes)
@@ -51,14 +51,14 @@ def refuse_announced_excess(
 async def capped(
     stream: AsyncIterator[bytes], limit_bytes: int, idle_s: float = IDLE_S, room: DiskBudget | None = None
 ) -> AsyncIterator[bytes]:
-    """The stream.
+    """The stream, with limits on its size and on the time between two chunks.
 
     Raises:
-        ProblemError: ``body_too_large`` at the first byte beyond the limit; ``body_timeout`` where nothing
-            comes for ``idle_s``.
-        LimitReached: ``storage_full`` where ``room`` says so, at the start or on the way.
+        ProblemError: ``body_too_large`` at the first byte beyond the limit; ``body_timeout`` if nothing
+            arrives for ``idle_s``.
+        LimitReached: ``storage_full`` if the disk has no room, at the start or later.
     """
-    total, looked_at = 0, -_LOOK_BYTES
+    total, checked_at = 0, -_CHECK_EVERY_BYTES
     while True:
         try:
             async with asyncio.timeout(idle_s):
@@ -70,16 +70,16 @@ async def capped(
         total += len(chunk)
         if total > limit_bytes:
             raise too_large(limit_bytes)
-        if room is not None and total - looked_at >= _LOOK_BYTES:
+        if room is not None and total - checked_at >= _CHECK_EVERY_BYTES:
             await asyncio.to_thread(room.require)
-            looked_at = total
+            checked_at = total
         yield chunk
 
 
 async def write_stream(
     stream: AsyncIterator[bytes], target: Path, limit_bytes: int, room: DiskBudget | None = None
 ) -> int:
-    """Writes the stream into a new file; returns its bytes. Raises as `capped` does."""
+    """Writes the stream to a new file; returns its size. Raises what `capped` raises."""
     total = 0
     with target.open("xb") as out:
         async for chunk in capped(stream, limit_bytes, room=room):
@@ -90,7 +90,7 @@ async def write_stream(
 
 @asynccontextmanager
 async def staging_folder(root: Path) -> AsyncIterator[Path]:
-    """A private folder that goes away in any case: at the end of the block, or at the next start."""
+    """A private folder, deleted at the end of the block or, after a crash, at the next start."""
     folder = root / uuid.uuid4().hex
     folder.mkdir(parents=True, mode=0o700)
     with (folder / _LOCK).open("wb") as lock:
@@ -102,7 +102,7 @@ async def staging_folder(root: Path) -> AsyncIterator[Path]:
 
 
 def sweep_staging(root: Path) -> int:
-    """Removes staging folders whose process is gone (its lock with it); returns how many."""
+    """Removes staging folders of dead processes, which no longer hold the lock; returns how many."""
     removed = 0
     for folder in root.iterdir() if root.is_dir() else ():
         try:
@@ -111,7 +111,7 @@ def sweep_staging(root: Path) -> int:
         except BlockingIOError:
             continue
         except OSError:
-            # No lock file: made a moment ago by a living process, or a torn removal; age tells.
+            # Without a lock file the folder is either brand new or half removed; its age tells which.
             if _younger_than(folder, 3600):
                 continue
         shutil.rmtree(folder, ignore_errors=True)
@@ -127,7 +127,7 @@ def _younger_than(path: Path, seconds: float) -> bool:
 
 
 class Form:
-    """A multipart form read from a stream: one file part to disk, small text fields to memory."""
+    """A multipart form read from a stream: one file goes to disk, small text fields to memory."""
 
     def __init__(
         self,
@@ -176,7 +176,7 @@ class Form:
             raise ProblemError("malformed_body", "The form is cut short: its end mark is missing.")
 
     async def _flush(self) -> None:
-        """Moves what the parser gave for the file to disk, outside of the event loop."""
+        """Writes the parsed bytes of the file to disk, in a thread."""
         if self._pending and self._out is not None:
             block, self._pending = b"".join(self._pending), []
             await asyncio.to_thread(self._out.write, block)

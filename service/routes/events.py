@@ -21,7 +21,7 @@ router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
 KEEP_ALIVE_S = 15.0
 _RETRY_MS = 2000
 # Another web process may be running already; the job continues.
-_GOODBYE = ": this process is stopping; reconnect with the id of the last event\nretry: 500\n\n"
+_GOODBYE = ": this process is stopping; connect again with the last event's id\nretry: 500\n\n"
 _STREAM: dict[int | str, dict[str, Any]] = {
     200: {
         "description": (

@@ -1,4 +1,4 @@
-"""One multipart request that is a whole job: archive in, dataset checked, job queued."""
+"""Submits a job with one multipart request: archive in, dataset checked, job queued."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from service.intake.uploads import Form, refuse_announced_excess, staging_folder
 from workers.settings.errors import EngineError
 from workers.webhooks.webhooks import request_with
 
-# Room for the text fields and the form's own lines beside the archive.
+# For the text fields and the delimiters of the form.
 _FORM_BYTES = 2**20
 TEXTS = frozenset(JobTexts.model_fields)
-# A word as it stands; the other texts are JSON.
+# Plain text; the other text fields are JSON.
 PLAIN = "priority"
 
 
 async def submit_form(caller: Caller, request: Request, idempotency_key: str | None) -> tuple[JobView, bool]:
-    """Takes the form (`archive`, JSON `options`, `labels`, `webhook`, the word `priority`).
+    """Submits the form: `archive`, `options`, `labels` and `webhook` as JSON, `priority` as plain text.
 
-    Returns the job and whether it is new. A repeated request with the same key is known by the archive's digest,
-    before anything is unpacked. Where anything is wrong, the dataset made for it is deleted again. Needs the scope
+    Returns the job and whether it is new. A repeated request with the same key is recognised by the archive's digest,
+    before anything is unpacked. If the job cannot be submitted, its dataset is deleted. Needs the scope
     ``datasets:write``.
     """
     caller.require("datasets:write")
     limit = caller.service.settings.max_archive_bytes + _FORM_BYTES
     refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.disk_budget)
     with caller.sending():
-        return await _taken(caller, request, idempotency_key, limit)
+        return await _submit_received(caller, request, idempotency_key, limit)
 
 
-async def _taken(
+async def _submit_received(
     caller: Caller, request: Request, idempotency_key: str | None, limit: int
 ) -> tuple[JobView, bool]:
     async with staging_folder(caller.service.staging_dir) as folder:

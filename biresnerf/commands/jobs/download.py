@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.jobs.follow_job import fetch
 from biresnerf.commands.jobs.service_options import JOB, JobName, service_at, service_options
 
@@ -36,7 +36,5 @@ def download_command(
     with service_at(url, api_key, job) as client:
         found = client.job(job.id)
         files = fetch(client, found, output, names=names or ("*",), replace=replace)
-    if as_json:
-        print_json({"job": found, "files": [str(path) for path in files]})
-    else:
-        click.echo(f"{len(files)} files in {os.path.relpath(output)}")
+    document = {"job": found, "files": [str(path) for path in files]}
+    show(document, f"{len(files)} files in {os.path.relpath(output)}", as_json=as_json)

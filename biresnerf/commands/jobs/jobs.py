@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from biresnerf.commands import exit_codes
-from biresnerf.commands.answers import json_option, print_json, table
+from biresnerf.commands.answers import json_option, print_json, show, table
 from biresnerf.commands.jobs.follow_job import require_success, timeout_option, waited_for
 from biresnerf.commands.jobs.job_progress import left_of, numbers_of, stage_of
 from biresnerf.commands.jobs.service_options import JOB, JobName, service_at, service_options
@@ -31,13 +31,10 @@ def status_command(job: JobName, url: str | None, api_key: str | None, as_json: 
     """
     with service_at(url, api_key, job) as client:
         found = client.job(job.id)
-    if as_json:
-        print_json(found)
-    else:
-        click.echo("\n".join(described(found)))
+    show(found, described(found), as_json=as_json)
 
 
-def described(job: JobView) -> list[str]:
+def described(job: JobView) -> str:
     """A job in lines of text."""
     lines = [f"{job.id}  {stage_of(job)}"]
     if job.state == "running":
@@ -57,7 +54,7 @@ def described(job: JobView) -> list[str]:
         lines.append("  " + "  ".join(f"{name}={value}" for name, value in job.labels.items()))
     if job.expires_at is not None:
         lines.append(f"  files are kept until {job.expires_at:%Y-%m-%d %H:%M %Z}")
-    return lines
+    return "\n".join(lines)
 
 
 @click.command("list")
@@ -78,9 +75,6 @@ def list_command(
         wanted = (name, value)
     with service_at(url, api_key) as client:
         found = client.jobs(state=state, label=wanted, limit=limit)
-    if as_json:
-        print_json({"items": found})
-        return
     rows = [
         (
             job.id,
@@ -92,7 +86,7 @@ def list_command(
         )
         for job in found
     ]
-    click.echo(table(rows) if rows else "no jobs")
+    show({"items": found}, table(rows) or "no jobs", as_json=as_json)
 
 
 @click.command("wait")
@@ -113,7 +107,7 @@ def wait_command(
             print_json(over)
         require_success(over)
         if not as_json:
-            click.echo("\n".join(described(over)))
+            click.echo(described(over))
 
 
 @click.command("logs")
@@ -174,10 +168,8 @@ def cancel_command(
         found = client.cancel(job.id, keep_partial=keep_partial)
         if (wait or timeout_s is not None) and not found.final:
             found = waited_for(client, found, timeout_s, as_json=as_json)
-    if as_json:
-        print_json(found)
-    else:
-        click.echo("\n".join(described(found)) if found.final else f"cancellation of {found.id} requested")
+    text = described(found) if found.final else f"cancellation of {found.id} requested"
+    show(found, text, as_json=as_json)
 
 
 @click.command("delete")

@@ -15,19 +15,12 @@ from biresnerf.options.refine_options import RefineOptions
 
 @click.command("bench")
 @click.option(
-    "--preset",
-    type=click.Choice(list(PRESETS)),
-    default="fast",
-    show_default=True,
-    help="The preset to measure.",
-)
+    "--preset", type=click.Choice(list(PRESETS)), default="fast", show_default=True, help="The preset to measure."
+)  # fmt: skip
 @click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
+    "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True,
     help="auto: the GPU if there is one.",
-)
+)  # fmt: skip
 @click.option("--threads", type=click.IntRange(0, 256), default=0, help="0: all cores.")
 @click.option(
     "--steps", type=click.IntRange(4, 10_000), default=60, show_default=True, help="Steps per stage."
@@ -55,16 +48,9 @@ def bench_command(as_json: bool, steps: int, views: int, size: int, **given: Any
     click.echo(f"kernels ready after {found['kernels_s']:.1f} s")
     rows = [("stage", "ms a step", "90 %", "rays", "samples", "million samples/s")]
     for stage in found["stages"]:
-        figures = (stage["step_ms"], stage["step_ms_90"])
-        rows.append(
-            (
-                stage["stage"],
-                *(f"{value:.1f}" for value in figures),
-                str(stage["rays"]),
-                str(stage["samples"]),
-                f"{stage['samples_per_s'] / 1e6:.2f}",
-            )
-        )
+        times = (f"{stage['step_ms']:.1f}", f"{stage['step_ms_90']:.1f}")
+        samples = (str(stage["samples"]), f"{stage['samples_per_s'] / 1e6:.2f}")
+        rows.append((stage["stage"], *times, str(stage["rays"]), *samples))
     click.echo(table(rows))
 
 

@@ -61,12 +61,11 @@ def kernels() -> Found:
         "import time; from biresnerf.field.cpu.compile_kernels import compile_kernels; began = time.process_time();"
         "compile_kernels(); print(time.process_time() - began)"
     )
-    done = _in_child(code, _COMPILE_S)
-    if isinstance(done, str):
-        return Found(
-            "kernels", "broken", done, "Reinstall numba and its llvmlite: pip install --force-reinstall numba"
-        )
-    seconds = float(done.stdout.split()[-1])
+    hint = "Reinstall numba and its llvmlite: pip install --force-reinstall numba"
+    output = _in_child("kernels", code, _COMPILE_S, hint)
+    if isinstance(output, Found):
+        return output
+    seconds = float(output.split()[-1])
     how = "compiled" if seconds > _SLOW_S else "loaded from the cache"
     return Found("kernels", "good", f"{how} in {seconds:.1f} s of processor time")
 
@@ -77,10 +76,11 @@ def gpu() -> Found:
         "import json, torch; from biresnerf.field.backends import cuda_problem; p = cuda_problem();"
         "print(json.dumps([p, None if p else torch.cuda.get_device_name()]))"
     )
-    done = _in_child(code, _IMPORT_S)
-    if isinstance(done, str):
-        return Found("GPU", "broken", done, "Reinstall torch: https://pytorch.org/get-started/locally/")
-    problem, name = json.loads(done.stdout.splitlines()[-1])
+    hint = "Reinstall torch: https://pytorch.org/get-started/locally/"
+    output = _in_child("GPU", code, _IMPORT_S, hint)
+    if isinstance(output, Found):
+        return output
+    problem, name = json.loads(output.splitlines()[-1])
     if problem is not None:
         return Found(
             "GPU", "missing", f"not used: {problem}", "Optional: the CPU kernels do the same. docs/cuda.md"
@@ -95,10 +95,13 @@ def colmap() -> Found:
             "COLMAP", "missing", "is not installed: images without poses cannot be registered",
             "pip install 'biresnerf[colmap]'",
         )  # fmt: skip
-    done = _in_child("import zlib, pycolmap; print(pycolmap.__version__)", _IMPORT_S)
-    if isinstance(done, str):
-        return Found("COLMAP", "broken", done, "pip install --force-reinstall pycolmap")
-    return Found("COLMAP", "good", f"pycolmap {done.stdout.strip()}, in its own process")
+    code = "import zlib, pycolmap; print(pycolmap.__version__)"
+    output = _in_child("COLMAP", code, _IMPORT_S, "pip install --force-reinstall pycolmap")
+    return (
+        output
+        if isinstance(output, Found)
+        else Found("COLMAP", "good", f"pycolmap {output.strip()}, in its own process")
+    )
 
 
 def video() -> Found:
@@ -133,13 +136,13 @@ def scratch() -> Found:
 CHECKS: Sequence[Check] = (versions, processor, kernels, gpu, colmap, video, report_page, scratch)
 
 
-def _in_child(code: str, limit_s: float) -> subprocess.CompletedProcess[str] | str:
-    """Runs Python code in a process of its own; returns the process, or why it failed."""
+def _in_child(name: str, code: str, limit_s: float, hint: str) -> str | Found:
+    """What Python code prints in a process of its own; or a broken check ``name`` if it fails."""
     try:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=limit_s)
     except subprocess.TimeoutExpired:
-        return f"did not answer within {limit_s:.0f} s"
+        return Found(name, "broken", f"did not answer within {limit_s:.0f} s", hint)
     if done.returncode != 0:
         last = done.stderr.strip().splitlines()[-1:] or ["no message"]
-        return f"failed ({done.returncode}): {last[0]}"
-    return done
+        return Found(name, "broken", f"failed ({done.returncode}): {last[0]}", hint)
+    return done.stdout

@@ -22,10 +22,7 @@ from biresnerf.options.formats import formats
     help="The input's folder, for formats that hold photos (pinhole).",
 )
 @click.option(
-    "--output",
-    "-o",
-    type=click.Path(path_type=Path),
-    help="Folder for the files. Default: the result's own.",
+    "--output", "-o", type=click.Path(path_type=Path), help="Folder for the files. Default: the result's own."
 )
 @json_option
 def export_command(

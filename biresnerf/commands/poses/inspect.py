@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.settings_option import settings_option
 from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import ResolvedOptions, parse_options
@@ -46,10 +46,7 @@ def inspect_command(
         load_images(dataset, options.max_image_size, options.background)
     found = {**contents(dataset), "pixels_checked": pixels, "plan": plan(dataset, options)}
     found["warnings"] += [f"fixed names no image: {name}" for name in missing_names]
-    if as_json:
-        print_json(found)
-    else:
-        click.echo("\n".join(_lines(found)))
+    show(found, "\n".join(_lines(found)), as_json=as_json)
 
 
 def contents(dataset: Dataset) -> dict[str, Any]:

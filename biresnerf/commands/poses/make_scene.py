@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.empty_folder import require_empty
 from biresnerf.errors import InputError
 
@@ -43,27 +43,19 @@ class MadeScene:
 @click.command("make-scene")
 @click.argument("output", type=click.Path(path_type=Path))
 @click.option(
-    "--kind",
-    type=click.Choice(list(KINDS)),
-    default="dome",
-    show_default=True,
+    "--kind", type=click.Choice(list(KINDS)), default="dome", show_default=True,
     help="; ".join(f"{kind}: {text}" for kind, text in KINDS.items()) + ".",
-)
+)  # fmt: skip
 @click.option(
-    "--of",
-    "own",
-    type=click.Path(path_type=Path),
+    "--of", "own", type=click.Path(path_type=Path),
     help="Use these images and poses, in any format that `refine` reads, as the truth instead of rendering some.",
-)
+)  # fmt: skip
 @click.option("--views", type=click.IntRange(3, 400), default=60, show_default=True, help="Number of images.")
 @click.option("--size", type=click.IntRange(16, 800), default=100, show_default=True, help="Their width, px.")
 @click.option(
-    "--noise",
-    type=click.FloatRange(0, 1),
-    default=0.15,
-    show_default=True,
+    "--noise", type=click.FloatRange(0, 1), default=0.15, show_default=True,
     help="Standard deviation of the pose noise, as in BARF, for dome and vase.",
-)
+)  # fmt: skip
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Seed of scene and noise."
 )
@@ -76,17 +68,8 @@ def make_scene_command(
     The scene is written to OUTPUT, the true poses to OUTPUT.truth.json; `biresnerf evaluate` compares a result with it.
     """
     made = make_scene(output, kind, own=own, views=views, size=size, noise=noise, seed=seed)
-    if as_json:
-        print_json(
-            {
-                "folder": str(made.folder),
-                "images": made.images,
-                "with_pose": made.with_pose,
-                "truth": str(made.truth),
-            }
-        )
-    else:
-        click.echo(str(made))
+    document = {**asdict(made), "folder": str(made.folder), "truth": str(made.truth)}
+    show(document, str(made), as_json=as_json)
 
 
 def make_scene(

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as ProgressBar
 
 from biresnerf.commands import exit_codes
-from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.settings_option import settings_option
 from biresnerf.errors import Interrupted
 from biresnerf.options.presets import PRESETS
@@ -136,10 +136,7 @@ def refine_command(
     except Interrupted as interrupted:
         click.echo(str(interrupted), err=True)
         return 128 + (stop.signal or signal.SIGINT)
-    if as_json:
-        print_json(report)
-    else:
-        click.echo(summary(report, output))
+    show(report, summary(report, output), as_json=as_json)
     return exit_codes.DONE
 
 
