@@ -8,21 +8,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.options.refine_options import ResolvedOptions
 
-_FROZEN = ConfigDict(frozen=True, extra="forbid")
-
 SwitchReason = Literal["stable", "cap"]
 IntrinsicsSource = Literal["given", "exif", "colmap", "guessed", "refined"]
 PoseSource = Literal[
-    "given",
-    "colmap",
-    "matches-incremental",
-    "matches-global",
-    "neighbours",
-    "nearest-view",
-    "forward-facing",
+    "given", "colmap", "matches-incremental", "matches-global", "neighbours", "nearest-view", "forward-facing"
 ]
-
-
 VerdictName = Literal["improved", "unchanged", "kept_input", "inconclusive", "failed_check"]
 Finding = Literal["better", "worse", "same", "open"]
 _VERDICT_WORDS: dict[VerdictName, str] = {
@@ -38,14 +28,16 @@ _RETURNED_WORDS = {
 }
 
 
-class PairedDifference(BaseModel):
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class PairedDifference(_Frozen):
     """One figure for the input's poses and for the refined ones, taken of the same views or images.
 
     `difference` is the mean over them of how much better the refined poses are: positive is better, whatever the
     figure. The interval is Student's, at 95 %.
     """
-
-    model_config = _FROZEN
 
     count: int = Field(examples=[18], description="Views or images that the figure was taken of.")
     before: float = Field(examples=[21.4], description="With the input's poses: the mean.")
@@ -60,10 +52,8 @@ class PairedDifference(BaseModel):
     )
 
 
-class HeldOutEvidence(BaseModel):
+class HeldOutEvidence(_Frozen):
     """Two equal short trainings on poses held still, the input's and the refined ones, scored on unseen views."""
-
-    model_config = _FROZEN
 
     protocol: Literal["frozen_retraining"] = "frozen_retraining"
     steps: int = Field(examples=[1000], description="Of each of the two trainings.")
@@ -75,13 +65,11 @@ class HeldOutEvidence(BaseModel):
     ssim: PairedDifference
 
 
-class EpipolarEvidence(BaseModel):
+class EpipolarEvidence(_Frozen):
     """How well matched features fit the poses: each image's median symmetric epipolar error.
 
     The difference is the mean of log2(before / after) over images: 1 is half the error.
     """
-
-    model_config = _FROZEN
 
     matches: int = Field(examples=[48_210])
     independent: bool = Field(
@@ -96,10 +84,8 @@ class EpipolarEvidence(BaseModel):
     )
 
 
-class Verdict(BaseModel):
+class Verdict(_Frozen):
     """Whether the refined poses are better than the input's, and why that is said."""
-
-    model_config = _FROZEN
 
     verdict: VerdictName
     returned: Literal["refined", "input"] = Field(
@@ -129,10 +115,8 @@ class Verdict(BaseModel):
         ]
 
 
-class ImageReport(BaseModel):
+class ImageReport(_Frozen):
     """What became of one image. Lengths are in the input's own units."""
-
-    model_config = _FROZEN
 
     name: str = Field(examples=["images/0001.jpg"])
     pose_source: PoseSource = Field(
@@ -193,10 +177,8 @@ class ImageReport(BaseModel):
         return tuple(name for name, value in self if value is True)
 
 
-class CameraReport(BaseModel):
+class CameraReport(_Frozen):
     """The intrinsics of one camera of the set, at full size: COLMAP's model, its parameters before and after."""
-
-    model_config = _FROZEN
 
     model: str = Field(examples=["OPENCV"])
     width: int = Field(examples=[1920])
@@ -210,20 +192,16 @@ class CameraReport(BaseModel):
     params_after: tuple[float, ...] = Field(examples=[[1501.2, 1501.2, 960.0, 540.0, 0.01, -0.02, 0.0, 0.0]])
 
 
-class HeldOut(BaseModel):
+class HeldOut(_Frozen):
     """Mean quality of held-out views, their poses fitted to the frozen field first (BARF's test-time protocol)."""
-
-    model_config = _FROZEN
 
     count: int = Field(examples=[6])
     psnr: float = Field(examples=[26.1])
     ssim: float = Field(examples=[0.84])
 
 
-class TrialReport(BaseModel):
+class TrialReport(_Frozen):
     """How poses to start from did: a short training with them held still, scored on views it was not shown."""
-
-    model_config = _FROZEN
 
     source: PoseSource
     placed: int = Field(
@@ -235,10 +213,8 @@ class TrialReport(BaseModel):
     )
 
 
-class SimilarityReport(BaseModel):
+class SimilarityReport(_Frozen):
     """x_in_input = scale * rotation @ x_in_optimised + translation: ties the optimised poses to the input's frame."""
-
-    model_config = _FROZEN
 
     scale: float = Field(examples=[2.4])
     rotation: tuple[tuple[float, float, float], ...] = Field(
@@ -247,19 +223,15 @@ class SimilarityReport(BaseModel):
     translation: tuple[float, float, float] = Field(examples=[[0.1, 0.0, -0.2]])
 
 
-class PointsReport(BaseModel):
+class PointsReport(_Frozen):
     """The sparse points of the COLMAP model; docs/formats.md says what the sources are."""
-
-    model_config = _FROZEN
 
     source: Literal["none", "given", "features", "tracks", "moved"] = Field(examples=["features"])
     count: int = Field(examples=[5210])
 
 
-class Report(BaseModel):
+class Report(_Frozen):
     """``report.json``."""
-
-    model_config = _FROZEN
 
     version: str = Field(examples=["0.1.0"])
     state: Literal["complete", "partial"] = Field(description="partial: stopped before the end, on request.")

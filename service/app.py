@@ -31,6 +31,7 @@ from service.intake.uploads import sweep_staging
 from service.routes import (
     artifacts,
     datasets,
+    derived_jobs,
     events,
     health,
     jobs,
@@ -40,7 +41,6 @@ from service.routes import (
     uploads,
     webhooks,
 )
-from service.routes import derived_jobs as job_life
 from workers.engine import open_stores
 from workers.process.watchdog import end_if_hung
 from workers.settings.errors import NotFound, Unavailable
@@ -50,7 +50,7 @@ from workers.settings.traces import flush_traces
 logger = logging.getLogger(__name__)
 
 _UNFINISHED_EVERY_S = 15.0
-_RESOURCES = (datasets, uploads, signed_uploads, jobs, job_life, events, artifacts, shares, webhooks)
+_RESOURCES = (datasets, uploads, signed_uploads, jobs, derived_jobs, events, artifacts, shares, webhooks)
 _ROUTERS = [module.router for module in (*_RESOURCES, meta, health, docs_page, web_page)]
 _DESCRIPTION = """
 Refines the camera poses of an image set.

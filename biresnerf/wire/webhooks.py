@@ -14,12 +14,7 @@ from pydantic import AfterValidator, ConfigDict, Field, StringConstraints
 from biresnerf.wire.base import Record
 
 WebhookEvent = Literal[
-    "job.queued",
-    "job.started",
-    "job.succeeded",
-    "job.failed",
-    "job.cancelled",
-    "dataset.validated",
+    "job.queued", "job.started", "job.succeeded", "job.failed", "job.cancelled", "dataset.validated"
 ]
 ALL_EVENTS: tuple[WebhookEvent, ...] = get_args(WebhookEvent)
 DeliveryState = Literal["pending", "delivered", "failed"]

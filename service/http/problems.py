@@ -104,10 +104,7 @@ class ProblemError(FaultError):
     @property
     def retryable(self) -> bool:
         """Whether the same request may succeed later."""
-        return self.status in {429, 503, 507} or self.code in {
-            "idempotency_in_progress",
-            "result_not_ready",
-        }
+        return self.status in {429, 503, 507} or self.code in {"idempotency_in_progress", "result_not_ready"}
 
     def response_headers(self) -> dict[str, str]:
         """Extra headers of the response; a retryable one says when to retry."""

@@ -11,7 +11,7 @@ import uuid
 from collections.abc import AsyncIterator, Callable, Collection
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
@@ -26,6 +26,12 @@ _LOCK = ".in-use"
 # A client that sends nothing for this long only occupies a connection and a folder.
 IDLE_S = 60.0
 _CHECK_EVERY_BYTES = 16 * 2**20  # between two checks of the free disk space
+
+
+def raw_request(*media_types: str) -> dict[str, Any]:
+    """The `openapi_extra` of a route whose body is the bytes of a file."""
+    content = {"schema": {"type": "string", "format": "binary"}}
+    return {"requestBody": {"required": True, "content": dict.fromkeys(media_types, content)}}
 
 
 def too_large(limit_bytes: int) -> ProblemError:

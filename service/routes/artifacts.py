@@ -20,11 +20,7 @@ router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
 REPORT = "report.json"
 
 
-@router.get(
-    "/artifacts",
-    operation_id="listArtifacts",
-    responses=declared("not_found", "expired"),
-)
+@router.get("/artifacts", operation_id="listArtifacts", responses=declared("not_found", "expired"))
 async def list_artifacts(job_id: JobId, caller: ReadCaller) -> ArtifactList:
     """All files of the result and of its exports. While the job runs: previews of poses and a render."""
     found = await caller.jobs.artifacts(job_id)
@@ -40,16 +36,10 @@ async def list_artifacts(job_id: JobId, caller: ReadCaller) -> ArtifactList:
 
 
 @router.get(
-    "/artifacts/{name:path}",
-    operation_id="getArtifact",
-    response_class=StreamingResponse,
-    responses=ANSWERS,
+    "/artifacts/{name:path}", operation_id="getArtifact", response_class=StreamingResponse, responses=ANSWERS
 )
 @router.head(
-    "/artifacts/{name:path}",
-    operation_id="headArtifact",
-    response_class=StreamingResponse,
-    responses=ANSWERS,
+    "/artifacts/{name:path}", operation_id="headArtifact", response_class=StreamingResponse, responses=ANSWERS
 )
 async def get_artifact(
     job_id: JobId, name: str, request: Request, caller: ReadCaller, asked: Asked

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import re
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Query, Request
 from fastapi.responses import JSONResponse, Response
@@ -26,16 +26,10 @@ from service.http.problems import ProblemError, declared
 from service.intake.archive_import import take_archive
 from service.intake.dataset_finalize import begin_check, finish_check
 from service.intake.json_body import JSON_BYTES_MAX, json_request, read_json
-from service.intake.uploads import capped, refuse_announced_excess, staging_folder, write_stream
+from service.intake.uploads import capped, raw_request, refuse_announced_excess, staging_folder, write_stream
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 ENTRY_BYTES = 2048  # allowed in a manifest for each file that a dataset may have
-_RAW_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
-    }
-}
 _DIGEST = re.compile(r"sha-256=:([A-Za-z0-9+/=]+):")
 
 
@@ -126,7 +120,7 @@ _TAKES = (
         204: {"description": "The file existed; its content was replaced."},
         **declared("malformed_body", "file_exists", "digest_mismatch", *_TAKES),
     },
-    openapi_extra=_RAW_BODY,
+    openapi_extra=raw_request("application/octet-stream"),
 )
 async def put_file(
     dataset_id: DatasetId,
@@ -180,15 +174,7 @@ def _announced_digest(header: str | None) -> str | None:
     responses=declared(
         "archive_too_large", "archive_rejected", "name_collision", "validation_timeout", *_TAKES
     ),
-    openapi_extra={
-        "requestBody": {
-            "required": True,
-            "content": {
-                kind: {"schema": {"type": "string", "format": "binary"}}
-                for kind in ("application/zip", "application/x-tar", "application/gzip")
-            },
-        }
-    },
+    openapi_extra=raw_request("application/zip", "application/x-tar", "application/gzip"),
 )
 async def upload_archive(dataset_id: DatasetId, request: Request, caller: DatasetWriter) -> DatasetView:
     """Uploads all files of a zip, tar or tar.gz, sent as the raw body. A folder around everything is dropped.

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import Response
 
-from biresnerf.wire.jobs import ForkJob, JobList, JobView, LogLine, NewExport, job_url
+from biresnerf.wire.jobs import ForkJob, JobList, JobView, NewExport, job_url
 from biresnerf.wire.results import IMAGE_COLUMNS, ImageList, ImageRow
 from service.answers.job_answers import POLL_S, IdempotencyKey, job_answer
 from service.http.access import Caller, JobWriter, ReadCaller
@@ -58,11 +58,9 @@ async def get_job_log(
         headers["Retry-After"] = POLL_S
     if (form or ("ndjson" if LINES in accept else "text")) == "text":
         return Response("".join(f"{line.text}\n" for line in lines), media_type="text/plain", headers=headers)
-    return Response("".join(map(_json_line, lines)), media_type=LINES, headers=headers)
-
-
-def _json_line(line: LogLine) -> str:
-    return line.model_dump_json() + "\n"
+    return Response(
+        "".join(f"{line.model_dump_json()}\n" for line in lines), media_type=LINES, headers=headers
+    )
 
 
 @router.get(
@@ -121,10 +119,7 @@ def _row(image: dict[str, Any]) -> ImageRow:
     ),
 )
 async def fork_job(
-    job_id: JobId,
-    request: Request,
-    caller: JobWriter,
-    idempotency_key: IdempotencyKey = None,
+    job_id: JobId, request: Request, caller: JobWriter, idempotency_key: IdempotencyKey = None
 ) -> Response:
     """Queues a job on the same dataset with other options, reusing the result of a stage of this one."""
     body = await read_json(request, ForkJob)

@@ -62,10 +62,7 @@ class EventStream(StreamingResponse):
     "/events",
     operation_id="followJob",
     response_class=EventStream,
-    responses={
-        **_STREAM,
-        **declared("not_found", "invalid_request"),
-    },
+    responses={**_STREAM, **declared("not_found", "invalid_request")},
 )
 async def follow_job(
     job_id: JobId,

@@ -178,10 +178,7 @@ async def cancel_job(job_id: JobId, request: Request, caller: JobWriter) -> Resp
 
 
 @router.delete(
-    "/{job_id}",
-    status_code=204,
-    operation_id="deleteJob",
-    responses=declared("not_found", "state_conflict"),
+    "/{job_id}", status_code=204, operation_id="deleteJob", responses=declared("not_found", "state_conflict")
 )
 async def delete_job(job_id: JobId, caller: JobWriter) -> None:
     """Deletes a job that has ended, with its results and exports."""

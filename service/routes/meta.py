@@ -42,10 +42,7 @@ async def get_options(
     return view
 
 
-@router.get(
-    "/v1/info",
-    operation_id="getInfo",
-)
+@router.get("/v1/info", operation_id="getInfo")
 async def get_info(caller: ReadCaller) -> Info:
     """Version and limits of this service, your share of it, and how many of your jobs are in each state."""
     limits = {

@@ -11,7 +11,7 @@ import binascii
 import re
 from datetime import UTC
 from email.utils import format_datetime
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Request
 from fastapi.responses import JSONResponse, Response
@@ -22,7 +22,7 @@ from service.http.access import DatasetWriter, ReadCaller
 from service.http.dependencies import DatasetId, UploadId
 from service.http.problems import ProblemError, declared
 from service.intake.archive_import import begin_taking
-from service.intake.uploads import capped, refuse_announced_excess
+from service.intake.uploads import capped, raw_request, refuse_announced_excess
 from workers.records import Upload
 
 VERSION = "1.0.0"
@@ -146,14 +146,6 @@ async def get_upload(upload_id: UploadId, caller: ReadCaller) -> UploadView:
     return await caller.uploads.get(upload_id)
 
 
-_APPENDS: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {CONTENT_TYPE: {"schema": {"type": "string", "format": "binary"}}},
-    }
-}
-
-
 @router.patch(
     "/uploads/{upload_id}",
     status_code=204,
@@ -163,7 +155,7 @@ _APPENDS: dict[str, Any] = {
         *("body_timeout", "storage_full", "too_many_uploads", *_ALWAYS),
     ),
     dependencies=[SameVersion],
-    openapi_extra=_APPENDS,
+    openapi_extra=raw_request(CONTENT_TYPE),
 )
 async def append_upload(
     upload_id: UploadId,

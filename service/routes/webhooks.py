@@ -74,10 +74,7 @@ async def change_webhook(
 
 
 @router.delete(
-    "/{webhook_id}",
-    status_code=204,
-    operation_id="deleteWebhook",
-    responses=declared("not_found"),
+    "/{webhook_id}", status_code=204, operation_id="deleteWebhook", responses=declared("not_found")
 )
 async def delete_webhook(webhook_id: WebhookId, caller: JobWriter) -> None:
     """Deletes the webhook with its deliveries; messages that wait are not sent."""
@@ -109,20 +106,14 @@ async def test_webhook(webhook_id: WebhookId, caller: JobWriter, response: Respo
     operation_id="listDeliveries",
     responses=declared("bad_cursor", "not_found", "invalid_request"),
 )
-async def list_deliveries(
-    webhook_id: WebhookId,
-    caller: ReadCaller,
-    paging: Paged,
-) -> DeliveryList:
+async def list_deliveries(webhook_id: WebhookId, caller: ReadCaller, paging: Paged) -> DeliveryList:
     """Messages sent and waiting, newest first, with the time and status of every attempt."""
     page = await caller.webhooks.deliveries(webhook_id, limit=paging.limit, cursor=paging.cursor)
     return paging.answer(DeliveryList, page)
 
 
 @router.get(
-    "/{webhook_id}/deliveries/{delivery_id}",
-    operation_id="getDelivery",
-    responses=declared("not_found"),
+    "/{webhook_id}/deliveries/{delivery_id}", operation_id="getDelivery", responses=declared("not_found")
 )
 async def get_delivery(webhook_id: WebhookId, delivery_id: DeliveryId, caller: ReadCaller) -> DeliveryView:
     """One message and its attempts."""

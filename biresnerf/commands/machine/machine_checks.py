@@ -18,6 +18,20 @@ from typing import Literal, TypeAlias
 _COMPILE_S, _IMPORT_S = 900.0, 120.0
 _WORK_BYTES = 2**30
 _SLOW_S = 6.0  # loading from the cache takes less, compiling far more
+# Processor time: on a busy machine loading takes long, too.
+_TIME_KERNELS = """
+import time
+from biresnerf.field.cpu.compile_kernels import compile_kernels
+began = time.process_time()
+compile_kernels()
+print(time.process_time() - began)
+"""
+_FIND_GPU = """
+import json, torch
+from biresnerf.field.backends import cuda_problem
+problem = cuda_problem()
+print(json.dumps([problem, None if problem else torch.cuda.get_device_name()]))
+"""
 
 # good: works; missing: only something optional is unavailable; broken: should work and does not.
 State = Literal["good", "missing", "broken"]
@@ -56,13 +70,8 @@ def processor() -> Found:
 
 def kernels() -> Found:
     """The CPU kernels, compiled or loaded in a process of their own."""
-    # Processor time: on a busy machine loading takes long, too.
-    code = (
-        "import time; from biresnerf.field.cpu.compile_kernels import compile_kernels; began = time.process_time();"
-        "compile_kernels(); print(time.process_time() - began)"
-    )
     hint = "Reinstall numba and its llvmlite: pip install --force-reinstall numba"
-    output = _in_child("kernels", code, _COMPILE_S, hint)
+    output = _in_child("kernels", _TIME_KERNELS, _COMPILE_S, hint)
     if isinstance(output, Found):
         return output
     seconds = float(output.split()[-1])
@@ -72,12 +81,8 @@ def kernels() -> Found:
 
 def gpu() -> Found:
     """Whether the CUDA kernels can run. A GPU is optional."""
-    code = (
-        "import json, torch; from biresnerf.field.backends import cuda_problem; p = cuda_problem();"
-        "print(json.dumps([p, None if p else torch.cuda.get_device_name()]))"
-    )
     hint = "Reinstall torch: https://pytorch.org/get-started/locally/"
-    output = _in_child("GPU", code, _IMPORT_S, hint)
+    output = _in_child("GPU", _FIND_GPU, _IMPORT_S, hint)
     if isinstance(output, Found):
         return output
     problem, name = json.loads(output.splitlines()[-1])

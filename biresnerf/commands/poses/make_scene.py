@@ -137,10 +137,7 @@ def _copied(own: Path, output: Path) -> Path:
         shutil.copyfile(frame.path, copy)
         frames.append(replace(frame, path=copy, raw={}))
     copied = replace(
-        dataset,
-        root=output,
-        frames=tuple(frames),
-        source=SourceFormat("nerfstudio", None, {}, np.eye(4)),
+        dataset, root=output, frames=tuple(frames), source=SourceFormat("nerfstudio", None, {}, np.eye(4))
     )
     path = output / "transforms.json"
     write_transforms(copied, copied.world_from_cam, path)
