@@ -86,7 +86,7 @@ def bind_images(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
     """The dataset of parsed poses and the images in or below ``root``.
 
     Args:
-        within: refuse files outside of this folder; for files of strangers.
+        within: refuse files outside of this folder; for uploaded sets.
 
     Raises:
         InputError: ``no_images``, ``image_missing``, ``pose_count_mismatch`` or a code of `dataset_of`.

@@ -38,6 +38,21 @@ Binder: TypeAlias = Callable[[ParsedPoses, Path, Path | None], Dataset]
 Writer: TypeAlias = Callable[[RefinedSet, Path, WriteContext], None]
 
 
+_HEAD_BYTES = 4096
+
+
+def head_holds(marker: bytes) -> Callable[[Path], bool]:
+    """Whether a file begins with something that holds ``marker``; for names that several programs use."""
+
+    def recognises(path: Path) -> bool:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return marker in file.read(_HEAD_BYTES)
+
+    return recognises
+
+
 @dataclass(frozen=True)
 class Codec:
     """A declared format with the functions that read and write it. A module lists its own in ``CODECS``.

@@ -27,7 +27,7 @@ def read_dataset(path: Path, within: Path | None = None) -> Dataset:
 
     Args:
         path: a folder, or the file in it that has the poses.
-        within: refuse files outside of this folder; for files of strangers.
+        within: refuse files outside of this folder; for uploaded sets.
 
     Raises:
         InputError: the input cannot be used; says the file, the field and a hint.

@@ -27,7 +27,7 @@ class Frame:
         path: the image file.
         camera: index into ``Dataset.cameras``.
         world_from_cam: float64 [4, 4], a rigid motion; OpenCV axes (x right, y down, z forward). None where
-            nobody has said yet where the image was taken.
+            it is not known yet.
         pose_source: who found the pose; None where there is none.
         raw: the frame as the user's file has it (empty for a folder of images).
         mask: a file that says which pixels count: where it is black they do not.
@@ -128,7 +128,7 @@ class Dataset:
 
     @property
     def anchors(self) -> NDArray[np.bool_]:
-        """Whose poses say what the frame is, bool [n]: those given; where there are none, all but guesses."""
+        """Frames that fix the world frame, bool [n]: those with given poses, or without any all but guesses."""
         given = np.array([frame.pose_source == "given" for frame in self.frames], dtype=np.bool_)
         if given.any():
             return given

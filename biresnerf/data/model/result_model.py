@@ -66,7 +66,7 @@ def model_at_poses(
 
     Images that did not change (``changed`` [n] false) keep their numbers to the bit. Images that the model did not
     have get new ids behind the last ones, and a frame each where the model has frames. Points are the given ones: the
-    caller is to put them right (`biresnerf.data.triangulate`).
+    caller is to put them right (`biresnerf.data.points.refined_points`).
 
     Args:
         given: the caller's model.
@@ -130,7 +130,7 @@ def _rigs_and_frames(
             rig = ColmapRig(max(rigs) + 1, sensor, {})
             rigs[rig.id] = rig
         new_pose = _rig_from_world(rig, [(sensor, image.id)], images)
-        if new_pose is None:  # a sensor whose place in its rig nobody knows: COLMAP has no way to hold this
+        if new_pose is None:  # a sensor of unknown pose in its rig: COLMAP cannot represent this
             continue
         number = max(frames, default=0) + 1
         frames[number] = ColmapFrame(number, rig.id, new_pose, ((sensor, image.id),))

@@ -1,4 +1,4 @@
-"""Files of strangers: what they name must lie inside the folder they sent, links included."""
+"""Uploaded sets: every file they name must lie inside their own folder, links included."""
 
 from __future__ import annotations
 

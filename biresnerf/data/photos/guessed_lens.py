@@ -1,4 +1,4 @@
-"""A first guess of the lens of a photo whose intrinsics nobody gave: EXIF's focal length, else a normal lens."""
+"""A first guess of the lens of a photo without given intrinsics: EXIF's focal length, else a normal lens."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def guess_lens(header: ImageHeader) -> tuple[Camera, IntrinsicsSource]:
 
 
 def guess_note(source: IntrinsicsSource) -> str:
-    """What the user is told of a lens that `guess_lens` found."""
+    """A note for the user on a lens that `guess_lens` found."""
     found = "taken from EXIF" if source == "exif" else "a guess"
     return f"no intrinsics are given: the focal length is {found}"
 

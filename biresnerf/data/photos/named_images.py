@@ -91,13 +91,6 @@ def unused_image_notes(paths: Sequence[Path], others: Iterable[Path] = ()) -> li
     ]
 
 
-def image_files(root: Path) -> dict[str, Path]:
-    """As `photos_beside`. Raises InputError ``no_images`` where there are none."""
-    files = photos_beside(root)
-    refuse_no_images(files, root)
-    return files
-
-
 def photos_beside(root: Path) -> dict[str, Path]:
     """The images beside poses that do not say where theirs are, by path with forward slashes; perhaps none.
 

@@ -6,18 +6,18 @@ leaves the tag alone; other programs turn photos first. A pose file shows which 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.image_files import FocalPlane, ImageHeader
+from biresnerf.data.photos.named_images import few_names
 
 T = TypeVar("T", bound=np.generic)
 # The orientation that undoes another.
 INVERSE = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
-NAMED = 5  # photos that a note names
 
 
 def turned_size(width: int, height: int, orientation: int) -> tuple[int, int]:
@@ -92,12 +92,12 @@ def orientation_notes(
     notes = []
     if done:
         notes.append(
-            f"{_some(done)}: turned as EXIF says, as w and h are those of the turned pictures; poses and "
+            f"{few_names(done)}: turned as EXIF says, as w and h are those of the turned pictures; poses and "
             "intrinsics are for them as turned"
         )
     if left:
         notes.append(
-            f"{_some(left)}: EXIF asks viewers to turn them; poses and intrinsics are for the pixels as stored, "
+            f"{few_names(left)}: EXIF asks viewers to turn them; poses and intrinsics are for the pixels as stored, "
             "as in COLMAP"
         )
     return notes
@@ -106,10 +106,4 @@ def orientation_notes(
 def page_notes(headers: Sequence[ImageHeader], names: Sequence[str]) -> list[str]:
     """A note on files of several pages or frames."""
     several = [name for header, name in zip(headers, names, strict=True) if header.several]
-    return [f"{_some(several)}: holds several pages or frames; the first is used"] if several else []
-
-
-def _some(names: Iterable[str]) -> str:
-    listed = list(names)
-    more = f" and {len(listed) - NAMED} more" if len(listed) > NAMED else ""
-    return ", ".join(listed[:NAMED]) + more
+    return [f"{few_names(several)}: holds several pages or frames; the first is used"] if several else []

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding.map_images import Mapping, ask_colmap, read_mapping
 from biresnerf.data.seeding.seeding_progress import OnSeeding, SeedingProgress
@@ -52,8 +52,7 @@ def remembered_mapping(
             on_progress=on_progress,
         )
         if remember is not None:
-            with whole_file(remember) as temporary:
-                temporary.write_text(json.dumps({"key": keys[0], "answer": answer}), "utf-8")
+            write_text(remember, json.dumps({"key": keys[0], "answer": answer}))
     return read_mapping(dataset, answer)
 
 

@@ -1,4 +1,4 @@
-"""Running COLMAP in a child process: time limit, stop on request, its death with ours, its crash told as an error."""
+"""Running COLMAP in a child process: it has a time limit, stops on request and dies with its parent."""
 
 from __future__ import annotations
 
@@ -88,25 +88,24 @@ def _wait(
     look: Callable[[], None],
 ) -> None:
     end = time.monotonic() + limit_s
-    running = True
-    while running:
+    while True:
         running = child.poll() is None
         for line in said.read().decode("utf-8", errors="replace").splitlines():
             if line.startswith(SAYS):
                 logger.info("%s", line.removeprefix(SAYS))
-        if running:
-            look()
-        if running and should_stop():
+        if not running:
+            return
+        look()
+        if should_stop():
             raise Interrupted("stopped while COLMAP looked for poses")
-        if running and time.monotonic() > end:
+        if time.monotonic() > end:
             raise InputError(
                 "seed_timeout",
                 f"COLMAP did not finish within {limit_s:g} s.",
                 where=set_name,
                 hint="Give fewer images, or approximate poses.",
             )
-        if running:
-            time.sleep(_POLL_S)
+        time.sleep(_POLL_S)
 
 
 def _keep(log_path: Path, folder: Path | None) -> None:

@@ -76,6 +76,10 @@ class _Given:
                 sources[i] = guess or source
         return InitialPoses(poses, name, tuple(sources))
 
+    def without_matches(self) -> InitialPoses:
+        """The given poses, and guesses for the missing ones."""
+        return self.candidate("given", None, "given", np.zeros((len(self.poses),) * 2, dtype=np.int64))
+
 
 def seed_poses(
     dataset: Dataset,
@@ -96,8 +100,8 @@ def seed_poses(
     to the frame of given poses. Images that COLMAP cannot place are guessed from those it can.
 
     COLMAP's threads make its answer differ a little from run to run. A run that is to be continued keeps it in the
-    file ``remember``, with colmap.log beside it. ``on_progress`` is called only
-    if COLMAP does run: at once, then when more is known.
+    file ``remember``, with colmap.log beside it. ``on_progress`` is called only if
+    COLMAP does run: at once, then when more is known.
 
     Raises:
         InputError: ``pose_missing``, ``colmap_missing``, ``seed_failed``, ``insufficient_overlap`` or ``seed_timeout``.
@@ -105,14 +109,13 @@ def seed_poses(
         RefinementError: ``seeding_crashed``: COLMAP itself failed, and there are no given poses.
     """
     given = _Given.of(dataset)
-    nothing = np.zeros((len(dataset), len(dataset)), dtype=np.int64)
     if start == "given" or (start == "none" and given.posed.all()):
         _refuse_missing(dataset)
-        return _seeding(dataset, given.candidate("given", None, "given", nothing))
+        return _seeding(dataset, given.without_matches())
     if start == "none":
-        return _seeding(dataset, _without_features(given, nothing))
+        return _seeding(dataset, _without_features(given))
     if not can_match():
-        return _without_colmap(given, start, nothing)
+        return _without_colmap(given, start)
     try:
         mapping = remembered_mapping(
             replace(dataset, frames=tuple(replace(f, world_from_cam=None) for f in dataset.frames))
@@ -125,7 +128,7 @@ def seed_poses(
             raise
         warning = f"The given poses could not be compared with feature matches: {error}"
         noted = replace(dataset, warnings=(*dataset.warnings, warning))
-        return _seeding(noted, given.candidate("given", None, "given", nothing))
+        return _seeding(noted, given.without_matches())
     if start == "auto" and given.posed.any():
         return _beside_given(given, mapping)
     return _from_scratch(given, mapping, start)
@@ -142,15 +145,15 @@ def _refuse_missing(dataset: Dataset) -> None:
         )
 
 
-def _without_features(given: _Given, nothing: NDArray[np.int64]) -> InitialPoses:
+def _without_features(given: _Given) -> InitialPoses:
     if given.posed.any():
-        return given.candidate("given", None, "given", nothing)
+        return given.without_matches()
     name: PoseSource = "forward-facing"
     count = len(given.dataset)
     return InitialPoses(np.tile(np.eye(4), (count, 1, 1)), name, (name,) * count)
 
 
-def _without_colmap(given: _Given, start: StartPoses, nothing: NDArray[np.int64]) -> Seeding:
+def _without_colmap(given: _Given, start: StartPoses) -> Seeding:
     if start == "colmap" or not given.posed.any():
         raise InputError(
             "colmap_missing",
@@ -161,7 +164,7 @@ def _without_colmap(given: _Given, start: StartPoses, nothing: NDArray[np.int64]
         )
     warning = "COLMAP is not installed: the given poses were not compared with feature matches."
     noted = replace(given.dataset, warnings=(*given.dataset.warnings, warning))
-    return _seeding(noted, given.candidate("given", None, "given", nothing))
+    return _seeding(noted, given.without_matches())
 
 
 def _with_focal_notes(dataset: Dataset, models: list[MappedModel]) -> Dataset:
@@ -262,7 +265,7 @@ def _facing_forward(given: _Given, what: str) -> Seeding:
         )
     warning = f"{what}: all cameras begin at one place, looking the same way, and find their poses without features."
     noted = replace(dataset, warnings=(*dataset.warnings, warning))
-    return _seeding(noted, _without_features(given, np.zeros((0, 0), dtype=np.int64)))
+    return _seeding(noted, _without_features(given))
 
 
 def _seeding(dataset: Dataset, *candidates: InitialPoses) -> Seeding:

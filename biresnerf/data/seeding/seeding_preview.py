@@ -11,7 +11,7 @@ from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field
 
 from biresnerf.data.formats.simple.poses_json import POSES, write_poses_json
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import whole_file, write_text
 from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.photos.decode import as_stored
@@ -58,15 +58,14 @@ def write_seeding_preview(
         found: what COLMAP has found out.
         poses: those given, or to start from.
     """
-    sheet, told = folder / PHOTOS, folder / SEEDING_JSON
+    sheet, progress = folder / PHOTOS, folder / SEEDING_JSON
     if not sheet.is_file():
         write_contact_sheet(dataset.frames, sheet)
-    with whole_file(told) as temporary:
-        temporary.write_text(_described(dataset, found).model_dump_json(indent=1), "utf-8")
+    write_text(progress, _described(dataset, found).model_dump_json(indent=1))
     if poses is None:
-        return [sheet, told]
+        return [sheet, progress]
     write_poses_json(poses, folder / POSES)
-    return [sheet, told, folder / POSES]
+    return [sheet, progress, folder / POSES]
 
 
 def _described(dataset: Dataset, found: SeedingProgress) -> SeedingPreview:

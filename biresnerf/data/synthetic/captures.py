@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.synthetic.scene import (
     CAMERA_ANGLE_X,
@@ -106,7 +104,7 @@ def write_walk(folder: Path, n_views: int, width: int, seed: int) -> Path:
         for index, matrix in enumerate(file_from_world_from_cam(in_metres, np.eye(4), 1.0))
     ]
     path = folder / "transforms.json"
-    _write_json(path, {**lens, "frames": frames})
+    write_json(path, {**lens, "frames": frames}, indent=1)
     return path
 
 
@@ -126,10 +124,5 @@ def write_vase(folder: Path, n_views: int, size: int, seed: int) -> Path:
         for index, matrix in enumerate(file_from_world_from_cam(poses, np.eye(4), 1.0))
     ]
     path = folder / "transforms.json"
-    _write_json(path, {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames})
+    write_json(path, {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}, indent=1)
     return path
-
-
-def _write_json(path: Path, document: dict[str, Any]) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(document, indent=1) + "\n")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.synthetic.shapes import Shape, Texture
 
@@ -156,8 +155,5 @@ def write_synthetic_scene(folder: Path, n_views: int, size: int, seed: int) -> P
         for index, matrix in enumerate(matrices)
     ]
     path = folder / "transforms.json"
-    with whole_file(path) as temporary:
-        temporary.write_text(
-            json.dumps({"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}, indent=1) + "\n"
-        )
+    write_json(path, {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}, indent=1)
     return path

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry
-from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
@@ -31,7 +31,6 @@ GAUSSIAN_SPLATTING = Format(
     gives="poses, two focal lengths an image",
     checked_against="files written from its source; one real file",
 )
-_HEAD_BYTES = 4096
 _KEYS = ("img_name", "width", "height", "position", "rotation", "fx", "fy")
 
 
@@ -90,12 +89,4 @@ def _invalid(where: str, what: str) -> InputError:
     return InputError("pose_file_invalid", what, where=where, hint="Give the cameras.json that 3DGS wrote.")
 
 
-def _is_cameras_json(path: Path) -> bool:
-    """Other programs write files of this name, too."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return b'"img_name"' in file.read(_HEAD_BYTES)
-
-
-CODECS = (Codec(GAUSSIAN_SPLATTING, parse=parse_gaussian_splatting, recognises=_is_cameras_json),)
+CODECS = (Codec(GAUSSIAN_SPLATTING, parse=parse_gaussian_splatting, recognises=head_holds(b'"img_name"')),)

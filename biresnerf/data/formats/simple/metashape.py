@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntry
-from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import SourceFormat
@@ -35,7 +35,6 @@ METASHAPE = Format(
     gives="poses, cameras of type frame, from a camera export (XML)",
     checked_against="files written from its manual; no export of the program itself was at hand",
 )
-_HEAD_BYTES = 4096
 
 
 _MAX_DEPTH, _MAX_ELEMENTS = 50, 500_000
@@ -238,11 +237,4 @@ def _invalid(where: str, what: str) -> InputError:
     return InputError("pose_file_invalid", what, where=where, hint="Export the cameras from Metashape again.")
 
 
-def _is_metashape(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return b"<chunk" in file.read(_HEAD_BYTES)
-
-
-CODECS = (Codec(METASHAPE, parse=parse_metashape, recognises=_is_metashape),)
+CODECS = (Codec(METASHAPE, parse=parse_metashape, recognises=head_holds(b"<chunk")),)

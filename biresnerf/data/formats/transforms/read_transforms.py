@@ -42,7 +42,7 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
 
     Args:
         path: the file.
-        within: refuse images outside of this folder; for files of strangers.
+        within: refuse images outside of this folder; for uploaded sets.
 
     Raises:
         InputError: with the file, the field and a hint; codes as in docs/input.md.
@@ -59,8 +59,7 @@ def parse_transforms(_root: Path, path: Path) -> ParsedPoses:
     worst, worst_name = 0.0, ""
     for index, row in enumerate(rows):
         where, pose = f"{path.name} frames[{index}]", None
-        name = row.get("file_path")
-        name = name if isinstance(name, str) else ""
+        name = row["file_path"] if isinstance(row.get("file_path"), str) else ""
         if row.get("transform_matrix") is not None:
             matrix, deviation = rigid_matrix(row["transform_matrix"], f"{where}.transform_matrix")
             pose = world_from_cam_of_file(matrix, source.applied_transform, source.applied_scale)
@@ -123,21 +122,17 @@ def _usable(value: Any) -> float | None:
 def _frame_objects(document: dict[str, Any], file: str) -> list[dict[str, Any]]:
     rows = document.get("frames")
     if not isinstance(rows, list):
-        raise InputError(
-            "pose_file_invalid",
-            "has no list of frames.",
-            where=f"{file} frames",
-            hint="Give a transforms.json as nerfstudio, instant-ngp or Blender write it.",
-        )
+        hint = "Give a transforms.json as nerfstudio, instant-ngp or Blender write it."
+        raise _invalid(f"{file} frames", "has no list of frames.", hint)
     for index, row in enumerate(rows):
         if not isinstance(row, dict):
-            raise InputError(
-                "pose_file_invalid",
-                "is not an object.",
-                where=f"{file} frames[{index}]",
-                hint="Give file_path and transform_matrix in each frame.",
-            )
+            hint = "Give file_path and transform_matrix in each frame."
+            raise _invalid(f"{file} frames[{index}]", "is not an object.", hint)
     return rows
+
+
+def _invalid(where: str, what: str, hint: str) -> InputError:
+    return InputError("pose_file_invalid", what, where=where, hint=hint)
 
 
 def _source_format(document: dict[str, Any], path: Path) -> SourceFormat:
@@ -146,12 +141,8 @@ def _source_format(document: dict[str, Any], path: Path) -> SourceFormat:
     if applied is not None:
         matrix, _ = rigid_matrix(applied, f"{path.name} applied_transform")
     if isinstance(scale, bool) or not isinstance(scale, int | float) or not 1e-9 < scale < 1e9:
-        raise InputError(
-            "pose_file_invalid",
-            "is not a positive number.",
-            where=f"{path.name} applied_scale",
-            hint="Remove the key, or give the factor that was applied to the positions.",
-        )
+        hint = "Remove the key, or give the factor that was applied to the positions."
+        raise _invalid(f"{path.name} applied_scale", "is not a positive number.", hint)
     kept = {key: None if key == "frames" else value for key, value in document.items()}
     return SourceFormat(_dialect(document), path, kept, matrix, float(scale), files=(path,))
 
