@@ -111,16 +111,11 @@ BIRESNERF = Method(
 
 # The baselines belong to the studies, which this package must not import. `find_method` loads theirs by name when a run
 # asks for one: the only way from here to there, and one that no import statement shows.
-BASELINES: dict[MethodName, str] = {
-    "biresnerf-paper": "BIRESNERF_PAPER",
-    "baa-ngp": "BAA_NGP",
-    "nerfacc-barf": "NERFACC_BARF",
-    "barf": "BARF",
-}
+BASELINES = "biresnerf.studies.baselines.methods"
 
 
 def find_method(name: MethodName) -> Method:
-    """The method of that name; a baseline's module is imported now."""
+    """The method of that name. Baselines are imported now: ``baa-ngp`` is `BAA_NGP` of their module."""
     if name == "biresnerf":
         return BIRESNERF
-    return getattr(importlib.import_module("biresnerf.studies.baselines.methods"), BASELINES[name])
+    return getattr(importlib.import_module(BASELINES), name.upper().replace("-", "_"))
