@@ -1,14 +1,16 @@
-"""Exponential against scipy, matrix exponentials and finite differences."""
+"""Exponential and logarithm against scipy, matrix exponentials and finite differences."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from biresnerf.geometry.lie import hat, se3_exp, so3_exp
+from biresnerf.geometry.lie import hat, se3_exp, so3_exp, so3_log
 
 # (type, what a rotation matrix's entries may be off by)
 TYPES = [(torch.float64, 1e-14), (torch.float32, 1e-6)]
@@ -28,6 +30,13 @@ ANGLES = [
     np.pi,
 ]
 HUGE = [2 * np.pi - 1e-6, 2 * np.pi, 100.0, 1e4, 1e6]
+
+unit_vectors = (
+    st.tuples(*[st.floats(-1, 1)] * 3)
+    .map(np.array)
+    .filter(lambda v: np.linalg.norm(v) > 0.1)
+    .map(lambda v: v / np.linalg.norm(v))
+)
 
 
 def axes(count: int = 20) -> np.ndarray:
@@ -74,15 +83,32 @@ def test_hat_is_the_cross_product():
     torch.testing.assert_close((hat(v) @ x[..., None])[..., 0], torch.linalg.cross(v, x))
 
 
+@settings(deadline=None)
+@given(unit_vectors, st.floats(0.0, np.pi - 1e-6))
+def test_log_inverts_exp(axis, angle):
+    rotvec = torch.tensor(axis * angle, dtype=torch.float64)
+    torch.testing.assert_close(so3_log(so3_exp(rotvec)), rotvec, atol=1e-9 * max(angle, 1e-6), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), TYPES)
+@pytest.mark.parametrize("below", [1e-3, 1e-5, 1e-7, 1e-9, 0.0])
+def test_exp_inverts_log_near_pi(below, dtype, tolerance):
+    rotation = so3_exp(torch.tensor(axes() * (np.pi - below), dtype=dtype))
+    rotvec = so3_log(rotation)
+    assert (rotvec.norm(dim=-1) <= torch.pi + 10 * tolerance).all()
+    torch.testing.assert_close(so3_exp(rotvec), rotation, atol=20 * tolerance, rtol=0)
+
+
 @pytest.mark.parametrize(("dtype", "tolerance"), TYPES)
 @pytest.mark.parametrize("angle", [*ANGLES, *HUGE, 1e10, 1e18])
 def test_value_and_gradient_are_finite_everywhere(angle, dtype, tolerance):
     rotvec = torch.tensor(axes() * angle, dtype=dtype, requires_grad=True)
     velocity = torch.ones_like(rotvec, requires_grad=True)
     rotation, translation = se3_exp(rotvec, velocity)
+    back = so3_log(rotation)
     weights = torch.randn(3, 3, dtype=dtype, generator=torch.Generator().manual_seed(1))
-    ((rotation * weights).sum() + (translation * weights[0]).sum()).backward()
-    for tensor in (rotation, translation, rotvec.grad, velocity.grad):
+    ((rotation * weights).sum() + (translation * weights[0]).sum() + (back * weights[1]).sum()).backward()
+    for tensor in (rotation, translation, back, rotvec.grad, velocity.grad):
         assert torch.isfinite(tensor).all()
     identity = torch.eye(3, dtype=dtype).expand_as(rotation)
     torch.testing.assert_close(rotation @ rotation.mT, identity, atol=20 * tolerance, rtol=0)
@@ -92,6 +118,14 @@ def test_gradient_at_zero_is_the_generator():
     jacobian = torch.autograd.functional.jacobian(so3_exp, torch.zeros(3, dtype=torch.float64))
     expected = torch.stack([hat(e) for e in torch.eye(3, dtype=torch.float64)], dim=-1)
     torch.testing.assert_close(jacobian, expected, atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.1, 0.2, 0.3, 1.0, 2.5, np.pi - 1e-2, np.pi - 1e-6])
+def test_log_after_exp_has_the_identity_as_jacobian(angle):
+    for axis in axes(5):
+        rotvec = torch.tensor(axis * angle)
+        jacobian = torch.autograd.functional.jacobian(lambda w: so3_log(so3_exp(w)), rotvec)
+        torch.testing.assert_close(jacobian, torch.eye(3, dtype=torch.float64), atol=1e-8, rtol=0)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-5, 0.5, 0.9999999, 1.0000001, 3.0, 10.0])
@@ -110,7 +144,9 @@ def test_a_batch_equals_its_elements_and_may_be_empty():
             one = se3_exp(rotvec[i, j], velocity[i, j])
             torch.testing.assert_close(rotation[i, j], one[0])
             torch.testing.assert_close(translation[i, j], one[1])
+            torch.testing.assert_close(so3_log(rotation)[i, j], so3_log(rotation[i, j]))
     assert so3_exp(torch.zeros(0, 3)).shape == (0, 3, 3)
+    assert so3_log(torch.zeros(0, 3, 3)).shape == (0, 3)
 
 
 def test_wrong_shapes_and_types_are_refused():
@@ -118,3 +154,5 @@ def test_wrong_shapes_and_types_are_refused():
         so3_exp(torch.zeros(4))
     with pytest.raises(ValueError, match="float type"):
         so3_exp(torch.zeros(3, dtype=torch.int64))
+    with pytest.raises(ValueError, match="rotation must have shape"):
+        so3_log(torch.zeros(4, 3))
