@@ -33,7 +33,8 @@ def epipolar_angles(
     baseline = _unit(baseline, _DEGENERATE * max(float(reach), 1e-300))
     sine_b = np.abs((_unit(np.cross(baseline, direction_a), _DEGENERATE) * direction_b).sum(1))
     sine_a = np.abs((_unit(np.cross(baseline, direction_b), _DEGENERATE) * direction_a).sum(1))
-    return (np.arcsin(np.minimum(sine_a, 1.0)) + np.arcsin(np.minimum(sine_b, 1.0))) / 2
+    mean_angle: Array = (np.arcsin(np.minimum(sine_a, 1.0)) + np.arcsin(np.minimum(sine_b, 1.0))) / 2
+    return mean_angle
 
 
 def match_depths(

@@ -24,7 +24,8 @@ def hat(vector: Tensor) -> Tensor:
     _require(vector, (3,), "vector")
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    flat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
+    return flat.reshape(*flat.shape[:-1], 3, 3)
 
 
 def so3_exp(rotvec: Tensor) -> Tensor:

@@ -86,7 +86,8 @@ def rotation_angle_deg(rotation: Array) -> Array:
         + (rotation[..., 1, 0] - rotation[..., 0, 1]) ** 2
     )
     twice_cosine = np.trace(rotation, axis1=-2, axis2=-1) - 1.0
-    return np.degrees(np.arctan2(twice_sine, twice_cosine))
+    angles: Array = np.degrees(np.arctan2(twice_sine, twice_cosine))
+    return angles
 
 
 def rotation_between_deg(a: Array, b: Array) -> Array:
@@ -168,7 +169,8 @@ def _reference(truth: Array) -> tuple[Array, float, Literal["focus", "spread", "
 
 
 def _cam_from_world_translation(world_from_cam: Array) -> Array:
-    return -np.einsum("nji,nj->ni", world_from_cam[:, :3, :3], world_from_cam[:, :3, 3])
+    translations: Array = -np.einsum("nji,nj->ni", world_from_cam[:, :3, :3], world_from_cam[:, :3, 3])
+    return translations
 
 
 def _spread(values: Array) -> Spread:

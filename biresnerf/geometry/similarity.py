@@ -185,7 +185,8 @@ def _rotation_of(correlation: Array, turn: Array) -> Array:
     left, values, right_t = np.linalg.svd(correlation)
     if values[1] > _LINE_BELOW * values[0]:
         sign = np.sign(np.linalg.det(left) * np.linalg.det(right_t))
-        return left @ np.diag([1.0, 1.0, sign]) @ right_t
+        rotation_of_plane: Array = left @ np.diag([1.0, 1.0, sign]) @ right_t
+        return rotation_of_plane
     # Complete both directions of the line to right-handed frames, then turn about the line by the angle that
     # brings the cameras closest.
     left[:, 2] *= np.linalg.det(left)
@@ -193,12 +194,16 @@ def _rotation_of(correlation: Array, turn: Array) -> Array:
     about = left.T @ turn @ right_t.T
     angle = np.arctan2(about[2, 1] - about[1, 2], about[1, 1] + about[2, 2])
     cos, sin = np.cos(angle), np.sin(angle)
-    return left @ np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]]) @ right_t
+    rotation: Array = left @ np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]]) @ right_t
+    return rotation
 
 
 def _nearest_rotation(matrix: Array) -> Array:
     left, _, right_t = np.linalg.svd(matrix)
-    return left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right_t))]) @ right_t
+    rotation: Array = (
+        left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right_t))]) @ right_t
+    )
+    return rotation
 
 
 def _is_point(spread: float, centres: Array) -> bool:
@@ -216,7 +221,7 @@ def _same(one: Similarity, other: Similarity, spread: float) -> bool:
     shifted = np.abs(one.translation - other.translation).max() / max(
         spread, float(np.abs(other.translation).max()), 1e-300
     )
-    return max(turned, scaled, shifted) < 1e-13
+    return bool(max(turned, scaled, shifted) < 1e-13)
 
 
 def _rig_pair(a_from_cam: Array, b_from_cam: Array) -> tuple[Array, Array]:

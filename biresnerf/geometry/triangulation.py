@@ -45,7 +45,8 @@ def triangulate(
         length = np.maximum(np.linalg.norm(to_point, axis=1), 1e-300)
         off_px = focal_px * np.linalg.norm((across @ to_point[:, :, None])[:, :, 0], axis=1) / length
         weights = (length.mean() / length) ** 2 / (1.0 + (off_px / CAUCHY_PX) ** 2)
-    return xyz + middle
+    points: Array = xyz + middle
+    return points
 
 
 def parallax_deg(origins: Array, xyz: Array, point: NDArray[np.int64]) -> Array:

@@ -207,7 +207,7 @@ def _on_image(i: Intrinsics, image_index: Tensor, x: Tensor, y: Tensor) -> Tenso
 def _from_plane(i: Intrinsics, image_index: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Unit directions [rays, 3] of positions on the plane of directions."""
     slopes = torch.stack([x, y, torch.ones_like(x)], dim=-1)
-    perspective = slopes / slopes.norm(dim=-1, keepdim=True)
+    perspective: Tensor = slopes / slopes.norm(dim=-1, keepdim=True)
     if not i.some_fisheye:
         return perspective
     s = x * x + y * y

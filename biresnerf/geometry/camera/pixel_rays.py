@@ -21,7 +21,8 @@ def rays_of_pixels(lens: FullParameters, pixel_xy: NDArray[np.float64]) -> NDArr
         across = np.where(angle > _NEAR_AXIS, np.sin(angle) / np.maximum(angle, _NEAR_AXIS), 1.0)
         return np.stack([x * across, y * across, np.cos(angle)], axis=1)
     directions = np.stack([x, y, np.ones_like(x)], axis=1)
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    units: NDArray[np.float64] = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return units
 
 
 def pixels_of_points(lens: FullParameters, points_in_cam: NDArray[np.float64]) -> NDArray[np.float64]:
