@@ -67,7 +67,6 @@ Every error is `application/problem+json` (RFC 9457) with a stable `code`.
 
 def create_app(settings: Settings) -> FastAPI:
     """The application; opens the engine when it starts (needs ``settings.database_url``, migrated)."""
-
     metrics = WebMetrics()
 
     @asynccontextmanager

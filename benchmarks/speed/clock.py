@@ -17,8 +17,10 @@ CLOCKS: dict[str, Clock] = {"wall": time.perf_counter, "cpu": time.process_time}
 def interleave(
     competitors: dict[str, Callable[[], Any]], rounds: int, clock: Clock, warm: int = 1
 ) -> dict[str, list[float]]:
-    """Seconds of each competitor in each round. Each runs `warm` times first, and in every round once unmeasured:
-    thread pools fall asleep while another's works."""
+    """Seconds of each competitor in each round.
+
+    Each runs `warm` times first, and in every round once unmeasured: thread pools sleep while another competitor runs.
+    """
     for run in competitors.values():
         for _ in range(warm):
             run()

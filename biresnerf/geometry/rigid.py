@@ -19,8 +19,9 @@ def rigid_inverse(b_from_a: Array) -> Array:
 
 
 def interpolate_pose(first: Array, second: Array, share: float) -> Array:
-    """The pose [4, 4] at ``share`` of the way from ``first`` to ``second``: its centre on the line between theirs,
-    its rotation on the shortest path (for opposite rotations, one of them).
+    """The pose [4, 4] at ``share`` of the way from ``first`` to ``second``.
+
+    Its centre is on the line between theirs, its rotation on the shortest path (for opposite rotations, one of them).
 
     Args:
         first, second: world_from_cam [4, 4].

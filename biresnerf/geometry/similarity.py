@@ -76,8 +76,7 @@ class Similarity:
 
 
 def align_by_spread(a_from_cam: Array, b_from_cam: Array) -> Similarity:
-    """The ``b_from_a`` that carries the camera centres of a rig in a onto those in b, as BARF's evaluation
-    does.
+    """The ``b_from_a`` that carries the camera centres of a rig in a onto those in b, as in BARF's evaluation.
 
     Scale is the ratio of the root-mean-square spreads, which is not the least-squares one (`trajectory_error`
     has that); the rotation comes from the singular value decomposition of the correlation with the determinant
@@ -180,8 +179,7 @@ def _align_weighted(
 
 
 def _rotation_of(correlation: Array, turn: Array) -> Array:
-    """Rotation maximising ``trace(rotation^T correlation)``; `turn` decides what a rank of one leaves
-    free."""
+    """Rotation maximising ``trace(rotation^T correlation)``; `turn` decides what a rank of one leaves free."""
     left, values, right_t = np.linalg.svd(correlation)
     if values[1] > _LINE_BELOW * values[0]:
         sign = np.sign(np.linalg.det(left) * np.linalg.det(right_t))

@@ -41,9 +41,11 @@ class Plan:
     equal_time: bool = False
 
     def options(self, variant: Variant, scene: Scene, start: Perturbation) -> RefineOptions:
-        """The variant's options. By default the run's seed is that of the noise, it starts from the perturbed poses
-        without feature matches, renders no orbit, returns the refined poses without a verdict, and holds out no
-        views of a scene that has test views. Raises `InputError`.
+        """The variant's options.
+
+        By default the run's seed is that of the noise. It starts from the perturbed poses without feature matches,
+        renders no orbit, returns the refined poses without a verdict, and holds out no views of a scene that has test
+        views. Raises `InputError`.
         """
         defaults: dict[str, Any] = {"seed": start.seed, "start": "given", "orbit_frames": 0, "verdict": False}
         if scene.test_file is not None:

@@ -190,6 +190,7 @@ def peak_memory_bytes() -> int:
 
 
 def main() -> int:
+    """Run the cell of the folder in ``argv[1]``; returns the exit status."""
     folder = Path(sys.argv[1])
     try:
         result = run_cell(folder, StopRequest())

@@ -209,6 +209,7 @@ def paired_wilcoxon(first: Sequence[float], other: Sequence[float]) -> PairedTes
 
 
 def failures_of(entries: Sequence[Entry]) -> tuple[Failure, ...]:
+    """The runs that ended in an error."""
     return tuple(
         Failure(
             scene=entry.scene,

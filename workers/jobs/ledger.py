@@ -40,7 +40,6 @@ class Ledger:
 
     async def progress(self, now: Progress) -> None:
         """Write the progress columns, and the options where they are reported; a new stage is also an event."""
-
         resolved = None if now.options is None else Jsonb(now.options.model_dump(mode="json"))
 
         async def write(connection: Connection, job: DictRow) -> None:

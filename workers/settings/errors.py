@@ -32,8 +32,9 @@ class Conflict(EngineError):
 
 
 class LimitReached(EngineError):
-    """A configured limit is reached. Codes: ``body_too_large``, ``too_many_files``, ``queue_full``,
-    ``quota_exhausted``, ``storage_full``.
+    """A configured limit is reached.
+
+    Codes: ``body_too_large``, ``too_many_files``, ``queue_full``, ``quota_exhausted``, ``storage_full``.
     """
 
 

@@ -1,6 +1,7 @@
-"""The two small networks in Numba, block by block: encoded point -> 16 outputs, the first of them the density's;
-those and the view -> colour.
+"""The two small networks in Numba, block by block.
 
+The first turns an encoded point into 16 outputs, one of which gives the density; the second turns those and the view
+into a colour.
 The definition is `biresnerf.field.reference.operations.network`. Weights are flattened: w1 [64, width], w2 [16, 64],
 w3 [64, 32], w4 [64, 64], w5 [4, 64] (three colours and a row of zeros).
 """
@@ -34,6 +35,7 @@ COLOUR_INPUTS = VIEW + OUT
 
 @njit(inline="always")
 def density_of(logit):
+    """Density of the first network's first output."""
     return exponential(min(logit - DENSITY_SHIFT, DENSITY_CAP))
 
 

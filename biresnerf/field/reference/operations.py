@@ -71,6 +71,7 @@ def network_logits(features: Tensor, view: Tensor, weights: list[Tensor]) -> tup
 
 
 def density_of(logit: Tensor) -> Tensor:
+    """Density of the first network's first output: a shifted exponential, capped."""
     return torch.exp((logit - DENSITY_SHIFT).clamp(max=DENSITY_CAP))
 
 

@@ -22,8 +22,10 @@ def psnr(image: Tensor, reference: Tensor, counts: Tensor | None = None) -> floa
 
 
 def ssim(image: Tensor, reference: Tensor, counts: Tensor | None = None) -> float:
-    """Structural similarity (Wang et al. 2004) of [h, w, 3] images: Gaussian window of 11 px, sigma 1.5, mean over
-    channels and over the pixels whose window lies inside; small images take the largest odd window that fits.
+    """Structural similarity (Wang et al. 2004) of [h, w, 3] images.
+
+    Gaussian window of 11 px, sigma 1.5, mean over channels and over the pixels whose window lies inside; small images
+    take the largest odd window that fits.
 
     Pixels that `counts` [h, w] leaves out have no part in it: windows weigh what is left of them, and the mean is over
     pixels that count (over all, where none has its window inside).
