@@ -60,7 +60,7 @@ def test_the_fast_field_ends_rays_where_the_definition_does():
         given.origin.detach().numpy(), given.direction.detach().numpy(), np.zeros((300, 16), np.float32),
         given, marching, PositionGradient(),
     )  # fmt: skip
-    kept = int((samples.kept_end - samples.kept_begin).sum())
+    kept = int((samples.composited.kept_end - samples.composited.kept_begin).sum())
     assert 0.1 * len(samples.t) < kept < 0.9 * len(samples.t)
     results = []
     for field in (fast, slow):
