@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,18 @@ RUN = {
     **{"steps": 2 * STEPS, "coarse_steps_min": STEPS // 4, "coarse_steps_max": STEPS, "max_image_size": SIZE},
     **{"samples_per_step": 8192, "pose_resolution_max": 48},
 }
-GAINS = np.random.default_rng(0).uniform(0.7, 1.4, VIEWS)
+# Short runs are chaotic, and end elsewhere on other processors: what compensation gains is claimed of their mean.
+DRAWS = [np.random.default_rng(seed).uniform(0.7, 1.4, VIEWS) for seed in range(4)]
+GAINS = DRAWS[0]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where a short training ended: mean rotation error, factors [views, 3], error of the last steps."""
+
+    rotation_deg: float
+    gains: np.ndarray
+    mean_squared_error: float
 
 
 def rendering(colour: torch.Tensor, opacity: torch.Tensor) -> Rendering:
@@ -36,40 +48,48 @@ def lit(images: ImageSet, gains: np.ndarray) -> ImageSet:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory) -> dict:
-    """Rotation error (deg) and factors after some steps from the true poses: photos alike or not, `none` and `on`."""
+def trained(tmp_path_factory) -> Callable[[np.ndarray | None, str], Outcome]:
+    """Trains from the true poses on photos with the given exposures (None: alike), compensating for them or not."""
     dataset, alike = tiny_set(tmp_path_factory.mktemp("scene"), VIEWS, SIZE)
-    truth, results = dataset.world_from_cam, {}
-    for photos, images in (("alike", alike), ("unlike", lit(alike, GAINS))):
-        for choice in ("none", "on"):
-            options = tiny_options(**RUN, exposure=choice)
-            optimiser = tiny_optimiser(dataset, images, options)
-            error = [optimiser.step().mean_squared_error for _ in range(STEPS)]
-            poses = optimiser.poses.poses().numpy()
-            turned = camera_errors(align_by_spread(poses, truth).apply_to_poses(poses), truth).rotation_deg
-            results[photos, choice] = (
-                float(turned.mean()),
-                optimiser.exposure.gains(),
-                float(np.mean(error[-20:])),
-            )
-    return results
+    truth = dataset.world_from_cam
+
+    def train(gains: np.ndarray | None, choice: str) -> Outcome:
+        images = alike if gains is None else lit(alike, gains)
+        optimiser = tiny_optimiser(dataset, images, tiny_options(**RUN, exposure=choice))
+        error = [optimiser.step().mean_squared_error for _ in range(STEPS)]
+        poses = optimiser.poses.poses().numpy()
+        turned = camera_errors(align_by_spread(poses, truth).apply_to_poses(poses), truth).rotation_deg
+        return Outcome(float(turned.mean()), optimiser.exposure.gains(), float(np.mean(error[-20:])))
+
+    return train
 
 
-def test_the_factors_of_unlike_photos_are_found(runs):
-    _, found, _ = runs["unlike", "on"]
+@pytest.fixture(scope="module")
+def alike(trained) -> dict[str, Outcome]:
+    return {choice: trained(None, choice) for choice in ("none", "on")}
+
+
+@pytest.fixture(scope="module")
+def unlike(trained) -> dict[str, list[Outcome]]:
+    """One outcome for each of `DRAWS`."""
+    return {choice: [trained(gains, choice) for gains in DRAWS] for choice in ("none", "on")}
+
+
+def test_the_factors_of_unlike_photos_are_found(alike, unlike):
+    found = unlike["on"][0].gains
     assert np.corrcoef(np.log(found.mean(1)), np.log(GAINS))[0, 1] > 0.8
-    _, alike, _ = runs["alike", "on"]
-    assert np.log(alike.mean(1)).std() < 0.8 * np.log(found.mean(1)).std()
+    assert np.log(alike["on"].gains.mean(1)).std() < 0.8 * np.log(found.mean(1)).std()
 
 
-def test_poses_are_dragged_less_far_where_exposures_are_compensated(runs):
-    assert runs["unlike", "on"][0] < 0.95 * runs["unlike", "none"][0]
-    assert runs["unlike", "on"][2] < 0.92 * runs["unlike", "none"][2]
+def test_poses_are_dragged_less_far_where_exposures_are_compensated(unlike):
+    for measure in ("rotation_deg", "mean_squared_error"):
+        on, none = (np.mean([getattr(outcome, measure) for outcome in unlike[c]]) for c in ("on", "none"))
+        assert on < 0.98 * none, measure
 
 
-def test_photos_that_are_alike_lose_nothing_by_compensation(runs):
-    assert runs["alike", "on"][0] < 1.1 * runs["alike", "none"][0]
-    assert runs["alike", "on"][2] < 1.1 * runs["alike", "none"][2]
+def test_photos_that_are_alike_lose_nothing_by_compensation(alike):
+    assert alike["on"].rotation_deg < 1.1 * alike["none"].rotation_deg
+    assert alike["on"].mean_squared_error < 1.1 * alike["none"].mean_squared_error
 
 
 def test_a_factor_lights_the_scene_and_not_what_lies_behind_it():
