@@ -102,7 +102,7 @@ def test_a_folder_without_one_gives_none(tmp_path):
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.001, 0.5, 0.99])
-def test_a_truncated_file_is_refused_with_its_name_and_the_mend(tmp_path, keep):
+def test_a_truncated_file_is_refused_with_its_name_and_the_hint(tmp_path, keep):
     path = save_checkpoint(tmp_path, checkpoint({"table": torch.rand(5000)}))
     content = path.read_bytes()
     path.write_bytes(content[: int(keep * len(content))])

@@ -43,7 +43,7 @@ def test_images_alone_are_sent_with_their_folder(scene: Path, tmp_path: Path) ->
     assert sorted(name for name, _ in look_at(tmp_path).files) == [f"images/r_{i}.png" for i in range(6)]
 
 
-def test_an_image_outside_of_the_folder_is_refused_with_a_mend(scene: Path, tmp_path: Path) -> None:
+def test_an_image_outside_of_the_folder_is_refused_with_a_hint(scene: Path, tmp_path: Path) -> None:
     inner = tmp_path / "inner"
     inner.mkdir()
     shutil.copytree(scene / "train", tmp_path / "train")

@@ -100,7 +100,7 @@ def test_without_wait_only_the_address_is_printed(http: httpx.Client, service: R
         (("--output", "."), "is not an empty folder"),
     ],
 )
-def test_what_the_user_can_mend_is_exit_2(
+def test_what_the_user_can_fix_is_exit_2(
     service: Running, scene: Path, arguments: tuple[str, ...], said: str
 ) -> None:
     done = submit(service, scene, *arguments)

@@ -187,7 +187,7 @@ BAD: dict[str, tuple[Callable[[Files], object], str | None, str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_scene_is_422_with_the_file_and_the_mend(http: httpx.Client, scene: Path, case: str) -> None:
+def test_a_bad_scene_is_422_with_the_file_and_the_hint(http: httpx.Client, scene: Path, case: str) -> None:
     change, code, names = BAD[case]
     files = scene_files(scene)
     change(files)

@@ -95,7 +95,7 @@ def test_sigterm_checkpoints_and_the_next_run_goes_on(tmp_path: Path, scene: Pat
     assert steps[0] >= kept.step
 
 
-def test_a_users_mistake_ends_with_2_and_says_what_to_mend(tmp_path: Path, scene: Path):
+def test_a_users_mistake_ends_with_2_and_says_what_to_fix(tmp_path: Path, scene: Path):
     folder = job_folder(tmp_path, scene, {"steps": 1})
     process = run(folder)
     process.communicate(timeout=60)

@@ -159,7 +159,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_files_are_refused_with_file_field_and_mend(tmp_path, case):
+def test_bad_files_are_refused_with_file_field_and_hint(tmp_path, case):
     code, place, change = BAD[case]
     document = nerfstudio_scene(tmp_path)
     read_dataset(save(tmp_path, copy.deepcopy(document)))  # good before the change
