@@ -22,6 +22,8 @@ from biresnerf.field.radiance_field import Marching, PositionGradient, Rays
 from biresnerf.field.reference import operations as reference
 from biresnerf.field.reference.field import ReferenceField
 
+pytestmark = pytest.mark.slow
+
 DENSE, HASHED = grid_levels(3, 8, 20, 14), grid_levels(4, 64, 200, 12)
 
 

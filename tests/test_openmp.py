@@ -9,6 +9,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 ENTRANCES = {
     "library": "import biresnerf; biresnerf.refine_poses",
     "command line": "from biresnerf.command_line import main\ntry: main()\nexcept SystemExit: import torch",

@@ -16,6 +16,8 @@ from tests.docs.forms_of_commands import check_shell, command_context, words_of
 from tests.docs.workplace import SETS, Workplace, done_job, furnish, make_result
 from tests.service.conftest import running_service, short_folder
 
+pytestmark = pytest.mark.server
+
 COMMANDS = all_commands()
 # Beginnings of commands that are not run here, and why. Their form is checked all the same.
 NOT_RUN = {

@@ -12,6 +12,8 @@ import pytest
 from docs.generate.pages import ROOT
 from tests.docs.small_runs import small_runs
 
+pytestmark = pytest.mark.slow
+
 
 # One of them: they differ in the set that is made, and the code of all three is run as scripts.
 @pytest.mark.parametrize("name", ["half_registered"])

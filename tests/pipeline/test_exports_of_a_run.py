@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.colmap.write_text import write_colmap_text
@@ -17,6 +18,8 @@ from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.pipeline import refine_poses
 from tests.data.points.test_refined_points import seen_model
 from tests.refine.tiny_scene import tiny_run
+
+pytestmark = pytest.mark.slow
 
 
 def test_a_text_model_comes_back_in_both_forms_with_its_ids_and_points_of_the_refined_cameras(tmp_path):

@@ -22,6 +22,8 @@ from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.pipeline import refine_poses
 from tests.refine.tiny_scene import tiny_run
 
+pytestmark = pytest.mark.slow
+
 FIXED = ("./train/r_1", "train/r_4.png")
 
 

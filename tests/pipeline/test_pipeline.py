@@ -30,6 +30,8 @@ from biresnerf.report import Report
 from biresnerf.stages import STAGES
 from biresnerf.viewer.report_html import BUNDLE
 
+pytestmark = pytest.mark.slow
+
 VIEWS, HELD_OUT = 30, 3
 # The input lies anywhere and has any scale: results must come back into this frame.
 INPUT_FROM_TRUTH = Similarity(

@@ -16,6 +16,8 @@ from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
 from biresnerf.report import Report
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = RefineOptions(
     preset="fast", device="cpu", start="given", steps=400, max_image_size=32, samples_per_step=4096,
     pose_resolution_max=24, reconstruction_levels=2, reconstruction_resolution_max=256, table_size_log2=12,

@@ -11,6 +11,8 @@ from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = RefineOptions(
     preset="fast", device="cpu", start="given", steps=60, coarse_steps_min=20, coarse_steps_max=30,
     max_image_size=24, samples_per_step=4096, table_size_log2=12, orbit_frames=0, verdict=False,

@@ -15,6 +15,8 @@ from biresnerf.resume import earlier_work, refuse_other_run, reusable_seeding, r
 from tests.refine.stages.test_checkpoint import checkpoint
 from tests.refine.tiny_scene import tiny_options, tiny_set
 
+pytestmark = pytest.mark.slow
+
 Scene = tuple[Dataset, ImageSet]
 
 

@@ -18,9 +18,12 @@ from biresnerf.refine.stages.checkpoint import CHECKPOINT
 from biresnerf.report import Report
 from tests.data.scenes import textured_arc
 
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed (extra: colmap)"
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed (extra: colmap)"
+    ),
+]
 QUICK = RefineOptions(
     preset="fast", device="cpu", steps=20, max_image_size=24, samples_per_step=1024, orbit_frames=0, holdout=0,
     pose_resolution_max=16, reconstruction_levels=1, reconstruction_resolution_max=128, table_size_log2=10,

@@ -16,6 +16,8 @@ from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = RefineOptions(
     preset="fast", device="cpu", start="given", steps=60, coarse_steps_min=20, coarse_steps_max=30, check_every=10,
     max_image_size=24, samples_per_step=2048, pose_resolution_max=24, reconstruction_levels=2, table_size_log2=10,

@@ -21,6 +21,8 @@ from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
 from tests.data.scenes import arc_poses, plain_features, textured_arc
 
+pytestmark = pytest.mark.slow
+
 needs_colmap = pytest.mark.skipif(
     importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed (extra: colmap)"
 )

@@ -16,6 +16,8 @@ from biresnerf.progress import Progress
 from biresnerf.report import Report
 from tests.refine.tiny_scene import tiny_run
 
+pytestmark = pytest.mark.slow
+
 # So few steps at so high a rate can only spoil true poses.
 OPTIONS = tiny_run(start="given", trial_steps=40, pose_rate=0.02, pose_rate_final=0.02)
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import httpx
+import pytest
 
 from biresnerf.client import Client
 from tests.service.conftest import (
@@ -19,6 +20,8 @@ from tests.service.conftest import (
     submit,
 )
 from tests.workers.buckets import by_boto, environment_of, fresh_bucket, moto_server
+
+pytestmark = pytest.mark.server
 
 
 def test_a_job_leaves_nothing_on_local_disk_and_its_files_come_from_the_bucket(

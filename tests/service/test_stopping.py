@@ -17,6 +17,8 @@ from service.http.request_context import RequestContext
 from tests.service.conftest import Running, finished, ready_dataset, submit
 from tests.service.routes.test_events import until_ready, web_process
 
+pytestmark = pytest.mark.server
+
 
 def test_a_long_poll_is_answered_when_the_service_stops(
     http: httpx.Client, service: Running, scene: Any

@@ -13,6 +13,8 @@ from biresnerf.studies.run_cell import run_cell
 from biresnerf.studies.scenes import find_scene
 from tests.refine.tiny_scene import tiny_run
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_stopped_cell_goes_on_and_is_measured_from_an_identity_start(tmp_path):
     write_synthetic_scene(tmp_path / "scene", 7, 24, seed=3)

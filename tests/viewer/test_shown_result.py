@@ -17,6 +17,8 @@ from biresnerf.viewer import report_html
 from biresnerf.viewer.report_html import read_report, write_report_html
 from tests.viewer.conftest import BUILT, OPTIONS, SHOWN
 
+pytestmark = pytest.mark.slow
+
 built = pytest.mark.skipif(not BUILT, reason="The viewer is not built; make web builds it.")
 
 

@@ -7,7 +7,7 @@ import pytest
 from benchmarks.chaos.__main__ import storm
 from tests.workers.conftest import short_folder
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.server, pytest.mark.anyio]
 
 
 async def test_every_job_of_a_small_storm_ends_right_and_nothing_is_left():

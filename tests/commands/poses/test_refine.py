@@ -17,6 +17,8 @@ from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.refine.stages.checkpoint import CHECKPOINT, load_checkpoint
 from biresnerf.report import Report
 
+pytestmark = pytest.mark.slow
+
 PROGRAM = Path(sys.executable).with_name("biresnerf")
 STEPS = 200
 SETTINGS = {

@@ -25,6 +25,8 @@ from biresnerf.geometry.pose_error import rotation_angle_deg, rotation_between_d
 from biresnerf.geometry.similarity import Similarity, align_by_spread
 from tests.data.scenes import plain_features, textured_arc
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("pycolmap", reason="needs pycolmap (pip install 'biresnerf[colmap]')")
 VIEWS, SIZE = 10, 200
 MISSING, BLANK = (2, 6), 5

@@ -24,6 +24,8 @@ from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error, rotation_between_deg
 from tests.data.scenes import arc_poses, assert_complete, plain_features, textured_arc, write_image
 
+pytestmark = pytest.mark.slow
+
 needs_colmap = pytest.mark.skipif(
     importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed (extra: colmap)"
 )

@@ -34,6 +34,8 @@ from tests.field.cuda.fields import (
     make_rays,
 )
 
+pytestmark = pytest.mark.slow
+
 needs_gpu = pytest.mark.skipif(not HAS_GPU, reason="CUDA graphs and late counts need a GPU; torch finds none")
 
 

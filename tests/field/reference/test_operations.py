@@ -15,6 +15,8 @@ from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.reference import operations as reference
 from biresnerf.field.spherical_harmonics import spherical_harmonics
 
+pytestmark = pytest.mark.slow
+
 DOUBLE = torch.float64
 
 

@@ -28,6 +28,8 @@ from biresnerf.write.output_folder import OutputFolder
 from biresnerf.write.result import write_result
 from tests.refine.tiny_scene import CPU, finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
+pytestmark = pytest.mark.slow
+
 SIZE, STEPS, PERIOD = 32, 160, 8
 TURNED, ORBITED, HELD_OUT = 5, 3, [3, 8]
 

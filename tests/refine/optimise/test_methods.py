@@ -27,6 +27,8 @@ from biresnerf.report import Report
 from biresnerf.studies.baselines import methods as baselines
 from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_run, tiny_set
 
+pytestmark = pytest.mark.slow
+
 SMALL_GRID = {
     "reconstruction_levels": 8,
     "reconstruction_resolution_min": 8,

@@ -9,6 +9,8 @@ from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refine.optimise.schedule import FREEZE_SHARE, Schedule, smooth_ramp
 
+pytestmark = pytest.mark.slow
+
 SMALL_JUMP = 0.15  # of the largest value; the shortest ramp takes 15 steps
 
 

@@ -16,6 +16,8 @@ from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.parameters.exposure import MOST, Exposure, brightness_spread, compensates
 from tests.refine.tiny_scene import CPU, photos_set, tiny_optimiser, tiny_options, tiny_set
 
+pytestmark = pytest.mark.slow
+
 VIEWS, SIZE, STEPS = 14, 32, 250
 RUN = {
     **{"steps": 2 * STEPS, "coarse_steps_min": STEPS // 4, "coarse_steps_max": STEPS, "max_image_size": SIZE},

@@ -30,6 +30,8 @@ from biresnerf.refine.scene.scene_frame import scene_frame
 from biresnerf.refine.verdict.run_report import camera_reports
 from tests.refine.tiny_scene import photos_set, tiny_optimiser, tiny_options, tiny_set
 
+pytestmark = pytest.mark.slow
+
 CPU = torch.device("cpu")
 CAMERAS = {
     "SIMPLE_PINHOLE": (60.0, 30.0, 20.0),

@@ -31,6 +31,8 @@ from biresnerf.refine.stages.stability import DetectorState
 from biresnerf.report import TrialReport
 from tests.data.scenes import assert_complete
 
+pytestmark = pytest.mark.slow
+
 POSES = np.random.default_rng(0).normal(0, 1e3, (3, 4, 4)) / 3
 
 

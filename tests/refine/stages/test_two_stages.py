@@ -12,6 +12,8 @@ from biresnerf.refine.stages.history import HISTORY, read_history
 from biresnerf.refine.stages.two_stages import TwoStages
 from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):

@@ -18,6 +18,8 @@ from biresnerf.refine.start.choose_start import choose_start
 from biresnerf.refine.start.first_step import MATCHED_MOBILITY, pose_mobility, stage_lengths
 from tests.refine.tiny_scene import CPU, tiny_options, tiny_set
 
+pytestmark = pytest.mark.slow
+
 VIEWS = 9
 
 

@@ -11,6 +11,8 @@ from biresnerf.refine.start import forward_facing
 from biresnerf.refine.start.forward_facing import find_forward_facing, mirrored, resemblance_psnr
 from tests.refine.tiny_scene import CPU, photos_set, tiny_options, tiny_set
 
+pytestmark = pytest.mark.slow
+
 
 def small_rig(seed: int) -> np.ndarray:
     """Cameras near one place that look nearly the same way."""

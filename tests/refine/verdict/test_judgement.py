@@ -19,6 +19,8 @@ from biresnerf.refine.verdict.pose_evidence import Rig, moved_px
 from biresnerf.refine.views.held_out_views import held_out_views, unseen_rounds, unseen_views
 from tests.refine.tiny_scene import CPU, given_scene, tiny_optimiser, tiny_options, tiny_set
 
+pytestmark = pytest.mark.slow
+
 VIEWS = 14
 OPTIONS = tiny_options(trial_steps=60, samples_per_step=8192)
 

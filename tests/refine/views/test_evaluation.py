@@ -13,6 +13,8 @@ from biresnerf.refine.views.evaluation import fit_held_out_poses, orbit_poses, r
 from biresnerf.refine.views.held_out_views import held_out_views
 from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 6, 10, 47, 100, 1000])
 @pytest.mark.parametrize("asked", ["auto", 0, 1, 7, 200])

@@ -39,6 +39,8 @@ from biresnerf.commands.jobs.submit import submit_command
 from service.commands.serve import free_port
 from tests.service.conftest import Running, Tenant, finished, submit, until
 
+pytestmark = pytest.mark.server
+
 COMMANDS = {
     "submit": submit_command,
     "status": status_command,

@@ -25,6 +25,8 @@ from biresnerf.wire.results import ArtifactView
 from service.commands.serve import free_port
 from tests.service.conftest import Running, dataset_ids, finished
 
+pytestmark = pytest.mark.server
+
 COMMAND = (sys.executable, "-m", "biresnerf.command_line", "submit")
 FAST = ("--preset", "fast", "--set", "steps=40", "--set", "seed=50")
 

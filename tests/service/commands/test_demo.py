@@ -21,6 +21,8 @@ from biresnerf.data.formats.read_dataset import read_poses
 from biresnerf.report import Report
 from tests.service.conftest import PATIENCE_S
 
+pytestmark = pytest.mark.server
+
 COMMAND = (sys.executable, "-m", "biresnerf.command_line", "demo")
 SMALL = ("--views", "8", "--size", "32", "--set", "steps=60", "--set", "orbit_frames=2")
 

@@ -12,6 +12,8 @@ from service.commands.doctor_checks import database, page
 from service.commands.serve import free_port
 from service.web_page import FOLDER
 
+pytestmark = pytest.mark.server
+
 
 def test_everything_that_tests_use_is_found_good() -> None:
     result = CliRunner().invoke(doctor_command, ["--json"], env={"BIRESNERF_DATABASE_URL": None})

@@ -22,6 +22,8 @@ from workers.database.embedded_postgres import EmbeddedPostgres
 from workers.database.migrate import migrate
 from workers.settings.settings import Settings
 
+pytestmark = pytest.mark.server
+
 HEAVY = ("torch", "numba", "pycolmap", "numpy", "PIL", "scipy", "biresnerf.data")
 
 

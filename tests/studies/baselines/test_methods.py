@@ -11,6 +11,8 @@ from biresnerf.refine.optimise.schedule import Schedule
 from biresnerf.refine.parameters.parametrisations import So3xR3
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 
+pytestmark = pytest.mark.slow
+
 DISTANCE = 4.0
 ONE_STAGE = ("baa-ngp", "nerfacc-barf", "barf")
 

@@ -35,7 +35,7 @@ SETTINGS = {
 }
 # Each run is a process that loads torch and kernels: seconds alone, minutes beside other work.
 LONGEST_S = 900
-pytestmark = pytest.mark.timeout(3 * LONGEST_S)
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3 * LONGEST_S)]
 PROGRAM = "import sys; from biresnerf.command_line import main; sys.argv[0] = 'biresnerf'; main()"
 
 

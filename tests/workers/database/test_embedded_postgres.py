@@ -21,6 +21,8 @@ from workers.database.migrate import migrate, step_names
 from workers.database.postgres_binaries import find_binaries, server_version, unprivileged_user
 from workers.settings.errors import SetupError
 
+pytestmark = pytest.mark.server
+
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root has another user run the server")
 LAUNCHER = """
 import sys, time

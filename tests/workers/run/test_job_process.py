@@ -21,6 +21,8 @@ from tests.workers.conftest import ROOT, Counting, Slots, quick_settings, ready_
 from workers.engine import open_stores
 from workers.run.job_process import is_want_of_memory
 
+pytestmark = pytest.mark.server
+
 SMALL = RefineOptions(
     preset="fast",
     steps=300,

@@ -17,6 +17,8 @@ from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.pipeline import refine_poses
 from workers.run.memory import smaller_options
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def photos(tmp_path: Path) -> Path:

@@ -16,7 +16,7 @@ from workers.store import file_places
 from workers.store.file_places import Bucket, BucketPlace, LocalPlace
 from workers.store.files import PART_BYTES, FileStore
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.server, pytest.mark.anyio]
 KINDS = ["folder", "moto", "s3rver"]
 LARGE = bytes(range(256)) * 80_000  # 20 MB: three parts
 

@@ -34,7 +34,7 @@ from workers.settings.settings import Settings
 from workers.upkeep.backup import make_backup
 from workers.upkeep.restore import restore_backup
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.server, pytest.mark.anyio]
 
 
 @pytest.fixture

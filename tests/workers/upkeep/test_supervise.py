@@ -20,7 +20,7 @@ from workers.database.postgres_binaries import unprivileged_user
 from workers.engine import open_stores
 from workers.settings.settings import Settings
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.server, pytest.mark.anyio]
 PROGRAM = Path(__file__).with_name("up_program.py")
 START_S = END_S = 90.0  # on a machine that has much else to do
 # Nobody is taken for dead who merely got no processor for seconds.

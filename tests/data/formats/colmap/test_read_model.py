@@ -22,6 +22,8 @@ from tests.data.formats.colmap.colmap_files import (
 )
 from tests.data.test_real_sets import ROOT
 
+pytestmark = pytest.mark.slow
+
 PARAMETERS = {
     "SIMPLE_PINHOLE": [700.0, 320.5, 240.25],
     "PINHOLE": [700.0, 710.0, 320.5, 240.25],
