@@ -1,0 +1,89 @@
+"""Metashape: lenses project as its manual says; labels, states and components of cameras are kept apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from biresnerf.data.formats.simple.metashape import parse_metashape
+from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera import Intrinsics, project
+from tests.data.formats.simple.trajectories import metashape_xml
+
+WIDTH, HEIGHT = 20, 16
+IDENTITY = " ".join(map(str, np.eye(4).ravel()))
+
+
+def parsed(folder: Path, **parts: str):
+    file = folder / "cameras.xml"
+    file.write_text(metashape_xml(**parts))
+    return parse_metashape(folder, file)
+
+
+def by_the_manual(points: np.ndarray, k: tuple[float, float, float], p: tuple[float, float], b1: float):
+    """Pixels of points in the camera's frame: Metashape Professional 2 manual, appendix on camera models."""
+    f, cx, cy = 18.5, 0.25, -0.25
+    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    r2 = x**2 + y**2
+    radial = 1 + k[0] * r2 + k[1] * r2**2 + k[2] * r2**3
+    x_lens = x * radial + p[0] * (r2 + 2 * x**2) + 2 * p[1] * x * y
+    y_lens = y * radial + p[1] * (r2 + 2 * y**2) + 2 * p[0] * x * y
+    return np.stack([WIDTH / 2 + cx + x_lens * (f + b1), HEIGHT / 2 + cy + y_lens * f], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("k", "p", "b1"),
+    [
+        ((0.0, 0.0, 0.0), (0.0, 0.0), 0.0),
+        ((0.05, -0.01, 0.0), (0.003, -0.002), 0.0),
+        ((0.05, -0.01, 0.002), (0.003, -0.002), 0.4),
+    ],
+    ids=["pinhole", "radial and tangential", "all terms and an aspect"],
+)
+def test_the_lens_projects_as_the_manual_says(tmp_path, k, p, b1):
+    terms = {"k1": k[0], "k2": k[1], "k3": k[2], "p1": p[0], "p2": p[1], "b1": b1}
+    lens = "".join(f"<{name}>{value}</{name}>" for name, value in terms.items())
+    camera = parsed(tmp_path, lens=lens).entries[0].lens
+    points = np.random.default_rng(0).uniform((-0.4, -0.3, 1), (0.4, 0.3, 3), (50, 3))
+    index = torch.zeros(len(points), dtype=torch.long)
+    found = project(Intrinsics.from_cameras([camera]), index, torch.tensor(points))
+    np.testing.assert_allclose(found.numpy(), by_the_manual(points, k, p, b1), atol=1e-4)
+
+
+@pytest.mark.parametrize("term", ["k4", "p3", "p4", "b2"])
+def test_a_term_that_no_supported_model_has_is_refused_and_named(tmp_path, term):
+    with pytest.raises(InputError, match=term) as refused:
+        parsed(tmp_path, lens=f"<{term}>0.01</{term}>")
+    assert refused.value.code == "camera_model_unsupported"
+
+
+def camera(number: int, inside: str, more: str = "") -> str:
+    return f'<camera id="{number}" sensor_id="0" label="{number}.png" {more}>{inside}</camera>'
+
+
+def test_cameras_not_aligned_have_no_pose_and_those_switched_off_are_left_out(tmp_path):
+    placed = f"<transform>{IDENTITY}</transform>"
+    cameras = camera(1, placed) + camera(2, "") + camera(3, placed, 'enabled="false"')
+    entries = {entry.name: entry.world_from_cam for entry in parsed(tmp_path, cameras=cameras).entries}
+    assert set(entries) == {"1.png", "2.png"}
+    np.testing.assert_array_equal(entries["1.png"], np.eye(4))
+    assert entries["2.png"] is None
+
+
+def test_the_largest_component_alone_has_poses(tmp_path):
+    placed = f"<transform>{IDENTITY}</transform>"
+    cameras = "".join(camera(n, placed, f'component_id="{int(n == 3)}"') for n in range(4))
+    result = parsed(tmp_path, cameras=cameras)
+    assert [entry.name for entry in result.entries if entry.world_from_cam is None] == ["3.png"]
+    assert any("3.png" in note for note in result.notes)
+
+
+def test_an_entity_is_refused_before_it_expands(tmp_path):
+    file = tmp_path / "cameras.xml"
+    file.write_text('<!DOCTYPE x [<!ENTITY a "aaaa">]>' + metashape_xml().partition("?>")[2])
+    with pytest.raises(InputError) as refused:
+        parse_metashape(tmp_path, file)
+    assert refused.value.code == "pose_file_invalid"
