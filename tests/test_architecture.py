@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+# The contracts are part of the lint as well.
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[1]
 LINT_IMPORTS = Path(sys.executable).with_name("lint-imports")
 # What a package is imported as, where that is not what it is installed as.

@@ -93,6 +93,7 @@ def test_what_changes_no_result_may_change_on_resuming_and_what_comes_later_keep
     }
 
 
+@pytest.mark.slow
 def test_the_type_checker_tells_options_asked_for_from_resolved_ones(tmp_path: Path):
     program = tmp_path / "program.py"
     program.write_text(
