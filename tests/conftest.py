@@ -30,7 +30,6 @@ EXPECTED_SKIPS = (
     r"npm cannot install",
     r"no zip program writes",
     r"all was sent before the signal came",
-    r"^got empty parameter set",
 )
 
 
