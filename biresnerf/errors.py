@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from biresnerf.frozen_model import FrozenModel
 
 
-class Fault(BaseModel):
+class Fault(FrozenModel):
     """What is wrong and how to fix it, the same in an exception, in a job's error and in an HTTP answer."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     code: str = Field(description="Stable machine-readable name in snake_case.", examples=["unsafe_path"])
     detail: str = Field(description="What is wrong, in one sentence.", examples=["The name has a part `..`."])

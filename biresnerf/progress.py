@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from biresnerf.errors import Interrupted
+from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.stages import ReusableStage, Stage
 
@@ -16,10 +17,8 @@ KERNELS_FROM, SEEDING_FROM, TRYING_FROM, START_KNOWN = 0.005, 0.01, 0.016, 0.02
 STAGES_FROM, EVALUATING_FROM, JUDGING_FROM, EXPORTING_FROM = 0.03, 0.88, 0.95, 0.99
 
 
-class Progress(BaseModel):
+class Progress(FrozenModel):
     """One report of progress. ``fraction`` never falls within one run."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     stage: Stage
     step: int = Field(0, ge=0)

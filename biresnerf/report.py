@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.refine_options import ResolvedOptions
 
 SwitchReason = Literal["stable", "cap"]
@@ -28,11 +29,7 @@ _RETURNED_WORDS = {
 }
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class PairedDifference(_Frozen):
+class PairedDifference(FrozenModel):
     """One figure for the input's poses and for the refined ones, taken of the same views or images.
 
     `difference` is the mean over them of how much better the refined poses are: positive is better, whatever the
@@ -52,7 +49,7 @@ class PairedDifference(_Frozen):
     )
 
 
-class HeldOutEvidence(_Frozen):
+class HeldOutEvidence(FrozenModel):
     """Two equal short trainings on poses held still, the input's and the refined ones, scored on unseen views."""
 
     protocol: Literal["frozen_retraining"] = "frozen_retraining"
@@ -65,7 +62,7 @@ class HeldOutEvidence(_Frozen):
     ssim: PairedDifference
 
 
-class EpipolarEvidence(_Frozen):
+class EpipolarEvidence(FrozenModel):
     """How well matched features fit the poses: each image's median symmetric epipolar error.
 
     The difference is the mean of log2(before / after) over images: 1 is half the error.
@@ -84,7 +81,7 @@ class EpipolarEvidence(_Frozen):
     )
 
 
-class Verdict(_Frozen):
+class Verdict(FrozenModel):
     """Whether the refined poses are better than the input's, and why that is said."""
 
     verdict: VerdictName
@@ -115,7 +112,7 @@ class Verdict(_Frozen):
         ]
 
 
-class ImageReport(_Frozen):
+class ImageReport(FrozenModel):
     """What became of one image. Lengths are in the input's own units."""
 
     name: str = Field(examples=["images/0001.jpg"])
@@ -177,7 +174,7 @@ class ImageReport(_Frozen):
         return tuple(name for name, value in self if value is True)
 
 
-class CameraReport(_Frozen):
+class CameraReport(FrozenModel):
     """The intrinsics of one camera of the set, at full size: COLMAP's model, its parameters before and after."""
 
     model: str = Field(examples=["OPENCV"])
@@ -192,7 +189,7 @@ class CameraReport(_Frozen):
     params_after: tuple[float, ...] = Field(examples=[[1501.2, 1501.2, 960.0, 540.0, 0.01, -0.02, 0.0, 0.0]])
 
 
-class HeldOut(_Frozen):
+class HeldOut(FrozenModel):
     """Mean quality of held-out views, their poses fitted to the frozen field first (BARF's test-time protocol)."""
 
     count: int = Field(examples=[6])
@@ -200,7 +197,7 @@ class HeldOut(_Frozen):
     ssim: float = Field(examples=[0.84])
 
 
-class TrialReport(_Frozen):
+class TrialReport(FrozenModel):
     """How poses to start from did: a short training with them held still, scored on views it was not shown."""
 
     source: PoseSource
@@ -213,7 +210,7 @@ class TrialReport(_Frozen):
     )
 
 
-class SimilarityReport(_Frozen):
+class SimilarityReport(FrozenModel):
     """x_in_input = scale * rotation @ x_in_optimised + translation: ties the optimised poses to the input's frame."""
 
     scale: float = Field(examples=[2.4])
@@ -223,14 +220,14 @@ class SimilarityReport(_Frozen):
     translation: tuple[float, float, float] = Field(examples=[[0.1, 0.0, -0.2]])
 
 
-class PointsReport(_Frozen):
+class PointsReport(FrozenModel):
     """The sparse points of the COLMAP model; docs/formats.md says what the sources are."""
 
     source: Literal["none", "given", "features", "tracks", "moved"] = Field(examples=["features"])
     count: int = Field(examples=[5210])
 
 
-class Report(_Frozen):
+class Report(FrozenModel):
     """``report.json``."""
 
     version: str = Field(examples=["0.1.0"])

@@ -13,8 +13,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust, align_row_flip
 
@@ -24,20 +25,16 @@ Array = NDArray[np.float64]
 _TABLE_DISTANCE = 4.0
 
 
-class Spread(BaseModel):
+class Spread(FrozenModel):
     """Mean, median and largest value over the cameras."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     mean: float
     median: float
     max: float
 
 
-class FrameError(BaseModel):
+class FrameError(FrozenModel):
     """Pose errors in one frame."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     rotation_deg: Spread
     translation: Spread = Field(
@@ -50,10 +47,8 @@ class FrameError(BaseModel):
     worst: int = Field(description="Index of the camera with the largest rotation error.")
 
 
-class PoseError(BaseModel):
+class PoseError(FrozenModel):
     """Pose errors of a rig: after alignment by a similarity, and as the poses stand."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     cameras: int
     aligned: FrameError = Field(

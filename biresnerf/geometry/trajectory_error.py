@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.pose_error import rotation_angle_deg, rotation_between_deg
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity, align_by_spread
@@ -16,10 +17,8 @@ THRESHOLDS_DEG = (1, 3, 5, 10)
 _NO_BASELINE = 1e-6
 
 
-class TrajectoryError(BaseModel):
+class TrajectoryError(FrozenModel):
     """Errors of a rig by definitions other than those of `PoseError`; lengths in units of the truth's world."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     ate_rmse: float = Field(
         description="Absolute trajectory error: root mean square distance of the centres after the least-squares "

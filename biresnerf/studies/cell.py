@@ -6,8 +6,9 @@ import hashlib
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.pose_error import PoseError
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.report import SwitchReason
@@ -17,10 +18,8 @@ EXIT_STOPPED = 143  # of the process of a cell that was stopped
 CELL, RESULT, LOG, RUN = "cell.json", "result.json", "log.txt", "run"  # in the folder of a cell
 
 
-class Record(BaseModel):
+class Record(FrozenModel):
     """Data that does not change and has no unknown keys."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class Perturbation(Record):

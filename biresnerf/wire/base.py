@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import ConfigDict, Field, StringConstraints
+
+from biresnerf.frozen_model import FrozenModel
 
 
-class Record(BaseModel):
+class Record(FrozenModel):
     """Base of every message."""
 
     # Responses contain every field, those with a default too, so their schemas call all fields required.
-    model_config = ConfigDict(frozen=True, extra="forbid", json_schema_serialization_defaults_required=True)
+    model_config = ConfigDict(json_schema_serialization_defaults_required=True)
 
 
 LABELS_MOST, LABEL_LENGTH = 20, 100

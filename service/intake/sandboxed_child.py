@@ -17,9 +17,10 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from biresnerf.errors import Fault, InputError
+from biresnerf.frozen_model import FrozenModel
 from service.http.problems import ProblemError
 from workers.process.die_with_parent import dying_with_parent
 
@@ -30,10 +31,8 @@ _ANSWER_BYTES_MAX = 16 * 2**20
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
-class Limits(BaseModel):
+class Limits(FrozenModel):
     """What a child may use."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seconds: float = Field(gt=0)
     memory_bytes: int = Field(gt=0, description="Address space, RLIMIT_AS.")

@@ -15,9 +15,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from biresnerf.errors import InputError
+from biresnerf.frozen_model import FrozenModel
 from biresnerf.wire.safe_paths import NameSet, checked_path, is_litter
 from service.intake.sandboxed_child import run_child
 
@@ -30,10 +31,8 @@ _TAR_BLOCK = 512
 _PACK_HINT = "Pack plain files and folders only, as zip, tar or tar.gz."
 
 
-class UnpackRequest(BaseModel):
+class UnpackRequest(FrozenModel):
     """An archive, the target folder, and the limits."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     archive: Path
     into: Path = Field(description="An empty folder of this process.")

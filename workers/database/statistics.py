@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
-
+from biresnerf.frozen_model import FrozenModel
 from biresnerf.wire.datasets import DatasetState
 from biresnerf.wire.jobs import JobState
 from workers.database.database import Connection, Database
 
 
-class Tally(BaseModel):
+class Tally(FrozenModel):
     """How often something happened, and what it adds up to. Durations have a bucket, all else is in bucket 0."""
-
-    model_config = ConfigDict(frozen=True)
 
     name: str
     label: str
@@ -21,20 +18,16 @@ class Tally(BaseModel):
     amount: float
 
 
-class SlotCount(BaseModel):
+class SlotCount(FrozenModel):
     """Living slots of one kind that do, or do not, run a job."""
-
-    model_config = ConfigDict(frozen=True)
 
     kind: str
     busy: bool
     slots: int
 
 
-class Statistics(BaseModel):
+class Statistics(FrozenModel):
     """The installation at one moment. ``tallies`` only ever grow."""
-
-    model_config = ConfigDict(frozen=True)
 
     jobs: dict[JobState, int]
     datasets: dict[DatasetState, int]

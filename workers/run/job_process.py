@@ -17,9 +17,10 @@ import traceback
 from pathlib import Path
 from typing import Literal, TextIO
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter
+from pydantic import TypeAdapter
 
 from biresnerf.errors import InputError, Interrupted, RefinementError
+from biresnerf.frozen_model import FrozenModel
 from biresnerf.openmp import let_waiting_threads_sleep
 from biresnerf.options.formats import ExportName
 from biresnerf.options.refine_options import RefineOptions, parse_options
@@ -33,10 +34,8 @@ EXIT_MEMORY = 4
 EXIT_STOPPED = 128 + signal.SIGTERM
 
 
-class Order(BaseModel):
+class Order(FrozenModel):
     """``job.json``: relative paths are below the job folder."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     task: Literal["refine", "export"] = "refine"
     input: Path

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from biresnerf.data.formats.simple.poses_json import POSES, write_poses_json
 from biresnerf.data.model.atomic_file import whole_file, write_text
@@ -19,19 +19,17 @@ from biresnerf.data.photos.image_files import DAMAGED, header_of, open_image, qu
 from biresnerf.data.photos.orientation import turned
 from biresnerf.data.seeding.seeding_progress import SeedingProgress
 from biresnerf.errors import InputError
+from biresnerf.frozen_model import FrozenModel
 
 SEEDING_JSON, PHOTOS = "seeding.json", "photos.jpg"
 SHEET_COLUMNS, SHEET_MOST = 6, 36
 TILE, _GAP = 128, 4  # px
 _GROUND = (238, 238, 238)
-_FROZEN = ConfigDict(frozen=True, extra="forbid")
 UNREADABLE: tuple[type[Exception], ...] = (InputError, *DAMAGED)
 
 
-class SeedingImage(BaseModel):
+class SeedingImage(FrozenModel):
     """What is known of one photo."""
-
-    model_config = _FROZEN
 
     name: str
     posed: bool
@@ -39,10 +37,8 @@ class SeedingImage(BaseModel):
     partners: int = Field(description="Photos that it has matches with.")
 
 
-class SeedingPreview(BaseModel):
+class SeedingPreview(FrozenModel):
     """``seeding.json``: how far the search for matching features is."""
-
-    model_config = _FROZEN
 
     matched_pairs: int
     images: tuple[SeedingImage, ...]

@@ -5,22 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.json_document import read_model
+from biresnerf.frozen_model import FrozenModel
 
-_FROZEN = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 VIEW, THUMBNAIL = "view.json", "thumbnail.jpg"
 CONTACT_SHEET, POINTS = "view/contact_sheet.jpg", "view/points_{source}.bin"
 
 PictureKind = Literal["render", "photo", "difference", "depth"]
 
 
-class ShownPictures(BaseModel):
+class ShownPictures(FrozenModel, allow_inf_nan=False):
     """A rendered view's files, relative to the result's folder."""
-
-    model_config = _FROZEN
 
     render: str
     photo: str
@@ -28,10 +26,8 @@ class ShownPictures(BaseModel):
     depth: str
 
 
-class ShownView(BaseModel):
+class ShownView(FrozenModel, allow_inf_nan=False):
     """A view that was rendered at the end."""
-
-    model_config = _FROZEN
 
     image: int = Field(description="Index of the image in poses.json.")
     held_out: bool = Field(description="Whether the field never learnt from its photo.")
@@ -41,10 +37,8 @@ class ShownView(BaseModel):
     pictures: ShownPictures
 
 
-class ContactSheet(BaseModel):
+class ContactSheet(FrozenModel, allow_inf_nan=False):
     """All photos, small, in one picture: image i lies in row i // columns, in the middle of its cell."""
-
-    model_config = _FROZEN
 
     file: str
     columns: int
@@ -52,10 +46,8 @@ class ContactSheet(BaseModel):
     cell_height: int
 
 
-class ShownPoints(BaseModel):
+class ShownPoints(FrozenModel, allow_inf_nan=False):
     """Points: float32 [count, 3] positions minus origin, little-endian, then uint8 [count, 3] colours."""
-
-    model_config = _FROZEN
 
     source: Literal["given", "features", "tracks", "moved", "field"] = Field(
         description="As points_source of poses.json; field: where the shown views' rays end in the radiance field."
@@ -65,10 +57,8 @@ class ShownPoints(BaseModel):
     origin: tuple[float, float, float]
 
 
-class ViewFile(BaseModel):
+class ViewFile(FrozenModel, allow_inf_nan=False):
     """The whole file; names of files are relative to the result's folder."""
-
-    model_config = _FROZEN
 
     format: Literal["biresnerf-view"] = "biresnerf-view"
     version: Literal[1] = 1

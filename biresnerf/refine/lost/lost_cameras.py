@@ -12,10 +12,10 @@ import logging
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
+from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.optimise.pose_hypotheses import pose_hypotheses
@@ -49,10 +49,8 @@ GUESSED_TIMES = 2  # that much where poses are guesses: more cameras need it
 FORWARD_COST = 0.4  # of a sample without its backward pass
 
 
-class RepairState(BaseModel):
+class RepairState(FrozenModel):
     """What a checkpoint keeps: images repaired, fixed points passed, samples spent."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     repaired: tuple[int, ...] = ()
     times: int = 0

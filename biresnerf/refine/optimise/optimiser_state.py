@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
+from biresnerf.frozen_model import FrozenModel
 
-class StepState(BaseModel):
+
+class StepState(FrozenModel):
     """The numbers of an optimisation that are not tensors.
 
     Attributes:
@@ -16,8 +17,6 @@ class StepState(BaseModel):
         rays: of the next step.
         pose_scale: factor of the pose rate, halved by each rollback.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     step_index: int
     switch: int | None

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -21,6 +21,7 @@ from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.points.feature_matches import KEPT, FeatureMatches
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import InputError
+from biresnerf.frozen_model import FrozenModel
 from biresnerf.refine.lost.lost_cameras import RepairState
 from biresnerf.refine.optimise.optimiser_state import StepState
 from biresnerf.refine.stages.stability import DetectorState
@@ -34,10 +35,8 @@ FORMAT = "4"
 MATCHED_IMAGES, MATCHED_XY = "matches.images", "matches.xy"  # names of tensors
 OTHER_FOLDER = "Choose another output folder, or remove this one."
 
-_FROZEN = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
-
-class RunOrigin(BaseModel):
+class RunOrigin(FrozenModel, arbitrary_types_allowed=True):
     """What a run was started with: only a run of the same origin continues it.
 
     Attributes:
@@ -46,14 +45,12 @@ class RunOrigin(BaseModel):
         seeding: COLMAP's result, if it ran: it would differ slightly in another run.
     """
 
-    model_config = _FROZEN
-
     fingerprint: str = ""
     stage_1_fingerprint: str = ""
     seeding: str | None = None
 
 
-class RunRecord(BaseModel):
+class RunRecord(FrozenModel, arbitrary_types_allowed=True):
     """What has happened in a run so far.
 
     Attributes:
@@ -61,8 +58,6 @@ class RunRecord(BaseModel):
         switch_reason: why stage 2 began.
         seconds: spent in each part of the run.
     """
-
-    model_config = _FROZEN
 
     resumed: int = 0
     rollbacks: int = 0
@@ -77,7 +72,7 @@ class RunRecord(BaseModel):
         self.seconds[part] = time.monotonic() - started
 
 
-class Checkpoint(BaseModel):
+class Checkpoint(FrozenModel, arbitrary_types_allowed=True):
     """All that a run needs to continue, in this process or another.
 
     Attributes:
@@ -86,8 +81,6 @@ class Checkpoint(BaseModel):
         snapshot_error: of the state that a rollback would restore, if there is one.
         tensors: of the optimisation, the snapshot and the feature matches, on the CPU.
     """
-
-    model_config = _FROZEN
 
     ends_stage_1: bool = False
     origin: RunOrigin

@@ -7,17 +7,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
 from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.frozen_model import FrozenModel
 
 HISTORY = "history.jsonl"
 
 
-class HistoryLine(BaseModel):
+class HistoryLine(FrozenModel):
     """One check of the detector. Studies add figures of their own."""
 
-    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
     step: int
     stage: Literal["coarse", "fine"]

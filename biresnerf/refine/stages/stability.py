@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
+from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.refine_options import DetectorName
 
 Verdict = Literal["running", "stable", "cap", "diverging"]
@@ -41,10 +41,8 @@ STILL_DEG = 0.05  # 90 % quantile of rotation change per block below which camer
 STAGGER = 1.7
 
 
-class DetectorState(BaseModel):
+class DetectorState(FrozenModel):
     """What a checkpoint keeps of the detector."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     decibels: tuple[float, ...] = ()
     confirmed: int = 0

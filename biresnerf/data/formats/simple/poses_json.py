@@ -10,12 +10,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.json_document import read_model
 from biresnerf.data.model.refined_set import PointsSource, RefinedSet
+from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.formats import Format
 
 POSES_JSON = Format(
@@ -30,7 +31,6 @@ POSES_JSON = Format(
 )
 
 POSES = POSES_JSON.in_result
-_FROZEN = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 AXES = (
     "world_from_cam and cam_from_world are [R | t] with OpenCV axes (x right, y down, z forward), in the input's "
     "world; the centre of the first pixel is (0.5, 0.5)"
@@ -40,10 +40,8 @@ Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row]
 
 
-class PoseCamera(BaseModel):
+class PoseCamera(FrozenModel, allow_inf_nan=False):
     """A lens: COLMAP's model name, size in px and parameters in COLMAP's order."""
-
-    model_config = _FROZEN
 
     model: str
     width: int
@@ -51,10 +49,8 @@ class PoseCamera(BaseModel):
     params: tuple[float, ...]
 
 
-class PoseImage(BaseModel):
+class PoseImage(FrozenModel, allow_inf_nan=False):
     """One image. Poses are the upper three rows of 4 x 4 matrices."""
-
-    model_config = _FROZEN
 
     name: str = Field(description="As the input writes it.")
     file_name: str = Field(description="Path relative to the input's folder, with extension.")
@@ -70,20 +66,16 @@ class PoseImage(BaseModel):
     flags: tuple[str, ...]
 
 
-class PoseSimilarity(BaseModel):
+class PoseSimilarity(FrozenModel, allow_inf_nan=False):
     """x_in_input = scale * rotation @ x_in_optimised + translation."""
-
-    model_config = _FROZEN
 
     scale: float
     rotation: tuple[Annotated[tuple[float, float, float], Field()], ...]
     translation: tuple[float, float, float]
 
 
-class PosesDocument(BaseModel):
+class PosesDocument(FrozenModel, allow_inf_nan=False):
     """The whole file."""
-
-    model_config = _FROZEN
 
     format: Literal["biresnerf-poses"] = "biresnerf-poses"
     version: Literal[1] = 1
