@@ -49,6 +49,8 @@ def quick_settings(data_dir: Path, database_url: str, **changes: object) -> Sett
         "poll_s": 0.5,
         "janitor_s": 0.5,
         "stop_grace_s": 5.0,
+        # After this long, what a killed API process stored and did not record is deleted.
+        "upload_expiry_s": 15.0,
         # Innocent jobs are hit by faults again and again; those that die of themselves must still fail soon.
         "max_attempts": 12,
         "job_command": (sys.executable, str(PROGRAM)),

@@ -11,6 +11,7 @@ from workers.records import DatasetFile
 from workers.settings.errors import Conflict, LimitReached
 from workers.settings.settings import Settings
 from workers.store.files import StoredFile
+from workers.store.trash import discard
 
 DATASET = """
     SELECT datasets.*, coalesce(total.files, 0) AS files, coalesce(total.bytes, 0)::bigint AS bytes,
@@ -50,9 +51,7 @@ async def record_file(
         "DELETE FROM dataset_files WHERE dataset_id = %s AND path = %s RETURNING key", dataset_id, path
     )
     if before is not None:
-        await connection.execute(
-            "INSERT INTO trash (prefix) VALUES (%s)", (before["key"].removesuffix(f"/{path}"),)
-        )
+        await discard(connection, before["key"].removesuffix(f"/{path}"))
     cursor = await connection.execute(
         "INSERT INTO dataset_files (dataset_id, path, key, size, sha256) VALUES (%s, %s, %s, %s, %s)"
         " RETURNING path, key, size, sha256, created_at",

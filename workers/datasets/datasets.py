@@ -31,6 +31,7 @@ from workers.records import NEWEST_FIRST, DatasetFile, Page, newest_first, page_
 from workers.settings.errors import Conflict, Expired, LimitReached, NotFound
 from workers.settings.settings import Settings
 from workers.store.files import FileStore, StoredFile
+from workers.store.trash import delete_unless_rescued, discard, rescue
 from workers.tenants.tenants import LOCAL_TENANT
 
 COPIES_AT_ONCE = 8
@@ -176,17 +177,21 @@ class DatasetStore(OwnedStore):
         async with self._database.transaction() as connection:
             there = await self._require_place(connection, dataset_id, path, overwrite)
             await require_byte_quota(connection, dataset_id, 1 if upload_id is None else 0)
+            # Until the file is recorded: this process may be killed before that.
+            await discard(connection, folder, after_s=self._settings.upload_expiry_s)
         room = min(self._settings.max_file_bytes, self._settings.max_dataset_bytes - there)
         try:
             stored = await store(key, room)
             async with self._database.transaction() as connection:
                 await self._require_place(connection, dataset_id, path, overwrite, stored.size)
+                await rescue(connection, folder)
                 recorded = await record_file(connection, dataset_id, path, stored, upload_id)
                 # All is counted now, also what the file replaced and what the upload has left.
                 await require_byte_quota(connection, dataset_id, 0)
                 return recorded
         except BaseException:
-            await self._files.delete_prefix(folder)
+            # Not where it was recorded and only the acknowledgement was lost.
+            await delete_unless_rescued(self._database, self._files, folder)
             raise
 
     async def _require_place(
@@ -262,7 +267,7 @@ class DatasetStore(OwnedStore):
                     "dataset_in_use", f"Delete first the jobs of {dataset_id}: {', '.join(users[:5])}."
                 )
             await connection.execute("DELETE FROM datasets WHERE id = %s", (dataset_id,))
-            await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (f"datasets/{dataset_id}",))
+            await discard(connection, f"datasets/{dataset_id}")
 
     async def _required(self, connection: Connection, dataset_id: str) -> DatasetView:
         sql = DATASET + f" WHERE datasets.id = %s AND {MINE}"

@@ -23,6 +23,7 @@ from workers.records import Upload, record_from_row
 from workers.settings.errors import Conflict, LimitReached, NotFound
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
+from workers.store.trash import discard
 
 # Memory for unstored pieces of all uploads of this process: the more uploads, the smaller the pieces of each.
 PIECES_BYTES = 256 * 2**20
@@ -194,7 +195,7 @@ class UploadStore(OwnedStore):
             )
             if row is not None:
                 await connection.execute("DELETE FROM upload_pieces WHERE upload_id = %s", (upload_id,))
-                await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (row["folder"],))
+                await discard(connection, row["folder"])
 
     async def conclude_signed(self, upload_id: str, late_s: float) -> None:
         """Mark a file stored that the client sent to the bucket; its signed address stays valid for ``late_s``."""

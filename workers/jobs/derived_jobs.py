@@ -20,6 +20,7 @@ from workers.jobs.quotas import require_room, submitting_for
 from workers.records import PRIORITIES, Page
 from workers.settings.errors import Conflict, Expired
 from workers.store.files import FileStore
+from workers.store.trash import discard, rescue
 
 NORMAL = PRIORITIES["normal"]
 # Of a fork that never came to be; long after any request has ended.
@@ -76,7 +77,7 @@ class DerivedJobs(JobStore):
                 "forked_from": job_id,
                 "forked_stage": stage,
             }
-            await connection.execute("DELETE FROM trash WHERE prefix = %s", (f"jobs/{fork_id}",))
+            await rescue(connection, f"jobs/{fork_id}")
             return await self._insert_below(connection, parent, fork_id, values), True
 
     async def _known_or_room(
@@ -100,11 +101,7 @@ class DerivedJobs(JobStore):
     ) -> dict[str, Any]:
         """The work of a stage and those before it, copied for the fork; trash until the fork is there."""
         async with self._database.transaction() as connection:
-            await connection.execute(
-                "INSERT INTO trash (prefix, not_before)"
-                " VALUES (%s, clock_timestamp() + make_interval(secs => %s))",
-                (f"jobs/{fork_id}", ABANDONED_S),
-            )
+            await discard(connection, f"jobs/{fork_id}", after_s=ABANDONED_S)
         copied: dict[str, Any] = {}
         for name in LATEST_FIRST[LATEST_FIRST.index(stage) :]:
             if name not in reusable:

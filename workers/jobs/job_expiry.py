@@ -6,6 +6,7 @@ import logging
 
 from workers.database.database import Connection
 from workers.jobs.job_states import add_event
+from workers.store.trash import discard
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +43,7 @@ async def expire_jobs(connection: Connection, limit: int) -> int:
             (job["id"],),
         )
         await add_event(connection, job["id"], "expired", freed)
-        await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (f"jobs/{job['id']}",))
+        await discard(connection, f"jobs/{job['id']}")
         over = f"{job['finished_at']:%Y-%m-%d %H:%M} UTC"
         log.info("expired %s of %s, over since %s: %s", job["id"], job["tenant"], over, freed)
     return len(due)

@@ -19,6 +19,7 @@ from workers.database import job_queue
 from workers.database.database import Connection
 from workers.records import LOG_NAME, POSES_NAME, PREVIEW_FOLDER, REPORT_NAME, Artifact
 from workers.settings.traces import traceparent
+from workers.store.trash import discard
 
 log = logging.getLogger(__name__)
 
@@ -239,12 +240,5 @@ async def trash_attempts(
 ) -> None:
     """Give to the trash what attempts left, except the results of ``keep`` and the preview named ``preview``."""
     # Twice the stall time: a frozen owner that wakes up later finds itself fenced at its first write.
-    await connection.execute(
-        "INSERT INTO trash (prefix, keep, not_before)"
-        " SELECT prefix, keep, clock_timestamp() + make_interval(secs => %s)"
-        " FROM (VALUES (%s, NULL), (%s, %s), (%s, %s)) AS garbage (prefix, keep)",
-        (
-            *(2 * stall_s, f"jobs/{job_id}/checkpoints", f"jobs/{job_id}/results", keep),
-            *(f"jobs/{job_id}/previews", preview),
-        ),
-    )
+    for folder, kept in (("checkpoints", None), ("results", keep), ("previews", preview)):
+        await discard(connection, f"jobs/{job_id}/{folder}", after_s=2 * stall_s, keep=kept)

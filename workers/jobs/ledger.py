@@ -6,9 +6,10 @@ last can write. The other gets `Fenced` and must leave without touching the queu
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Sequence
-from typing import Any, TypeVar
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from typing import Any, Literal, TypeVar
 
+from psycopg import sql
 from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
 
@@ -22,11 +23,13 @@ from workers.jobs.claim import Claim, Fenced
 from workers.jobs.job_states import add_event, finish, finish_cancelled, requeue, trash_attempts
 from workers.process.waiting import retry_while_unavailable
 from workers.records import LOG_NAME, Artifact
+from workers.store.trash import discard
 
 PREVIEW_KEPT_S = 60.0  # after another one took its place: it may be on its way to somebody
 LOG_LINES_MAX = 20_000  # of one job
 _LOCKED = """
-    SELECT run_token, state, cancel_requested, keep_partial, log_lines FROM jobs WHERE id = %s FOR UPDATE"""
+    SELECT run_token, state, cancel_requested, keep_partial, log_lines, checkpoint, reusable, previews
+    FROM jobs WHERE id = %s FOR UPDATE"""
 T = TypeVar("T")
 
 
@@ -65,15 +68,8 @@ class Ledger:
         """Point the job at a new checkpoint and give the one before to the trash."""
 
         async def write(connection: Connection, job: DictRow) -> None:
-            await connection.execute(
-                "INSERT INTO trash (prefix) SELECT checkpoint ->> 'prefix' FROM jobs"
-                " WHERE id = %s AND checkpoint ->> 'prefix' <> %s",
-                (self.claim.job_id, prefix),
-            )
-            await connection.execute(
-                "UPDATE jobs SET checkpoint = %s WHERE id = %s",
-                (Jsonb({"prefix": prefix, "files": list(files)}), self.claim.job_id),
-            )
+            await _discard_replaced(connection, job["checkpoint"], prefix)
+            await self._set(connection, "checkpoint", {"prefix": prefix, "files": list(files)})
             await add_event(connection, self.claim.job_id, "checkpoint", {"step": step})
 
         await self._fenced(write)
@@ -82,15 +78,9 @@ class Ledger:
         """Keep the work of a stage for other jobs to start from, in the place of an earlier attempt's."""
 
         async def write(connection: Connection, job: DictRow) -> None:
-            await connection.execute(
-                "INSERT INTO trash (prefix) SELECT reusable -> %s ->> 'prefix' FROM jobs"
-                " WHERE id = %s AND reusable -> %s ->> 'prefix' <> %s",
-                (stage, self.claim.job_id, stage, prefix),
-            )
-            await connection.execute(
-                "UPDATE jobs SET reusable = reusable || %s WHERE id = %s",
-                (Jsonb({stage: {"prefix": prefix, "files": list(files)}}), self.claim.job_id),
-            )
+            await _discard_replaced(connection, job["reusable"].get(stage), prefix)
+            stages = {**job["reusable"], stage: {"prefix": prefix, "files": list(files)}}
+            await self._set(connection, "reusable", stages)
 
         await self._fenced(write)
 
@@ -98,16 +88,9 @@ class Ledger:
         """Let the job show these files, in the place of those before."""
 
         async def write(connection: Connection, job: DictRow) -> None:
-            await connection.execute(
-                "INSERT INTO trash (prefix, not_before)"
-                " SELECT previews ->> 'prefix', clock_timestamp() + make_interval(secs => %s) FROM jobs"
-                " WHERE id = %s AND previews ->> 'prefix' <> %s",
-                (PREVIEW_KEPT_S, self.claim.job_id, prefix),
-            )
-            shown = {"prefix": prefix, "artifacts": [item.model_dump() for item in artifacts]}
-            await connection.execute(
-                "UPDATE jobs SET previews = %s WHERE id = %s", (Jsonb(shown), self.claim.job_id)
-            )
+            await _discard_replaced(connection, job["previews"], prefix, after_s=PREVIEW_KEPT_S)
+            listed = [item.model_dump() for item in artifacts]
+            await self._set(connection, "previews", {"prefix": prefix, "artifacts": listed})
             data = {"stage": now.stage, "step": now.step, "files": [item.name for item in artifacts]}
             await add_event(connection, self.claim.job_id, "preview", data)
 
@@ -218,6 +201,15 @@ class Ledger:
 
         return await self._fenced(write, done=True)
 
+    async def _set(
+        self,
+        connection: Connection,
+        column: Literal["checkpoint", "reusable", "previews"],
+        value: dict[str, Any],
+    ) -> None:
+        update = sql.SQL("UPDATE jobs SET {} = %s WHERE id = %s").format(sql.Identifier(column))
+        await connection.execute(update, (Jsonb(value), self.claim.job_id))
+
     async def _fenced(
         self, write: Callable[[Connection, DictRow], Awaitable[T]], *, done: T | None = None
     ) -> T:
@@ -236,3 +228,11 @@ class Ledger:
                 return await write(connection, job)
 
         return await retry_while_unavailable(once)
+
+
+async def _discard_replaced(
+    connection: Connection, replaced: Mapping[str, Any] | None, prefix: str, *, after_s: float = 0.0
+) -> None:
+    """Have the files deleted that a column named before those under ``prefix``."""
+    if replaced is not None and replaced["prefix"] != prefix:
+        await discard(connection, replaced["prefix"], after_s=after_s)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import re
 import time
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -20,16 +19,12 @@ from workers.jobs.job_states import offer_held_jobs, requeue_lost, take_back
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
+from workers.store.trash import take_trash_out
 
 log = logging.getLogger(__name__)
 
 JANITOR_LOCK = 7_201_605
 UPKEEP_S = 3600
-TRASH_AT_ONCE = 20
-# What could not be deleted (a store that answered with an error, a file that came late) is tried again.
-TRASH_AGAIN_S = 60.0
-# A whole job or dataset, as opposed to a checkpoint that was replaced.
-_WHOLE = re.compile(r"(jobs|datasets)/[^/]+")
 
 
 class Janitor:
@@ -44,11 +39,11 @@ class Janitor:
 
     async def run(self) -> None:
         """Rounds until cancelled."""
-        # Apart, for it can take long, and the pauses between two rounds tell something.
+        # The trash apart: it can take long, and a round is told by its pause whether the machine slept.
         trash = partial(take_trash_out, self._database, self._files)
-        await asyncio.gather(self._again_and_again(self._round), self._again_and_again(trash))
+        await asyncio.gather(self._repeat(self._round), self._repeat(trash))
 
-    async def _again_and_again(self, duty: Callable[[], Awaitable[None]]) -> None:
+    async def _repeat(self, duty: Callable[[], Awaitable[None]]) -> None:
         while True:
             await asyncio.sleep(self._settings.janitor_s)
             try:
@@ -110,34 +105,3 @@ async def release_worker(database: Database, worker_id: int | None) -> None:
         for entry_id in await job_queue.entries_of_worker(connection, worker_id):
             await take_back(connection, entry_id)
         await job_queue.unregister_worker(connection, worker_id)
-
-
-async def take_trash_out(database: Database, files: FileStore) -> None:
-    """Delete files that nothing refers to any more, of at most 20 folders that are due. Raises `Unavailable`.
-
-    Outside of a transaction: a thousand files in a bucket take their time. Safe to run concurrently.
-    """
-    for row in await database.fetch(
-        "SELECT id, prefix, keep FROM trash WHERE not_before <= clock_timestamp() ORDER BY id LIMIT %s",
-        TRASH_AT_ONCE,
-    ):
-        prefix, keep = row["prefix"], row["keep"]
-        doomed = await _below(files, prefix, keep)
-        await files.delete_prefix(prefix, keep=keep)
-        left = await _below(files, prefix, keep)
-        if left:
-            log.error("%d files of %s could not be deleted; trying again", len(left), prefix)
-            await database.fetch(
-                "UPDATE trash SET not_before = clock_timestamp() + make_interval(secs => %s) WHERE id = %s",
-                *(TRASH_AGAIN_S, row["id"]),
-            )
-            continue
-        await database.fetch("DELETE FROM trash WHERE id = %s", row["id"])
-        level = logging.INFO if _WHOLE.fullmatch(prefix) else logging.DEBUG
-        log.log(level, "deleted %s: %d files, %d bytes; none is left", prefix, len(doomed), sum(doomed))
-
-
-async def _below(files: FileStore, prefix: str, keep: str | None) -> list[int]:
-    """Sizes of the files in a folder, less those in its sub-folder ``keep``."""
-    kept = None if keep is None else f"{prefix}/{keep}/"
-    return [file.size for file in await files.list(prefix) if kept is None or not file.key.startswith(kept)]

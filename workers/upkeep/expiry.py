@@ -16,6 +16,7 @@ from workers.jobs.job_expiry import date_jobs, delete_expired_jobs, expire_jobs,
 from workers.process.waiting import first_done
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
+from workers.store.trash import discard
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +110,7 @@ class Expiry:
                 dataset_id,
             )
             await connection.execute("DELETE FROM uploads WHERE dataset_id = %s", (dataset_id,))
-            await connection.execute("INSERT INTO trash (prefix) VALUES (%s)", (f"datasets/{dataset_id}",))
+            await discard(connection, f"datasets/{dataset_id}")
         log.info("expired %s of %s, unused: %s", dataset_id, row["tenant"], what)
 
     async def _forget(self) -> None:

@@ -15,9 +15,9 @@ from biresnerf.options.refine_options import RefineOptions
 from tests.workers.conftest import ready_dataset
 from workers.database.database import open_database
 from workers.engine import Stores
-from workers.queue.janitor import take_trash_out
 from workers.settings.errors import Conflict, Expired, NotFound
 from workers.settings.settings import Settings
+from workers.store.trash import take_trash_out
 from workers.upkeep.dispatcher import dispatch
 from workers.upkeep.expiry import Expiry
 

@@ -1,0 +1,85 @@
+"""Folders to delete, listed in the transaction that makes them garbage and deleted later by the janitors.
+
+A folder whose files are to be recorded is listed before they are stored, and taken off the list in the transaction that
+records them: so a process that is killed in between leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+
+from workers.database.database import Connection, Database
+from workers.settings.errors import Unavailable
+from workers.store.files import FileStore
+
+log = logging.getLogger(__name__)
+
+FOLDERS_AT_ONCE = 20
+# When a folder is tried again that could not be deleted: the store answered with an error, or a file came late.
+RETRY_S = 60.0
+# The folder of a whole job or dataset, as opposed to a checkpoint that was replaced.
+_WHOLE = re.compile(r"(jobs|datasets)/[^/]+")
+
+
+async def discard(
+    connection: Connection, folder: str, *, after_s: float = 0.0, keep: str | None = None
+) -> None:
+    """Have a folder deleted, after ``after_s`` and except its sub-folder named ``keep``."""
+    await connection.execute(
+        "INSERT INTO trash (prefix, keep, not_before)"
+        " VALUES (%s, %s, clock_timestamp() + make_interval(secs => %s))",
+        (folder, keep, after_s),
+    )
+
+
+async def rescue(connection: Connection, folder: str) -> None:
+    """Keep a folder that was to be deleted; raises `Unavailable` where it may be gone already."""
+    sql = "DELETE FROM trash WHERE prefix = %s AND not_before > clock_timestamp() RETURNING id"
+    if await connection.row(sql, folder) is None:
+        raise Unavailable(
+            "storage_unavailable", "Storing took too long, and the files may be deleted by now."
+        )
+
+
+async def delete_unless_rescued(database: Database, files: FileStore, folder: str) -> None:
+    """Delete a listed folder now; where the database is away, a janitor does it in its time."""
+    listed = "UPDATE trash SET not_before = clock_timestamp() WHERE prefix = %s RETURNING id"
+    try:
+        if await database.fetch(listed, folder):
+            await files.delete_prefix(folder)
+    except Unavailable as error:
+        log.warning("%s is deleted later: %s", folder, error)
+
+
+async def take_trash_out(database: Database, files: FileStore) -> None:
+    """Delete the folders that are due, at most 20. Raises `Unavailable`.
+
+    Outside of a transaction: a thousand files in a bucket take their time. Safe to run concurrently.
+    """
+    for row in await database.fetch(
+        # What is being rescued just now is passed over.
+        "SELECT id, prefix, keep FROM trash WHERE not_before <= clock_timestamp() ORDER BY id LIMIT %s"
+        " FOR UPDATE SKIP LOCKED",
+        FOLDERS_AT_ONCE,
+    ):
+        folder, keep = row["prefix"], row["keep"]
+        found = await _sizes(files, folder, keep)
+        await files.delete_prefix(folder, keep=keep)
+        left = await _sizes(files, folder, keep)
+        if left:
+            log.error("%d files of %s could not be deleted; trying again", len(left), folder)
+            await database.fetch(
+                "UPDATE trash SET not_before = clock_timestamp() + make_interval(secs => %s) WHERE id = %s",
+                *(RETRY_S, row["id"]),
+            )
+            continue
+        await database.fetch("DELETE FROM trash WHERE id = %s", row["id"])
+        level = logging.INFO if _WHOLE.fullmatch(folder) else logging.DEBUG
+        log.log(level, "deleted %s: %d files, %d bytes; none is left", folder, len(found), sum(found))
+
+
+async def _sizes(files: FileStore, folder: str, keep: str | None) -> list[int]:
+    """Sizes of the files in a folder, except those in its sub-folder ``keep``."""
+    kept = None if keep is None else f"{folder}/{keep}/"
+    return [file.size for file in await files.list(folder) if kept is None or not file.key.startswith(kept)]
