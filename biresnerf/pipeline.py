@@ -14,7 +14,7 @@ import torch
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import load_images
-from biresnerf.data.points.feature_matches import FeatureMatches
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.errors import Interrupted
 from biresnerf.field.backends import resolve_here, use_threads
@@ -23,7 +23,7 @@ from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import KERNELS_FROM, START_KNOWN, Monitor, OnProgress, Progress
 from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refine.scene.scene import Scene
-from biresnerf.refine.stages.checkpoint import MATCHES, SEEDING, Checkpoint, RunOrigin
+from biresnerf.refine.stages.checkpoint import SEEDING, TRACKS, Checkpoint, RunOrigin
 from biresnerf.refine.stages.two_stages import Observer, TwoStages
 from biresnerf.refine.start.choose_start import find_start
 from biresnerf.refine.start.first_step import first_step, stage_lengths
@@ -153,13 +153,13 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
     origin = run_origin(folder.path, dataset, images, options)
     if earlier is not None:
         refuse_other_run(folder.path, earlier, origin)
-        start, matches = earlier.start, earlier.matches
+        start, tracks = earlier.start, earlier.tracks
     else:
         folder.path.mkdir(parents=True, exist_ok=True)
         start = find_start(seeding.candidates, images, options, setup.device, setup.threads, monitor)
-        matches = FeatureMatches.load(folder.path / MATCHES, dataset.names)
+        tracks = Tracks.load(folder.path / TRACKS, dataset.names)
     held_out = held_out_views(len(dataset), options.holdout, start.reliable)
-    return Scene(seeding.dataset, images, start, held_out, matches), origin
+    return Scene(seeding.dataset, images, start, held_out, tracks), origin
 
 
 def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observer | None) -> TwoStages:

@@ -14,9 +14,9 @@ from biresnerf.errors import InputError
 from biresnerf.options.refine_options import RESULT_OPTIONS, STAGE_1_OPTIONS, ResolvedOptions
 from biresnerf.refine.stages.checkpoint import (
     COARSE,
-    MATCHES,
     OTHER_FOLDER,
     SEEDING,
+    TRACKS,
     Checkpoint,
     RunOrigin,
     load_checkpoint,
@@ -85,5 +85,5 @@ def refuse_other_run(folder: Path, earlier: Checkpoint, origin: RunOrigin) -> No
 
 def reusable_seeding(folder: Path) -> dict[ReusableStage, tuple[str, ...]]:
     """Files that another run can take COLMAP's answer from; nothing where COLMAP was not asked."""
-    kept = tuple(path.as_posix() for path in (SEEDING, MATCHES) if (folder / path).is_file())
+    kept = tuple(path.as_posix() for path in (SEEDING, TRACKS) if (folder / path).is_file())
     return {"seeding": kept} if SEEDING.as_posix() in kept else {}

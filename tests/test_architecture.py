@@ -58,7 +58,7 @@ VIOLATIONS = [
         "readers and writers of files",
     ),
     (
-        "biresnerf/data/points/match_tracks.py",
+        "biresnerf/data/points/tracks.py",
         "import biresnerf.data.seeding.seed_poses",
         "readers and writers of files",
     ),

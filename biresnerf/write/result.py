@@ -140,7 +140,7 @@ def _write_poses(
     Returns the report with notes on them, and the set as written.
     """
     refined = described(dataset, world_from_cam, report)
-    refined = with_points_of(refined, dataset.source.colmap, scene.matches, scene.images)
+    refined = with_points_of(refined, dataset.source.colmap, scene.tracks, scene.images)
     notes = write_result_formats(
         refined, folder, exports, WriteContext(dataset, should_stop=monitor.should_stop)
     )

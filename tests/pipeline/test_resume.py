@@ -10,7 +10,7 @@ import pytest
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import InputError
-from biresnerf.refine.stages.checkpoint import COARSE, MATCHES, SEEDING, RunOrigin, save_checkpoint
+from biresnerf.refine.stages.checkpoint import COARSE, SEEDING, TRACKS, RunOrigin, save_checkpoint
 from biresnerf.resume import earlier_work, refuse_other_run, reusable_seeding, run_origin
 from tests.refine.stages.test_checkpoint import checkpoint
 from tests.refine.tiny_scene import tiny_options, tiny_set
@@ -85,8 +85,8 @@ def test_an_unfinished_run_comes_before_the_end_of_stage_1_and_brings_colmaps_an
 
 
 def test_only_colmaps_answer_makes_seeding_reusable(tmp_path: Path):
-    (tmp_path / MATCHES).parent.mkdir()
-    (tmp_path / MATCHES).write_bytes(b"")
+    (tmp_path / TRACKS).parent.mkdir()
+    (tmp_path / TRACKS).write_bytes(b"")
     assert reusable_seeding(tmp_path) == {}
     (tmp_path / SEEDING).write_text("{}")
-    assert reusable_seeding(tmp_path) == {"seeding": (SEEDING.as_posix(), MATCHES.as_posix())}
+    assert reusable_seeding(tmp_path) == {"seeding": (SEEDING.as_posix(), TRACKS.as_posix())}

@@ -15,8 +15,7 @@ from biresnerf.data.model.colmap_scene import NO_POINT, ColmapModel, ColmapPoint
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.result_model import matrix_of_pose, with_points
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.data.points.feature_matches import FeatureMatches
-from biresnerf.data.points.match_tracks import match_tracks
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points, rays_of_pixels
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.triangulation import parallax_deg, triangulate
@@ -28,43 +27,44 @@ NEAREST = 4  # cameras that carry a point along that no image is known to see
 
 
 def with_points_of(
-    refined: RefinedSet, given: ColmapModel | None, matches: FeatureMatches | None, images: ImageSet
+    refined: RefinedSet, given: ColmapModel | None, tracks: Tracks | None, images: ImageSet
 ) -> RefinedSet:
     """The result with the best points there are: of the input's tracks, else of feature matches, else carried along.
 
     Args:
         refined: without points.
         given: the input, where it was a COLMAP model.
-        matches: found on the way; between frames in the order of ``refined``.
+        tracks: through feature matches, of frames in the order of ``refined``.
         images: the photos, for colours.
     """
     if given is not None and len(given.points.track_image_ids):
         return with_given_points(refined, given)
-    if matches is not None:
-        matched = with_matched_points(refined, matches, images)
+    if tracks is not None:
+        matched = with_matched_points(refined, tracks, images)
         if len(matched.model.points):
             return matched
     return refined if given is None else with_given_points(refined, given)
 
 
-def with_matched_points(refined: RefinedSet, matches: FeatureMatches, images: ImageSet) -> RefinedSet:
-    """The result with points triangulated from feature matches; the model's features are then the matched ones."""
-    features, tracks = match_tracks(matches, len(refined))
-    if not tracks:
-        return refined
+def with_matched_points(refined: RefinedSet, tracks: Tracks, images: ImageSet) -> RefinedSet:
+    """The result with points triangulated from tracks; the model's features are then those of the tracks."""
     ids = np.array(refined.image_ids)
     model_images = dict(refined.model.images)
+    feature = np.zeros(len(tracks), dtype=np.int64)  # of each observation: row among its photo's features
     for row, number in enumerate(refined.image_ids):
-        none = np.full(len(features[row]), NO_POINT)
-        model_images[number] = replace(model_images[number], points2d_px=features[row], point3d_ids=none)
-    elements = np.concatenate(tracks)
-    starts = np.concatenate(([0], np.cumsum([len(track) for track in tracks]))).astype(np.int64)
-    seen = np.stack([_colour(images, refined, photo, features[photo][k]) for photo, k in elements])
-    rgb = np.add.reduceat(seen, starts[:-1], axis=0) / np.diff(starts)[:, None]
-    count = len(tracks)
+        own = tracks.image == row
+        feature[own] = np.arange(own.sum())
+        none = np.full(own.sum(), NO_POINT)
+        model_images[number] = replace(model_images[number], points2d_px=tracks.xy[own], point3d_ids=none)
+    starts = np.concatenate(([0], np.cumsum(tracks.lengths))).astype(np.int64)
+    seen = np.stack(
+        [_colour(images, refined, i, xy) for i, xy in zip(tracks.image.tolist(), tracks.xy, strict=True)]
+    )
+    rgb = np.add.reduceat(seen, starts[:-1], axis=0) / tracks.lengths[:, None]
+    count = tracks.points
     points = ColmapPoints(
         np.arange(1, count + 1), np.zeros((count, 3)), np.rint(rgb).astype(np.uint8), np.full(count, -1.0),
-        starts, ids[elements[:, 0]], elements[:, 1].copy(),
+        starts, ids[tracks.image], feature,
     )  # fmt: skip
     model = replace(refined.model, images=model_images)
     return replace(refined, model=with_points(model, triangulated(model, points)), points_source="features")

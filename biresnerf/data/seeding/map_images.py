@@ -18,7 +18,7 @@ from biresnerf.data.model.image_order import natural_order, pose_distances
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_likeness import likeness
 from biresnerf.data.photos.masks import write_masks
-from biresnerf.data.points.feature_matches import KEPT, keep_matches
+from biresnerf.data.points.tracks import KEPT, keep_tracks
 from biresnerf.data.seeding.colmap_child import DATABASE
 from biresnerf.data.seeding.colmap_process import run_colmap
 from biresnerf.data.seeding.seeding_progress import OnSeeding, SeedingWatch
@@ -105,7 +105,7 @@ def ask_colmap(
 ) -> dict[str, Any]:
     """What COLMAP finds, as plain data for `read_mapping`. Poses that the set has guide it.
 
-    Beside the log in ``log_folder`` the matches are left, for `FeatureMatches.load`. One thread where all poses are
+    Beside the log in ``log_folder`` the tracks are left, for `Tracks.load`. One thread where all poses are
     given: more would make the answer differ from run to run. One where little is asked of it, too: each takes memory.
 
     Raises:
@@ -131,7 +131,7 @@ def ask_colmap(
         watch = SeedingWatch(Path(work, DATABASE), on_progress)
         answer = run_colmap(request, Path(work), should_stop, limit_s, log_folder, watch.look)
         if log_folder is not None:
-            keep_matches(Path(work), dataset.names, log_folder / KEPT)
+            keep_tracks(Path(work), dataset.names, log_folder / KEPT)
         return answer
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.data.points.feature_matches import FeatureMatches
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.initial_poses import InitialPoses
 
 
@@ -21,14 +21,14 @@ class Scene:
         images: its photos at the working size.
         start: the poses that the optimisation starts from.
         held_out: indices of the views that the field is not trained on, to be scored.
-        matches: feature matches of the photos, where any were looked for and found.
+        tracks: through feature matches of the photos, where any were looked for and found.
     """
 
     dataset: Dataset
     images: ImageSet
     start: InitialPoses
     held_out: list[int]
-    matches: FeatureMatches | None = None
+    tracks: Tracks | None = None
 
     @property
     def excluded_from_training(self) -> list[int]:

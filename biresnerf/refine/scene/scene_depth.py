@@ -7,42 +7,38 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.points.feature_matches import FeatureMatches
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.epipolar import epipolar_angles, match_depths
 
-AGREE_DEG = 1.0  # a match whose epipolar error is larger is not used: either it or the poses are wrong
-LEAST_PARALLAX_DEG = 1.0  # between the rays of a match; below, noise makes the depth
-LEAST_MATCHES = 30
+AGREE_DEG = 1.0  # a pair whose epipolar error is larger is not used: either it or the poses are wrong
+LEAST_PARALLAX_DEG = 1.0  # between the rays of a pair; below, noise makes the depth
+LEAST_PAIRS = 30  # of observations of one point
 
 
-def match_rays(
-    intrinsics: Intrinsics, matches: FeatureMatches
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Directions in the first and the second camera of each match, float64 [m, 3] each, of length 1.
+def track_rays(intrinsics: Intrinsics, tracks: Tracks) -> NDArray[np.float64]:
+    """Direction of each observation in the axes of its camera, float64 [m, 3], of length 1.
 
     Args:
         intrinsics: of all images of the set, at full size.
     """
-    first, second = (
-        directions_in_cam(intrinsics, torch.from_numpy(image.copy()), torch.from_numpy(xy.copy())).numpy()
-        for image, xy in zip(matches.images.T, matches.xy.transpose(1, 0, 2), strict=True)
-    )
-    return first, second
+    image, xy = torch.from_numpy(tracks.image.copy()), torch.from_numpy(tracks.xy.copy())
+    rays: NDArray[np.float64] = directions_in_cam(intrinsics, image, xy).numpy()
+    return rays
 
 
 def matched_depth(
-    dataset: Dataset, world_from_cam: NDArray[np.float64], matches: FeatureMatches | None
+    dataset: Dataset, world_from_cam: NDArray[np.float64], tracks: Tracks | None
 ) -> float | None:
-    """Median depth of matched points in front of the cameras at poses [n, 4, 4], in their unit.
+    """Median depth of tracked points in front of the cameras at poses [n, 4, 4], in their unit.
 
-    None where too few matches agree with the poses, or all points are too far away for the rig's width.
+    None where too few observations agree with the poses, or all points are too far away for the rig's width.
     """
-    if matches is None:
+    if tracks is None:
         return None
     intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
-    a, b = matches.images.T
-    ray_a, ray_b = match_rays(intrinsics, matches)
+    rays, pairs = track_rays(intrinsics, tracks), tracks.pairs()
+    (a, b), (ray_a, ray_b) = (tracks.image[side] for side in pairs), (rays[side] for side in pairs)
     errors = np.degrees(epipolar_angles(world_from_cam, a, b, ray_a, ray_b))
     world_a = np.einsum("mij,mj->mi", world_from_cam[a, :3, :3], ray_a)
     world_b = np.einsum("mij,mj->mi", world_from_cam[b, :3, :3], ray_b)
@@ -51,4 +47,4 @@ def matched_depth(
     )
     depths = match_depths(world_from_cam, a, b, ray_a, ray_b)
     usable = (errors < AGREE_DEG) & (parallax > LEAST_PARALLAX_DEG) & (depths > 0).all(1)
-    return float(np.median(depths[usable])) if usable.sum() >= LEAST_MATCHES else None
+    return float(np.median(depths[usable])) if usable.sum() >= LEAST_PAIRS else None

@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from biresnerf.data.model.atomic_file import whole_file
-from biresnerf.data.points.feature_matches import KEPT, FeatureMatches
+from biresnerf.data.points.tracks import KEPT, Tracks
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import InputError
 from biresnerf.frozen_model import FrozenModel
@@ -29,10 +29,10 @@ from biresnerf.report import SwitchReason
 
 CHECKPOINT = Path("checkpoint") / "latest.safetensors"
 SEEDING = CHECKPOINT.with_name("seeding.json")  # COLMAP's result; every checkpoint carries a copy
-MATCHES = CHECKPOINT.with_name(KEPT)  # feature matches; every checkpoint carries them, too
+TRACKS = CHECKPOINT.with_name(KEPT)  # through feature matches; every checkpoint carries them, too
 COARSE = CHECKPOINT.with_name("coarse.safetensors")  # the state at the end of stage 1, for runs that share it
-FORMAT = "4"
-MATCHED_IMAGES, MATCHED_XY = "matches.images", "matches.xy"  # names of tensors
+FORMAT = "5"
+TRACKED = "tracks."  # before the names of tensors
 OTHER_FOLDER = "Choose another output folder, or remove this one."
 
 
@@ -79,7 +79,7 @@ class Checkpoint(FrozenModel, arbitrary_types_allowed=True):
         ends_stage_1: whether this is the state at the end of stage 1, kept for other runs.
         block_errors: mean squared errors of the steps since the detector's last check.
         snapshot_error: of the state that a rollback would restore, if there is one.
-        tensors: of the optimisation, the snapshot and the feature matches, on the CPU.
+        tensors: of the optimisation, the snapshot and the tracks, on the CPU.
     """
 
     ends_stage_1: bool = False
@@ -94,19 +94,19 @@ class Checkpoint(FrozenModel, arbitrary_types_allowed=True):
     tensors: dict[str, Tensor] = Field(exclude=True, repr=False)
 
     @property
-    def matches(self) -> FeatureMatches | None:
-        """The feature matches that it carries."""
-        if MATCHED_IMAGES not in self.tensors:
-            return None
-        return FeatureMatches.of(self.tensors[MATCHED_IMAGES].numpy(), self.tensors[MATCHED_XY].numpy())
+    def tracks(self) -> Tracks | None:
+        """The tracks that it carries."""
+        arrays = {
+            k.removeprefix(TRACKED): v.numpy() for k, v in self.tensors.items() if k.startswith(TRACKED)
+        }
+        return Tracks.of(**arrays) if arrays else None
 
 
-def match_tensors(matches: FeatureMatches | None) -> dict[str, Tensor]:
-    """Feature matches as tensors of a checkpoint."""
-    if matches is None:
+def track_tensors(tracks: Tracks | None) -> dict[str, Tensor]:
+    """Tracks as tensors of a checkpoint."""
+    if tracks is None:
         return {}
-    images, xy = matches.kept()
-    return {MATCHED_IMAGES: torch.from_numpy(images), MATCHED_XY: torch.from_numpy(xy)}
+    return {TRACKED + name: torch.from_numpy(array) for name, array in tracks.kept().items()}
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:

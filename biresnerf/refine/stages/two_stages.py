@@ -25,8 +25,8 @@ from biresnerf.refine.stages.checkpoint import (
     Checkpoint,
     RunOrigin,
     RunRecord,
-    match_tensors,
     save_checkpoint,
+    track_tensors,
 )
 from biresnerf.refine.stages.history import History, HistoryLine
 from biresnerf.refine.stages.stability import StabilityDetector
@@ -254,7 +254,7 @@ class TwoStages:
 
     def _save(self, *, ends_stage_1: bool = False) -> None:
         state = self.optimiser.coarse_state() if ends_stage_1 else self.optimiser.state()
-        tensors = {**match_tensors(self.scene.matches), **state, "poses_at_check": self._poses_at_check}
+        tensors = {**track_tensors(self.scene.tracks), **state, "poses_at_check": self._poses_at_check}
         if self._snapshot is not None:
             tensors.update({SNAPSHOT + name: tensor for name, tensor in self._snapshot[1].items()})
         checkpoint = Checkpoint(

@@ -31,7 +31,7 @@ def first_step(scene: Scene, options: ResolvedOptions, device: torch.device, thr
     dataset, images, start = scene.dataset, scene.images, scene.start
     bodies = rigid_bodies(dataset, options)
     world_from_cam = bodies.held(start.world_from_cam, dataset.world_from_cam)
-    frame = scene_frame(world_from_cam, images, matched_depth(dataset, world_from_cam, scene.matches))
+    frame = scene_frame(world_from_cam, images, matched_depth(dataset, world_from_cam, scene.tracks))
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
     excluded = scene.excluded_from_training
     lenses = lenses_of(dataset, images, options.refine_intrinsics, excluded, device, dollies=not bodies.tied)

@@ -99,9 +99,9 @@ def judge_poses(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Ju
     moved = 0.0
     if np.isfinite(after.world_from_cam).all():
         moved = moved_px(before, after, images)
-        if scene.matches is not None:
+        if scene.tracks is not None:
             independent = not scene.start.matched.any()
-            epipolar = compare_on_matches(before, after, scene.matches, independent=independent)
+            epipolar = compare_on_matches(before, after, scene.tracks, independent=independent)
         if moved >= MEASURABLE_PX:
             heldout = compare_on_unseen_views(
                 before, after, images, scene.held_out, optimiser.options, optimiser.device, optimiser.threads,

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.data.points.feature_matches import FeatureMatches
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project
 from biresnerf.geometry.epipolar import epipolar_angles
 from biresnerf.geometry.focus import focus_point
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.refine.scene.scene_depth import match_rays
+from biresnerf.refine.scene.scene_depth import track_rays
 from biresnerf.refine.start.frozen_trials import FrozenTrials, TrialScores, joined
 from biresnerf.refine.verdict.verdict import EPIPOLAR_MATTERS, PSNR_MATTERS, SSIM_MATTERS, paired
 from biresnerf.refine.views.held_out_views import unseen_rounds
@@ -105,14 +105,14 @@ def compare_on_unseen_views(
 
 
 def compare_on_matches(
-    before: Rig, after: Rig, matches: FeatureMatches, *, independent: bool
+    before: Rig, after: Rig, tracks: Tracks, *, independent: bool
 ) -> EpipolarComparison | None:
     """Each image's median epipolar error with either rig; None where too few images have matches.
 
     Args:
         independent: whether the rig `after` has not been made from these matches.
     """
-    old, new = (_image_errors(rig, matches) for rig in (before, after))
+    old, new = (_image_errors(rig, tracks) for rig in (before, after))
     known = np.isfinite(old) & np.isfinite(new)
     if known.sum() < LEAST_MATCHED:
         return None
@@ -121,7 +121,7 @@ def compare_on_matches(
     medians = {"before": float(np.median(old[known])), "after": float(np.median(new[known]))}
     sides = [max(camera.width, camera.height) for camera in after.cameras]
     evidence = EpipolarEvidence(
-        matches=len(matches),
+        matches=len(tracks.pairs()[0]),
         independent=independent,
         error_px=comparison.model_copy(update=medians),
         share_of_image=medians["after"] / float(np.median(sides)),
@@ -129,10 +129,10 @@ def compare_on_matches(
     return EpipolarComparison(old, new, evidence)
 
 
-def _image_errors(rig: Rig, matches: FeatureMatches) -> Array:
+def _image_errors(rig: Rig, tracks: Tracks) -> Array:
     intrinsics = Intrinsics.from_cameras(rig.cameras)
-    a, b = matches.images.T
-    ray_a, ray_b = match_rays(intrinsics, matches)
+    rays, pairs = track_rays(intrinsics, tracks), tracks.pairs()
+    (a, b), (ray_a, ray_b) = (tracks.image[side] for side in pairs), (rays[side] for side in pairs)
     focal = ((intrinsics.fx + intrinsics.fy) / 2).numpy()
     errors = epipolar_angles(rig.world_from_cam, a, b, ray_a, ray_b) * (focal[a] + focal[b]) / 2
     medians = np.full(len(rig.cameras), np.nan)

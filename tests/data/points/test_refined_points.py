@@ -15,14 +15,13 @@ from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.refined_set import refined_set
 from biresnerf.data.model.result_model import model_of_poses, with_points
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.data.points.feature_matches import FeatureMatches
-from biresnerf.data.points.match_tracks import match_tracks
 from biresnerf.data.points.refined_points import (
     MOST_ERROR_PX,
     triangulated,
     with_given_points,
     with_points_of,
 )
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points, rays_of_pixels
 from biresnerf.geometry.rigid import rigid_inverse
@@ -198,8 +197,8 @@ def test_points_without_tracks_go_with_the_cameras_near_them():
     np.testing.assert_allclose(moved.model.points.xyz, motion.apply(xyz), atol=1e-9)
 
 
-def pairwise(model: ColmapModel, rng: np.random.Generator, wrong: int = 0) -> FeatureMatches:
-    """Every pair of images whose features see one point, as matches; some go astray."""
+def pairwise(model: ColmapModel, rng: np.random.Generator, wrong: int = 0) -> Tracks:
+    """Every pair of images whose features see one point, matched; some go astray."""
     order = {number: row for row, number in enumerate(model.images)}
     found = []
     for k in range(len(model.points)):
@@ -216,7 +215,7 @@ def pairwise(model: ColmapModel, rng: np.random.Generator, wrong: int = 0) -> Fe
         (a, xy), (b, _) = found[i]
         found[i] = ((a, xy), (b, found[i + 50][1][1] + 31.0))
     images = np.array([[a[0], b[0]] for a, b in found])
-    return FeatureMatches.of(images, np.array([[a[1], b[1]] for a, b in found]))
+    return Tracks.of_matches(images, np.array([[a[1], b[1]] for a, b in found]))
 
 
 def photos_like(model: ColmapModel, colours: np.ndarray) -> ImageSet:
@@ -235,11 +234,11 @@ def test_feature_matches_become_the_points_that_their_rays_meet_in():
     rng = np.random.default_rng(14)
     poses, xyz = random_poses(rng, 6), rng.uniform(-0.6, 0.6, (40, 3))
     model = seen_model(15, poses, xyz, model="SIMPLE_RADIAL")
-    matches = pairwise(model, rng, wrong=5)
+    tracks = pairwise(model, rng, wrong=5)
     dataset = dataset_of(replace(model), poses)
     bare = refined_set(replace(dataset, source=replace(dataset.source, colmap=None)), poses)
     images = photos_like(model, model.points.rgb)
-    result = with_points_of(bare, None, matches, images)
+    result = with_points_of(bare, None, tracks, images)
     assert result.points_source == "features"
     found = result.model.points
     assert 35 <= len(found) <= 45
@@ -250,14 +249,6 @@ def test_feature_matches_become_the_points_that_their_rays_meet_in():
     assert np.median(np.abs(found.rgb.astype(int) - model.points.rgb[nearest]).max(1)) <= 40
     for image in result.model.images.values():  # every feature says which point it is of
         assert (image.point3d_ids >= 0).sum() == (found.track_image_ids == image.id).sum()
-
-
-def test_tracks_that_run_through_two_features_of_a_photo_leave_it_out():
-    images = np.array([[0, 1], [1, 2], [0, 2]])
-    xy = np.array([[[1, 1], [2, 2]], [[2, 2], [3, 3]], [[9, 9], [3, 3]]], float)
-    features, tracks = match_tracks(FeatureMatches(images, xy), 4)
-    assert [len(rows) for rows in features] == [2, 1, 1, 0]
-    assert [track.tolist() for track in tracks] == [[[1, 0], [2, 0]]]
 
 
 def test_the_inputs_own_tracks_go_before_matches_and_nothing_comes_of_nothing():

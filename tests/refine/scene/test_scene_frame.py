@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from biresnerf.data.model.camera import Camera
-from biresnerf.data.points.feature_matches import FeatureMatches
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.scene.scene_depth import matched_depth
 from biresnerf.refine.scene.scene_frame import scene_frame
@@ -126,7 +126,7 @@ def test_where_axes_do_not_meet_matches_tell_how_far_the_scene_is(scene):
     focal, cx, cy = images.cameras[0].full().fx, images.cameras[0].full().cx, images.cameras[0].full().cy
     full = dataset.cameras[0].width / images.cameras[0].width
     seen = [focal * (points[:, :2] - rows[i, :2, 3]) / points[:, 2:] + [cx, cy] for i in (0, n - 1)]
-    matches = FeatureMatches(np.stack([a, b], axis=1), full * np.stack(seen, axis=1))
+    matches = Tracks.of_matches(np.stack([a, b], axis=1), full * np.stack(seen, axis=1))
     depth = matched_depth(dataset, rows, matches)
     assert depth == pytest.approx(np.median(points[:, 2]), rel=0.02)
     frame = scene_frame(rows, images, depth)
@@ -139,7 +139,7 @@ def test_matches_that_contradict_the_poses_tell_no_depth(scene):
     dataset, _ = scene
     rng = np.random.default_rng(1)
     pairs = np.stack([np.zeros(100, dtype=np.int64), np.ones(100, dtype=np.int64)], axis=1)
-    few = FeatureMatches(pairs[:20], rng.uniform(0, dataset.cameras[0].width, (20, 2, 2)))
+    few = Tracks.of_matches(pairs[:20], rng.uniform(0, dataset.cameras[0].width, (20, 2, 2)))
     assert matched_depth(dataset, dataset.world_from_cam, few) is None
     assert matched_depth(dataset, dataset.world_from_cam, None) is None
 

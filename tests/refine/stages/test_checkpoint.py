@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from biresnerf.data.points.feature_matches import FeatureMatches
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import InputError
 from biresnerf.refine.lost.lost_cameras import RepairState
@@ -24,8 +24,8 @@ from biresnerf.refine.stages.checkpoint import (
     RunOrigin,
     RunRecord,
     load_checkpoint,
-    match_tensors,
     save_checkpoint,
+    track_tensors,
 )
 from biresnerf.refine.stages.stability import DetectorState
 from biresnerf.report import TrialReport
@@ -87,15 +87,15 @@ def test_the_end_of_stage_1_has_a_file_of_its_own(tmp_path):
     assert load_checkpoint(tmp_path, COARSE).ends_stage_1
 
 
-def test_feature_matches_come_back_as_a_run_has_them(tmp_path):
+def test_tracks_come_back_as_a_run_has_them(tmp_path):
     images, xy = np.array([[0, 1], [1, 2]]), np.random.default_rng(0).uniform(0, 640, (2, 2, 2))
-    matches = FeatureMatches.of(images, xy)
-    save_checkpoint(tmp_path, checkpoint(match_tensors(matches)))
-    back = load_checkpoint(tmp_path).matches
-    np.testing.assert_array_equal(back.images, matches.images)
-    np.testing.assert_array_equal(back.xy, matches.xy)
-    save_checkpoint(tmp_path, checkpoint(match_tensors(None)))
-    assert load_checkpoint(tmp_path).matches is None
+    tracks = Tracks.of_matches(images, xy)
+    save_checkpoint(tmp_path, checkpoint(track_tensors(tracks)))
+    back = load_checkpoint(tmp_path).tracks
+    for name in ("point", "image", "xy"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(tracks, name))
+    save_checkpoint(tmp_path, checkpoint(track_tensors(None)))
+    assert load_checkpoint(tmp_path).tracks is None
 
 
 def test_a_folder_without_one_gives_none(tmp_path):

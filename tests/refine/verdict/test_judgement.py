@@ -9,7 +9,7 @@ import pytest
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.data.points.feature_matches import FeatureMatches
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.progress import Monitor
 from biresnerf.refine.start import frozen_trials
@@ -40,7 +40,7 @@ def with_poses(dataset: Dataset, poses: np.ndarray) -> Dataset:
     return replace(dataset, frames=frames)
 
 
-def true_matches(dataset: Dataset) -> FeatureMatches:
+def true_matches(dataset: Dataset) -> Tracks:
     """Where random points of the scene lie in pairs of photos, by the true poses; to half a pixel."""
     rng = np.random.default_rng(7)
     points = rng.uniform(-0.5, 0.5, (600, 3))
@@ -52,19 +52,19 @@ def true_matches(dataset: Dataset) -> FeatureMatches:
         poses = dataset.world_from_cam[pair[:, side]]
         in_cam = np.einsum("mji,mj->mi", poses[:, :3, :3], points - poses[:, :3, 3])
         xy[:, side] = in_cam[:, :2] / in_cam[:, 2:] * [full.fx, full.fy] + [full.cx, full.cy]
-    return FeatureMatches(pair.astype(np.int64), xy + rng.normal(0, 0.1, xy.shape))
+    return Tracks.of_matches(pair, xy + rng.normal(0, 0.1, xy.shape))
 
 
 def judged(
     scene: tuple[Dataset, ImageSet],
     given: np.ndarray,
     refined: np.ndarray,
-    matches: FeatureMatches | None = None,
+    tracks: Tracks | None = None,
 ) -> Judgement:
     """The verdict on a run that was given one set of poses and ended with the other."""
     dataset, images = scene
     optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3])
-    run = replace(given_scene(with_poses(dataset, given), images, [3]), matches=matches)
+    run = replace(given_scene(with_poses(dataset, given), images, [3]), tracks=tracks)
     return judge_poses(run, optimiser, Monitor())
 
 

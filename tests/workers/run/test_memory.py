@@ -76,7 +76,7 @@ def test_an_answer_found_with_more_effort_is_not_asked_for_again_and_one_with_le
         with monkeypatch.context() as patched:
             answer = {"models": [], "matches": [], "focals": {}}
             patched.setattr(map_images, "run_colmap", lambda *_: answer)
-            patched.setattr(map_images, "keep_matches", lambda *_: None)
+            patched.setattr(map_images, "keep_tracks", lambda *_: None)
             kept.unlink(missing_ok=True)
             remembered_mapping(dataset, lambda: False, 0, effort, None, kept, lambda _: None)
 
