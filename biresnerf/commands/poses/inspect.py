@@ -55,7 +55,7 @@ def contents(dataset: Dataset) -> dict[str, Any]:
     return {
         "folder": str(dataset.root),
         "format": dataset.source.dialect,
-        "pose_files": [str(file) for file in dataset.source.files or filter(None, [dataset.source.file])],
+        "pose_files": [str(file) for file in dataset.source.files],
         "images": len(dataset),
         "with_pose": int(dataset.posed.sum()),
         "without_pose": [f.name for f in dataset.frames if f.world_from_cam is None],

@@ -116,8 +116,6 @@ def _made(output: Path, kind: str, views: int, size: int, seed: int) -> Path:
 
 def _copied(own: Path, output: Path) -> Path:
     """Copies the user's images to `output`, with their poses in a transforms.json of nerfstudio's dialect."""
-    import numpy as np
-
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.formats.transforms.write_transforms import write_transforms
     from biresnerf.data.model.dataset import SourceFormat
@@ -136,9 +134,7 @@ def _copied(own: Path, output: Path) -> Path:
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(frame.path, copy)
         frames.append(replace(frame, path=copy, raw={}))
-    copied = replace(
-        dataset, root=output, frames=tuple(frames), source=SourceFormat("nerfstudio", None, {}, np.eye(4))
-    )
+    copied = replace(dataset, root=output, frames=tuple(frames), source=SourceFormat("nerfstudio"))
     path = output / "transforms.json"
     write_transforms(copied, copied.world_from_cam, path)
     return path

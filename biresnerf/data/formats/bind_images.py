@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import posixpath
 import unicodedata
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any, TypeAlias
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +29,21 @@ from biresnerf.data.photos.orientation import (
     turned_header,
 )
 from biresnerf.errors import InputError
-from biresnerf.report import PoseSource
 
 _IMAGES = "images/"
-# The lens of an image by its header and name, where the pose file does not give it without them.
-LensOf: TypeAlias = Callable[[ImageHeader, str], Camera | None]
+
+
+class FrameCamera(NamedTuple):
+    """The camera of one image, who found its intrinsics, whether other images share them, and notes for the user."""
+
+    camera: Camera
+    source: IntrinsicsSource = "given"
+    shared: bool = False
+    notes: tuple[str, ...] = ()
+
+
+# The lens of an image by its header and name, where the pose file does not give it without them. It fits the header.
+LensOf: TypeAlias = Callable[[ImageHeader, str], FrameCamera]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,18 +55,22 @@ class PoseEntry:
         world_from_cam: float64 [4, 4], OpenCV axes; None where the file has no pose for it.
         where: the file, and the place in it, for messages.
         lens: its intrinsics, for the size that the file means, which may differ from the image's; None if unknown.
+        size: width and height that the file declares where ``lens`` depends on the image; None where it does not.
         timestamp_s: when it was taken, where the file gives that.
         camera_id: the file's own number of the camera: cameras of different numbers stay apart even if equal.
         raw: the entry as a transforms.json has it.
+        mask: the file of its mask, or None, and whether the mask is inverted; looked for in masks/ where left out.
     """
 
     name: str
     world_from_cam: NDArray[np.float64] | None
     where: str
     lens: Camera | LensOf | None = None
+    size: tuple[float | None, float | None] = (None, None)
     timestamp_s: float | None = None
     camera_id: int | None = None
     raw: dict[str, Any] = field(default_factory=dict)
+    mask: tuple[Path | None, bool] | None = None
 
 
 # Pairs of an image file's name and its entry, in the order of the dataset, and notes for the user.
@@ -124,78 +139,102 @@ def dataset_of(
     source: SourceFormat,
     notes: Sequence[str],
     within: Path | None,
+    *,
+    table: str = "",
 ) -> Dataset:
-    """The dataset of these images, in their order; reads their headers and looks for masks in masks/.
+    """The dataset of these images, in their order; reads their headers and looks for masks.
+
+    Args:
+        table: the part of the pose file that lists the images, for messages.
 
     Raises:
-        InputError: ``too_few_images``, ``unsafe_path``, ``image_size_mismatch``, ``poses_coincide``, or a code of
-            `read_header`.
+        InputError: ``too_few_images``, ``unsafe_path``, ``image_size_mismatch``, ``mixed_sizes``, ``poses_coincide``,
+            or a code of `read_header` or of the entries' lenses.
     """
-    place = source.files[0].name if source.files else root.name
+    place = f"{source.files[0].name} {table}".rstrip() if source.files else root.name
     refuse_too_few(len(images), place)
     names = [entry.name for _, entry in images]
     if within is not None:
         refuse_outside([path for path, _ in images], names, within, place)
     stored = [read_header(path, entry.name) for path, entry in images]
-    lenses = [
-        entry.lens(header, entry.name) if callable(entry.lens) else entry.lens
-        for (_, entry), header in zip(images, stored, strict=True)
-    ]
-    sizes = [(None, None) if lens is None else (float(lens.width), float(lens.height)) for lens in lenses]
-    orientations = meant_orientations(stored, sizes)
+    orientations = meant_orientations(stored, [_declared_size(entry) for _, entry in images])
     headers = [turned_header(header, turn) for header, turn in zip(stored, orientations, strict=True)]
-    warnings = [*notes, *orientation_notes(stored, orientations, names), *page_notes(stored, names)]
+    found = [_camera_of(entry, header) for (_, entry), header in zip(images, headers, strict=True)]
+    _refuse_mixed_sizes(found, [entry for _, entry in images])
     cameras: dict[tuple[Camera, IntrinsicsSource, int | None], int] = {}
     frames = []
-    for (path, entry), lens, header, orientation in zip(images, lenses, headers, orientations, strict=True):
-        if lens is None:
-            fitted, by = guess_lens(header)
-        else:
-            fitted, by = fitted_camera(lens, header, entry, warnings), "given"
-        index = cameras.setdefault((fitted, by, entry.camera_id), len(cameras))
-        mask, inverted = mask_beside(root, path, entry.name, within)
-        pose_source: PoseSource | None = None if entry.world_from_cam is None else "given"
+    for (path, entry), lens, orientation in zip(images, found, orientations, strict=True):
+        index = cameras.setdefault((lens.camera, lens.source, entry.camera_id), len(cameras))
+        mask, inverted = entry.mask or mask_beside(root, path, entry.name, within)
         frames.append(
             Frame(
-                entry.name, path, index, entry.world_from_cam, pose_source, entry.raw,
-                mask=mask, mask_inverted=inverted, orientation=orientation, timestamp_s=entry.timestamp_s,
+                entry.name, path, index, entry.world_from_cam,
+                None if entry.world_from_cam is None else "given", entry.raw, mask=mask, mask_inverted=inverted,
+                orientation=orientation, timestamp_s=entry.timestamp_s,
             )
         )  # fmt: skip
-    poses = [frame.world_from_cam for frame in frames if frame.world_from_cam is not None]
-    refuse_coinciding(poses, place)
-    warnings += _pose_notes(frames) + _mask_notes(frames)
-    sources = tuple(by for _, by, _ in cameras)
-    if poses:
-        warnings += [guess_note(by) for by in sources if by != "given"]
+    refuse_coinciding([frame.world_from_cam for frame in frames if frame.world_from_cam is not None], place)
+    warnings = [*notes, *orientation_notes(stored, orientations, names), *page_notes(stored, names)]
+    warnings += [note for lens in found for note in lens.notes]
+    if source.files:  # a folder of images alone never has poses or intrinsics
+        warnings += _pose_notes(frames, table or "images")
+        warnings += [guess_note(lens.source) for lens in found if lens.source != "given"]
+    masked = sum(frame.mask is not None for frame in frames)
+    if masked:
+        warnings.append(f"masks were found for {masked} of {len(frames)} images")
     return Dataset(
         root,
         tuple(camera for camera, _, _ in cameras),
         tuple(frames),
         source,
         tuple(dict.fromkeys(warnings)),
-        sources,
+        tuple(by for _, by, _ in cameras),
     )
 
 
-def fitted_camera(camera: Camera, header: ImageHeader, image: PoseEntry, notes: list[str]) -> Camera:
-    """``camera`` resized to the image's true size. Raises InputError ``image_size_mismatch`` for another shape."""
-    size = (header.width, header.height)
+def _declared_size(entry: PoseEntry) -> tuple[float | None, float | None]:
+    return (entry.lens.width, entry.lens.height) if isinstance(entry.lens, Camera) else entry.size
+
+
+def _camera_of(entry: PoseEntry, header: ImageHeader) -> FrameCamera:
+    """The entry's camera at the image's true size. Raises InputError ``image_size_mismatch`` for another shape."""
+    if entry.lens is None:
+        return FrameCamera(*guess_lens(header))
+    if not isinstance(entry.lens, Camera):
+        return entry.lens(header, entry.name)
+    camera, size = entry.lens, (header.width, header.height)
     if (camera.width, camera.height) == size:
-        return camera
-    sizes = f"{image.name} has {size[0]} x {size[1]} px, its camera {camera.width} x {camera.height}"
+        return FrameCamera(camera)
     if not same_shape(camera.width, camera.height, *size):
-        turned = (camera.height, camera.width) == size
+        how = "turned by 90 degrees" if (camera.height, camera.width) == size else "not the same shape"
         raise InputError(
             "image_size_mismatch",
-            f"{sizes}: {'turned by 90 degrees' if turned else 'not the same shape'}.",
-            where=image.where,
+            f"{entry.name} has {size[0]} x {size[1]} px, its camera {camera.width} x {camera.height}: {how}.",
+            where=entry.where,
             hint="Give the intrinsics of these images; cropped or turned images need their own.",
         )
-    notes.append(
+    note = (
         f"{camera.width} x {camera.height} px in the camera, {size[0]} x {size[1]} in the images: "
         "the intrinsics were scaled to the images"
     )
-    return camera.resized(*size)
+    return FrameCamera(camera.resized(*size), notes=(note,))
+
+
+def _refuse_mixed_sizes(found: Sequence[FrameCamera], entries: Sequence[PoseEntry]) -> None:
+    """Raises InputError ``mixed_sizes`` where images of different sizes share intrinsics."""
+    sizes: dict[tuple[int, int], PoseEntry] = {}
+    for lens, entry in zip(found, entries, strict=True):
+        if lens.shared:
+            sizes.setdefault((lens.camera.width, lens.camera.height), entry)
+    if len(sizes) > 1:
+        (size_a, a), (size_b, b) = list(sizes.items())[:2]
+        raise InputError(
+            "mixed_sizes",
+            f"{a.name} has {size_a[0]} x {size_a[1]} px, {b.name} {size_b[0]} x {size_b[1]} px, "
+            "but the intrinsics are shared.",
+            where=b.where,
+            hint="Give each frame its own fl_x, fl_y, cx, cy, w and h, or images of one size.",
+        )
 
 
 def match_files(
@@ -228,10 +267,7 @@ def match_files(
         ("by the same name in another Unicode form", lambda name: unicodedata.normalize("NFC", name)),
         ("by file name alone", posixpath.basename),
         ("by file name, whatever its case", lambda name: posixpath.basename(name).casefold()),
-        (
-            "by file name without extension",
-            lambda name: posixpath.splitext(posixpath.basename(name))[0].casefold(),
-        ),
+        ("by file name without extension", lambda name: PurePosixPath(name).stem.casefold()),
     ):
         open_names = _unique([name for name in names if name not in found], key)
         open_files = _unique([file for file in files if file not in found.values()], key)
@@ -252,19 +288,13 @@ def match_files(
 
 
 def _unique(names: Sequence[str], key: Callable[[str], str]) -> dict[str, str]:
-    grouped: dict[str, list[str]] = {}
-    for name in names:
-        grouped.setdefault(key(name), []).append(name)
-    return {shared: group[0] for shared, group in grouped.items() if len(group) == 1}
+    """The names by their key, without those that share one."""
+    counts = Counter(map(key, names))
+    return {key(name): name for name in names if counts[key(name)] == 1}
 
 
-def _pose_notes(frames: Sequence[Frame]) -> list[str]:
+def _pose_notes(frames: Sequence[Frame], what: str) -> list[str]:
     without = [frame.name for frame in frames if frame.world_from_cam is None]
-    if not without or len(without) == len(frames):
-        return []
-    return [f"{len(without)} of {len(frames)} images have no pose yet: {few_names(without)}"]
-
-
-def _mask_notes(frames: Sequence[Frame]) -> list[str]:
-    masked = sum(frame.mask is not None for frame in frames)
-    return [f"masks were found for {masked} of {len(frames)} images"] if masked else []
+    return (
+        [f"{len(without)} of {len(frames)} {what} have no pose yet: {few_names(without)}"] if without else []
+    )

@@ -109,7 +109,7 @@ def _read_images(root: Path, images: Sequence[Path], within: Path | None) -> Dat
     names = [path.relative_to(root).as_posix() for path in images]
     root = root.resolve()  # "." has no name
     entries = [(root / name, PoseEntry(name, None, name)) for name in names]
-    return dataset_of(root, entries, SourceFormat("images", None, {}, np.eye(4)), (), within)
+    return dataset_of(root, entries, SourceFormat("images"), (), within)
 
 
 def _named_entries(parsed: ParsedPoses, root: Path) -> Sequence[PoseEntry]:

@@ -68,9 +68,9 @@ class SourceFormat:
     """
 
     dialect: str
-    file: Path | None
-    document: dict[str, Any]
-    applied_transform: NDArray[np.float64]
+    file: Path | None = None
+    document: dict[str, Any] = field(default_factory=dict)
+    applied_transform: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     applied_scale: float = 1.0
     colmap: ColmapModel | None = None
     files: tuple[Path, ...] = ()

@@ -6,8 +6,6 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, by_name, dataset_of
 from biresnerf.data.formats.colmap.read_model import read_colmap_model, world_from_cam_of
 from biresnerf.data.model.colmap_scene import ColmapModel
@@ -33,7 +31,7 @@ def parse_colmap(_root: Path, model_folder: Path) -> ParsedPoses:
         for image in sorted(model.images.values(), key=lambda image: image.name)
     )
     tables = tuple(sorted(path for path in model_folder.iterdir() if path.suffix == Path(table).suffix))
-    source = SourceFormat("colmap", None, {}, np.eye(4), colmap=model, files=tables)
+    source = SourceFormat("colmap", colmap=model, files=tables)
     return ParsedPoses(source, entries, notes=(*model.notes, *_beside_notes(model_folder)))
 
 

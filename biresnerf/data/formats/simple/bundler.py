@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, in_order
+from biresnerf.data.formats.bind_images import FrameCamera, ParsedPoses, PoseEntry, in_order
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
 from biresnerf.data.model.atomic_file import write_text
@@ -67,7 +67,7 @@ def parse_bundler(root: Path, file: Path) -> ParsedPoses:
     files = (file,) if list_file is None else (file, list_file)
     hint = "Give list.txt as it was written with the bundle file: one image a line, in its order."
     return ParsedPoses(
-        SourceFormat("bundler", None, {}, np.eye(4), files=files),
+        SourceFormat("bundler", files=files),
         tuple(entries),
         assign=(lambda names: in_order(entries, names, file.name, hint)) if list_file is None else None,
         named=list_file is not None,
@@ -165,11 +165,11 @@ def _without_focal(line: str) -> str:
     )
 
 
-def _camera(lens: Lens, where: str, header: ImageHeader, _name: str) -> Camera:
+def _camera(lens: Lens, where: str, header: ImageHeader, _name: str) -> FrameCamera:
     focal, k1, k2 = lens
     centre = (header.width / 2, header.height / 2)
     model, params = ("RADIAL", (focal, *centre, k1, k2)) if k1 or k2 else ("SIMPLE_PINHOLE", (focal, *centre))
-    return camera_of_numbers(model, header.width, header.height, params, where)
+    return FrameCamera(camera_of_numbers(model, header.width, header.height, params, where))
 
 
 def _invalid(where: str, what: str) -> InputError:

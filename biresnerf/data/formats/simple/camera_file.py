@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from biresnerf.data.formats.bind_images import LensOf
+from biresnerf.data.formats.bind_images import FrameCamera, LensOf
 from biresnerf.data.formats.colmap import read_text as colmap_text
 from biresnerf.data.formats.colmap.model_checks import broken, camera_of_numbers
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
@@ -17,7 +17,7 @@ from biresnerf.errors import InputError
 CAMERA_NAMES = ("camera.json", "cameras.txt", "calib.txt")
 
 
-def read_camera_file(root: Path) -> tuple[LensOf | None, tuple[Path, ...]]:
+def read_camera_file(root: Path) -> tuple[Camera | LensOf | None, tuple[Path, ...]]:
     """The lens of the images, by their header, and the files that were read; None where there is no such file.
 
     camera.json has the keys of a transforms.json's top (``w``, ``h``, ``fl_x``, ``k1``, ...), cameras.txt is COLMAP's
@@ -33,7 +33,7 @@ def read_camera_file(root: Path) -> tuple[LensOf | None, tuple[Path, ...]]:
     if file.suffix == ".json":
         document = read_json_object(file)
 
-        def of_json(header: ImageHeader, name: str) -> Camera:
+        def of_json(header: ImageHeader, name: str) -> FrameCamera:
             found = camera_of_frame(Fields({}, document, file.name, 0), header, name)
             if found.source != "given":
                 raise InputError(
@@ -42,19 +42,19 @@ def read_camera_file(root: Path) -> tuple[LensOf | None, tuple[Path, ...]]:
                     where=file.name,
                     hint="Add fl_x (pixels), or remove the file: a focal length is then guessed and refined.",
                 )
-            return found.camera
+            return found
 
         return of_json, (file,)
     if file.name == "cameras.txt":
         cameras = list(colmap_text.parse_cameras(read_text(file), file.name).values())
         if len(cameras) != 1:
             raise broken(file.name, f"has {len(cameras)} cameras, and does not say which image is by which")
-        return (lambda _header, _name: cameras[0]), (file,)
-    focal_x, focal_y, cx, cy = _kitti_projection(file)
+        return cameras[0], (file,)
+    params = _kitti_projection(file)
 
-    def of_calibration(header: ImageHeader, _name: str) -> Camera:
-        params = (focal_x, focal_y, cx, cy)
-        return camera_of_numbers("PINHOLE", header.width, header.height, params, f"{file.name} P0")
+    def of_calibration(header: ImageHeader, _name: str) -> FrameCamera:
+        camera = camera_of_numbers("PINHOLE", header.width, header.height, params, f"{file.name} P0")
+        return FrameCamera(camera)
 
     return of_calibration, (file,)
 

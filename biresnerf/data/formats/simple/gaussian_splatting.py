@@ -49,7 +49,7 @@ def parse_gaussian_splatting(_root: Path, file: Path) -> ParsedPoses:
     entries = tuple(_entry(row, f"{file.name} [{index}]") for index, row in enumerate(rows))
     if len({entry.name for entry in entries}) != len(entries):
         raise InputError("duplicate_image", "names an image twice.", where=file.name, hint="Remove one.")
-    source = SourceFormat("gaussian-splatting", None, {}, np.eye(4), files=(file,))
+    source = SourceFormat("gaussian-splatting", files=(file,))
     return ParsedPoses(source, entries)
 
 

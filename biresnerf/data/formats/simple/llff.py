@@ -63,7 +63,7 @@ def parse_llff(_root: Path, file: Path) -> ParsedPoses:
         entries.append(PoseEntry(str(index), pose, where, _camera(height, width, focal, where)))
     hint = "Leave in images/ just the images that the poses are for; their order by name decides."
     return ParsedPoses(
-        SourceFormat("llff", None, {}, np.eye(4), files=(file,)),
+        SourceFormat("llff", files=(file,)),
         tuple(entries),
         assign=lambda names: in_order(entries, names, file.name, hint),
         named=False,

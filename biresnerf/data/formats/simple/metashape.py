@@ -73,7 +73,7 @@ def parse_metashape(_root: Path, file: Path) -> ParsedPoses:
         notes.append(
             f"{len(apart)} images belong to another component; their poses were not taken: {few_names(apart)}"
         )
-    source = SourceFormat("metashape", None, {}, np.eye(4), files=(file,))
+    source = SourceFormat("metashape", files=(file,))
     return ParsedPoses(
         source, tuple(entries), assign=lambda names: _assign(entries, names, file), notes=tuple(notes)
     )

@@ -139,7 +139,8 @@ def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
     times: Sequence[float | None] = trajectory.times_s or [None] * len(trajectory.poses)
     rows = zip(trajectory.names(), trajectory.poses, trajectory.lines, times, strict=True)
     entries = [
-        PoseEntry(name, pose, f"{file.name} line {line}", lens, time) for name, pose, line, time in rows
+        PoseEntry(name, pose, f"{file.name} line {line}", lens, timestamp_s=time)
+        for name, pose, line, time in rows
     ]
 
     def assign(names: Sequence[str]) -> Assignment:
@@ -153,7 +154,7 @@ def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
         return pairs, [f"{file.name}: images and poses were matched {how}"]
 
     table = [root / TIMES_OF_IMAGES] if (root / TIMES_OF_IMAGES).is_file() else []
-    source = SourceFormat(trajectory.dialect, None, {}, np.eye(4), files=(file, *camera_files, *table))
+    source = SourceFormat(trajectory.dialect, files=(file, *camera_files, *table))
     return ParsedPoses(source, tuple(entries), assign, named=False)
 
 

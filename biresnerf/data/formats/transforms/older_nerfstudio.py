@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import posixpath
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.formats.bind_images import PoseEntry
 from biresnerf.data.formats.colmap.read_model import model_forms, read_colmap_model, world_from_cam_of
-from biresnerf.data.model.conventions import file_from_world_from_cam
-from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.errors import InputError
 
 MODEL = "colmap/sparse/0"
@@ -20,11 +19,11 @@ OLDER_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 
 _EQUAL = 1e-4
 
 
-def applied_transform_left_out(file: Path, rows: list[dict[str, Any]]) -> NDArray[np.float64] | None:
+def applied_transform_left_out(file: Path, entries: Sequence[PoseEntry]) -> NDArray[np.float64] | None:
     """The transform that ``file``, which names none, was made with, where the model beside it shows that it was.
 
     nerfstudio itself takes this transform as soon as there is a model; here the model's poses must agree with the
-    frames' after it, for folders of other programs hold both files too. None where they do not.
+    frames' after it, as folders of other programs hold both files, too. None where they do not.
     """
     folder = file.parent / MODEL
     if not model_forms(folder):
@@ -35,12 +34,10 @@ def applied_transform_left_out(file: Path, rows: list[dict[str, Any]]) -> NDArra
         return None  # not what is read; nothing is taken from it
     by_name = {posixpath.basename(image.name): world_from_cam_of(image.cam_from_world) for image in images}
     off, size, found = 0.0, 1.0, 0
-    for index, row in enumerate(rows):
-        pose = by_name.get(posixpath.basename(str(row.get("file_path"))))
-        if pose is None or row.get("transform_matrix") is None:
-            continue
-        matrix, _ = rigid_matrix(row["transform_matrix"], f"{file.name} frames[{index}].transform_matrix")
-        expected = file_from_world_from_cam(pose, OLDER_TRANSFORM, 1.0)
-        found, off = found + 1, max(off, float(np.abs(matrix - expected).max()))
-        size = max(size, float(np.abs(expected).max()))
+    for entry in entries:
+        pose = by_name.get(posixpath.basename(entry.name))
+        if pose is not None and entry.world_from_cam is not None:
+            expected = OLDER_TRANSFORM @ pose
+            found, off = found + 1, max(off, float(np.abs(entry.world_from_cam - expected).max()))
+            size = max(size, float(np.abs(expected).max()))
     return OLDER_TRANSFORM if found and off <= _EQUAL * size else None

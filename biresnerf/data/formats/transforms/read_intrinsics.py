@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
+from biresnerf.data.formats.bind_images import FrameCamera
 from biresnerf.data.formats.transforms.write_intrinsics import FOCAL_KEYS
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
@@ -18,7 +19,6 @@ from biresnerf.geometry.camera.camera_models import (
     smallest_model,
 )
 from biresnerf.geometry.camera.lens import lens_problem
-from biresnerf.report import IntrinsicsSource
 
 _UNSUPPORTED = "camera_model_unsupported"
 # Keys of instant-ngp that mean a lens of neither family.
@@ -56,15 +56,6 @@ class Fields:
                 hint="Give a number (pixels for lengths).",
             )
         return float(value)
-
-
-class FrameCamera(NamedTuple):
-    """The camera, who found its intrinsics, whether other frames share them, and notes for the user."""
-
-    camera: Camera
-    source: IntrinsicsSource
-    shared: bool
-    notes: tuple[str, ...]
 
 
 def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCamera:

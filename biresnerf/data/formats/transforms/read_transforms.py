@@ -4,32 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry
+from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, dataset_of
 from biresnerf.data.formats.transforms.older_nerfstudio import applied_transform_left_out
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.conventions import world_from_cam_of_file
-from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
+from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.model.json_document import read_json_object
-from biresnerf.data.model.pose_validation import ROTATION_WARNED, refuse_coinciding, rigid_matrix
-from biresnerf.data.photos.image_files import ImageHeader, read_header
+from biresnerf.data.model.pose_validation import ROTATION_WARNED, rigid_matrix
 from biresnerf.data.photos.mask_files import dynamic_mask, named_mask
 from biresnerf.data.photos.named_images import (
-    few_names,
     find_images,
     refuse_names_outside,
     refuse_too_few,
     unused_image_notes,
 )
-from biresnerf.data.photos.orientation import meant_orientations, orientation_notes, page_notes, turned_header
 from biresnerf.errors import InputError
-from biresnerf.report import IntrinsicsSource
 
 _NGP_KEYS = frozenset(
     {"aabb_scale", "scale", "offset", "is_fisheye", "sharpness", "x_fov", "enable_depth_loading"}
@@ -65,7 +60,8 @@ def parse_transforms(_root: Path, path: Path) -> ParsedPoses:
             pose = world_from_cam_of_file(matrix, source.applied_transform, source.applied_scale)
             if deviation > worst:
                 worst, worst_name = deviation, name
-        entries.append(PoseEntry(name, pose, where, raw=row))
+        lens = partial(camera_of_frame, Fields(row, source.document, path.name, index))
+        entries.append(PoseEntry(name, pose, where, lens, _named_size(row, document), raw=row))
     notes: tuple[str, ...] = ()
     if worst > ROTATION_WARNED:
         notes = (f"rotations were made orthonormal; the worst was off by {worst:.1e} ({worst_name})",)
@@ -78,34 +74,26 @@ def bind_transforms(parsed: ParsedPoses, root: Path, within: Path | None = None)
     Raises:
         InputError: codes as in docs/input.md.
     """
-    path = parsed.source.file
-    assert path is not None, "parse_transforms gives it"
-    rows = [entry.raw for entry in parsed.entries]
-    refuse_too_few(len(rows), f"{path.name} frames")
+    path = parsed.source.files[0]
+    refuse_too_few(len(parsed.entries), f"{path.name} frames")
     names = _names(parsed.entries)
     if within is not None:
         refuse_names_outside(path, names, within, "file_path")
     paths = find_images(path, names)
-    source, poses, notes = _with_older_transform(parsed, rows)
-    stored = [read_header(image, name) for image, name in zip(paths, names, strict=True)]
-    sizes = [_named_size(row, source.document) for row in rows]
-    orientations = meant_orientations(stored, sizes)
-    headers = [turned_header(header, o) for header, o in zip(stored, orientations, strict=True)]
-    cameras, sources, camera_indices, more = _cameras(rows, source, headers, names, path.name)
-    refuse_coinciding([pose for pose in poses if pose is not None], f"{path.name} frames")
-    masks = _masks(path, rows, paths, within)
-    notes += [*more, *parsed.notes, *_pose_notes(poses, names)]
-    notes += orientation_notes(stored, orientations, names) + page_notes(stored, names)
-    notes += _other_notes(rows, source.document, masks)
-    notes += unused_image_notes(paths, [mask for mask, _ in masks if mask is not None])
-    frames = tuple(
-        Frame(
-            name, paths[i], camera_indices[i], poses[i], "given" if poses[i] is not None else None, rows[i],
-            mask=masks[i][0], mask_inverted=masks[i][1], orientation=orientations[i],
-        )
-        for i, name in enumerate(names)
-    )  # fmt: skip
-    return Dataset(root, cameras, frames, source, tuple(notes), sources)
+    parsed = _with_older_transform(parsed)
+    images = [
+        (image, replace(entry, mask=_mask(path, entry, image, within)))
+        for image, entry in zip(paths, parsed.entries, strict=True)
+    ]
+    notes = list(parsed.notes)
+    if any(
+        place.get("rolling_shutter")
+        for place in (parsed.source.document, *(row.raw for row in parsed.entries))
+    ):
+        notes.append("rolling_shutter is not modelled")
+    dataset = dataset_of(root, images, parsed.source, notes, within, table="frames")
+    masks = [frame.mask for frame in dataset.frames if frame.mask is not None]
+    return replace(dataset, warnings=(*dataset.warnings, *unused_image_notes(paths, masks)))
 
 
 def _named_size(row: dict[str, Any], document: dict[str, Any]) -> tuple[float | None, float | None]:
@@ -156,24 +144,25 @@ def _dialect(document: dict[str, Any]) -> str:
     return "blender" if "camera_angle_x" in document and "fl_x" not in keys else "nerfstudio"
 
 
-def _with_older_transform(
-    parsed: ParsedPoses, rows: list[dict[str, Any]]
-) -> tuple[SourceFormat, list[NDArray[np.float64] | None], list[str]]:
-    """Source, poses and notes; older nerfstudio's transform is undone where a model beside the file shows it."""
-    source, poses = parsed.source, [entry.world_from_cam for entry in parsed.entries]
-    assert source.file is not None, "parse_transforms gives it"
-    older = None
+def _with_older_transform(parsed: ParsedPoses) -> ParsedPoses:
+    """The same; older nerfstudio's transform is undone where a model beside the file shows it."""
+    source, older = parsed.source, None
     if source.dialect == "nerfstudio" and source.document.get("applied_transform") is None:
-        older = applied_transform_left_out(source.file, rows)
+        older = applied_transform_left_out(source.files[0], parsed.entries)
     if older is None:
-        return source, poses, []
+        return parsed
     note = (
         "applied_transform is not given; colmap/sparse/0 shows that it was older nerfstudio's, so that model's "
         "world is taken for the result's COLMAP model"
     )
     world_from_file = np.linalg.inv(older)
-    poses = [None if pose is None else world_from_file @ pose for pose in poses]
-    return replace(source, applied_transform=older), poses, [note]
+    entries = tuple(
+        entry
+        if entry.world_from_cam is None
+        else replace(entry, world_from_cam=world_from_file @ entry.world_from_cam)
+        for entry in parsed.entries
+    )
+    return ParsedPoses(replace(source, applied_transform=older), entries, notes=(note, *parsed.notes))
 
 
 def _names(entries: Sequence[PoseEntry]) -> list[str]:
@@ -188,62 +177,9 @@ def _names(entries: Sequence[PoseEntry]) -> list[str]:
     return [entry.name for entry in entries]
 
 
-def _cameras(
-    rows: list[dict[str, Any]], source: SourceFormat, headers: list[ImageHeader], names: list[str], file: str
-) -> tuple[tuple[Camera, ...], tuple[IntrinsicsSource, ...], list[int], list[str]]:
-    """The cameras, who found each (empty where the file gives all), each frame's, and notes."""
-    cameras: dict[tuple[Camera, IntrinsicsSource], int] = {}
-    shared_sizes: dict[tuple[int, int], int] = {}
-    indices: list[int] = []
-    notes: dict[str, None] = {}
-    for index, (row, header, name) in enumerate(zip(rows, headers, names, strict=True)):
-        result = camera_of_frame(Fields(row, source.document, file, index), header, name)
-        if result.shared:
-            shared_sizes.setdefault((header.width, header.height), index)
-        indices.append(cameras.setdefault((result.camera, result.source), len(cameras)))
-        notes.update(dict.fromkeys(result.notes))
-    if len(shared_sizes) > 1:
-        (size_a, a), (size_b, b) = list(shared_sizes.items())[:2]
-        raise InputError(
-            "mixed_sizes",
-            f"{names[a]} has {size_a[0]} x {size_a[1]} px, {names[b]} {size_b[0]} x {size_b[1]} px, "
-            "but the intrinsics are shared.",
-            where=f"{file} frames[{b}]",
-            hint="Give each frame its own fl_x, fl_y, cx, cy, w and h, or images of one size.",
-        )
-    sources = tuple(by for _, by in cameras)
-    return tuple(camera for camera, _ in cameras), sources, indices, list(notes)
-
-
-def _pose_notes(poses: Sequence[NDArray[np.float64] | None], names: Sequence[str]) -> list[str]:
-    without = [name for name, pose in zip(names, poses, strict=True) if pose is None]
-    return (
-        [f"{len(without)} of {len(names)} frames have no pose yet: {few_names(without)}"] if without else []
-    )
-
-
-def _masks(
-    path: Path, rows: list[dict[str, Any]], images: Sequence[Path], within: Path | None
-) -> list[tuple[Path | None, bool]]:
-    """Each frame's mask, its own or instant-ngp's beside the image, and whether it is black where pixels count."""
-    masks = []
-    for index, (row, image) in enumerate(zip(rows, images, strict=True)):
-        name = row.get("mask_path")
-        where = f"{path.name} frames[{index}].mask_path"
-        if name is None:
-            masks.append(dynamic_mask(image, within))
-        else:
-            masks.append((named_mask(path, name, where, within), False))
-    return masks
-
-
-def _other_notes(
-    rows: list[dict[str, Any]], document: dict[str, Any], masks: list[tuple[Path | None, bool]]
-) -> list[str]:
-    notes = []
-    masked = sum(mask is not None for mask, _ in masks)
-    if masked:
-        notes.append(f"masks were found for {masked} of {len(rows)} images")
-    if any(row.get("rolling_shutter") or document.get("rolling_shutter") for row in rows):
-        notes.append("rolling_shutter is not modelled")
-    return notes
+def _mask(file: Path, entry: PoseEntry, image: Path, within: Path | None) -> tuple[Path | None, bool]:
+    """The frame's own mask, or instant-ngp's beside the image, and whether it is black where pixels count."""
+    name = entry.raw.get("mask_path")
+    if name is None:
+        return dynamic_mask(image, within)
+    return named_mask(file, name, f"{entry.where}.mask_path", within), False
