@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.geometry.focus import rms_spread
+from biresnerf.report import SimilarityReport
 
 Array = NDArray[np.float64]
 
@@ -46,6 +47,21 @@ class Similarity:
     @classmethod
     def identity(cls) -> Similarity:
         return cls(1.0, np.eye(3), np.zeros(3))
+
+    @classmethod
+    def of(cls, report: SimilarityReport) -> Similarity:
+        """The similarity that a report holds."""
+        return cls(report.scale, np.array(report.rotation), np.array(report.translation))
+
+    def report(self) -> SimilarityReport:
+        """The numbers for a report."""
+        return SimilarityReport.model_validate(
+            {
+                "scale": self.scale,
+                "rotation": self.rotation.tolist(),
+                "translation": self.translation.tolist(),
+            }
+        )
 
     def apply(self, x_in_a: Array) -> Array:
         """Points [..., 3] in a to points [..., 3] in b."""

@@ -114,11 +114,10 @@ def write_rendered(folder: Path, stem: str, view: RenderedView, photo: NDArray[n
 
 def described(dataset: Dataset, world_from_cam: NDArray[np.float64], report: Report) -> RefinedSet:
     """The set at poses [n, 4, 4], with what the report says of each image."""
-    tie = report.input_from_optimised
     return refined_set(
         dataset,
         world_from_cam,
-        similarity=Similarity(tie.scale, np.array(tie.rotation), np.array(tie.translation)),
+        similarity=Similarity.of(report.input_from_optimised),
         pose_sources=[image.pose_source for image in report.images],
         flags=[image.flags for image in report.images],
     )

@@ -10,7 +10,8 @@ import pytest
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.colmap.write_text import write_colmap_text
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.model.result_model import matrix_of_pose, model_of_poses
+from biresnerf.data.model.colmap_scene import matrix_of_pose
+from biresnerf.data.model.result_model import model_of_poses
 from biresnerf.data.synthetic.scene import synthetic_cameras, write_synthetic_scene
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points
 from biresnerf.geometry.perturb import perturb_poses

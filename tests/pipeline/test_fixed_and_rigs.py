@@ -13,9 +13,14 @@ from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.simple.poses_json import read_poses_json
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
-from biresnerf.data.model.colmap_scene import ColmapFrame, ColmapModel, ColmapRig
+from biresnerf.data.model.colmap_scene import (
+    ColmapFrame,
+    ColmapModel,
+    ColmapRig,
+    matrix_of_pose,
+    rigid_pose_of,
+)
 from biresnerf.data.model.refined_set import refined_set
-from biresnerf.data.model.result_model import matrix_of_pose, rigid_pose_of
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.rigid import rigid_inverse

@@ -123,12 +123,8 @@ def by_name(entries: Sequence[PoseEntry], names: Sequence[str]) -> Assignment:
 def in_order(entries: Sequence[PoseEntry], names: Sequence[str], file: str, hint: str) -> Assignment:
     """The entries with the images in the order of their names. Raises InputError ``pose_count_mismatch``."""
     if len(names) != len(entries):
-        raise InputError(
-            "pose_count_mismatch",
-            f"has {len(entries)} poses for {len(names)} images, and does not say which belongs to which.",
-            where=file,
-            hint=hint,
-        )
+        detail = f"has {len(entries)} poses for {len(names)} images, and does not say which belongs to which."
+        raise InputError("pose_count_mismatch", detail, where=file, hint=hint)
     pairs = [(name, replace(entry, name=name)) for name, entry in zip(names, entries, strict=True)]
     return pairs, [f"{file}: images were taken in the order of their names"]
 
@@ -265,6 +261,7 @@ def match_files(
     notes = []
     for rule, key in (
         ("by the same name in another Unicode form", lambda name: unicodedata.normalize("NFC", name)),
+        ("by path without extension", lambda name: posixpath.splitext(name)[0]),
         ("by file name alone", posixpath.basename),
         ("by file name, whatever its case", lambda name: posixpath.basename(name).casefold()),
         ("by file name without extension", lambda name: PurePosixPath(name).stem.casefold()),

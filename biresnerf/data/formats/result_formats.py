@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
-
 from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.colmap.format import COLMAP
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.simple.poses_json import POSES, PoseImage, matrix_of, read_poses_json
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
 from biresnerf.errors import InputError
@@ -90,19 +87,16 @@ def read_result(folder: Path, photos: Path | None = None) -> RefinedSet:
         if number is None or not 0 <= image.camera < len(document.cameras):
             raise _inconsistent(folder, image.name)
         image_ids.append(number)
-    cameras = []
     for camera in document.cameras:
         if len(camera.params) != len(MODEL_PARAMETERS.get(camera.model, ())):
             raise _inconsistent(folder, camera.model)
-        cameras.append(Camera(camera.model, camera.width, camera.height, camera.params))
-    tie = document.input_from_optimised
     return RefinedSet(
-        tuple(cameras),
+        document.cameras,
         tuple(_image(image, photos) for image in document.images),
         model,
         tuple(image_ids),
         document.points_source,
-        Similarity(tie.scale, np.array(tie.rotation), np.array(tie.translation)),
+        Similarity.of(document.input_from_optimised),
         document.timestamps_s,
     )
 

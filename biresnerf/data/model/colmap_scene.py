@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.camera import Camera
+from biresnerf.data.model.conventions import quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from biresnerf.geometry.rigid import rigid_inverse
 
 SensorType = Literal["CAMERA", "IMU"]
+SENSOR_TYPES: tuple[SensorType, ...] = ("CAMERA", "IMU")  # by COLMAP's numbers
 ModelForm = Literal["binary", "text"]
 Sensor = tuple[SensorType, int]
 NO_POINT = -1  # of an observation that belongs to no 3D point
@@ -26,6 +29,18 @@ class RigidPose:
 
     quat_wxyz: NDArray[np.float64]
     translation: NDArray[np.float64]
+
+
+def rigid_pose_of(b_from_a: NDArray[np.float64]) -> RigidPose:
+    """The pose of a matrix [4, 4] as COLMAP writes it; the quaternion's w is not negative."""
+    return RigidPose(quat_wxyz_from_rotation(b_from_a[:3, :3]), b_from_a[:3, 3].copy())
+
+
+def matrix_of_pose(pose: RigidPose) -> NDArray[np.float64]:
+    """The matrix [4, 4] of a pose as COLMAP writes it."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation_from_quat_wxyz(pose.quat_wxyz), pose.translation
+    return matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +60,11 @@ class ColmapImage:
     cam_from_world: RigidPose
     points2d_px: NDArray[np.float64]
     point3d_ids: NDArray[np.int64]
+
+    @property
+    def world_from_cam(self) -> NDArray[np.float64]:
+        """The pose, float64 [4, 4]."""
+        return rigid_inverse(matrix_of_pose(self.cam_from_world))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,3 +142,8 @@ class ColmapModel:
     rigs: dict[int, ColmapRig]
     frames: dict[int, ColmapFrame]
     notes: tuple[str, ...] = ()
+
+    @property
+    def tables(self) -> tuple[str, ...]:
+        """The names of the model's files, without suffix. points3D is written even without points: readers need it."""
+        return ("points3D", "cameras", "images", *(("rigs", "frames") if self.rigs else ()))

@@ -19,22 +19,11 @@ from biresnerf.data.model.colmap_scene import (
     ColmapRig,
     RigidPose,
     Sensor,
+    matrix_of_pose,
     no_points,
+    rigid_pose_of,
 )
-from biresnerf.data.model.conventions import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from biresnerf.geometry.rigid import rigid_inverse
-
-
-def rigid_pose_of(b_from_a: NDArray[np.float64]) -> RigidPose:
-    """The pose of a matrix [4, 4] as COLMAP writes it; the quaternion's w is not negative."""
-    return RigidPose(quat_wxyz_from_rotation(b_from_a[:3, :3]), b_from_a[:3, 3].copy())
-
-
-def matrix_of_pose(pose: RigidPose) -> NDArray[np.float64]:
-    """The matrix [4, 4] of a pose as COLMAP writes it."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation_from_quat_wxyz(pose.quat_wxyz), pose.translation
-    return matrix
 
 
 def model_of_poses(

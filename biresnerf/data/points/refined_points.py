@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.colmap_scene import NO_POINT, ColmapModel, ColmapPoints
+from biresnerf.data.model.colmap_scene import NO_POINT, ColmapModel, ColmapPoints, matrix_of_pose
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.result_model import matrix_of_pose, with_points
+from biresnerf.data.model.result_model import with_points
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points, rays_of_pixels
@@ -165,7 +165,7 @@ class _Views:
         for number in np.unique(image_ids).tolist():
             rows, image = image_ids == number, model.images[number]
             lens = model.cameras[image.camera_id].full()
-            world_from_cam = rigid_inverse(matrix_of_pose(image.cam_from_world))
+            world_from_cam = image.world_from_cam
             self.pixel_xy[rows] = image.points2d_px[features[rows]]
             self.focal_px[rows] = (lens.fx * lens.fy) ** 0.5
             self.origins[rows] = world_from_cam[:3, 3]

@@ -11,18 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-# COLMAP's ids and parameter names, in COLMAP's order (src/colmap/sensor/models.h).
-MODEL_IDS: dict[str, int] = {
-    "SIMPLE_PINHOLE": 0,
-    "PINHOLE": 1,
-    "SIMPLE_RADIAL": 2,
-    "RADIAL": 3,
-    "OPENCV": 4,
-    "OPENCV_FISHEYE": 5,
-    "FULL_OPENCV": 6,
-    "SIMPLE_RADIAL_FISHEYE": 8,
-    "RADIAL_FISHEYE": 9,
-}
+# All models of COLMAP 4.2 by their ids (src/colmap/sensor/models.h).
+COLMAP_MODELS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
+    "FOV",
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
+)
+# The models that are supported, with COLMAP's parameters in COLMAP's order.
 MODEL_PARAMETERS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -34,7 +30,8 @@ MODEL_PARAMETERS: dict[str, tuple[str, ...]] = {
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
 }
-FISHEYE_MODELS = frozenset({"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"})
+MODEL_IDS = {name: number for number, name in enumerate(COLMAP_MODELS) if name in MODEL_PARAMETERS}
+FISHEYE_MODELS = frozenset(name for name in MODEL_PARAMETERS if name.endswith("FISHEYE"))
 # If the requested model cannot represent a camera, the first of these that can is used.
 _FALLBACKS = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 

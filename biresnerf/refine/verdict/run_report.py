@@ -14,7 +14,7 @@ from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.first_step import poses_in_input_frame
 from biresnerf.refine.verdict.judgement import Judgement, motion
 from biresnerf.refine.views.evaluation import ViewScore
-from biresnerf.report import CameraReport, HeldOut, ImageReport, Report, SimilarityReport
+from biresnerf.report import CameraReport, HeldOut, ImageReport, Report
 
 
 def run_report(
@@ -59,11 +59,7 @@ def run_report(
         device=str(optimiser.device),
         threads=optimiser.threads,
         working_size=(int(scene.images.widths.max()), int(scene.images.heights.max())),
-        input_from_optimised=SimilarityReport(
-            scale=similarity.scale,
-            rotation=tuple(tuple(float(v) for v in row) for row in similarity.rotation),
-            translation=tuple(float(v) for v in similarity.translation),
-        ),
+        input_from_optimised=similarity.report(),
         warnings=dataset.warnings
         + _unmatched_warnings(scene)
         + _lost_warnings(dataset, lost)

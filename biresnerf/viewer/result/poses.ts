@@ -1,5 +1,5 @@
 // Arithmetic on poses: interpolation, distances, fields of view.
-import type { PoseCamera, PoseImage } from "schemas";
+import type { Camera, PoseImage } from "schemas";
 
 export type Triple = readonly [number, number, number];
 /** Upper three rows of a 4 x 4 matrix; OpenCV axes (x right, y down, z forward), in the input's world. */
@@ -96,7 +96,7 @@ export function turnDeg(first: Matrix, second: Matrix): number {
 }
 
 /** Borders of the image at distance 1 in front of the lens: left, top, right, bottom; without distortion. */
-export function bordersOf(camera: PoseCamera): [number, number, number, number] {
+export function bordersOf(camera: Camera): [number, number, number, number] {
   const { width, height, params } = camera;
   // COLMAP's models with one focal length have f, cx, cy; the others fx, fy, cx, cy.
   const single = /^(SIMPLE_|RADIAL)/.test(camera.model);

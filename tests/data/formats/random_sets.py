@@ -9,9 +9,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from biresnerf.data.model.camera import Camera
-from biresnerf.data.model.colmap_scene import ColmapFrame, ColmapImage, ColmapModel, ColmapPoints, ColmapRig
+from biresnerf.data.model.colmap_scene import (
+    ColmapFrame,
+    ColmapImage,
+    ColmapModel,
+    ColmapPoints,
+    ColmapRig,
+    matrix_of_pose,
+    rigid_pose_of,
+)
 from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
-from biresnerf.data.model.result_model import matrix_of_pose, model_of_poses, rigid_pose_of, with_points
+from biresnerf.data.model.result_model import model_of_poses, with_points
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity

@@ -11,8 +11,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
+from biresnerf.data.model.colmap_scene import matrix_of_pose
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
-from biresnerf.data.model.result_model import matrix_of_pose
 from biresnerf.errors import InputError
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.rigid import rigid_inverse

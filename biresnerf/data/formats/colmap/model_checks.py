@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
     NO_POINT,
+    SENSOR_TYPES,
     ColmapFrame,
     ColmapImage,
     ColmapPoints,
@@ -22,20 +23,12 @@ from biresnerf.data.model.colmap_scene import (
 )
 from biresnerf.data.model.pose_validation import MAX_COORDINATE
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import MODEL_IDS, MODEL_PARAMETERS
+from biresnerf.geometry.camera.camera_models import COLMAP_MODELS, MODEL_IDS, MODEL_PARAMETERS
 from biresnerf.geometry.camera.lens import lens_problem
 
 MAX_SIDE_PX = 10**6
 # COLMAP writes unit quaternions with 15 digits, others with 6; a length beyond this is no rounding.
 QUAT_LENGTH_ERROR = 1e-2
-_SENSOR_TYPES: dict[int, SensorType] = {0: "CAMERA", 1: "IMU"}
-# Of COLMAP 4.2 (src/colmap/sensor/models.h), to name in a message what is not supported.
-_ALL_MODELS = (
-    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
-    "FOV",
-    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
-    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
-)
 _HINT = "Export the model again with COLMAP, or copy it again: it may be cut off."
 
 
@@ -52,9 +45,9 @@ def refuse_repeated(table: dict[int, Any], number: int, what: str) -> None:
 
 def sensor_type(kind: int, where: str) -> SensorType:
     """The sensor's type by COLMAP's number."""
-    if kind not in _SENSOR_TYPES:
+    if not 0 <= kind < len(SENSOR_TYPES):
         raise broken(where, f"{kind} is no type of sensor")
-    return _SENSOR_TYPES[kind]
+    return SENSOR_TYPES[kind]
 
 
 def rig_of_sensors(number: int, sensors: Sequence[tuple[Sensor, RigidPose | None]], where: str) -> ColmapRig:
@@ -68,27 +61,20 @@ def rig_of_sensors(number: int, sensors: Sequence[tuple[Sensor, RigidPose | None
 
 def model_name_of_id(model_id: int, where: str) -> str:
     """The camera model's name. Raises InputError ``camera_model_unsupported``."""
-    for name, number in MODEL_IDS.items():
-        if number == model_id:
-            return name
-    known = _ALL_MODELS[model_id] if 0 <= model_id < len(_ALL_MODELS) else None
-    raise _unsupported(known or f"number {model_id}", where)
+    known = 0 <= model_id < len(COLMAP_MODELS)
+    return supported_model(COLMAP_MODELS[model_id] if known else f"number {model_id}", where)
 
 
 def supported_model(name: str, where: str) -> str:
     """``name`` itself. Raises InputError ``camera_model_unsupported``."""
     if name not in MODEL_IDS:
-        raise _unsupported(name[:40], where)
+        raise InputError(
+            "camera_model_unsupported",
+            f"the camera model {name[:40]} is not supported.",
+            where=where,
+            hint=f"Supported are {', '.join(MODEL_IDS)}; undistort the images with COLMAP's image_undistorter.",
+        )
     return name
-
-
-def _unsupported(name: str, where: str) -> InputError:
-    return InputError(
-        "camera_model_unsupported",
-        f"the camera model {name} is not supported.",
-        where=where,
-        hint=f"Supported are {', '.join(MODEL_IDS)}; undistort the images with COLMAP's image_undistorter.",
-    )
 
 
 def camera_of_numbers(model: str, width: int, height: int, params: Sequence[float], where: str) -> Camera:

@@ -7,7 +7,8 @@ other is `biresnerf.data.formats.colmap.model_checks`' to say.
 from __future__ import annotations
 
 import struct
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from biresnerf.data.model.colmap_scene import (
 )
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
 
+Row = TypeVar("Row")
 _U64, _U32, _U8 = struct.Struct("<Q"), struct.Struct("<I"), struct.Struct("<B")
 _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I7dI")
@@ -96,43 +98,49 @@ class _Bytes:
             raise broken(self.file, f"{self.left} bytes follow the last record")
 
 
+def _table(
+    data: bytes, file: str, kind: str, least_bytes: int, parse: Callable[[_Bytes, str], tuple[int, Row]]
+) -> dict[int, Row]:
+    """The rows by id; ``parse`` reads one from its first byte, given its name for messages."""
+    source = _Bytes(data, file)
+    table: dict[int, Row] = {}
+    for index in range(source.count(_U64, least_bytes, f"{kind}s")):
+        number, row = parse(source, f"{kind} {index + 1}")
+        refuse_repeated(table, number, f"{file} {kind}")
+        table[number] = row
+    source.finish()
+    return table
+
+
 def parse_cameras(data: bytes, file: str) -> dict[int, Camera]:
     """The cameras by id."""
-    source = _Bytes(data, file)
-    cameras: dict[int, Camera] = {}
-    for index in range(source.count(_U64, _CAMERA.size, "cameras")):
-        number, model_id, width, height = source.take(_CAMERA, f"camera {index + 1}")
-        model = model_name_of_id(model_id, f"{file} camera {number}")
+
+    def camera(source: _Bytes, what: str) -> tuple[int, Camera]:
+        number, model_id, width, height = source.take(_CAMERA, what)
+        where = f"{file} camera {number}"
+        model = model_name_of_id(model_id, where)
         form = struct.Struct(f"<{len(MODEL_PARAMETERS[model])}d")
         params = source.take(form, f"the parameters of camera {number}")
-        refuse_repeated(cameras, number, f"{file} camera")
-        cameras[number] = camera_of_numbers(model, width, height, params, f"{file} camera {number}")
-    source.finish()
-    return cameras
+        return number, camera_of_numbers(model, width, height, params, where)
+
+    return _table(data, file, "camera", _CAMERA.size, camera)
 
 
 def parse_images(data: bytes, file: str) -> dict[int, ColmapImage]:
     """The registered images by id."""
-    source = _Bytes(data, file)
-    images: dict[int, ColmapImage] = {}
-    for index in range(source.count(_U64, _IMAGE.size + 1 + _U64.size, "images")):
-        number, *pose, camera_id = source.take(_IMAGE, f"image {index + 1}")
+
+    def image(source: _Bytes, what: str) -> tuple[int, ColmapImage]:
+        number, *pose, camera_id = source.take(_IMAGE, what)
         where = f"{file} image {number}"
         name = image_name(source.name(f"image {number}"), where)
         points = source.array(_POINT_2D, source.count(_U64, _POINT_2D.itemsize, f"points of image {number}"))
         if not np.isfinite(points["xy"]).all():
             raise broken(where, "a feature's position is no finite number", code="pose_not_finite")
-        refuse_repeated(images, number, f"{file} image")
-        images[number] = ColmapImage(
-            number,
-            name,
-            camera_id,
-            rigid_pose(pose, where),
-            points["xy"].astype(np.float64),
-            points["id"].astype(np.int64),  # COLMAP's mark of no point, 2^64 - 1, becomes NO_POINT
-        )
-    source.finish()
-    return images
+        ids = points["id"].astype(np.int64)  # COLMAP's mark of no point, 2^64 - 1, becomes NO_POINT
+        xy = points["xy"].astype(np.float64)
+        return number, ColmapImage(number, name, camera_id, rigid_pose(pose, where), xy, ids)
+
+    return _table(data, file, "image", _IMAGE.size + 1 + _U64.size, image)
 
 
 def parse_points(data: bytes, file: str) -> ColmapPoints:
@@ -164,10 +172,9 @@ def parse_points(data: bytes, file: str) -> ColmapPoints:
 
 def parse_rigs(data: bytes, file: str) -> dict[int, ColmapRig]:
     """The rigs by id."""
-    source = _Bytes(data, file)
-    rigs: dict[int, ColmapRig] = {}
-    for index in range(source.count(_U64, _RIG.size, "rigs")):
-        number, sensors = source.take(_RIG, f"rig {index + 1}")
+
+    def rig(source: _Bytes, what: str) -> tuple[int, ColmapRig]:
+        number, sensors = source.take(_RIG, what)
         where = f"{file} rig {number}"
         if sensors * _SENSOR.size > source.left:
             raise broken(where, f"names {sensors} sensors, but only {source.left} bytes follow")
@@ -179,10 +186,9 @@ def parse_rigs(data: bytes, file: str) -> dict[int, ColmapRig]:
                 raise broken(where, "a yes or no is neither")
             pose = rigid_pose(source.take(_POSE, f"a pose of rig {number}"), where) if has_pose else None
             listed.append((sensor, pose))
-        refuse_repeated(rigs, number, f"{file} rig")
-        rigs[number] = rig_of_sensors(number, listed, where)
-    source.finish()
-    return rigs
+        return number, rig_of_sensors(number, listed, where)
+
+    return _table(data, file, "rig", _RIG.size, rig)
 
 
 def _sensor(source: _Bytes, where: str) -> Sensor:
@@ -192,16 +198,14 @@ def _sensor(source: _Bytes, where: str) -> Sensor:
 
 def parse_frames(data: bytes, file: str) -> dict[int, ColmapFrame]:
     """The frames by id."""
-    source = _Bytes(data, file)
-    frames: dict[int, ColmapFrame] = {}
-    for index in range(source.count(_U64, _FRAME.size, "frames")):
-        number, rig_id, *pose, data_count = source.take(_FRAME, f"frame {index + 1}")
+
+    def frame(source: _Bytes, what: str) -> tuple[int, ColmapFrame]:
+        number, rig_id, *pose, data_count = source.take(_FRAME, what)
         where = f"{file} frame {number}"
         if data_count * _DATA_ID.size > source.left:
             raise broken(where, f"names {data_count} images, but only {source.left} bytes follow")
         taken = [source.take(_DATA_ID, f"frame {number}") for _ in range(data_count)]
-        refuse_repeated(frames, number, f"{file} frame")
         data_ids = tuple(((sensor_type(kind, where), sensor), data_id) for kind, sensor, data_id in taken)
-        frames[number] = ColmapFrame(number, rig_id, rigid_pose(pose, where), data_ids)
-    source.finish()
-    return frames
+        return number, ColmapFrame(number, rig_id, rigid_pose(pose, where), data_ids)
+
+    return _table(data, file, "frame", _FRAME.size, frame)

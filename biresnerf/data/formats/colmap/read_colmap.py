@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, by_name, dataset_of
-from biresnerf.data.formats.colmap.read_model import read_colmap_model, world_from_cam_of
+from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.model.colmap_scene import ColmapModel
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.photos.image_files import read_header
@@ -23,7 +23,7 @@ def parse_colmap(_root: Path, model_folder: Path) -> ParsedPoses:
     entries = tuple(
         PoseEntry(
             image.name,
-            world_from_cam_of(image.cam_from_world),
+            image.world_from_cam,
             f"{table} image {image.id}",
             model.cameras[image.camera_id],
             camera_id=image.camera_id,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -26,9 +25,11 @@ from biresnerf.data.model.colmap_scene import (
     ColmapRig,
     ModelForm,
     RigidPose,
+    matrix_of_pose,
     no_points,
+    rigid_pose_of,
 )
-from biresnerf.data.model.conventions import rotation_from_quat_wxyz
+from biresnerf.data.model.text_file import read_bytes, read_text
 
 MAX_TABLE_BYTES = 2 * 2**30
 _SUFFIXES: dict[ModelForm, str] = {"binary": ".bin", "text": ".txt"}
@@ -61,11 +62,11 @@ def read_colmap_model(folder: Path) -> ColmapModel:
     tables = _Tables(folder, form)
     notes = [f"the binary model in {folder.name} was read and the text model beside it was not"]
     notes = notes if len(forms) > 1 else []
-    cameras: dict[int, Camera] = tables.required("cameras")
-    images: dict[int, ColmapImage] = tables.required("images")
-    points: ColmapPoints | None = tables.optional("points3D")
-    rigs: dict[int, ColmapRig] | None = tables.optional("rigs")
-    frames: dict[int, ColmapFrame] | None = tables.optional("frames")
+    cameras: dict[int, Camera] = tables.read("cameras")
+    images: dict[int, ColmapImage] = tables.read("images")
+    points: ColmapPoints | None = tables.read("points3D")
+    rigs: dict[int, ColmapRig] | None = tables.read("rigs")
+    frames: dict[int, ColmapFrame] | None = tables.read("frames")
     check_images(images, cameras, tables.file("images"))
     if points is None:
         notes.append(f"{tables.file('points3D')} is missing: the model is taken without points")
@@ -91,37 +92,19 @@ class _Tables:
 
     def __init__(self, folder: Path, form: ModelForm) -> None:
         self.folder, self.form = folder, form
-        self.parsers: ModuleType = colmap_binary if form == "binary" else colmap_text
 
     def file(self, table: str) -> str:
         return table + _SUFFIXES[self.form]
 
-    def required(self, table: str) -> Any:
-        """The parsed table."""
-        return self._parse(table, self.folder / self.file(table))
-
-    def optional(self, table: str) -> Any:
+    def read(self, table: str) -> Any:
         """The parsed table, or None where there is no such file."""
         path = self.folder / self.file(table)
-        return self._parse(table, path) if path.is_file() else None
-
-    def _parse(self, table: str, path: Path) -> Any:
-        parse = getattr(self.parsers, "parse_" + table.removesuffix("3D"))
-        return parse(self._content(path), path.name)
-
-    def _content(self, path: Path) -> bytes | str:
-        try:
-            size = path.stat().st_size
-            if size > MAX_TABLE_BYTES:
-                raise broken(
-                    path.name, f"{size / 2**30:.1f} GiB is more than is read", hint="Split the model."
-                )
-            content = path.read_bytes()
-            return content if self.form == "binary" else content.decode("utf-8-sig")
-        except OSError as error:
-            raise broken(path.name, f"cannot be read: {error.strerror}") from None
-        except UnicodeDecodeError:
-            raise broken(path.name, "is not UTF-8 text") from None
+        if not path.is_file():
+            return None
+        parser = "parse_" + table.removesuffix("3D")
+        if self.form == "binary":
+            return getattr(colmap_binary, parser)(read_bytes(path, MAX_TABLE_BYTES), path.name)
+        return getattr(colmap_text, parser)(read_text(path, MAX_TABLE_BYTES), path.name)
 
 
 def _unseeing(image: ColmapImage) -> ColmapImage:
@@ -138,31 +121,16 @@ def _with_poses_of_frames(
         for sensor, data_id in frame.data_ids:
             if sensor[0] != "CAMERA":
                 continue
-            cam_from_rig = None if sensor == rig.reference else rig.sensor_from_rig[sensor]
-            if sensor != rig.reference and cam_from_rig is None:
-                continue
-            cam_from_world = composed(cam_from_rig, frame.rig_from_world)
+            cam_from_world = frame.rig_from_world
+            if sensor != rig.reference:
+                cam_from_rig = rig.sensor_from_rig[sensor]
+                if cam_from_rig is None:
+                    continue
+                cam_from_world = rigid_pose_of(matrix_of_pose(cam_from_rig) @ matrix_of_pose(cam_from_world))
             if not _same(cam_from_world, images[data_id].cam_from_world):
                 images[data_id] = replace(images[data_id], cam_from_world=cam_from_world)
                 moved.append(images[data_id].name)
     return images, moved
-
-
-def composed(c_from_b: RigidPose | None, b_from_a: RigidPose) -> RigidPose:
-    """``c_from_a``; None stands for no motion."""
-    if c_from_b is None:
-        return b_from_a
-    (w, x, y, z), (a, b, c, d) = c_from_b.quat_wxyz, b_from_a.quat_wxyz
-    quat_wxyz = np.array(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ]
-    )
-    turned = rotation_from_quat_wxyz(c_from_b.quat_wxyz) @ b_from_a.translation
-    return RigidPose(quat_wxyz, turned + c_from_b.translation)
 
 
 def _same(one: RigidPose, other: RigidPose) -> bool:
@@ -172,11 +140,3 @@ def _same(one: RigidPose, other: RigidPose) -> bool:
     return bool(
         turned < _SAME_POSE and np.linalg.norm(one.translation - other.translation) < _SAME_POSE * far
     )
-
-
-def world_from_cam_of(cam_from_world: RigidPose) -> np.ndarray:
-    """The pose as float64 [4, 4]."""
-    rotation = rotation_from_quat_wxyz(cam_from_world.quat_wxyz).T
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ cam_from_world.translation
-    return pose

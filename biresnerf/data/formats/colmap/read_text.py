@@ -25,6 +25,7 @@ from biresnerf.data.formats.colmap.model_checks import (
 )
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
+    SENSOR_TYPES,
     ColmapFrame,
     ColmapImage,
     ColmapPoints,
@@ -36,7 +37,6 @@ from biresnerf.data.model.colmap_scene import (
 
 T = TypeVar("T")
 _MAX_ID = 2**63 - 1
-_SENSOR_NUMBERS = {"CAMERA": 0, "IMU": 1}
 _NO_POINT_WORDS = ("-1", str(2**64 - 1))
 
 
@@ -194,7 +194,7 @@ def _bounded(ids: list[int], file: str) -> NDArray[np.int64]:
 def _sensor(words: _Words) -> Sensor:
     name = words.word("a sensor's type")
     number = words.integer("a sensor's id")
-    return sensor_type(_SENSOR_NUMBERS.get(name, -1), words.where), number
+    return sensor_type(SENSOR_TYPES.index(name) if name in SENSOR_TYPES else -1, words.where), number
 
 
 def _pose(words: _Words, what: str) -> RigidPose:

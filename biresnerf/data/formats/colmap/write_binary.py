@@ -11,29 +11,23 @@ from pathlib import Path
 import numpy as np
 
 from biresnerf.data.model.atomic_file import whole_file
-from biresnerf.data.model.colmap_scene import ColmapModel, RigidPose, Sensor
+from biresnerf.data.model.colmap_scene import SENSOR_TYPES, ColmapModel, RigidPose, Sensor
 from biresnerf.geometry.camera.camera_models import MODEL_IDS
 
-_SENSOR_TYPES = {"CAMERA": 0, "IMU": 1}
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("id", "<u8")])
 
 
 def write_colmap_binary(model: ColmapModel, folder: Path) -> None:
     """Writes the model's files into ``folder``, each whole or not at all (COLMAP wants ``sparse/0``).
 
-    A points3D.bin is written even without points: readers fail without it.
-
     Raises:
         ValueError: a name that the tables cannot hold.
     """
     if any("\0" in image.name or not image.name for image in model.images.values()):
         raise ValueError("image names must not be empty and not hold NUL")
-    _write(folder / "points3D.bin", _points(model))
-    _write(folder / "cameras.bin", _cameras(model))
-    _write(folder / "images.bin", _images(model))
-    if model.rigs:
-        _write(folder / "rigs.bin", _rigs(model))
-        _write(folder / "frames.bin", _frames(model))
+    for table in model.tables:
+        with whole_file(folder / f"{table}.bin") as temporary:
+            temporary.write_bytes(_TABLES[table](model))
 
 
 def _cameras(model: ColmapModel) -> bytes:
@@ -93,13 +87,11 @@ def _frames(model: ColmapModel) -> bytes:
 
 
 def _sensor(sensor: Sensor) -> bytes:
-    return struct.pack("<iI", _SENSOR_TYPES[sensor[0]], sensor[1])
+    return struct.pack("<iI", SENSOR_TYPES.index(sensor[0]), sensor[1])
 
 
 def _pose(pose: RigidPose) -> bytes:
     return struct.pack("<7d", *pose.quat_wxyz, *pose.translation)
 
 
-def _write(path: Path, content: bytes) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_bytes(content)
+_TABLES = {"points3D": _points, "cameras": _cameras, "images": _images, "rigs": _rigs, "frames": _frames}

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.colmap_scene import ColmapModel, RigidPose, Sensor
 from biresnerf.errors import InputError
 
@@ -28,12 +28,8 @@ def write_colmap_text(model: ColmapModel, folder: Path) -> None:
                 where="colmap-text",
                 hint="Use the binary model in colmap/sparse/0, or rename the image.",
             )
-    _write(folder / "points3D.txt", _points(model))
-    _write(folder / "cameras.txt", _cameras(model))
-    _write(folder / "images.txt", _images(model))
-    if model.rigs:
-        _write(folder / "rigs.txt", _rigs(model))
-        _write(folder / "frames.txt", _frames(model))
+    for table in model.tables:
+        write_text(folder / f"{table}.txt", "\n".join(_TABLES[table](model)))
 
 
 def _cameras(model: ColmapModel) -> Iterator[str]:
@@ -95,7 +91,4 @@ def _numbers(values: Iterable[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _write(path: Path, lines: Iterator[str]) -> None:
-    with whole_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        for line in lines:
-            file.write(line + "\n")
+_TABLES = {"points3D": _points, "cameras": _cameras, "images": _images, "rigs": _rigs, "frames": _frames}

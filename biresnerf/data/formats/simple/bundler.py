@@ -21,9 +21,10 @@ from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.text_file import read_text
+from biresnerf.data.model.text_file import finite_numbers, read_text
 from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.errors import InputError
+from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.options.formats import Format
 
 BUNDLER = Format(
@@ -44,6 +45,7 @@ BUNDLER = Format(
 
 LIST_NAMES = ("list.txt", "bundle/list.txt")
 MAX_CAMERAS = 100_000
+_HINT = "Export the bundle file (v0.3) again."
 _LINES_PER_CAMERA, _LINES_PER_POINT = 5, 3
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 _CENTRED_PX = 1e-6
@@ -110,24 +112,13 @@ def _world_from_cam(
     rotation: NDArray[np.float64], translation: NDArray[np.float64], where: str
 ) -> NDArray[np.float64]:
     cam_from_world = _OPENCV_FROM_OPENGL @ np.column_stack([rotation, translation])
-    matrix, _ = rigid_matrix(cam_from_world.tolist(), where)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = matrix[:3, :3].T, -matrix[:3, :3].T @ matrix[:3, 3]
-    return pose
+    return rigid_inverse(rigid_matrix(cam_from_world.tolist(), where)[0])
 
 
 def _numbers(lines: Sequence[Sequence[str]], rows: int, columns: int, where: str) -> NDArray[np.float64]:
     if len(lines) != rows or any(len(line) != columns for line in lines):
         raise _invalid(where, f"is not {rows} lines of {columns} numbers.")
-    try:
-        values = np.array([[float(word) for word in line] for line in lines])
-    except ValueError:
-        raise _invalid(where, "holds a word that is no number.") from None
-    if not np.isfinite(values).all():
-        raise InputError(
-            "pose_not_finite", "NaN or an infinite number.", where=where, hint="Export it again."
-        )
-    return values
+    return finite_numbers([word for line in lines for word in line], where, _HINT).reshape(rows, columns)
 
 
 def _listed_names(root: Path, file: Path, count: int) -> tuple[Path | None, list[str]]:
@@ -173,7 +164,7 @@ def _camera(lens: Lens, where: str, header: ImageHeader, _name: str) -> FrameCam
 
 
 def _invalid(where: str, what: str) -> InputError:
-    return InputError("pose_file_invalid", what, where=where, hint="Export the bundle file (v0.3) again.")
+    return InputError("pose_file_invalid", what, where=where, hint=_HINT)
 
 
 def bundler_problem(camera: Camera) -> str | None:

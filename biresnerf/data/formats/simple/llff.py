@@ -17,6 +17,7 @@ from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.data.model.text_file import read_bytes
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 
@@ -94,11 +95,7 @@ def _rows(file: Path) -> NDArray[np.float64]:
             code, what, where=file.name, hint="Write it again with numpy.save, 17 numbers a row."
         )
 
-    try:
-        with file.open("rb") as stream:
-            content = stream.read(_MAX_HEADER_BYTES + MAX_IMAGES * _COLUMNS * 8 + 1)
-    except OSError as error:
-        raise invalid(f"cannot be read: {error.strerror}.") from None
+    content = read_bytes(file, _MAX_HEADER_BYTES + MAX_IMAGES * _COLUMNS * 8)
     start = {1: 10, 2: 12}.get(content[6] if len(content) > 12 else 0, 0)
     if not content.startswith(b"\x93NUMPY") or not start:
         raise invalid("is no npy file.")

@@ -9,19 +9,19 @@ import xml.parsers.expat
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntry
+from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntry, by_name
 from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
-from biresnerf.data.model.text_file import read_text
+from biresnerf.data.model.text_file import finite_numbers, read_text
 from biresnerf.data.photos.named_images import few_names
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
@@ -37,6 +37,7 @@ METASHAPE = Format(
 )
 
 
+_HINT = "Export the cameras from Metashape again."
 _MAX_DEPTH, _MAX_ELEMENTS = 50, 500_000
 
 
@@ -75,22 +76,13 @@ def parse_metashape(_root: Path, file: Path) -> ParsedPoses:
         )
     source = SourceFormat("metashape", files=(file,))
     return ParsedPoses(
-        source, tuple(entries), assign=lambda names: _assign(entries, names, file), notes=tuple(notes)
+        source, tuple(entries), assign=lambda names: _assign(entries, names), notes=tuple(notes)
     )
 
 
-def _assign(entries: list[PoseEntry], names: Sequence[str], file: Path) -> Assignment:
-    image_of_label = _images_of_labels(names)
-    missing = [entry.name for entry in entries if entry.name not in image_of_label]
-    if missing:
-        raise InputError(
-            "image_missing",
-            f"{len(missing)} of {len(entries)} images not found: {few_names(missing)}.",
-            where=file.name,
-            hint="Put the images into images/ under their labels.",
-        )
-    images = [image_of_label[entry.name] for entry in entries]
-    return [(image, replace(entry, name=image)) for image, entry in zip(images, entries, strict=True)], []
+def _assign(entries: list[PoseEntry], names: Sequence[str]) -> Assignment:
+    pairs, _ = by_name(entries, names)
+    return [(name, replace(entry, name=name)) for name, entry in pairs], []
 
 
 class _Builder(ElementTree.TreeBuilder):
@@ -142,36 +134,14 @@ def _labelled(chunk: ElementTree.Element, file: Path) -> dict[str, ElementTree.E
     return entries
 
 
-def _images_of_labels(names: Sequence[str]) -> dict[str, str]:
-    """The image that a label means: its path, its file name, or that without extension, where just one has it."""
-    places: dict[str, list[str]] = {}
-    for name in names:
-        path = PurePosixPath(name)
-        for label in {name, path.name, path.stem, str(path.with_suffix(""))}:
-            places.setdefault(label, []).append(name)
-    return {label: found[0] for label, found in places.items() if len(found) == 1}
-
-
 def _pose(entry: ElementTree.Element, where: str) -> NDArray[np.float64] | None:
     transform = entry.find("transform")
     if transform is None:
         return None
-    values = _floats(transform, where)
+    values = finite_numbers((transform.text or "").split(), where, _HINT)
     if len(values) != 16:
         raise _invalid(where, f"the transform has {len(values)} numbers, not 16.")
     return rigid_matrix(np.reshape(values, (4, 4)).tolist(), where)[0]
-
-
-def _floats(element: ElementTree.Element, where: str) -> list[float]:
-    try:
-        values = [float(word) for word in (element.text or "").split()]
-    except ValueError:
-        raise _invalid(where, f"{element.tag} holds a word that is no number.") from None
-    if not np.isfinite(values).all():
-        raise InputError(
-            "pose_not_finite", "NaN or an infinite number.", where=where, hint="Export it again."
-        )
-    return values
 
 
 def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
@@ -193,9 +163,8 @@ def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
         )
     values = {}
     for name in ("f", "fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2"):
-        element = calibration.find(name)
-        numbers = [] if element is None else _floats(element, where)
-        values[name] = numbers[0] if numbers else 0.0
+        numbers = finite_numbers(calibration.findtext(name, "").split(), where, _HINT)
+        values[name] = float(numbers[0]) if len(numbers) else 0.0
     unmodelled = [name for name in ("k4", "p3", "p4", "b2") if values[name]]
     if unmodelled:
         raise InputError(
@@ -234,7 +203,7 @@ def _colmap_camera(values: dict[str, float], width: int, height: int, where: str
 
 
 def _invalid(where: str, what: str) -> InputError:
-    return InputError("pose_file_invalid", what, where=where, hint="Export the cameras from Metashape again.")
+    return InputError("pose_file_invalid", what, where=where, hint=_HINT)
 
 
 CODECS = (Codec(METASHAPE, parse=parse_metashape, recognises=head_holds(b"<chunk")),)

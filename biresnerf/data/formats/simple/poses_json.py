@@ -6,7 +6,7 @@ With the COLMAP model it loses nothing, so the other formats of a result can be 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +14,12 @@ from pydantic import Field
 
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.model.atomic_file import write_json
+from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.json_document import read_model
 from biresnerf.data.model.refined_set import PointsSource, RefinedSet
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.formats import Format
+from biresnerf.report import SimilarityReport
 
 POSES_JSON = Format(
     name="poses",
@@ -40,15 +42,6 @@ Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row]
 
 
-class PoseCamera(FrozenModel, allow_inf_nan=False):
-    """A lens: COLMAP's model name, size in px and parameters in COLMAP's order."""
-
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
-
-
 class PoseImage(FrozenModel, allow_inf_nan=False):
     """One image. Poses are the upper three rows of 4 x 4 matrices."""
 
@@ -66,30 +59,21 @@ class PoseImage(FrozenModel, allow_inf_nan=False):
     flags: tuple[str, ...]
 
 
-class PoseSimilarity(FrozenModel, allow_inf_nan=False):
-    """x_in_input = scale * rotation @ x_in_optimised + translation."""
-
-    scale: float
-    rotation: tuple[Annotated[tuple[float, float, float], Field()], ...]
-    translation: tuple[float, float, float]
-
-
 class PosesDocument(FrozenModel, allow_inf_nan=False):
     """The whole file."""
 
     format: Literal["biresnerf-poses"] = "biresnerf-poses"
     version: Literal[1] = 1
     axes: str = AXES
-    cameras: tuple[PoseCamera, ...]
+    cameras: tuple[Camera, ...]
     images: tuple[PoseImage, ...]
-    input_from_optimised: PoseSimilarity
+    input_from_optimised: SimilarityReport
     points_source: PointsSource
     timestamps_s: tuple[float, ...] | None = None
 
 
 def write_poses_json(refined: RefinedSet, path: Path) -> None:
     """Writes the file, whole or not at all; numbers with all their digits."""
-    similarity = refined.similarity
     images = tuple(
         PoseImage(
             name=image.name,
@@ -105,16 +89,9 @@ def write_poses_json(refined: RefinedSet, path: Path) -> None:
         for image, cam_from_world in zip(refined.images, refined.cam_from_world, strict=True)
     )
     document = PosesDocument(
-        cameras=tuple(
-            PoseCamera(model=c.model, width=c.width, height=c.height, params=c.params)
-            for c in refined.cameras
-        ),
+        cameras=refined.cameras,
         images=images,
-        input_from_optimised=PoseSimilarity(
-            scale=similarity.scale,
-            rotation=tuple(tuple(row) for row in similarity.rotation.tolist()),
-            translation=tuple(similarity.translation.tolist()),
-        ),
+        input_from_optimised=refined.similarity.report(),
         points_source=refined.points_source,
         timestamps_s=refined.timestamps_s,
     )

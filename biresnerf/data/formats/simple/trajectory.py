@@ -20,7 +20,7 @@ from biresnerf.data.model.conventions import quat_wxyz_from_rotation, rotation_f
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.text_file import read_text
+from biresnerf.data.model.text_file import finite_numbers, read_text
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 
@@ -67,6 +67,7 @@ TIMES_OF_IMAGES = "rgb.txt"  # of TUM's sets
 MAX_POSES = 100_000
 MAX_TIME_APART_S = 0.02  # between an image and its pose, as in TUM's own tools
 _QUAT_LENGTH_ERROR = 1e-2
+_HINT = "Give lines of `time x y z qx qy qz qw` (TUM), or of 12 numbers, [R | t] by rows (KITTI)."
 _HEAD = "# timestamp tx ty tz qx qy qz qw: camera to world, OpenCV axes (x right, y down, z forward), the input's frame"
 _COLUMNS: dict[int, str] = {8: "tum", 12: "kitti"}
 # What `refine` writes above its poses: which image was taken when.
@@ -92,12 +93,7 @@ class Trajectory:
             columns = columns or len(words)
             if len(words) not in _COLUMNS or len(words) != columns:
                 raise _invalid(where, f"has {len(words)} numbers, not 8 (TUM) or 12 (KITTI) as every line.")
-            try:
-                values = np.array([float(word) for word in words])
-            except ValueError:
-                raise _invalid(where, "holds a word that is no number.") from None
-            if not np.isfinite(values).all():
-                raise _invalid(where, "NaN or an infinite number.", "pose_not_finite")
+            values = finite_numbers(words, where, _HINT)
             rows = _tum_rows(values, where) if columns == 8 else values.reshape(3, 4)
             self.poses.append(rigid_matrix(rows.tolist(), where)[0])
             self.lines.append(number)
@@ -251,8 +247,7 @@ def _tum_rows(values: NDArray[np.float64], where: str) -> NDArray[np.float64]:
 
 
 def _invalid(where: str, what: str, code: str = "pose_file_invalid") -> InputError:
-    hint = "Give lines of `time x y z qx qy qz qw` (TUM), or of 12 numbers, [R | t] by rows (KITTI)."
-    return InputError(code, what, where=where, hint=hint)
+    return InputError(code, what, where=where, hint=_HINT)
 
 
 def write_tum(refined: RefinedSet, path: Path) -> None:

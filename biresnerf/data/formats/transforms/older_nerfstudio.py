@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import PoseEntry
-from biresnerf.data.formats.colmap.read_model import model_forms, read_colmap_model, world_from_cam_of
+from biresnerf.data.formats.colmap.read_model import model_forms, read_colmap_model
 from biresnerf.errors import InputError
 
 MODEL = "colmap/sparse/0"
@@ -32,7 +32,7 @@ def applied_transform_left_out(file: Path, entries: Sequence[PoseEntry]) -> NDAr
         images = read_colmap_model(folder).images.values()
     except InputError:
         return None  # not what is read; nothing is taken from it
-    by_name = {posixpath.basename(image.name): world_from_cam_of(image.cam_from_world) for image in images}
+    by_name = {posixpath.basename(image.name): image.world_from_cam for image in images}
     off, size, found = 0.0, 1.0, 0
     for entry in entries:
         pose = by_name.get(posixpath.basename(entry.name))

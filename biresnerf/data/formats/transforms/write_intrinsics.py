@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 from biresnerf.data.model.camera import Camera
+from biresnerf.geometry.camera.camera_models import COEFFICIENTS
 
 FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
-_OTHER_KEYS = ("cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 def family(camera: Camera) -> str:
@@ -32,7 +32,7 @@ def lens_values(camera: Camera) -> dict[str, Any]:
 
 def says_lens(place: dict[str, Any]) -> bool:
     """Whether a frame brings intrinsics of its own."""
-    return any(place.get(key) is not None for key in (*FOCAL_KEYS, *_OTHER_KEYS))
+    return any(place.get(key) is not None for key in (*FOCAL_KEYS, "cx", "cy", *COEFFICIENTS))
 
 
 def put_lens(place: dict[str, Any], camera: Camera) -> None:

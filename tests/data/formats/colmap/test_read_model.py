@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from biresnerf.data.formats.colmap.read_model import model_forms, read_colmap_model, world_from_cam_of
+from biresnerf.data.formats.colmap.read_model import model_forms, read_colmap_model
 from biresnerf.data.model.colmap_scene import ColmapModel, RigidPose
 from biresnerf.geometry.camera.camera_models import MODEL_IDS
 from tests.data.formats.colmap.colmap_files import (
@@ -127,9 +127,7 @@ def test_both_forms_of_a_model_read_the_same_and_binary_goes_first(tmp_path):
     for image, other in zip(text.images.values(), binary.images.values(), strict=True):
         assert (image.id, image.name, image.camera_id) == (other.id, other.name, other.camera_id)
         np.testing.assert_array_equal(image.point3d_ids, other.point3d_ids)
-        np.testing.assert_array_equal(
-            world_from_cam_of(image.cam_from_world), world_from_cam_of(other.cam_from_world)
-        )
+        np.testing.assert_array_equal(image.world_from_cam, other.world_from_cam)
     assert text.cameras == binary.cameras
     assert text.frames.keys() == binary.frames.keys()
     assert text.rigs[2].reference == binary.rigs[2].reference == ("CAMERA", 7)
@@ -160,7 +158,7 @@ def test_the_frames_poses_go_before_the_images_as_in_colmap(tmp_path):
 
 def test_a_camera_stands_where_its_pose_says(tmp_path):
     model = read_colmap_model(write_tables(tmp_path, tiny_tables()))
-    pose = world_from_cam_of(model.images[12].cam_from_world)
+    pose = model.images[12].world_from_cam
     np.testing.assert_array_equal(pose[:3, 3], [-12.0, -0.5, -2.0])
     np.testing.assert_array_equal(pose[:3, :3], np.eye(3))
 
