@@ -11,6 +11,7 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
+from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 from starlette.routing import Route
 
@@ -99,6 +100,7 @@ def create_app(settings: Settings) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
+        generate_unique_id_function=_operation_id,
         # Spans of requests, once `set_up_traces` was called.
         telemetry={"metrics": False, "logs": False, "operation_spans": False, "exclude": is_probe},
     )
@@ -110,6 +112,12 @@ def create_app(settings: Settings) -> FastAPI:
         app.include_router(router)
     describe(app, _ROUTERS)
     return app
+
+
+def _operation_id(route: APIRoute) -> str:
+    """`getJob` for the function `get_job`; `headArtifact` where `get_artifact` also serves HEAD."""
+    verb, *words = route.name.split("_")
+    return ("head" if route.methods == {"HEAD"} else verb) + "".join(word.capitalize() for word in words)
 
 
 async def _finish_checks(service: Service) -> None:

@@ -30,8 +30,7 @@ ANSWERS: dict[int | str, dict[str, Any]] = {
     },
     **declared(
         # Signed links need no key, so the codes of guarded operations are not theirs.
-        *("bad_range", "not_found", "expired", "range_not_satisfiable"),
-        *("database_unavailable", "storage_unavailable"),
+        *("bad_range", "expired", "range_not_satisfiable", "database_unavailable", "storage_unavailable")
     ),
 }
 

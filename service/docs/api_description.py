@@ -17,28 +17,14 @@ from service.http.problems import MEDIA_TYPE, declared
 _PROBLEM = {"$ref": "#/components/schemas/Problem"}
 
 
-def _by_path(operation: str, parameter: str, answer: str = "$response.body#/id") -> dict[str, Any]:
-    return {operation: {"operationId": operation, "parameters": {parameter: answer}}}
-
-
-# Which values of a response the next calls take: operation -> (status, links).
-_LINKS: dict[str, tuple[str, dict[str, Any]]] = {
-    "createDataset": (
-        "201",
-        {
-            **_by_path("putFile", "dataset_id"),
-            **_by_path("uploadArchive", "dataset_id"),
-            **_by_path("createUpload", "dataset_id"),
-            **_by_path("finalizeDataset", "dataset_id"),
-        },
-    ),
-    "createUpload": ("201", {**_by_path("appendUpload", "upload_id"), **_by_path("getUpload", "upload_id")}),
-    "uploadArchive": ("200", _by_path("finalizeDataset", "dataset_id")),
-    "finalizeDataset": (
-        "200",
-        {"submitJob": {"operationId": "submitJob", "requestBody": {"dataset_id": "$response.body#/id"}}},
-    ),
-    "submitJob": ("202", {**_by_path("getJob", "job_id"), **_by_path("cancelJob", "job_id")}),
+_ID = "$response.body#/id"
+# The next calls with the id in a response: operation -> (status, parameter, operations).
+_NEXT = {
+    "createDataset": ("201", "dataset_id", ["putFile", "uploadArchive", "createUpload", "finalizeDataset"]),
+    "createUpload": ("201", "upload_id", ["appendUpload", "getUpload"]),
+    "uploadArchive": ("200", "dataset_id", ["finalizeDataset"]),
+    "finalizeDataset": ("200", "dataset_id", ["submitJob"]),
+    "submitJob": ("202", "job_id", ["getJob", "cancelJob"]),
 }
 # Problems of every operation, and of those with a JSON body; `REFUSALS` are those of guarded operations.
 _ANY = ("malformed_request", "head_timeout", "headers_too_large", "internal_error")
@@ -60,9 +46,11 @@ def describe(app: FastAPI, routers: Sequence[APIRouter]) -> None:
                 operation["responses"] = _answers(operation["responses"], _common_problems(operation))
                 if method == "head":
                     operation["responses"]["200"].pop("content", None)
-                status, links = _LINKS.get(operation["operationId"], ("", {}))
-                if links:
-                    operation["responses"][status]["links"] = links
+                if operation["operationId"] in _NEXT:
+                    status, parameter, following = _NEXT[operation["operationId"]]
+                    operation["responses"][status]["links"] = {
+                        name: _link(name, parameter) for name in following
+                    }
         schemas = document["components"]["schemas"]
         for name in _UNUSED:
             schemas.pop(name, None)
@@ -76,9 +64,26 @@ def describe(app: FastAPI, routers: Sequence[APIRouter]) -> None:
 
 def _common_problems(operation: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
     """The problems of all operations of this kind, which routes need not declare."""
-    guarded = bool(operation.get("security"))
-    takes_json = "application/json" in operation.get("requestBody", {}).get("content", {})
-    return declared(*_ANY, *(REFUSALS if guarded else ()), *(_JSON_BODY if takes_json else ()))
+    codes = list(_ANY)
+    if operation.get("security"):
+        codes += REFUSALS
+    if "application/json" in operation.get("requestBody", {}).get("content", {}):
+        codes += _JSON_BODY
+    parameters = {parameter["name"]: parameter["in"] for parameter in operation.get("parameters", [])}
+    if "path" in parameters.values():
+        codes.append("not_found")
+    if "query" in parameters.values():
+        codes.append("invalid_request")
+    if "cursor" in parameters:
+        codes.append("bad_cursor")
+    return declared(*codes)
+
+
+def _link(operation: str, parameter: str) -> dict[str, Any]:
+    """The OpenAPI link by which ``operation`` takes the id of a response."""
+    if operation == "submitJob":
+        return {"operationId": operation, "requestBody": {parameter: _ID}}
+    return {"operationId": operation, "parameters": {parameter: _ID}}
 
 
 def _models(routers: Sequence[APIRouter]) -> set[type[BaseModel]]:

@@ -20,7 +20,7 @@ router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
 REPORT = "report.json"
 
 
-@router.get("/artifacts", operation_id="listArtifacts", responses=declared("not_found", "expired"))
+@router.get("/artifacts", responses=declared("expired"))
 async def list_artifacts(job_id: JobId, caller: ReadCaller) -> ArtifactList:
     """All files of the result and of its exports. While the job runs: previews of poses and a render."""
     found = await caller.jobs.artifacts(job_id)
@@ -35,12 +35,8 @@ async def list_artifacts(job_id: JobId, caller: ReadCaller) -> ArtifactList:
     return ArtifactList(items=items)
 
 
-@router.get(
-    "/artifacts/{name:path}", operation_id="getArtifact", response_class=StreamingResponse, responses=ANSWERS
-)
-@router.head(
-    "/artifacts/{name:path}", operation_id="headArtifact", response_class=StreamingResponse, responses=ANSWERS
-)
+@router.get("/artifacts/{name:path}", response_class=StreamingResponse, responses=ANSWERS)
+@router.head("/artifacts/{name:path}", response_class=StreamingResponse, responses=ANSWERS)
 async def get_artifact(
     job_id: JobId, name: str, request: Request, caller: ReadCaller, asked: Asked
 ) -> Response:
@@ -52,12 +48,7 @@ async def get_artifact(
     return await answer_with(caller.service, artifact, asked, reading=request.method == "GET")
 
 
-@router.get(
-    "/report",
-    operation_id="getReport",
-    response_model=Report,
-    responses=declared("not_found", "expired", "result_not_ready"),
-)
+@router.get("/report", response_model=Report, responses=declared("expired", "result_not_ready"))
 async def get_report(job_id: JobId, caller: ReadCaller) -> Response:
     """The machine-readable report of a finished job (the artifact `report.json`)."""
     artifact = await find_report(caller, job_id)

@@ -41,7 +41,6 @@ async def _new_dataset(request: Request) -> NewDataset:
 @router.post(
     "",
     status_code=201,
-    operation_id="createDataset",
     response_model=DatasetView,
     responses=declared("unsafe_path", "quota_exhausted"),
     openapi_extra=json_request(NewDataset),
@@ -62,35 +61,26 @@ async def create_dataset(
     return dataset
 
 
-@router.get("", operation_id="listDatasets", responses=declared("bad_cursor", "invalid_request"))
+@router.get("")
 async def list_datasets(caller: ReadCaller, paging: Paged, state: DatasetState | None = None) -> DatasetList:
     """Datasets, newest first."""
     page = await caller.datasets.list(state=state, limit=paging.limit, cursor=paging.cursor)
     return paging.answer(DatasetList, page)
 
 
-@router.get("/{dataset_id}", operation_id="getDataset", responses=declared("not_found"))
+@router.get("/{dataset_id}")
 async def get_dataset(dataset_id: DatasetId, caller: ReadCaller) -> DatasetView:
     """The dataset, with the report of its check once it is finalized."""
     return await caller.datasets.get(dataset_id)
 
 
-@router.delete(
-    "/{dataset_id}",
-    status_code=204,
-    operation_id="deleteDataset",
-    responses=declared("not_found", "dataset_in_use"),
-)
+@router.delete("/{dataset_id}", status_code=204, responses=declared("dataset_in_use"))
 async def delete_dataset(dataset_id: DatasetId, caller: DatasetWriter) -> None:
     """Deletes the dataset and its files. All its jobs must be deleted first."""
     await caller.datasets.delete(dataset_id)
 
 
-@router.get(
-    "/{dataset_id}/files",
-    operation_id="listFiles",
-    responses=declared("bad_cursor", "not_found", "expired", "invalid_request"),
-)
+@router.get("/{dataset_id}/files", responses=declared("expired"))
 async def list_files(
     dataset_id: DatasetId,
     request: Request,
@@ -106,7 +96,7 @@ async def list_files(
 
 
 _TAKES = (
-    *("body_timeout", "not_found", "dataset_not_open", "body_too_large", "too_many_files"),
+    *("body_timeout", "dataset_not_open", "body_too_large", "too_many_files"),
     *("unsafe_path", "storage_full", "quota_exhausted", "too_many_uploads"),
 )
 
@@ -114,7 +104,6 @@ _TAKES = (
 @router.put(
     "/{dataset_id}/files/{path:path}",
     status_code=201,
-    operation_id="putFile",
     response_model=FileView,
     responses={
         204: {"description": "The file existed; its content was replaced."},
@@ -170,7 +159,6 @@ def _announced_digest(header: str | None) -> str | None:
 
 @router.post(
     "/{dataset_id}/archive",
-    operation_id="uploadArchive",
     responses=declared(
         "archive_too_large", "archive_rejected", "name_collision", "validation_timeout", *_TAKES
     ),
@@ -194,11 +182,10 @@ async def upload_archive(dataset_id: DatasetId, request: Request, caller: Datase
 
 @router.post(
     "/{dataset_id}/finalize",
-    operation_id="finalizeDataset",
     response_model=DatasetView,
     responses={
         202: {"model": DatasetView, "description": "In progress (with `Prefer: respond-async`)."},
-        **declared("not_found", "dataset_not_complete", "dataset_invalid", "name_collision"),
+        **declared("dataset_not_complete", "dataset_invalid", "name_collision"),
     },
 )
 async def finalize_dataset(

@@ -18,8 +18,7 @@ from service.intake.json_body import json_request, read_json
 from service.routes.artifacts import find_report, whole_file
 from workers.jobs.derived_jobs import DerivedJobs
 
-router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
-_ALWAYS = ("not_found", "expired", "invalid_request")
+router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"], responses=declared("expired"))
 LINES = "application/x-ndjson"
 _LOG: dict[int | str, dict[str, Any]] = {
     200: {
@@ -32,9 +31,7 @@ _LOG: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.get(
-    "/logs", operation_id="getJobLog", response_class=Response, responses={**_LOG, **declared(*_ALWAYS)}
-)
+@router.get("/logs", response_class=Response, responses=_LOG)
 async def get_job_log(
     job_id: JobId,
     caller: ReadCaller,
@@ -63,12 +60,7 @@ async def get_job_log(
     )
 
 
-@router.get(
-    "/images",
-    operation_id="listImages",
-    responses=declared("result_not_ready", "storage_unavailable", *_ALWAYS),
-    tags=["results"],
-)
+@router.get("/images", responses=declared("result_not_ready", "storage_unavailable"), tags=["results"])
 async def list_images(
     job_id: JobId,
     caller: ReadCaller,
@@ -110,12 +102,11 @@ def _row(image: dict[str, Any]) -> ImageRow:
 @router.post(
     "/fork",
     status_code=202,
-    operation_id="forkJob",
     response_model=JobView,
     openapi_extra=json_request(ForkJob, required=False),
     responses=declared(
         *("fork_not_possible", "dataset_not_ready", "invalid_options", "queue_full", "quota_exhausted"),
-        *("bad_idempotency_key", "idempotency_key_reused", "storage_unavailable", "storage_full", *_ALWAYS),
+        *("bad_idempotency_key", "idempotency_key_reused", "storage_unavailable", "storage_full"),
     ),
 )
 async def fork_job(
@@ -133,15 +124,12 @@ async def fork_job(
 @router.post(
     "/exports",
     status_code=202,
-    operation_id="exportJob",
     response_model=JobView,
     tags=["results"],
     openapi_extra=json_request(NewExport, required=False),
     responses={
         200: {"model": JobView, "description": "The same export was requested before and is complete."},
-        **declared(
-            *("result_not_ready", "state_conflict", "queue_full", "quota_exhausted", "storage_full", *_ALWAYS)
-        ),
+        **declared("result_not_ready", "state_conflict", "queue_full", "quota_exhausted", "storage_full"),
     },
 )
 async def export_job(job_id: JobId, request: Request, caller: JobWriter) -> Response:
@@ -155,7 +143,7 @@ async def export_job(job_id: JobId, request: Request, caller: JobWriter) -> Resp
     return job_answer(job, status=200 if job.final else 202, new=new)
 
 
-@router.get("/exports", operation_id="listExports", tags=["results"], responses=declared(*_ALWAYS))
+@router.get("/exports", tags=["results"])
 async def list_exports(job_id: JobId, caller: ReadCaller) -> JobList:
     """All exports of the job, the oldest first."""
     page = await _derived(caller).exports(job_id)

@@ -13,7 +13,7 @@ from fastapi.responses import StreamingResponse
 from service.http.access import ReadCaller
 from service.http.dependencies import JobId
 from service.http.metrics import WebMetrics
-from service.http.problems import declared, wrong_field
+from service.http.problems import wrong_field
 from workers.records import JobUpdate
 from workers.settings.errors import NotFound, Unavailable
 
@@ -58,12 +58,7 @@ class EventStream(StreamingResponse):
     media_type = "text/event-stream"
 
 
-@router.get(
-    "/events",
-    operation_id="followJob",
-    response_class=EventStream,
-    responses={**_STREAM, **declared("not_found", "invalid_request")},
-)
+@router.get("/events", response_class=EventStream, responses=_STREAM)
 async def follow_job(
     job_id: JobId,
     caller: ReadCaller,

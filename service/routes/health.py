@@ -25,20 +25,20 @@ _CODES: dict[Need, str] = {
 _LACKING = ("database_unavailable", "storage_unavailable", "queue_unavailable", "unavailable")
 
 
-@router.get("/livez", operation_id="livez")
+@router.get("/livez")
 async def livez() -> Health:
     """The process runs and responds. Its dependencies are not checked: a restart would not repair them."""
     return Health()
 
 
-@router.get("/readyz", operation_id="readyz", responses=declared(*_LACKING))
+@router.get("/readyz", responses=declared(*_LACKING))
 async def readyz(service: CurrentService) -> Health:
     """Database, file storage and queue respond, so jobs can be submitted. 503 once the service is stopping."""
     await _require_everything(service)
     return Health()
 
 
-@router.get("/startupz", operation_id="startupz", responses=declared(*_LACKING))
+@router.get("/startupz", responses=declared(*_LACKING))
 async def startupz(service: CurrentService) -> Health:
     """The service has been ready once since its start; after that use `readyz`."""
     if not service.started.is_set():
@@ -60,7 +60,6 @@ async def _require_everything(service: Service) -> None:
 
 @router.get(
     "/metrics",
-    operation_id="getMetrics",
     response_class=PlainTextResponse,
     responses={
         200: {

@@ -52,7 +52,6 @@ _BODY = {
 @router.post(
     "",
     status_code=202,
-    operation_id="submitJob",
     response_model=JobView,
     openapi_extra=_BODY,
     responses={
@@ -104,7 +103,7 @@ async def submit_job(
     return job_answer(job, status=200 if job.final else 202, new=new, headers=applied)
 
 
-@router.get("", operation_id="listJobs", responses=declared("bad_cursor", "invalid_request"))
+@router.get("")
 async def list_jobs(
     caller: ReadCaller,
     paging: Paged,
@@ -135,12 +134,7 @@ def _label(text: str | None) -> tuple[str, str] | None:
     return name, value
 
 
-@router.get(
-    "/{job_id}",
-    operation_id="getJob",
-    response_model=JobView,
-    responses={304: {"description": "Not modified."}, **declared("not_found", "invalid_request")},
-)
+@router.get("/{job_id}", response_model=JobView, responses={304: {"description": "Not modified."}})
 async def get_job(
     job_id: JobId,
     caller: ReadCaller,
@@ -160,12 +154,10 @@ async def get_job(
 
 @router.post(
     "/{job_id}/cancel",
-    operation_id="cancelJob",
     response_model=JobView,
     openapi_extra=json_request(CancelJob, required=False),
     responses={
         202: {"model": JobView, "description": "Cancellation is requested; the job ends within 10 seconds."},
-        **declared("not_found"),
     },
 )
 async def cancel_job(job_id: JobId, request: Request, caller: JobWriter) -> Response:
@@ -177,9 +169,7 @@ async def cancel_job(job_id: JobId, request: Request, caller: JobWriter) -> Resp
     return job_answer(job, status=200 if job.final else 202)
 
 
-@router.delete(
-    "/{job_id}", status_code=204, operation_id="deleteJob", responses=declared("not_found", "state_conflict")
-)
+@router.delete("/{job_id}", status_code=204, responses=declared("state_conflict"))
 async def delete_job(job_id: JobId, caller: JobWriter) -> None:
     """Deletes a job that has ended, with its results and exports."""
     await caller.jobs.delete(job_id)

@@ -19,12 +19,7 @@ router = APIRouter(tags=["service"])
 ARCHIVES = ["application/zip", "application/x-tar", "application/gzip"]
 
 
-@router.get(
-    "/v1/options",
-    operation_id="getOptions",
-    response_model=OptionsView,
-    responses={304: {"description": "Not modified."}},
-)
+@router.get("/v1/options", response_model=OptionsView, responses={304: {"description": "Not modified."}})
 async def get_options(
     response: Response, _: ReadCaller, if_none_match: IfNoneMatch = None
 ) -> OptionsView | Response:
@@ -42,7 +37,7 @@ async def get_options(
     return view
 
 
-@router.get("/v1/info", operation_id="getInfo")
+@router.get("/v1/info")
 async def get_info(caller: ReadCaller) -> Info:
     """Version and limits of this service, your share of it, and how many of your jobs are in each state."""
     limits = {

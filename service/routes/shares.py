@@ -21,15 +21,10 @@ from service.http.problems import ProblemError, declared
 from service.intake.json_body import body_of, json_request
 
 router = APIRouter(prefix="/v1", tags=["results"])
+_SHARED = {**ANSWERS, **declared("expired", "link_expired")}
 
 
-@router.post(
-    "/jobs/{job_id}/shares",
-    status_code=201,
-    operation_id="shareArtifact",
-    responses=declared("not_found"),
-    openapi_extra=json_request(NewShare),
-)
+@router.post("/jobs/{job_id}/shares", status_code=201, openapi_extra=json_request(NewShare))
 async def share_artifact(
     job_id: JobId,
     caller: JobWriter,  # the link outlives the key that made it
@@ -45,18 +40,8 @@ async def share_artifact(
     return ShareView(name=artifact.name, href=href, expires_at=datetime.fromtimestamp(expires, UTC))
 
 
-@router.get(
-    "/shared/{job_id}/{name:path}",
-    operation_id="getShared",
-    response_class=StreamingResponse,
-    responses={**ANSWERS, **declared("link_expired")},
-)
-@router.head(
-    "/shared/{job_id}/{name:path}",
-    operation_id="headShared",
-    response_class=StreamingResponse,
-    responses={**ANSWERS, **declared("link_expired")},
-)
+@router.get("/shared/{job_id}/{name:path}", response_class=StreamingResponse, responses=_SHARED)
+@router.head("/shared/{job_id}/{name:path}", response_class=StreamingResponse, responses=_SHARED)
 async def get_shared(
     job_id: JobId,
     name: str,

@@ -21,9 +21,8 @@ router = APIRouter(prefix="/v1", tags=["uploads"])
 @router.post(
     "/datasets/{dataset_id}/signed-uploads",
     status_code=201,
-    operation_id="signUploads",
     responses=declared(
-        *("direct_upload_unavailable", "not_found", "dataset_not_open", "too_many_files"),
+        *("direct_upload_unavailable", "dataset_not_open", "too_many_files"),
         *("unsafe_path", "quota_exhausted", "storage_unavailable"),
     ),
     openapi_extra=json_request(NewSignedUploads),
@@ -65,9 +64,8 @@ def _key(upload: Upload) -> str:
 
 @router.post(
     "/uploads/{upload_id}/complete",
-    operation_id="completeUpload",
     responses=declared(
-        *("upload_incomplete", "not_found", "state_conflict", "dataset_not_open", "digest_mismatch"),
+        *("upload_incomplete", "state_conflict", "dataset_not_open", "digest_mismatch"),
         *("body_too_large", "too_many_files", "quota_exhausted", "storage_unavailable"),
     ),
 )

@@ -29,20 +29,18 @@ VERSION = "1.0.0"
 CONTENT_TYPE = "application/offset+octet-stream"
 SPEAKS = {"Tus-Resumable": VERSION}
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_ALWAYS = ("precondition_failed", "storage_unavailable")
 _METADATA = (
     "`name BASE64` pairs with commas between. `path`: the upload is this one file; without it, an archive. "
     "`sha256`: the digest of the whole upload, in hex."
 )
 
 
-def _speak_tus(request: Request) -> None:
-    """Adds the protocol version to every response, errors included."""
+def _speak_tus(
+    request: Request, tus_resumable: Annotated[str, Header(description="`1.0.0`; optional for GET.")] = ""
+) -> None:
+    """Adds the protocol version to every response, errors included; requests that tus defines must name it."""
     request.state.extra_headers = SPEAKS
-
-
-def _same_version(tus_resumable: Annotated[str, Header(description="`1.0.0`")] = "") -> None:
-    if tus_resumable.strip() != VERSION:
+    if request.method not in {"GET", "OPTIONS"} and tus_resumable.strip() != VERSION:
         raise ProblemError(
             "precondition_failed",
             f"The header Tus-Resumable must be {VERSION}.",
@@ -51,8 +49,12 @@ def _same_version(tus_resumable: Annotated[str, Header(description="`1.0.0`")] =
         )
 
 
-router = APIRouter(prefix="/v1", tags=["uploads"], dependencies=[Depends(_speak_tus)])
-SameVersion = Depends(_same_version)
+router = APIRouter(
+    prefix="/v1",
+    tags=["uploads"],
+    dependencies=[Depends(_speak_tus)],
+    responses=declared("precondition_failed", "storage_unavailable"),
+)
 
 
 def _where(upload: Upload) -> dict[str, str]:
@@ -64,12 +66,7 @@ def _where(upload: Upload) -> dict[str, str]:
     }
 
 
-@router.options(
-    "/datasets/{dataset_id}/uploads",
-    status_code=204,
-    operation_id="describeUploads",
-    responses=declared("not_found"),
-)
+@router.options("/datasets/{dataset_id}/uploads", status_code=204)
 async def describe_uploads(dataset_id: DatasetId, caller: ReadCaller) -> Response:
     """Which parts of the tus protocol are supported."""
     headers = {
@@ -83,13 +80,11 @@ async def describe_uploads(dataset_id: DatasetId, caller: ReadCaller) -> Respons
 @router.post(
     "/datasets/{dataset_id}/uploads",
     status_code=201,
-    operation_id="createUpload",
     response_model=UploadView,
     responses=declared(
-        *("not_found", "dataset_not_open", "invalid_request", "unsafe_path", "body_too_large"),
-        *("too_many_files", "storage_full", "quota_exhausted", *_ALWAYS),
+        *("dataset_not_open", "invalid_request", "unsafe_path", "body_too_large"),
+        *("too_many_files", "storage_full", "quota_exhausted"),
     ),
-    dependencies=[SameVersion],
 )
 async def create_upload(
     dataset_id: DatasetId,
@@ -129,18 +124,13 @@ def _metadata(header: str) -> dict[str, str]:
     return values
 
 
-@router.head(
-    "/uploads/{upload_id}",
-    operation_id="headUpload",
-    responses=declared("not_found", *_ALWAYS),
-    dependencies=[SameVersion],
-)
+@router.head("/uploads/{upload_id}")
 async def head_upload(upload_id: UploadId, caller: ReadCaller) -> Response:
     """The offset at which the upload continues (`Upload-Offset`)."""
     return Response(status_code=200, headers=_where(await caller.uploads.get(upload_id)))
 
 
-@router.get("/uploads/{upload_id}", operation_id="getUpload", responses=declared("not_found", *_ALWAYS))
+@router.get("/uploads/{upload_id}")
 async def get_upload(upload_id: UploadId, caller: ReadCaller) -> UploadView:
     """The progress of the upload, and its outcome (`stored` or `rejected`) once all bytes are received."""
     return await caller.uploads.get(upload_id)
@@ -149,12 +139,10 @@ async def get_upload(upload_id: UploadId, caller: ReadCaller) -> UploadView:
 @router.patch(
     "/uploads/{upload_id}",
     status_code=204,
-    operation_id="appendUpload",
     responses=declared(
-        *("not_found", "offset_mismatch", "body_too_large", "unsupported_media", "invalid_request"),
-        *("body_timeout", "storage_full", "too_many_uploads", *_ALWAYS),
+        *("offset_mismatch", "body_too_large", "unsupported_media", "invalid_request"),
+        *("body_timeout", "storage_full", "too_many_uploads"),
     ),
-    dependencies=[SameVersion],
     openapi_extra=raw_request(CONTENT_TYPE),
 )
 async def append_upload(
@@ -182,13 +170,7 @@ async def append_upload(
     return Response(status_code=204, headers=_where(upload))
 
 
-@router.delete(
-    "/uploads/{upload_id}",
-    status_code=204,
-    operation_id="deleteUpload",
-    responses=declared("not_found", *_ALWAYS),
-    dependencies=[SameVersion],
-)
+@router.delete("/uploads/{upload_id}", status_code=204)
 async def delete_upload(upload_id: UploadId, caller: DatasetWriter) -> None:
     """Deletes the upload. Files that it has already added to the dataset stay."""
     await caller.uploads.delete(upload_id)

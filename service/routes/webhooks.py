@@ -28,7 +28,6 @@ router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 @router.post(
     "",
     status_code=201,
-    operation_id="createWebhook",
     openapi_extra=json_request(NewWebhook),
     responses=declared("webhook_url_refused", "too_many_webhooks"),
 )
@@ -41,7 +40,7 @@ async def create_webhook(
     return WebhookWithSecret(**dict(webhook), secret=secret)
 
 
-@router.get("", operation_id="listWebhooks", responses=declared("bad_cursor", "invalid_request"))
+@router.get("")
 async def list_webhooks(
     caller: ReadCaller,
     paging: Paged,
@@ -54,7 +53,7 @@ async def list_webhooks(
     return paging.answer(WebhookList, page)
 
 
-@router.get("/{webhook_id}", operation_id="getWebhook", responses=declared("not_found"))
+@router.get("/{webhook_id}")
 async def get_webhook(webhook_id: WebhookId, caller: ReadCaller) -> WebhookView:
     """The webhook, and since when its deliveries fail."""
     return await caller.webhooks.get(webhook_id)
@@ -62,9 +61,8 @@ async def get_webhook(webhook_id: WebhookId, caller: ReadCaller) -> WebhookView:
 
 @router.patch(
     "/{webhook_id}",
-    operation_id="changeWebhook",
     openapi_extra=json_request(WebhookChange),
-    responses=declared("not_found", "webhook_url_refused"),
+    responses=declared("webhook_url_refused"),
 )
 async def change_webhook(
     caller: JobWriter, webhook_id: WebhookId, body: Annotated[WebhookChange, Depends(body_of(WebhookChange))]
@@ -73,27 +71,20 @@ async def change_webhook(
     return await caller.webhooks.change(webhook_id, **body.model_dump())
 
 
-@router.delete(
-    "/{webhook_id}", status_code=204, operation_id="deleteWebhook", responses=declared("not_found")
-)
+@router.delete("/{webhook_id}", status_code=204)
 async def delete_webhook(webhook_id: WebhookId, caller: JobWriter) -> None:
     """Deletes the webhook with its deliveries; messages that wait are not sent."""
     await caller.webhooks.delete(webhook_id)
 
 
-@router.post("/{webhook_id}/secret", operation_id="rotateWebhookSecret", responses=declared("not_found"))
-async def rotate_secret(webhook_id: WebhookId, caller: JobWriter) -> WebhookWithSecret:
+@router.post("/{webhook_id}/secret")
+async def rotate_webhook_secret(webhook_id: WebhookId, caller: JobWriter) -> WebhookWithSecret:
     """Creates a new secret. For 24 hours messages are also signed with the previous one."""
     webhook, secret = await caller.webhooks.rotate(webhook_id)
     return WebhookWithSecret(**dict(webhook), secret=secret)
 
 
-@router.post(
-    "/{webhook_id}/test",
-    status_code=202,
-    operation_id="testWebhook",
-    responses=declared("not_found", "state_conflict"),
-)
+@router.post("/{webhook_id}/test", status_code=202, responses=declared("state_conflict"))
 async def test_webhook(webhook_id: WebhookId, caller: JobWriter, response: Response) -> DeliveryView:
     """Sends a message `webhook.test`; its delivery is at `Location`."""
     delivery = await caller.webhooks.test(webhook_id)
@@ -101,20 +92,14 @@ async def test_webhook(webhook_id: WebhookId, caller: JobWriter, response: Respo
     return delivery
 
 
-@router.get(
-    "/{webhook_id}/deliveries",
-    operation_id="listDeliveries",
-    responses=declared("bad_cursor", "not_found", "invalid_request"),
-)
+@router.get("/{webhook_id}/deliveries")
 async def list_deliveries(webhook_id: WebhookId, caller: ReadCaller, paging: Paged) -> DeliveryList:
     """Messages sent and waiting, newest first, with the time and status of every attempt."""
     page = await caller.webhooks.deliveries(webhook_id, limit=paging.limit, cursor=paging.cursor)
     return paging.answer(DeliveryList, page)
 
 
-@router.get(
-    "/{webhook_id}/deliveries/{delivery_id}", operation_id="getDelivery", responses=declared("not_found")
-)
+@router.get("/{webhook_id}/deliveries/{delivery_id}")
 async def get_delivery(webhook_id: WebhookId, delivery_id: DeliveryId, caller: ReadCaller) -> DeliveryView:
     """One message and its attempts."""
     return await caller.webhooks.delivery(webhook_id, delivery_id)
@@ -123,8 +108,7 @@ async def get_delivery(webhook_id: WebhookId, delivery_id: DeliveryId, caller: R
 @router.post(
     "/{webhook_id}/deliveries/{delivery_id}/redeliver",
     status_code=202,
-    operation_id="redeliver",
-    responses=declared("not_found", "state_conflict"),
+    responses=declared("state_conflict"),
 )
 async def redeliver(webhook_id: WebhookId, delivery_id: DeliveryId, caller: JobWriter) -> DeliveryView:
     """Sends a message again at once, with its original id, so that receivers recognise it."""
