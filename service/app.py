@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI, Request
@@ -78,8 +78,8 @@ def create_app(settings: Settings) -> FastAPI:
             swept = await asyncio.to_thread(sweep_staging, service.staging_dir)
             if swept:
                 logger.info("removed %d unfinished uploads", swept)
-            service.keep_running(asyncio.create_task(_finish_checks(service)))
-            service.keep_running(asyncio.create_task(_finish_uploads(service)))
+            service.keep_running(asyncio.create_task(_repeat(_finish_checks, service)))
+            service.keep_running(asyncio.create_task(_repeat(_finish_uploads, service)))
             await log_access(service)
             try:
                 yield
@@ -120,32 +120,30 @@ def _operation_id(route: APIRoute) -> str:
     return ("head" if route.methods == {"HEAD"} else verb) + "".join(word.capitalize() for word in words)
 
 
-async def _finish_checks(service: Service) -> None:
-    """Finishes checks whose process was killed."""
+async def _repeat(work: Callable[[Service], Awaitable[None]], service: Service) -> None:
+    """Does the work now and again, whatever happens to it."""
     while True:
         try:
-            for dataset_id in await service.stores.datasets.unfinished():
-                with contextlib.suppress(NotFound):  # deleted meanwhile
-                    await service.stores.datasets.check(dataset_id)
+            await work(service)
         except Unavailable as error:
-            logger.warning("unfinished checks are waiting: %s", error.detail)
+            logger.warning("unfinished checks and uploads are waiting: %s", error.detail)
         except Exception:
-            logger.exception("a check failed; it will be retried")
+            logger.exception("%s failed; it will be retried", work.__name__)
         await asyncio.sleep(_UNFINISHED_EVERY_S)
+
+
+async def _finish_checks(service: Service) -> None:
+    """Finishes checks whose process was killed."""
+    for dataset_id in await service.stores.datasets.unfinished():
+        with contextlib.suppress(NotFound):  # deleted meanwhile
+            await service.stores.datasets.check(dataset_id)
 
 
 async def _finish_uploads(service: Service) -> None:
     """Finishes uploads that another process received but did not store; deletes those that expired."""
-    while True:
-        try:
-            for upload_id in await service.stores.uploads.untaken():
-                await take_upload(service, upload_id)
-            await service.stores.uploads.expire()
-        except Unavailable as error:
-            logger.warning("received uploads are waiting: %s", error.detail)
-        except Exception:
-            logger.exception("an upload could not be stored; it will be retried")
-        await asyncio.sleep(_UNFINISHED_EVERY_S)
+    for upload_id in await service.stores.uploads.untaken():
+        await take_upload(service, upload_id)
+    await service.stores.uploads.expire()
 
 
 def _answer_with_problems(app: FastAPI) -> None:
@@ -175,7 +173,7 @@ def _as_problem(error: Exception) -> ProblemError:
     if isinstance(error, FaultError):
         return problem_of(error)
     if isinstance(error, RequestValidationError):
-        return validation_problem([{**item, "type": item["type"]} for item in error.errors()], below="")
+        return validation_problem(error.errors())
     if isinstance(error, HTTPException):
         return _from_http_exception(error)
     raise error

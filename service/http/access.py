@@ -62,24 +62,19 @@ class Identity:
 
 @dataclass(frozen=True)
 class Caller:
-    """The identified client of a request; its stores are limited to its tenant.
+    """The identified client of a request, with the stores limited to its tenant.
 
     ``client`` is what limits are counted by: the key, or the address without one; None on loopback.
     """
 
     service: Service
-    identity: Identity
+    tenant: str
+    scopes: frozenset[KeyScope]
     client: str | None
-
-    @property
-    def tenant(self) -> str:
-        """The tenant of the caller."""
-        return self.identity.tenant
-
-    @property
-    def scopes(self) -> frozenset[KeyScope]:
-        """The scopes of the caller."""
-        return self.identity.scopes
+    jobs: JobStore
+    datasets: DatasetStore
+    uploads: UploadStore
+    webhooks: WebhookStore
 
     def require(self, scope: KeyScope) -> None:
         """Raises ``ProblemError`` (``scope_required``) if the caller lacks the scope."""
@@ -92,26 +87,6 @@ class Caller:
     def sending(self) -> AbstractContextManager[None]:
         """Counts an upload while it runs; raises ``ProblemError`` (``too_many_uploads``) at the client's limit."""
         return self.service.sending.counted(self.client)
-
-    @property
-    def jobs(self) -> JobStore:
-        """The tenant's jobs."""
-        return self.service.stores.jobs.for_tenant(self.tenant)
-
-    @property
-    def datasets(self) -> DatasetStore:
-        """The tenant's datasets."""
-        return self.service.stores.datasets.for_tenant(self.tenant)
-
-    @property
-    def uploads(self) -> UploadStore:
-        """The uploads into the tenant's datasets."""
-        return self.service.stores.uploads.for_tenant(self.tenant)
-
-    @property
-    def webhooks(self) -> WebhookStore:
-        """The tenant's webhooks."""
-        return self.service.stores.webhooks.for_tenant(self.tenant)
 
 
 class Access:
@@ -280,7 +255,15 @@ _bearer = HTTPBearer(
 async def _caller(
     request: Request, needed: SecurityScopes, _documented: Annotated[Any, Security(_bearer)]
 ) -> Caller:
-    caller = Caller(service_of(request), request.state.identity, request.state.client)
+    service, identity = service_of(request), request.state.identity
+    tenant, stores = identity.tenant, service.stores
+    caller = Caller(
+        *(service, tenant, identity.scopes, request.state.client),
+        jobs=stores.jobs.for_tenant(tenant),
+        datasets=stores.datasets.for_tenant(tenant),
+        uploads=stores.uploads.for_tenant(tenant),
+        webhooks=stores.webhooks.for_tenant(tenant),
+    )
     for scope in needed.scopes:
         caller.require(scope)  # type: ignore[arg-type]
     return caller

@@ -17,7 +17,7 @@ from service.http.dependencies import Service
 from service.http.problems import ProblemError, problem_of
 from service.intake.sandboxed_child import Limits, run_confined
 from service.intake.unpack import UnpackRequest
-from service.intake.uploads import staging_folder, write_stream
+from service.intake.uploads import capped, staging_folder, write_stream
 from workers.process.waiting import retry_while_unavailable
 from workers.records import Upload
 from workers.settings.errors import EngineError, NotFound, Unavailable
@@ -34,9 +34,9 @@ _KEPT_FOLDERS = {"images"}
 
 
 async def take_archive(
-    service: Service, dataset_id: str, archive: Path, into: Path, upload_id: str | None = None
+    service: Service, dataset_id: str, archive: Path, upload_id: str | None = None
 ) -> DatasetView:
-    """Unpacks ``archive`` in a child, into the empty folder ``into``; then stores what came out.
+    """Unpacks ``archive``, which is alone in a staging folder, in a child process; then stores what came out.
 
     ``upload_id``: the upload that it came by. Nothing is stored unless the whole archive is good.
 
@@ -52,6 +52,8 @@ async def take_archive(
     allowed = min(settings.max_unpacked_bytes, settings.max_dataset_bytes - dataset.bytes)
     # Twice: unpacked here, and then stored, which may be on the same disk.
     room = await asyncio.to_thread(service.disk_budget.free_bytes) // 2
+    into = archive.parent / "content"
+    into.mkdir()
     request = UnpackRequest(
         archive=archive,
         into=into,
@@ -150,9 +152,8 @@ async def _add_to_dataset(service: Service, upload: Upload) -> None:
         )
         return
     async with staging_folder(service.staging_dir) as folder:
-        archive, into = folder / "archive", folder / "content"
-        into.mkdir()
-        await write_stream(uploads.content(upload), archive, upload.size, service.disk_budget)
+        archive = folder / "archive"
+        await write_stream(capped(uploads.content(upload), upload.size, room=service.disk_budget), archive)
         if upload.sha256 is not None:
             found = await asyncio.to_thread(file_sha256, archive)
             if found != upload.sha256:
@@ -161,7 +162,7 @@ async def _add_to_dataset(service: Service, upload: Upload) -> None:
                     f"What arrived has SHA-256 {found}, announced was {upload.sha256}.",
                     hint="Send the archive again.",
                 )
-        await take_archive(service, upload.dataset_id, archive, into, upload.id)
+        await take_archive(service, upload.dataset_id, archive, upload.id)
 
 
 async def settle_uploads(service: Service, dataset_id: str) -> None:

@@ -3,26 +3,58 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Callable, Coroutine, Iterable
 from typing import Any, TypeVar
 
-from fastapi import Request
+from fastapi import Request, Response
+from fastapi.routing import APIRoute
 from pydantic import BaseModel, ValidationError
+from starlette.types import Scope
 
 from biresnerf.wire.problems import FieldProblem
 from service.http.problems import ProblemError
-from service.intake.uploads import capped, refuse_announced_excess
+from service.intake.uploads import limited_body
 
 JSON_BYTES_MAX = 2**20
 Model = TypeVar("Model", bound=BaseModel)
 
 
-async def read_json(request: Request, model: type[Model], limit: int = JSON_BYTES_MAX) -> Model:
-    """The body, of ``limit`` bytes at most, as the model.
+class JsonRoute(APIRoute):
+    """A route with a JSON body, which is read strictly before FastAPI validates it."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """The handler of requests; FastAPI calls it once for the route."""
+        handle, field = super().get_route_handler(), self.body_field
+        if field is None:
+            return handle
+
+        async def handle_strictly(request: Request) -> Response:
+            if not field.field_info.is_required() and not request.headers.get("content-type"):
+                return await handle(request)
+            return await handle(
+                _ReadRequest(request.scope, await read_json(request, self.bytes_max(request)))
+            )
+
+        return handle_strictly
+
+    def bytes_max(self, _: Request) -> int:
+        """The largest size of the body."""
+        return JSON_BYTES_MAX
+
+
+class _ReadRequest(Request):
+    """A request whose JSON body was read."""
+
+    def __init__(self, scope: Scope, values: Any) -> None:
+        super().__init__(scope)
+        self._body, self._json = b"read", values
+
+
+async def read_json(request: Request, limit: int = JSON_BYTES_MAX) -> Any:
+    """The values of the body, which has ``limit`` bytes at most.
 
     Raises:
-        ProblemError: ``unsupported_media``, ``body_too_large``, ``malformed_json``, ``invalid_request``,
-            ``invalid_options``.
+        ProblemError: ``unsupported_media``, ``body_too_large``, ``malformed_json``.
     """
     content_type = request.headers.get("content-type", "")
     if content_type.split(";")[0].strip().lower() != "application/json":
@@ -31,18 +63,8 @@ async def read_json(request: Request, model: type[Model], limit: int = JSON_BYTE
             f"The Content-Type {content_type!r} is not application/json.",
             where="Content-Type",
         )
-    refuse_announced_excess(request.headers.get("content-length"), limit)
-    body = b"".join([chunk async for chunk in capped(request.stream(), limit)])
-    return validate(load_json(body), model)
-
-
-def body_of(model: type[Model]) -> Callable[[Request], Awaitable[Model]]:
-    """A dependency that reads the request's body as the model."""
-
-    async def read(request: Request) -> Model:
-        return await read_json(request, model)
-
-    return read
+    body = b"".join([chunk async for chunk in limited_body(request, limit)])
+    return load_json(body)
 
 
 def load_json(text: bytes | str) -> Any:
@@ -60,7 +82,7 @@ def validate(values: Any, model: type[Model]) -> Model:
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise validation_problem(error.errors()) from None
+        raise validation_problem({**item, "loc": ("body", *item["loc"])} for item in error.errors()) from None
 
 
 def _no_constant(name: str) -> float:
@@ -74,9 +96,9 @@ def _no_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return values
 
 
-def validation_problem(found: Iterable[Any], below: str = "#") -> ProblemError:
+def validation_problem(found: Iterable[Any]) -> ProblemError:
     """Pydantic's findings as one problem; ``invalid_options`` where an option is at fault."""
-    fields = [FieldProblem(pointer=_pointer(item["loc"], below), detail=_detail(item)) for item in found]
+    fields = [FieldProblem(pointer=_pointer(item["loc"]), detail=_detail(item)) for item in found]
     in_options = any(field.pointer.startswith("#/options") for field in fields)
     return ProblemError(
         "invalid_options" if in_options else "invalid_request",
@@ -86,22 +108,17 @@ def validation_problem(found: Iterable[Any], below: str = "#") -> ProblemError:
     )
 
 
-def _pointer(location: tuple[int | str, ...], below: str) -> str:
+def _pointer(location: tuple[int | str, ...]) -> str:
+    """`/query/limit`, and `#/options/steps` for what FastAPI calls body, options, steps."""
     # RFC 6901 escapes; a key of the user's may hold anything.
     parts = [str(part).replace("~", "~0").replace("/", "~1")[:100] for part in location]
-    return "/".join([below, *parts])
+    return "/".join(["#", *parts[1:]] if parts[0] == "body" else ["", *parts])
 
 
 def _detail(item: Any) -> str:
     if item["type"] == "extra_forbidden":
         return "There is no such field."
     return f"{item['msg']}."
-
-
-def json_request(model: type[BaseModel], *, required: bool = True) -> dict[str, Any]:
-    """The `openapi_extra` of a route that reads its JSON body by hand."""
-    body: dict[str, Any] = {"content": {"application/json": json_content(model)}}
-    return {"requestBody": {"required": True, **body} if required else body}
 
 
 def json_content(model: type[BaseModel]) -> dict[str, Any]:

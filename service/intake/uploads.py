@@ -8,11 +8,12 @@ import re
 import shutil
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable, Collection
+from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from fastapi import Request
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
@@ -20,6 +21,11 @@ from biresnerf.wire.problems import FieldProblem
 from service.http.problems import ProblemError
 from workers.process.disk_space import DiskBudget
 
+# The methods of `Form` that the parser calls.
+_CALLBACKS = (
+    *("on_part_begin", "on_header_field", "on_header_value", "on_header_end", "on_headers_finished"),
+    *("on_part_data", "on_part_end", "on_end"),
+)
 _FIELD_BYTES_MAX = 256 * 1024
 _HEADER_BYTES_MAX = 8 * 1024
 _LOCK = ".in-use"
@@ -34,24 +40,15 @@ def raw_request(*media_types: str) -> dict[str, Any]:
     return {"requestBody": {"required": True, "content": dict.fromkeys(media_types, content)}}
 
 
-def too_large(limit_bytes: int) -> ProblemError:
-    """The error for a body beyond the limit."""
-    return ProblemError(
-        "body_too_large",
-        f"The body is larger than {limit_bytes} bytes.",
-        hint="Send fewer or smaller images, or single files; GET /v1/info tells the limits.",
-    )
-
-
-def refuse_announced_excess(
-    content_length: str | None, limit_bytes: int, room: DiskBudget | None = None
-) -> None:
-    """Refuses a body by its Content-Length before it is read; `capped` counts what really arrives."""
-    if content_length is not None and content_length.isdigit():
-        if int(content_length) > limit_bytes:
-            raise too_large(limit_bytes)
+def limited_body(request: Request, limit_bytes: int, room: DiskBudget | None = None) -> AsyncIterator[bytes]:
+    """The body of the request as `capped` passes it; refused at once where its Content-Length exceeds the limits."""
+    announced = request.headers.get("content-length", "")
+    if announced.isdigit():
+        if int(announced) > limit_bytes:
+            raise _too_large(limit_bytes)
         if room is not None:
-            room.require(int(content_length))
+            room.require(int(announced))
+    return capped(request.stream(), limit_bytes, room=room)
 
 
 async def capped(
@@ -75,23 +72,26 @@ async def capped(
             raise ProblemError("body_timeout", f"No byte of the body came for {idle_s:g} s.") from None
         total += len(chunk)
         if total > limit_bytes:
-            raise too_large(limit_bytes)
+            raise _too_large(limit_bytes)
         if room is not None and total - checked_at >= _CHECK_EVERY_BYTES:
             await asyncio.to_thread(room.require)
             checked_at = total
         yield chunk
 
 
-async def write_stream(
-    stream: AsyncIterator[bytes], target: Path, limit_bytes: int, room: DiskBudget | None = None
-) -> int:
-    """Writes the stream to a new file; returns its size. Raises what `capped` raises."""
-    total = 0
+def _too_large(limit_bytes: int) -> ProblemError:
+    return ProblemError(
+        "body_too_large",
+        f"The body is larger than {limit_bytes} bytes.",
+        hint="Send fewer or smaller images, or single files; GET /v1/info tells the limits.",
+    )
+
+
+async def write_stream(stream: AsyncIterator[bytes], target: Path) -> None:
+    """Writes the stream to a new file."""
     with target.open("xb") as out:
-        async for chunk in capped(stream, limit_bytes, room=room):
-            total += len(chunk)
+        async for chunk in stream:
             await asyncio.to_thread(out.write, chunk)
-    return total
 
 
 @asynccontextmanager
@@ -135,18 +135,10 @@ def _younger_than(path: Path, seconds: float) -> bool:
 class Form:
     """A multipart form read from a stream: one file goes to disk, small text fields to memory."""
 
-    def __init__(
-        self,
-        file_field: str,
-        text_fields: Collection[str],
-        target: Path,
-        limit_bytes: int,
-        room: DiskBudget | None = None,
-    ) -> None:
+    def __init__(self, file_field: str, text_fields: Collection[str], target: Path) -> None:
         self.texts: dict[str, str] = {}
         self.has_file = False
-        self._file_field, self._text_fields = file_field, text_fields
-        self._target, self._limit, self._room = target, limit_bytes, room
+        self._file_field, self._text_fields, self._target = file_field, text_fields, target
         self._out: IO[bytes] | None = None
         self._pending: list[bytes] = []
         self._header_name = self._header_value = b""
@@ -159,17 +151,16 @@ class Form:
         """Reads the whole body.
 
         Raises:
-            ProblemError: ``malformed_body``, ``invalid_request`` (unknown or repeated field),
-                ``body_too_large``.
-            LimitReached: ``storage_full``.
+            ProblemError: ``malformed_body``, ``invalid_request`` (unknown or repeated field).
         """
         _, parameters = parse_options_header(content_type)
         boundary = parameters.get(b"boundary")
         if not boundary:
             raise ProblemError("malformed_body", "The Content-Type has no boundary.", where="Content-Type")
         try:
-            parser = MultipartParser(boundary, self._callbacks())  # type: ignore[arg-type]
-            async for chunk in capped(stream, self._limit, room=self._room):
+            callbacks = {name: getattr(self, f"_{name}") for name in _CALLBACKS}
+            parser = MultipartParser(boundary, callbacks)  # type: ignore[arg-type]
+            async for chunk in stream:
                 parser.write(chunk)
                 await self._flush()
             parser.finalize()
@@ -186,18 +177,6 @@ class Form:
         if self._pending and self._out is not None:
             block, self._pending = b"".join(self._pending), []
             await asyncio.to_thread(self._out.write, block)
-
-    def _callbacks(self) -> dict[str, Callable[..., None]]:
-        return {
-            "on_part_begin": self._on_part_begin,
-            "on_header_field": self._on_header_field,
-            "on_header_value": self._on_header_value,
-            "on_header_end": self._on_header_end,
-            "on_headers_finished": self._on_headers_finished,
-            "on_part_data": self._on_part_data,
-            "on_part_end": self._on_part_end,
-            "on_end": self._on_end,
-        }
 
     def _on_part_begin(self) -> None:
         self._headers, self._field, self._text = {}, "", bytearray()

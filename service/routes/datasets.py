@@ -7,7 +7,7 @@ import binascii
 import re
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Query, Request
+from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import JSONResponse, Response
 
 from biresnerf.wire.datasets import (
@@ -25,17 +25,19 @@ from service.http.dependencies import DatasetId, Paged, next_link, service_of
 from service.http.problems import ProblemError, declared
 from service.intake.archive_import import take_archive
 from service.intake.dataset_finalize import begin_check, finish_check
-from service.intake.json_body import JSON_BYTES_MAX, json_request, read_json
-from service.intake.uploads import capped, raw_request, refuse_announced_excess, staging_folder, write_stream
+from service.intake.json_body import JSON_BYTES_MAX, JsonRoute
+from service.intake.uploads import limited_body, raw_request, staging_folder, write_stream
 
-router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 ENTRY_BYTES = 2048  # allowed in a manifest for each file that a dataset may have
 _DIGEST = re.compile(r"sha-256=:([A-Za-z0-9+/=]+):")
 
 
-async def _new_dataset(request: Request) -> NewDataset:
-    limit = JSON_BYTES_MAX + ENTRY_BYTES * service_of(request).settings.max_files
-    return await read_json(request, NewDataset, limit)
+class _ManifestRoute(JsonRoute):
+    def bytes_max(self, request: Request) -> int:
+        return JSON_BYTES_MAX + ENTRY_BYTES * service_of(request).settings.max_files
+
+
+router = APIRouter(prefix="/v1/datasets", tags=["datasets"], route_class=_ManifestRoute)
 
 
 @router.post(
@@ -43,11 +45,8 @@ async def _new_dataset(request: Request) -> NewDataset:
     status_code=201,
     response_model=DatasetView,
     responses=declared("unsafe_path", "quota_exhausted"),
-    openapi_extra=json_request(NewDataset),
 )
-async def create_dataset(
-    caller: DatasetWriter, body: Annotated[NewDataset, Depends(_new_dataset)], response: Response
-) -> DatasetView:
+async def create_dataset(caller: DatasetWriter, body: NewDataset, response: Response) -> DatasetView:
     """Creates an empty dataset. With a manifest, `missing` in the response lists the files to send.
 
     Files that the tenant has sent before (same size and SHA-256) are copied and need not be sent.
@@ -116,21 +115,18 @@ async def put_file(
     path: str,
     request: Request,
     caller: DatasetWriter,
-    content_length: Annotated[int | None, Header(ge=0)] = None,
     repr_digest: Annotated[str | None, Header(description="`sha-256=:BASE64:`")] = None,
     if_none_match: Annotated[str | None, Header(description="`*`: do not replace an existing file.")] = None,
 ) -> Response:
     """Uploads one file as raw bytes. Repeating the request changes nothing."""
     limit = caller.service.settings.max_file_bytes
     safe = checked_path(path)
-    refuse_announced_excess(
-        None if content_length is None else str(content_length), limit, caller.service.disk_budget
-    )
+    body = limited_body(request, limit, caller.service.disk_budget)
     with caller.sending():
         file, new = await caller.datasets.add_file(
             dataset_id,
             safe,
-            capped(request.stream(), limit, room=caller.service.disk_budget),
+            body,
             sha256=_announced_digest(repr_digest),
             overwrite=(if_none_match or "").strip() != "*",
         )
@@ -169,15 +165,12 @@ async def upload_archive(dataset_id: DatasetId, request: Request, caller: Datase
 
     If one entry is not acceptable, no file is added.
     """
-    limit = caller.service.settings.max_archive_bytes
-    refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.disk_budget)
+    body = limited_body(request, caller.service.settings.max_archive_bytes, caller.service.disk_budget)
     await caller.datasets.get(dataset_id)
     with caller.sending():
         async with staging_folder(caller.service.staging_dir) as folder:
-            await write_stream(request.stream(), folder / "archive", limit, caller.service.disk_budget)
-            into = folder / "content"
-            into.mkdir()
-            return await take_archive(caller.service, dataset_id, folder / "archive", into)
+            await write_stream(body, folder / "archive")
+            return await take_archive(caller.service, dataset_id, folder / "archive")
 
 
 @router.post(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Header, Query, Request
+from fastapi import APIRouter, Header, Query
 from fastapi.responses import Response
 
 from biresnerf.wire.jobs import ForkJob, JobList, JobView, NewExport, job_url
@@ -14,11 +14,13 @@ from service.answers.job_answers import POLL_S, IdempotencyKey, job_answer
 from service.http.access import Caller, JobWriter, ReadCaller
 from service.http.dependencies import JobId
 from service.http.problems import declared, wrong_field
-from service.intake.json_body import json_request, read_json
+from service.intake.json_body import JsonRoute
 from service.routes.artifacts import find_report, whole_file
 from workers.jobs.derived_jobs import DerivedJobs
 
-router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"], responses=declared("expired"))
+router = APIRouter(
+    prefix="/v1/jobs/{job_id}", tags=["jobs"], responses=declared("expired"), route_class=JsonRoute
+)
 LINES = "application/x-ndjson"
 _LOG: dict[int | str, dict[str, Any]] = {
     200: {
@@ -103,17 +105,15 @@ def _row(image: dict[str, Any]) -> ImageRow:
     "/fork",
     status_code=202,
     response_model=JobView,
-    openapi_extra=json_request(ForkJob, required=False),
     responses=declared(
         *("fork_not_possible", "dataset_not_ready", "invalid_options", "queue_full", "quota_exhausted"),
         *("bad_idempotency_key", "idempotency_key_reused", "storage_unavailable", "storage_full"),
     ),
 )
 async def fork_job(
-    job_id: JobId, request: Request, caller: JobWriter, idempotency_key: IdempotencyKey = None
+    job_id: JobId, caller: JobWriter, body: ForkJob, idempotency_key: IdempotencyKey = None
 ) -> Response:
     """Queues a job on the same dataset with other options, reusing the result of a stage of this one."""
-    body = await read_json(request, ForkJob)
     changes = body.options.model_dump(mode="json", exclude_unset=True)
     job, new = await _derived(caller).fork(
         job_id, changes, body.from_stage, labels=body.labels, idempotency_key=idempotency_key
@@ -126,19 +126,17 @@ async def fork_job(
     status_code=202,
     response_model=JobView,
     tags=["results"],
-    openapi_extra=json_request(NewExport, required=False),
     responses={
         200: {"model": JobView, "description": "The same export was requested before and is complete."},
         **declared("result_not_ready", "state_conflict", "queue_full", "quota_exhausted", "storage_full"),
     },
 )
-async def export_job(job_id: JobId, request: Request, caller: JobWriter) -> Response:
+async def export_job(job_id: JobId, caller: JobWriter, body: NewExport) -> Response:
     """Writes the result in additional formats; the files are then listed with those of the job.
 
     The response is a job of its own, which can be followed and cancelled like any other. Repeating the request
     returns the same export.
     """
-    body = await read_json(request, NewExport)
     job, new = await _derived(caller).export(job_id, body.formats)
     return job_answer(job, status=200 if job.final else 202, new=new)
 

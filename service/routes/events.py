@@ -11,8 +11,7 @@ from fastapi import APIRouter, Header, Query
 from fastapi.responses import StreamingResponse
 
 from service.http.access import ReadCaller
-from service.http.dependencies import JobId
-from service.http.metrics import WebMetrics
+from service.http.dependencies import JobId, Service
 from service.http.problems import wrong_field
 from workers.records import JobUpdate
 from workers.settings.errors import NotFound, Unavailable
@@ -73,8 +72,7 @@ async def follow_job(
     # Read the first update before the response begins, so that a missing job is a 404, not an empty stream.
     first = await anext(updates, None)
     headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
-    events = _counted(_stream(first, updates, caller.service.closing), caller.service.metrics)
-    return EventStream(events, headers=headers)
+    return EventStream(_stream(first, updates, caller.service), headers=headers)
 
 
 def _start(after: int | None, last_event_id: str | None) -> int:
@@ -86,60 +84,41 @@ def _start(after: int | None, last_event_id: str | None) -> int:
     return int(last_event_id)
 
 
-async def _counted(events: AsyncGenerator[str], metrics: WebMetrics) -> AsyncIterator[str]:
-    """The events; counts one listener while they are read."""
-    with metrics.listeners.track_inprogress():
-        async with contextlib.aclosing(events):
-            async for event in events:
-                yield event
-
-
 async def _stream(
-    first: JobUpdate | None, updates: AsyncGenerator[JobUpdate | None], closing: asyncio.Event
-) -> AsyncGenerator[str]:
-    yield f"retry: {_RETRY_MS}\n\n"
-    update: JobUpdate | None = first
-    async with contextlib.aclosing(updates):
-        while True:
-            yield ": still here\n\n" if update is None else _as_text(update)
-            if update is not None and update.job.final:
-                return
-            try:
-                update = await _next_or_closing(updates, closing)
-            except (_Ended, NotFound, Unavailable):
-                # The job was deleted or the database is unavailable: the client reconnects and gets the error.
-                if closing.is_set():
-                    yield _GOODBYE
-                return
-
-
-class _Ended(Exception):
-    """The stream has no more updates."""
-
-
-async def _next(updates: AsyncGenerator[JobUpdate | None]) -> JobUpdate | None:
-    async for update in updates:
-        return update
-    raise _Ended
+    first: JobUpdate | None, updates: AsyncGenerator[JobUpdate | None], service: Service
+) -> AsyncIterator[str]:
+    update = first
+    with service.metrics.listeners.track_inprogress():
+        async with contextlib.aclosing(updates):
+            yield f"retry: {_RETRY_MS}\n\n"
+            while True:
+                yield ": still here\n\n" if update is None else _as_text(update)
+                if update is not None and update.job.final:
+                    return
+                try:
+                    update = await _next_or_closing(updates, service.closing)
+                except (StopAsyncIteration, NotFound, Unavailable):
+                    # The job was deleted or the database is unavailable: the client reconnects and gets the error.
+                    if service.closing.is_set():
+                        yield _GOODBYE
+                    return
 
 
 async def _next_or_closing(
     updates: AsyncGenerator[JobUpdate | None], closing: asyncio.Event
 ) -> JobUpdate | None:
-    """The next update; ends the iteration when the server shuts down."""
-    update = asyncio.ensure_future(_next(updates))
-    end = asyncio.ensure_future(closing.wait())
+    """The next update; raises ``StopAsyncIteration`` when there is none, or when the service stops."""
+    update = asyncio.ensure_future(anext(updates))
+    waits = (update, asyncio.ensure_future(closing.wait()))
     try:
-        await asyncio.wait({update, end}, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
         if update.done():
             return update.result()
-        raise _Ended
+        raise StopAsyncIteration
     finally:
-        for waiting in (update, end):
-            if not waiting.done():
-                waiting.cancel()
-                with contextlib.suppress(asyncio.CancelledError):
-                    await waiting
+        for wait in waits:
+            wait.cancel()
+        await asyncio.gather(*waits, return_exceptions=True)
 
 
 def _as_text(update: JobUpdate) -> str:

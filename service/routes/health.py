@@ -79,21 +79,17 @@ async def get_metrics(
     ] = "",
 ) -> Response:
     """Metrics of this process and of the installation; without the database only of this process."""
-    await _require_scraper(service, authorization)
-    try:
-        installation = await service.stores.monitor.statistics()
-    except Unavailable:
-        installation = None
-    text, media_type = Exposition(service.metrics, installation).rendered(accept)
-    return Response(text, media_type=media_type, headers={"Cache-Control": "no-store"})
-
-
-async def _require_scraper(service: Service, authorization: str) -> None:
-    """Metrics reveal what the service does, so not everyone who can reach the port may read them."""
     if not await may_scrape(service, authorization):
+        # Metrics reveal what the service does, so not everyone who can reach the port may read them.
         raise ProblemError(
             "metrics_token_required",
             "The token of /metrics is missing, wrong, or not set.",
             hint="Set BIRESNERF_METRICS_TOKEN and send it as Authorization: Bearer; an admin key does too.",
             headers={"WWW-Authenticate": "Bearer"},
         )
+    try:
+        installation = await service.stores.monitor.statistics()
+    except Unavailable:
+        installation = None
+    text, media_type = Exposition(service.metrics, installation).rendered(accept)
+    return Response(text, media_type=media_type, headers={"Cache-Control": "no-store"})

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import Response
 from pydantic import AwareDatetime
 
-from biresnerf.wire.jobs import CancelJob, JobList, JobState, JobView, NewJob
+from biresnerf.wire.jobs import CancelJob, JobList, JobState, JobTexts, JobView, NewJob
 from service.answers.job_answers import (
     POLL_S,
     IdempotencyKey,
@@ -21,11 +21,10 @@ from service.http.access import JobWriter, ReadCaller
 from service.http.dependencies import IfNoneMatch, JobId, Paged
 from service.http.http_conditionals import none_match
 from service.http.problems import ProblemError, declared, wrong_field
-from service.intake.json_body import json_content, json_request, read_json
-from service.routes.one_shot import submit_form
+from service.intake.json_body import JsonRoute, json_content, read_json, validate
+from service.routes.one_shot import PLAIN, TEXTS, submit_form
 
-router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
-_TEXTS = json_content(NewJob)["schema"]["properties"]
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=JsonRoute)
 _FORM: dict[str, Any] = {
     "schema": {
         "type": "object",
@@ -33,12 +32,11 @@ _FORM: dict[str, Any] = {
         "additionalProperties": False,
         "properties": {
             "archive": {"type": "string", "format": "binary", "description": "zip, tar or tar.gz"},
-            **{name: _TEXTS[name] for name in ("options", "labels", "webhook", "priority")},
+            **json_content(JobTexts)["schema"]["properties"],
         },
     },
     "encoding": {
-        **{name: {"contentType": "application/json"} for name in ("options", "labels", "webhook")},
-        "priority": {"contentType": "text/plain"},
+        name: {"contentType": "text/plain" if name == PLAIN else "application/json"} for name in TEXTS
     },
 }
 _BODY = {
@@ -47,6 +45,7 @@ _BODY = {
         "content": {"application/json": json_content(NewJob), "multipart/form-data": _FORM},
     }
 }
+_DISCARD = CancelJob()
 
 
 @router.post(
@@ -80,7 +79,7 @@ async def submit_job(
     if kind == "multipart/form-data":
         job, new = await submit_form(caller, request, idempotency_key)
     elif kind == "application/json":
-        body = await read_json(request, NewJob)
+        body = validate(await read_json(request), NewJob)
         job, new = await caller.jobs.submit(
             body.dataset_id,
             body.options,
@@ -155,16 +154,12 @@ async def get_job(
 @router.post(
     "/{job_id}/cancel",
     response_model=JobView,
-    openapi_extra=json_request(CancelJob, required=False),
     responses={
         202: {"model": JobView, "description": "Cancellation is requested; the job ends within 10 seconds."},
     },
 )
-async def cancel_job(job_id: JobId, request: Request, caller: JobWriter) -> Response:
+async def cancel_job(job_id: JobId, caller: JobWriter, body: CancelJob = _DISCARD) -> Response:
     """Cancels a job, with a partial result if requested. A job that has ended stays as it is."""
-    body = CancelJob()
-    if request.headers.get("content-type"):
-        body = await read_json(request, CancelJob)
     job = await caller.jobs.cancel(job_id, keep_partial=body.keep_partial)
     return job_answer(job, status=200 if job.final else 202)
 

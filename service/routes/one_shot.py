@@ -14,13 +14,13 @@ from service.http.problems import wrong_field
 from service.intake.archive_import import file_sha256, take_archive
 from service.intake.dataset_finalize import begin_check, finish_check
 from service.intake.json_body import load_json, validate
-from service.intake.uploads import Form, refuse_announced_excess, staging_folder
+from service.intake.uploads import Form, limited_body, staging_folder
 from workers.settings.errors import EngineError
 from workers.webhooks.webhooks import request_with
 
 # For the text fields and the delimiters of the form.
 _FORM_BYTES = 2**20
-TEXTS = frozenset(JobTexts.model_fields)
+TEXTS = tuple(JobTexts.model_fields)
 # Plain text; the other text fields are JSON.
 PLAIN = "priority"
 
@@ -34,42 +34,33 @@ async def submit_form(caller: Caller, request: Request, idempotency_key: str | N
     """
     caller.require("datasets:write")
     limit = caller.service.settings.max_archive_bytes + _FORM_BYTES
-    refuse_announced_excess(request.headers.get("content-length"), limit, caller.service.disk_budget)
+    body = limited_body(request, limit, caller.service.disk_budget)
     with caller.sending():
-        return await _submit_received(caller, request, idempotency_key, limit)
+        async with staging_folder(caller.service.staging_dir) as folder:
+            form = Form("archive", TEXTS, folder / "archive")
+            await form.read(request.headers["content-type"], body)
+            return await _submit_received(caller, folder / "archive", form, idempotency_key)
 
 
 async def _submit_received(
-    caller: Caller, request: Request, idempotency_key: str | None, limit: int
+    caller: Caller, archive: Path, form: Form, idempotency_key: str | None
 ) -> tuple[JobView, bool]:
-    async with staging_folder(caller.service.staging_dir) as folder:
-        archive = folder / "archive"
-        form = Form("archive", TEXTS, archive, limit, caller.service.disk_budget)
-        await form.read(request.headers["content-type"], request.stream())
-        if not form.has_file:
-            raise wrong_field("#/archive", "The form has no file field `archive`.")
-        texts = _texts(form)
-        digest = await asyncio.to_thread(file_sha256, archive)
-        if idempotency_key is not None:
-            subject = request_with(digest, texts.webhook)
-            known = await caller.jobs.repeated(
-                subject, texts.options, texts.labels, idempotency_key, texts.priority
-            )
-            if known is not None:
-                return known, False
-        into = folder / "content"
-        into.mkdir()
-        return await _make_job(caller, archive, into, texts, digest, idempotency_key)
-
-
-async def _make_job(
-    caller: Caller, archive: Path, into: Path, texts: JobTexts, digest: str, idempotency_key: str | None
-) -> tuple[JobView, bool]:
+    if not form.has_file:
+        raise wrong_field("#/archive", "The form has no file field `archive`.")
+    texts = _texts(form)
+    digest = await asyncio.to_thread(file_sha256, archive)
+    if idempotency_key is not None:
+        subject = request_with(digest, texts.webhook)
+        known = await caller.jobs.repeated(
+            subject, texts.options, texts.labels, idempotency_key, texts.priority
+        )
+        if known is not None:
+            return known, False
     datasets = caller.datasets
     dataset = await datasets.create("one-shot")
     used = False
     try:
-        await take_archive(caller.service, dataset.id, archive, into)
+        await take_archive(caller.service, dataset.id, archive)
         await begin_check(caller, dataset.id)
         await finish_check(caller, dataset.id)
         job, used = await caller.jobs.submit(

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from typing import Annotated
 from urllib.parse import quote
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response, StreamingResponse
 
 from biresnerf.wire.results import NewShare, ShareView
@@ -18,17 +18,17 @@ from service.answers.downloads import ANSWERS, Asked, answer_with, find_artifact
 from service.http.access import JobWriter
 from service.http.dependencies import CurrentService, JobId
 from service.http.problems import ProblemError, declared
-from service.intake.json_body import body_of, json_request
+from service.intake.json_body import JsonRoute
 
-router = APIRouter(prefix="/v1", tags=["results"])
+router = APIRouter(prefix="/v1", tags=["results"], route_class=JsonRoute)
 _SHARED = {**ANSWERS, **declared("expired", "link_expired")}
 
 
-@router.post("/jobs/{job_id}/shares", status_code=201, openapi_extra=json_request(NewShare))
+@router.post("/jobs/{job_id}/shares", status_code=201)
 async def share_artifact(
     job_id: JobId,
     caller: JobWriter,  # the link outlives the key that made it
-    body: Annotated[NewShare, Depends(body_of(NewShare))],
+    body: NewShare,
     response: Response,
 ) -> ShareView:
     """Creates a link to one file that needs no key and expires. Anyone with the link can read the file."""

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from fastapi import APIRouter, Depends
+from fastapi import APIRouter
 
 from biresnerf.wire.datasets import FileView, NewSignedUploads, SignedUpload, SignedUploads
 from biresnerf.wire.safe_paths import checked_path
 from service.http.access import Caller, DatasetWriter
 from service.http.dependencies import DatasetId, UploadId
 from service.http.problems import ProblemError, declared
-from service.intake.json_body import body_of, json_request
+from service.intake.json_body import JsonRoute
 from workers.records import Upload
 from workers.settings.errors import NotFound
 
-router = APIRouter(prefix="/v1", tags=["uploads"])
+router = APIRouter(prefix="/v1", tags=["uploads"], route_class=JsonRoute)
 
 
 @router.post(
@@ -25,13 +23,8 @@ router = APIRouter(prefix="/v1", tags=["uploads"])
         *("direct_upload_unavailable", "dataset_not_open", "too_many_files"),
         *("unsafe_path", "quota_exhausted", "storage_unavailable"),
     ),
-    openapi_extra=json_request(NewSignedUploads),
 )
-async def sign_uploads(
-    dataset_id: DatasetId,
-    caller: DatasetWriter,
-    body: Annotated[NewSignedUploads, Depends(body_of(NewSignedUploads))],
-) -> SignedUploads:
+async def sign_uploads(dataset_id: DatasetId, caller: DatasetWriter, body: NewSignedUploads) -> SignedUploads:
     """Creates a signed URL at the store for each file. `PUT` the bytes there, then `POST …/complete` here."""
     await caller.datasets.get(dataset_id)
     paths = [checked_path(file.path) for file in body.files]

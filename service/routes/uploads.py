@@ -22,7 +22,7 @@ from service.http.access import DatasetWriter, ReadCaller
 from service.http.dependencies import DatasetId, UploadId
 from service.http.problems import ProblemError, declared
 from service.intake.archive_import import begin_taking
-from service.intake.uploads import capped, raw_request, refuse_announced_excess
+from service.intake.uploads import limited_body, raw_request
 from workers.records import Upload
 
 VERSION = "1.0.0"
@@ -160,9 +160,7 @@ async def append_upload(
         raise ProblemError("unsupported_media", f"The Content-Type must be {CONTENT_TYPE}.")
     uploads = caller.uploads
     upload = await uploads.get(upload_id)
-    room = upload.size - upload_offset
-    refuse_announced_excess(request.headers.get("content-length"), max(room, 0))
-    body = capped(request.stream(), max(room, 0), room=caller.service.disk_budget)
+    body = limited_body(request, max(upload.size - upload_offset, 0), caller.service.disk_budget)
     with caller.sending():
         upload = await uploads.append(upload_id, upload_offset, body)
     if upload.state == "received":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Response
+from fastapi import APIRouter, Query, Response
 
 from biresnerf.wire.webhooks import (
     DeliveryList,
@@ -20,20 +20,13 @@ from biresnerf.wire.webhooks import (
 from service.http.access import JobWriter, ReadCaller
 from service.http.dependencies import DeliveryId, Paged, WebhookId
 from service.http.problems import declared
-from service.intake.json_body import body_of, json_request
+from service.intake.json_body import JsonRoute
 
-router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
+router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"], route_class=JsonRoute)
 
 
-@router.post(
-    "",
-    status_code=201,
-    openapi_extra=json_request(NewWebhook),
-    responses=declared("webhook_url_refused", "too_many_webhooks"),
-)
-async def create_webhook(
-    caller: JobWriter, body: Annotated[NewWebhook, Depends(body_of(NewWebhook))], response: Response
-) -> WebhookWithSecret:
+@router.post("", status_code=201, responses=declared("webhook_url_refused", "too_many_webhooks"))
+async def create_webhook(caller: JobWriter, body: NewWebhook, response: Response) -> WebhookWithSecret:
     """Creates a webhook for all jobs and datasets. The secret is shown only in this response."""
     webhook, secret = await caller.webhooks.create(caller.tenant, body.url, body.events, body.description)
     response.headers["Location"] = webhook_url(webhook.id)
@@ -59,14 +52,8 @@ async def get_webhook(webhook_id: WebhookId, caller: ReadCaller) -> WebhookView:
     return await caller.webhooks.get(webhook_id)
 
 
-@router.patch(
-    "/{webhook_id}",
-    openapi_extra=json_request(WebhookChange),
-    responses=declared("webhook_url_refused"),
-)
-async def change_webhook(
-    caller: JobWriter, webhook_id: WebhookId, body: Annotated[WebhookChange, Depends(body_of(WebhookChange))]
-) -> WebhookView:
+@router.patch("/{webhook_id}", responses=declared("webhook_url_refused"))
+async def change_webhook(caller: JobWriter, webhook_id: WebhookId, body: WebhookChange) -> WebhookView:
     """Changes the given fields; disables or enables the webhook."""
     return await caller.webhooks.change(webhook_id, **body.model_dump())
 

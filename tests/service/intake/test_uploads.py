@@ -67,7 +67,7 @@ def test_a_form_is_read_the_same_however_it_is_cut(
     head = '--b0und\r\nContent-Disposition: form-data; name="{}"{}\r\n\r\n'
     body = head.format("options", "").encode() + text.encode() + b"\r\n"
     body += head.format("archive", '; filename="a.zip"').encode() + archive + b"\r\n--b0und--\r\n"
-    form = Form("archive", {"options"}, target, 10_000)
+    form = Form("archive", {"options"}, target)
     if b"--b0und" in archive + text.encode():
         return
     asyncio.run(form.read("multipart/form-data; boundary=b0und", pieces(body, cuts)))
@@ -93,7 +93,7 @@ def test_a_form_is_read_the_same_however_it_is_cut(
     ],
 )
 def test_a_bad_form_is_a_problem(tmp_path: Path, body: bytes, code: str) -> None:
-    form = Form("archive", {"options"}, tmp_path / "archive", 2**20)
+    form = Form("archive", {"options"}, tmp_path / "archive")
     with pytest.raises(ProblemError) as caught:
         asyncio.run(form.read("multipart/form-data; boundary=b", pieces(body, [])))
     assert caught.value.code == code
