@@ -81,7 +81,7 @@ def _write_table() -> str:
 
 
 def page_formats() -> str:
-    """What the web page shows of formats: service/web/formats.ts."""
+    """What the web page shows of formats: service/web/formats.json."""
     downloads = [
         {
             "name": one.heading,
@@ -93,8 +93,4 @@ def page_formats() -> str:
         if one.in_result
     ]
     titles = ", ".join(one.title for one in formats().values() if one.found_as)
-    return (
-        "// Written by `make docs` from the declarations of formats in biresnerf/data/formats.\n"
-        f"export const READ_FORMATS = {json.dumps(titles)};\n\n"
-        f"export const RESULT_FORMATS = {json.dumps(downloads, indent=2, ensure_ascii=False)};\n"
-    )
+    return json.dumps({"read": titles, "results": downloads}, indent=1, ensure_ascii=False) + "\n"

@@ -30,7 +30,7 @@ def generated() -> dict[Path, str]:
         ROOT / "docs/settings.md": settings_page(),
         ROOT / "docs/commands.md": commands_page(),
         ROOT / "docs/formats.md": format_page(ROOT / "docs/formats.md"),
-        ROOT / "service/web/formats.ts": page_formats(),
+        ROOT / "service/web/formats.json": page_formats(),
         ROOT / "docs/result.schema.json": result_schema(),
         ROOT / "docs/openapi.json": openapi_document(),
     }

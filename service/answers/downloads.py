@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import AsyncIterator
 from typing import Annotated, Any
 from urllib.parse import quote
 
@@ -84,14 +83,9 @@ async def answer_with(service: Service, artifact: Artifact, asked: Conditions, *
     status = 206 if part else 200
     if not reading:
         return Response(status_code=status, headers=headers, media_type=artifact.media_type)
-    content = await _opened(service, artifact, first, last + 1)
+    await service.stores.files.head(artifact.key)  # a missing file raises before the response begins
+    content = service.stores.files.read(artifact.key, first, last + 1)
     return StreamingResponse(content, status_code=status, headers=headers, media_type=artifact.media_type)
-
-
-async def _opened(service: Service, artifact: Artifact, start: int, end: int) -> AsyncIterator[bytes]:
-    """The byte stream; a missing file raises before the response begins, so that it is a 404."""
-    await service.stores.files.head(artifact.key)
-    return service.stores.files.read(artifact.key, start, end)
 
 
 def _headers(artifact: Artifact, etag: str) -> dict[str, str]:

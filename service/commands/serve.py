@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import socket
 import sys
-from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.settings_option import settings_option
-from service.commands.installation import settings_with, setup_problems
+from service.commands.installation import data_dir_option, settings_with, setup_problems
+
+if TYPE_CHECKING:
+    from workers.settings.settings import Settings
 
 
 def free_port() -> int:
@@ -31,9 +33,7 @@ def free_port() -> int:
 @click.option(
     "--slots", type=click.IntRange(0, 64), help="Jobs at the same time. Default: BIRESNERF_SLOTS, else 1."
 )
-@click.option(
-    "--data-dir", type=click.Path(path_type=Path), help="Folder for files and the private database."
-)
+@data_dir_option
 def up_command(host: str | None, port: int | None, slots: int | None, data_dir: Path | None) -> None:
     """Run a whole service on this machine: database, API, dispatcher and workers.
 
@@ -52,29 +52,22 @@ def up_command(host: str | None, port: int | None, slots: int | None, data_dir: 
             settings = settings.model_copy(update={"port": free_port()})
         variables = {"BIRESNERF_HOST": settings.host, "BIRESNERF_PORT": str(settings.port)}
         api = ChildSpec("api", (sys.executable, "-m", "service.server"), variables)
-        ready = _announcer(settings.host, settings.port)
         children = [api, dispatcher_spec(settings), *slot_specs(settings)]
-        sys.exit(asyncio.run(supervise(settings, children, on_ready=ready)))
+        sys.exit(asyncio.run(supervise(settings, children, on_ready=lambda _: _announce(settings))))
 
 
-def _announcer(host: str, port: int) -> Callable[[str], Coroutine[None, None, None]]:
-    async def announce(_: str) -> None:
-        import asyncio
+async def _announce(settings: Settings) -> None:
+    """Prints the service's address once it is ready."""
+    import asyncio
 
-        shown = f"[{host}]" if ":" in host else host
-        url = f"http://{'127.0.0.1' if host in {'0.0.0.0', '::'} else shown}:{port}"
-        while not await asyncio.to_thread(_answers, url):
+    from biresnerf.client import AsyncClient
+
+    host = "127.0.0.1" if settings.host in {"0.0.0.0", "::"} else settings.host
+    url = f"http://{f'[{host}]' if ':' in host else host}:{settings.port}"
+    async with AsyncClient(url) as client:
+        while not await client.ready():
             await asyncio.sleep(0.1)
-        click.echo(f"ready at {url}  (the page; API docs: {url}/docs)")
-
-    return announce
-
-
-def _answers(url: str) -> bool:
-    from biresnerf.client import Client
-
-    with Client(url) as client:
-        return client.ready()
+    click.echo(f"ready at {url}  (the page; API docs: {url}/docs)")
 
 
 @click.command("api")

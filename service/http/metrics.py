@@ -91,9 +91,10 @@ class Exposition(Collector):
         """All metric families."""
         yield InfoMetricFamily("biresnerf_build", "What runs here.", {"version": __version__})
         yield from self._web.registry.collect()
-        answers = GaugeMetricFamily("biresnerf_database_up", "1 while the database answers this process.")
-        answers.add_metric([], 0 if self._installation is None else 1)
-        yield answers
+        answers = self._installation is not None
+        yield GaugeMetricFamily(
+            "biresnerf_database_up", "1 while the database answers this process.", answers
+        )
         if self._installation is not None:
             yield from _families(self._installation)
 
@@ -106,15 +107,16 @@ class Exposition(Collector):
 
 
 def _families(now: Statistics) -> Iterator[Metric]:
-    yield _gauge("biresnerf_jobs", "Jobs by state.", "state", now.jobs)
-    yield _gauge("biresnerf_datasets", "Datasets by state.", "state", now.datasets)
-    yield _gauge(
-        "biresnerf_queue_oldest_seconds", "Age of the job queued longest.", "", {"": now.oldest_queued_s}
-    )
-    yield _gauge("biresnerf_trash", "Folders of files that wait for deletion.", "", {"": now.trash})
-    yield _gauge("biresnerf_webhooks_pending", "Webhook messages to send.", "", {"": now.webhooks_pending})
+    yield _by_state("biresnerf_jobs", "Jobs by state.", now.jobs)
+    yield _by_state("biresnerf_datasets", "Datasets by state.", now.datasets)
     late = "How long the most urgent webhook message is overdue: grows where no dispatcher runs."
-    yield _gauge("biresnerf_webhooks_late_seconds", late, "", {"": now.webhooks_late_s})
+    for name, help_text, amount in (
+        ("queue_oldest_seconds", "Age of the job queued longest.", now.oldest_queued_s),
+        ("trash", "Folders of files that wait for deletion.", now.trash),
+        ("webhooks_pending", "Webhook messages to send.", now.webhooks_pending),
+        ("webhooks_late_seconds", late, now.webhooks_late_s),
+    ):
+        yield GaugeMetricFamily(f"biresnerf_{name}", help_text, amount)
     slots = GaugeMetricFamily("biresnerf_slots", "Living worker slots.", labels=["kind", "busy"])
     for slot in now.slots:
         slots.add_metric([slot.kind, str(slot.busy).lower()], slot.slots)
@@ -126,15 +128,14 @@ def _families(now: Statistics) -> Iterator[Metric]:
             counter.add_metric([value] if label else [], found.get(value, 0.0))
         yield counter
     for tally, (name, label, help_text) in _DURATIONS.items():
-        yield _histogram(
-            name, help_text, label, [item for item in now.tallies if item.name == tally], now.bounds_s
-        )
+        durations = [item for item in now.tallies if item.name == tally]
+        yield _histogram(name, help_text, label, durations, now.bounds_s)
 
 
-def _gauge(name: str, help_text: str, label: str, values: Mapping[Any, float]) -> Metric:
-    family = GaugeMetricFamily(name, help_text, labels=[label] if label else [])
-    for key, value in values.items():
-        family.add_metric([key] if label else [], value)
+def _by_state(name: str, help_text: str, values: Mapping[Any, float]) -> Metric:
+    family = GaugeMetricFamily(name, help_text, labels=["state"])
+    for state, value in values.items():
+        family.add_metric([state], value)
     return family
 
 

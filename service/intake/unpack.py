@@ -62,19 +62,16 @@ def unpack(request: UnpackRequest) -> dict[str, Any]:
             elif head[257:262] == b"ustar":
                 _unpack_tar(file, sink)
             else:
-                raise _rejected("This is not a zip, tar or tar.gz archive.", hint=_PACK_HINT)
+                raise sink.rejected("This is not a zip, tar or tar.gz archive.", hint=_PACK_HINT)
     except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise _rejected(f"The archive is broken: {error}.", where=sink.current) from None
+        raise sink.rejected(f"The archive is broken: {error}.") from None
     except (NotImplementedError, ValueError, OverflowError) as error:
-        raise _rejected(
-            f"The archive is damaged or of an unknown kind: {error}.", where=sink.current
-        ) from None
+        raise sink.rejected(f"The archive is damaged or of an unknown kind: {error}.") from None
     except MemoryError:
-        raise _rejected(
-            "The archive's table of contents is unreasonably large.", where=sink.current
-        ) from None
+        raise sink.rejected("The archive's table of contents is unreasonably large.") from None
     if sink.files == 0:
-        raise _rejected("The archive holds no files.", hint="Pack the images and transforms.json.")
+        sink.current = ""  # the archive as a whole is at fault
+        raise sink.rejected("The archive holds no files.", hint="Pack the images and transforms.json.")
     return {"files": sink.files, "bytes": sink.bytes}
 
 
@@ -135,6 +132,10 @@ class _Sink:
             what = f"The archive unpacks to more than {self.request.ratio_max:g} times its size."
         return InputError("archive_too_large", what, where=self.current, hint="Send fewer or smaller images.")
 
+    def rejected(self, what: str, hint: str = "Create the archive again and resend it.") -> InputError:
+        """The error for the archive or its current entry."""
+        return InputError("archive_rejected", what, where=self.current, hint=hint)
+
     def _too_many(self) -> InputError:
         return InputError(
             "too_many_files",
@@ -151,17 +152,14 @@ def _unpack_zip(file: IO[bytes], sink: _Sink) -> None:
             path = sink.entry(info.orig_filename.removesuffix("/") if info.is_dir() else info.orig_filename)
             mode = info.external_attr >> 16
             if info.flag_bits & _ENCRYPTED:
-                raise _rejected(
-                    "The entry is encrypted.", where=sink.current, hint="Pack without a password."
-                )
+                raise sink.rejected("The entry is encrypted.", hint="Pack without a password.")
             if stat.S_IFMT(mode) not in {0, stat.S_IFREG, stat.S_IFDIR}:
-                raise _rejected("The entry is a link or a device.", where=sink.current, hint=_PACK_HINT)
+                raise sink.rejected("The entry is a link or a device.", hint=_PACK_HINT)
             if info.is_dir() or path is None:
                 continue
             if info.compress_type not in _METHODS:
-                raise _rejected(
+                raise sink.rejected(
                     f"The entry is packed by method {info.compress_type}.",
-                    where=sink.current,
                     hint="Use deflate.",
                 )
             with archive.open(info) as content:
@@ -176,21 +174,19 @@ def _unpack_tar(plain: IO[bytes] | gzip.GzipFile, sink: _Sink) -> None:
             if member.isdir():
                 continue
             if not member.isreg() or member.issparse():
-                raise _rejected(
-                    "The entry is a link, a device or sparse.", where=sink.current, hint=_PACK_HINT
-                )
+                raise sink.rejected("The entry is a link, a device or sparse.", hint=_PACK_HINT)
             if member.size < 0:
-                raise _rejected("The entry has a negative size.", where=sink.current)
+                raise sink.rejected("The entry has a negative size.")
             content = archive.extractfile(member)
             if content is None:
-                raise _rejected("The entry has no content.", where=sink.current)
+                raise sink.rejected("The entry has no content.")
             if path is not None:
                 sink.write(path, content)
     # tarfile accepts a truncated archive; a complete one ends with blocks of zeros.
     while counted.read(_CHUNK):
         pass
     if counted.tail.strip(b"\0") or len(counted.tail) < _TAR_BLOCK:
-        raise _rejected("The archive is cut short: its end mark is missing.", where=sink.current)
+        raise sink.rejected("The archive is cut short: its end mark is missing.")
 
 
 def _members(archive: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
@@ -218,12 +214,6 @@ class _CountedReader:
             raise self._sink.over_budget()
         self.tail = (self.tail + data)[-_TAR_BLOCK:]
         return data
-
-
-def _rejected(
-    what: str, *, where: str = "", hint: str = "Create the archive again and resend it."
-) -> InputError:
-    return InputError("archive_rejected", what, where=where, hint=hint)
 
 
 if __name__ == "__main__":

@@ -104,10 +104,8 @@ _TAKES = (
     "/{dataset_id}/files/{path:path}",
     status_code=201,
     response_model=FileView,
-    responses={
-        204: {"description": "The file existed; its content was replaced."},
-        **declared("malformed_body", "file_exists", "digest_mismatch", *_TAKES),
-    },
+    responses=declared("malformed_body", "file_exists", "digest_mismatch", *_TAKES)
+    | {204: {"description": "The file existed; its content was replaced."}},
     openapi_extra=raw_request("application/octet-stream"),
 )
 async def put_file(
@@ -176,10 +174,8 @@ async def upload_archive(dataset_id: DatasetId, request: Request, caller: Datase
 @router.post(
     "/{dataset_id}/finalize",
     response_model=DatasetView,
-    responses={
-        202: {"model": DatasetView, "description": "In progress (with `Prefer: respond-async`)."},
-        **declared("dataset_not_complete", "dataset_invalid", "name_collision"),
-    },
+    responses=declared("dataset_not_complete", "dataset_invalid", "name_collision")
+    | {202: {"model": DatasetView, "description": "In progress (with `Prefer: respond-async`)."}},
 )
 async def finalize_dataset(
     dataset_id: DatasetId,

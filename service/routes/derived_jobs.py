@@ -126,10 +126,8 @@ async def fork_job(
     status_code=202,
     response_model=JobView,
     tags=["results"],
-    responses={
-        200: {"model": JobView, "description": "The same export was requested before and is complete."},
-        **declared("result_not_ready", "state_conflict", "queue_full", "quota_exhausted", "storage_full"),
-    },
+    responses=declared("result_not_ready", "state_conflict", "queue_full", "quota_exhausted", "storage_full")
+    | {200: {"model": JobView, "description": "The same export was requested before and is complete."}},
 )
 async def export_job(job_id: JobId, caller: JobWriter, body: NewExport) -> Response:
     """Writes the result in additional formats; the files are then listed with those of the job.

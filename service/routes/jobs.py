@@ -53,14 +53,12 @@ _DISCARD = CancelJob()
     status_code=202,
     response_model=JobView,
     openapi_extra=_BODY,
-    responses={
-        200: {"model": JobView, "description": "The job has ended; only with `Prefer: wait`."},
-        **declared(
-            *("bad_idempotency_key", "not_found", "dataset_not_ready", "invalid_options"),
-            *("idempotency_key_reused", "archive_rejected", "queue_full", "storage_full", "too_many_uploads"),
-            *("webhook_url_refused", "priority_not_allowed", "quota_exhausted"),
-        ),
-    },
+    responses=declared(
+        *("bad_idempotency_key", "not_found", "dataset_not_ready", "invalid_options"),
+        *("idempotency_key_reused", "archive_rejected", "queue_full", "storage_full", "too_many_uploads"),
+        *("webhook_url_refused", "priority_not_allowed", "quota_exhausted"),
+    )
+    | {200: {"model": JobView, "description": "The job has ended; only with `Prefer: wait`."}},
 )
 async def submit_job(
     request: Request,

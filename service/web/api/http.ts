@@ -20,19 +20,24 @@ export function forgetKey(): void {
   apiKey.set(null);
 }
 
-/** An error of the service or of the connection to it. */
+interface ProblemFields {
+  status: number;
+  code: string;
+  title: string;
+  detail: string;
+  hint?: string;
+  where?: string;
+  errors?: readonly FieldProblem[];
+  /** Seconds after which the service wants the request again. */
+  waitS?: number;
+}
+
+/** An error of the service or of the connection to it; it has the fields that it is made of. */
+export interface Problem extends Readonly<Required<ProblemFields>> {}
 export class Problem extends Error {
-  constructor(
-    readonly status: number,
-    readonly code: string,
-    readonly title: string,
-    readonly detail: string,
-    readonly hint: string = "",
-    readonly where: string = "",
-    readonly errors: readonly FieldProblem[] = [],
-    readonly waitS: number = 0,
-  ) {
-    super(detail);
+  constructor(fields: ProblemFields) {
+    super(fields.detail);
+    Object.assign(this, { hint: "", where: "", errors: [], waitS: 0, ...fields });
   }
 
   /** Whether the same request may succeed later. */
@@ -40,32 +45,19 @@ export class Problem extends Error {
     return this.status === 0 || this.status === 429 || this.status >= 500;
   }
 
-  /** The same problem at a place, unless it already names one. */
-  at(place: string): Problem {
-    const { status, code, title, detail, hint, where, errors, waitS } = this;
-    return new Problem(status, code, title, detail, hint, where || place, errors, waitS);
-  }
-
   static unreachable(): Problem {
-    return new Problem(
-      0,
-      "unreachable",
-      "The service does not respond",
-      "The connection was refused or lost.",
-      "The page retries by itself.",
-    );
+    const title = "The service does not respond";
+    const detail = "The connection was refused or lost.";
+    return new Problem({ status: 0, code: "unreachable", title, detail, hint: "The page retries by itself." });
   }
 
   static of(status: number, text: string, retryAfter: string | null): Problem {
     const waitS = Number(retryAfter) || 0;
     try {
-      const body = JSON.parse(text);
-      return new Problem(
-        ...([status, String(body.code), String(body.title), String(body.detail)] as const),
-        ...([body.hint ?? "", body.where ?? "", body.errors ?? [], waitS] as const),
-      );
+      return new Problem({ ...(JSON.parse(text) as ProblemFields), status, waitS });
     } catch {
-      return new Problem(status, "unknown", `The service responded with status ${status}`, text.slice(0, 300), "", "", [], waitS);
+      const title = `The service responded with status ${status}`;
+      return new Problem({ status, code: "unknown", title, detail: text.slice(0, 300), waitS });
     }
   }
 }
@@ -120,7 +112,8 @@ export async function requestJson<T>(method: string, path: string, options: Requ
 /** Whatever was thrown, as a problem. */
 export function asProblem(error: unknown): Problem {
   if (error instanceof Problem) return error;
-  return new Problem(0, "page_error", "The page failed", error instanceof Error ? error.message : String(error));
+  const detail = error instanceof Error ? error.message : String(error);
+  return new Problem({ status: 0, code: "page_error", title: "The page failed", detail });
 }
 
 export const pause = (ms: number) => new Promise<void>((done) => setTimeout(done, ms));

@@ -1,6 +1,6 @@
 // The programs that read the files of a result, and how to get them.
 import type { ArtifactView } from "schemas";
-import { RESULT_FORMATS } from "../formats";
+import formats from "../formats.json"; // written by `make docs` from biresnerf/data/formats
 
 export interface Consumer {
   name: string;
@@ -12,7 +12,7 @@ export interface Consumer {
 }
 
 export const CONSUMERS: readonly Consumer[] = [
-  ...RESULT_FORMATS,
+  ...formats.results,
   { name: "To share", words: "The views of this page in one file that needs no network", files: "report.html" },
   { name: "To share, as a video", words: "A flight around the scene", files: "renders/orbit.mp4" },
   { name: "Numbers and evidence", words: "The figures behind the verdict, and the outcome for each image", files: "report.json" },

@@ -2,7 +2,8 @@
 import { useState } from "preact/hooks";
 import type { ArtifactView, JobView, ShareView } from "schemas";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
-import { address, apiKey, asProblem, pause, Problem, request, requestJson } from "../api/http";
+import { useAttempt } from "../api/hooks";
+import { address, apiKey, pause, request, requestJson } from "../api/http";
 import { artifactUrl } from "../api/picture_urls";
 import { useStore } from "../api/store";
 import { isOver } from "../jobs/state";
@@ -34,29 +35,27 @@ export function Downloads({ job, artifacts, onNewFiles }: Props) {
   );
 }
 
-interface RowProps {
-  job: JobView;
+interface RowProps extends Omit<Props, "artifacts"> {
   consumer: Consumer;
   files: ArtifactView[];
-  onNewFiles: () => Promise<void>;
 }
 
 function Row({ job, consumer, files, onNewFiles }: RowProps) {
   const [status, setStatus] = useState("");
-  const [problem, setProblem] = useState<Problem | null>(null);
+  const { attempt, busy, problem } = useAttempt();
   const [open, setOpen] = useState(false);
   const keyed = useStore(apiKey) !== null;
   const jobUrl = address(`v1/jobs/${job.id}`);
   const single = files.length === 1 ? files[0] : undefined;
-  const attempt = async (action: () => Promise<void>) => {
-    setProblem(null);
-    try {
-      await action();
-    } catch (error) {
-      setProblem(asProblem(error));
-      setOpen(files.length > 0); // curl and Python may succeed where the page failed
-    }
+  const label = (busy && status) || (single ? "Download" : files.length ? "Download .zip" : "Create");
+  const act = async () => {
+    const done = await attempt(async () => {
+      if (single) await saveOne(single);
+      else if (files.length) await saveAll(job, consumer, files, setStatus);
+      else await exported(job, consumer, setStatus, onNewFiles);
+    });
     setStatus("");
+    if (!done) setOpen(files.length > 0); // curl and Python may succeed where the page failed
   };
   const size = files.reduce((sum, file) => sum + file.size, 0);
   return (
@@ -67,44 +66,28 @@ function Row({ job, consumer, files, onNewFiles }: RowProps) {
       </div>
       <div class="download-act">
         {files.length > 0 && (
-          <span class="soft number">
-            {single ? single.name.split("/").at(-1) : count(files.length, "file")} · {bytes(size)}
-          </span>
+          <>
+            <span class="soft number">
+              {single ? baseName(single) : count(files.length, "file")} · {bytes(size)}
+            </span>
+            <button
+              type="button"
+              class="plain-link"
+              aria-expanded={open}
+              aria-label={`curl, Python ${consumer.name}`}
+              onClick={() => setOpen(!open)}
+            >
+              curl, Python
+            </button>
+          </>
         )}
-        {files.length > 0 && (
-          <button
-            type="button"
-            class="plain-link"
-            aria-expanded={open}
-            aria-label={`curl, Python ${consumer.name}`}
-            onClick={() => setOpen(!open)}
-          >
-            curl, Python
-          </button>
-        )}
-        {files.length === 0 && (
-          <button
-            class="act small"
-            disabled={status !== ""}
-            aria-label={`${status || "Create"} ${consumer.name}`}
-            onClick={() => attempt(() => exported(job, consumer, setStatus, onNewFiles))}
-          >
-            {status || "Create"}
-          </button>
-        )}
-        {single && !keyed && (
-          <a class="act small" href={artifactUrl(single.href)} download={single.name.split("/").at(-1)} aria-label={`Download ${consumer.name}`}>
+        {single && !keyed ? (
+          <a class="act small" href={artifactUrl(single.href)} download={baseName(single)} aria-label={`Download ${consumer.name}`}>
             Download
           </a>
-        )}
-        {files.length > 0 && (keyed || !single) && (
-          <button
-            class="act small"
-            disabled={status !== ""}
-            aria-label={`${status || (single ? "Download" : "Download .zip")} ${consumer.name}`}
-            onClick={() => attempt(() => (single ? saveOne(single) : saveAll(job, consumer, files, setStatus)))}
-          >
-            {status || (single ? "Download" : "Download .zip")}
+        ) : (
+          <button class="act small" disabled={busy} aria-label={`${label} ${consumer.name}`} onClick={act}>
+            {label}
           </button>
         )}
       </div>
@@ -119,6 +102,8 @@ function Row({ job, consumer, files, onNewFiles }: RowProps) {
     </li>
   );
 }
+
+const baseName = ({ name }: ArtifactView) => name.slice(name.lastIndexOf("/") + 1);
 
 function Lines({ label, text }: { label: string; text: string }) {
   return (
@@ -136,19 +121,15 @@ function Lines({ label, text }: { label: string; text: string }) {
 
 function Share({ job, file }: { job: JobView; file: ArtifactView }) {
   const [link, setLink] = useState("");
-  const [problem, setProblem] = useState<Problem | null>(null);
+  const { attempt, problem } = useAttempt();
   const make = async () => {
-    try {
-      const json = { name: file.name, valid_s: SHARED_S };
-      setLink(address((await requestJson<ShareView>("POST", `v1/jobs/${job.id}/shares`, { json })).href));
-    } catch (error) {
-      setProblem(asProblem(error));
-    }
+    const json = { name: file.name, valid_s: SHARED_S };
+    setLink(address((await requestJson<ShareView>("POST", `v1/jobs/${job.id}/shares`, { json })).href));
   };
   if (link) return <Lines label="Link that needs no key, valid for 7 days" text={link} />;
   return (
     <>
-      <button class="act" onClick={make}>
+      <button class="act" onClick={() => attempt(make)}>
         Create a link that needs no key
       </button>
       {problem && <ProblemBox problem={problem} />}
@@ -156,12 +137,7 @@ function Share({ job, file }: { job: JobView; file: ArtifactView }) {
   );
 }
 
-async function exported(
-  job: JobView,
-  consumer: Consumer,
-  say: (text: string) => void,
-  onNewFiles: () => Promise<void>,
-): Promise<void> {
+async function exported(job: JobView, consumer: Consumer, say: (text: string) => void, onNewFiles: () => Promise<void>) {
   say("Writing …");
   const json = { formats: [consumer.exported] };
   let made = await requestJson<JobView>("POST", `v1/jobs/${job.id}/exports`, { json });
@@ -177,7 +153,7 @@ async function exported(
 
 async function saveOne(file: ArtifactView): Promise<void> {
   const answer = await request("GET", `${file.href}?redirect=false`);
-  save(await answer.blob(), file.name.split("/").at(-1) ?? file.name);
+  save(await answer.blob(), baseName(file));
 }
 
 /** All files as one zip, packed as they arrive: none is held in memory whole. */

@@ -2,7 +2,8 @@
 import type { ComponentChildren } from "preact";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { JobView } from "schemas";
-import { asProblem, type Problem, requestJson } from "../api/http";
+import { useAttempt } from "../api/hooks";
+import { type Problem, requestJson } from "../api/http";
 import { Store, useStore } from "../api/store";
 import { isOver } from "../jobs/state";
 import { OptionsForm } from "../options/form";
@@ -24,18 +25,28 @@ export function Actions({ job }: { job: JobView }) {
   );
 }
 
-/** A button and the dialog that it opens. */
+interface Choice {
+  label: string;
+  tone?: string;
+  run: () => Promise<void>;
+}
+
+/** A button and the dialog that it opens, which closes when what the user chose there is done. */
 function DialogButton(props: {
   button: string;
   title: string;
   tone?: string;
   wide?: boolean;
+  choices: readonly Choice[];
+  /** The last button, which only closes the dialog. */
+  dismiss: string;
   /** Opens the dialog too, whenever it changes. */
   request?: object | null;
-  children: (close: () => void) => ComponentChildren;
+  children: (problem: Problem | null) => ComponentChildren;
 }) {
   const dialog = useRef<HTMLDialogElement>(null);
   const [open, setOpen] = useState(false);
+  const { attempt, busy, problem } = useAttempt();
   const close = () => dialog.current?.close();
   const show = () => {
     setOpen(true);
@@ -59,7 +70,18 @@ function DialogButton(props: {
         {open && (
           <div class="dialog-body">
             <h2>{props.title}</h2>
-            {props.children(close)}
+            {props.children(problem)}
+            {problem && <ProblemBox problem={problem} />}
+            <p class="dialog-acts">
+              {props.choices.map(({ label, tone = "", run }) => (
+                <button key={label} class={`act ${tone}`} disabled={busy} onClick={async () => (await attempt(run)) && close()}>
+                  {label}
+                </button>
+              ))}
+              <button class="act" onClick={close}>
+                {props.dismiss}
+              </button>
+            </p>
           </div>
         )}
       </dialog>
@@ -67,83 +89,43 @@ function DialogButton(props: {
   );
 }
 
-function useAttempt(): [Problem | null, boolean, (action: () => Promise<void>) => Promise<void>] {
-  const [problem, setProblem] = useState<Problem | null>(null);
-  const [busy, setBusy] = useState(false);
-  const attempt = async (action: () => Promise<void>) => {
-    setBusy(true);
-    setProblem(null);
-    try {
-      await action();
-    } catch (error) {
-      setProblem(asProblem(error));
-    }
-    setBusy(false);
-  };
-  return [problem, busy, attempt];
-}
-
 function Cancel({ job }: { job: JobView }) {
-  const [problem, busy, attempt] = useAttempt();
-  const cancel = (keep_partial: boolean, close: () => void) =>
-    attempt(async () => {
-      await requestJson("POST", `v1/jobs/${job.id}/cancel`, { json: { keep_partial } });
-      close();
-    });
+  const cancel = (keep_partial: boolean) => () => requestJson<void>("POST", `v1/jobs/${job.id}/cancel`, { json: { keep_partial } });
   return (
-    <DialogButton button={job.cancel_requested ? "Cancelling …" : "Cancel"} title="Cancel this job?">
-      {(close) => (
-        <>
-          <p>It stops within 10 seconds. The best poses so far can be kept as a partial result.</p>
-          {problem && <ProblemBox problem={problem} />}
-          <p class="dialog-acts">
-            <button class="act primary" disabled={busy} onClick={() => cancel(true, close)}>
-              Cancel and keep the poses so far
-            </button>
-            <button class="act" disabled={busy} onClick={() => cancel(false, close)}>
-              Cancel and keep nothing
-            </button>
-            <button class="act" onClick={close}>
-              Let it run
-            </button>
-          </p>
-        </>
-      )}
+    <DialogButton
+      button={job.cancel_requested ? "Cancelling …" : "Cancel"}
+      title="Cancel this job?"
+      choices={[
+        { label: "Cancel and keep the poses so far", tone: "primary", run: cancel(true) },
+        { label: "Cancel and keep nothing", run: cancel(false) },
+      ]}
+      dismiss="Let it run"
+    >
+      {() => <p>It stops within 10 seconds. The best poses so far can be kept as a partial result.</p>}
     </DialogButton>
   );
 }
 
 function Delete({ job }: { job: JobView }) {
-  const [problem, busy, attempt] = useAttempt();
-  const remove = () =>
-    attempt(async () => {
-      await requestJson("DELETE", `v1/jobs/${job.id}`);
-      location.hash = "#/";
-    });
+  const remove = async () => {
+    await requestJson("DELETE", `v1/jobs/${job.id}`);
+    location.hash = "#/";
+  };
   return (
-    <DialogButton button="Delete" title="Delete this job?" tone="danger">
-      {(close) => (
-        <>
-          <p>Its files and exports are deleted for good. The images that it was made from stay.</p>
-          {problem && <ProblemBox problem={problem} />}
-          <p class="dialog-acts">
-            <button class="act danger" disabled={busy} onClick={remove}>
-              Delete it
-            </button>
-            <button class="act" onClick={close}>
-              Keep it
-            </button>
-          </p>
-        </>
-      )}
+    <DialogButton
+      button="Delete"
+      title="Delete this job?"
+      tone="danger"
+      choices={[{ label: "Delete it", tone: "danger", run: remove }]}
+      dismiss="Keep it"
+    >
+      {() => <p>Its files and exports are deleted for good. The images that it was made from stay.</p>}
     </DialogButton>
   );
 }
 
 function RunAgain({ job }: { job: JobView }) {
   const [values, setValues] = useState<Values>({});
-  const [problem, busy, attempt] = useAttempt();
-  const labels = job.labels;
   const pending = useStore(runAgainRequest);
   const request = pending?.job === job.id ? pending : null;
   useEffect(() => {
@@ -151,41 +133,32 @@ function RunAgain({ job }: { job: JobView }) {
     setValues((chosen) => ({ ...chosen, ...request.values }));
     runAgainRequest.set(null);
   }, [request]);
-  const show = (made: JobView, close: () => void) => {
-    close();
+  const submit = async (path: string, json: object) => {
+    const made = await requestJson<JobView>("POST", path, { json: { ...json, labels: job.labels } });
     location.hash = `#/jobs/${made.id}`;
   };
-  const fork = (close: () => void) =>
-    attempt(async () => {
-      const json = { options: values, labels };
-      show(await requestJson<JobView>("POST", `v1/jobs/${job.id}/fork`, { json }), close);
-    });
-  const restart = (close: () => void) =>
-    attempt(async () => {
-      // Another preset replaces all options; otherwise this job's options apply.
-      const options = values.preset ? values : { ...job.options, ...values };
-      show(await requestJson<JobView>("POST", "v1/jobs", { json: { dataset_id: job.dataset_id, options, labels } }), close);
-    });
+  const fork = () => submit(`v1/jobs/${job.id}/fork`, { options: values });
+  // Another preset replaces all options; otherwise this job's options apply.
+  const options = values.preset ? values : { ...job.options, ...values };
+  const restart = () => submit("v1/jobs", { dataset_id: job.dataset_id, options });
   return (
-    <DialogButton button="Run again …" title="Run again with other options" wide request={request}>
-      {(close) => (
+    <DialogButton
+      button="Run again …"
+      title="Run again with other options"
+      wide
+      request={request}
+      choices={[
+        { label: "Run from the start", tone: "primary", run: restart },
+        { label: "Fork: continue from this job's work", run: fork },
+      ]}
+      dismiss="Close"
+    >
+      {(problem) => (
         <>
           <OptionsForm values={values} onChange={setValues} base={job.resolved_options ?? job.options} problems={problem?.errors ?? []} />
           <p class="soft">
             A fork reuses COLMAP's result or all of stage 1, as far as the changed options allow; if they allow neither, the
             service says why.
-          </p>
-          {problem && <ProblemBox problem={problem} />}
-          <p class="dialog-acts">
-            <button class="act primary" disabled={busy} onClick={() => restart(close)}>
-              Run from the start
-            </button>
-            <button class="act" disabled={busy} onClick={() => fork(close)}>
-              Fork: continue from this job's work
-            </button>
-            <button class="act" onClick={close}>
-              Close
-            </button>
           </p>
         </>
       )}

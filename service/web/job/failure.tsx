@@ -4,20 +4,13 @@ import { ProblemBox } from "../parts/problem_box";
 
 export function Failure({ job, images }: { job: JobView; images: readonly string[] }) {
   const { error } = job;
-  if (job.state === "expired") {
+  if (job.partial && job.state !== "expired") return null; // the verdict says so
+  const gone = WITHOUT_RESULT[job.state];
+  if (gone) {
     return (
       <section class="card">
-        <h2>Its files have expired</h2>
-        <p>The images may still be there: run the job again.</p>
-      </section>
-    );
-  }
-  if (job.partial) return null; // the verdict says so
-  if (job.state === "cancelled") {
-    return (
-      <section class="card">
-        <h2>Cancelled</h2>
-        <p>Only its log was kept. Run it again or fork it to continue.</p>
+        <h2>{gone.title}</h2>
+        <p>{gone.words}</p>
       </section>
     );
   }
@@ -51,6 +44,10 @@ export function Failure({ job, images }: { job: JobView; images: readonly string
   );
 }
 
+const WITHOUT_RESULT: Record<string, { title: string; words: string }> = {
+  expired: { title: "Its files have expired", words: "The images may still be there: run the job again." },
+  cancelled: { title: "Cancelled", words: "Only its log was kept. Run it again or fork it to continue." },
+};
 const HEADINGS: Record<string, string> = {
   timeout: "The job took longer than the service allows",
   out_of_memory: "The job ran out of memory",

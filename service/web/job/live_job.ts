@@ -42,10 +42,6 @@ export class LiveJob extends Store<LiveState> {
     super(NOTHING);
   }
 
-  start(): void {
-    void this.run();
-  }
-
   close(): void {
     this.stop.abort();
   }
@@ -66,7 +62,8 @@ export class LiveJob extends Store<LiveState> {
     return this.loading;
   }
 
-  private async run(): Promise<void> {
+  /** Keeps the state up to date until the job is over or the page is left. */
+  async run(): Promise<void> {
     try {
       await this.waitForJob();
       await this.refresh();

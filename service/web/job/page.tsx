@@ -18,7 +18,7 @@ import { JobViews } from "./views";
 export function JobPage({ id }: { id: string }) {
   const live = useMemo(() => new LiveJob(id), [id]);
   useEffect(() => {
-    live.start();
+    void live.run();
     return () => live.close();
   }, [live]);
   const seen = useStore(live);

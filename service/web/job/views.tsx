@@ -1,55 +1,31 @@
 // The views of a job's result or, while it runs, of its previews; one image is selected in all of them.
 import type { ComponentChildren } from "preact";
-import { useEffect, useState } from "preact/hooks";
+import { useState } from "preact/hooks";
 import type { ArtifactView, JobView, PosesDocument, ViewFile } from "schemas";
 import { type UrlOf, useWidgetData } from "../../../biresnerf/viewer/result/widget_data";
-import { asProblem, type Problem } from "../api/http";
+import { once, useLoaded } from "../api/hooks";
 import { isOver } from "../jobs/state";
 import { ProblemBox } from "../parts/problem_box";
 import { Images } from "./images";
 import type { LiveState } from "./live_job";
 import { Seeding } from "./seeding";
 
-type Widgets = typeof import("./widgets");
-
-function useWidgets(): { widgets: Widgets | null; problem: Problem | null } {
-  const [widgets, setWidgets] = useState<Widgets | null>(null);
-  const [problem, setProblem] = useState<Problem | null>(null);
-  useEffect(() => {
-    import("./widgets").then(setWidgets, (error) => setProblem(asProblem(error)));
-  }, []);
-  return { widgets, problem };
-}
-
 export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
-  const { widgets, problem } = useWidgets();
+  const { poses, report, view, points, history } = seen;
   const job = seen.job!;
-  if (problem) return <ProblemBox problem={problem} />;
-  if (isOver(job) && !seen.poses && !seen.history.length) return null;
-  return (
-    <>
-      {widgets && seen.report && isOver(job) && (
-        <widgets.VerdictSentence
-          verdict={seen.report.verdict}
-          state={seen.report.state}
-          asked={seen.report.options.verdict !== false}
-        />
-      )}
-      <Views seen={seen} urlOf={urlOf} widgets={widgets} />
-    </>
-  );
-}
-
-function Views({ seen, urlOf, widgets }: { seen: LiveState; urlOf: UrlOf; widgets: Widgets | null }) {
-  const { poses, report, view, points } = seen;
-  const job = seen.job!;
+  const over = isOver(job);
+  const { value: widgets, problem } = useLoaded(() => import("./widgets"), once, []);
   const [chosen, setChosen] = useState<number | null | undefined>(undefined);
   const first = view?.views[0]?.image ?? (poses?.images.length ? 0 : null);
-  const selected = chosen === undefined ? first : chosen;
-  const choice = { selected, onSelect: setChosen };
+  const choice = { selected: chosen === undefined ? first : chosen, onSelect: setChosen };
   const { names, cameras, centres, rows, cellOf } = useWidgetData(poses, report, view, urlOf);
+  if (problem) return <ProblemBox problem={problem} />;
+  if (over && !poses && !history.length) return null;
   return (
     <>
+      {widgets && report && over && (
+        <widgets.VerdictSentence verdict={report.verdict} state={report.state} asked={report.options.verdict !== false} />
+      )}
       <div class="job-pictures">
         <Panel name="Cameras" kind="panel-scene">
           {widgets && poses ? (
@@ -58,7 +34,7 @@ function Views({ seen, urlOf, widgets }: { seen: LiveState; urlOf: UrlOf; widget
             <Placeholder job={job} for="cameras" />
           )}
         </Panel>
-        <Panel name={view ? "Photo and render" : seen.job!.stage === "seeding" ? "Feature matches" : "Preview"} kind="panel-compare">
+        <Panel name={view ? "Photo and render" : job.stage === "seeding" ? "Feature matches" : "Preview"} kind="panel-compare">
           {widgets && view ? (
             <widgets.ImageCompare {...{ names, centres, urlOf, ...choice }} views={view.views} />
           ) : (
@@ -67,12 +43,12 @@ function Views({ seen, urlOf, widgets }: { seen: LiveState; urlOf: UrlOf; widget
         </Panel>
       </div>
       <Panel name="Progress of the run" kind="panel-curves">
-        {widgets && seen.history.length > 1 ? (
+        {widgets && history.length > 1 ? (
           <widgets.Curves
-            lines={seen.history}
+            lines={history}
             switchStep={report?.switch_step ?? null}
             switchReason={report?.switch_reason ?? null}
-            steps={isOver(job) ? (report?.steps_done ?? null) : job.progress.steps_total || null}
+            steps={over ? (report?.steps_done ?? null) : job.progress.steps_total || null}
           />
         ) : (
           <Placeholder job={job} for="curves" />

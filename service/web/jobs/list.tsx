@@ -3,7 +3,8 @@ import { useEffect, useState } from "preact/hooks";
 import type { JobList, JobView } from "schemas";
 import { Pick } from "../../../biresnerf/viewer/widgets/controls";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
-import { asProblem, type Problem, requestJson } from "../api/http";
+import { useLoaded } from "../api/hooks";
+import { requestJson } from "../api/http";
 import { usePicture } from "../api/picture_urls";
 import { moment } from "../parts/format";
 import { ProblemBox } from "../parts/problem_box";
@@ -24,7 +25,8 @@ const listView = { state: "" as JobState | "", wanted: PAGE, scroll: 0 };
 export function JobsPage() {
   const [state, setState] = useState(listView.state);
   const [wanted, setWanted] = useState(listView.wanted);
-  const { found, problem } = useJobs(state, wanted);
+  // All that are shown: the running one may be older than many that wait.
+  const { value: found, problem } = useLoaded((signal) => newest(state, wanted, signal), lasting, [state, wanted]);
   useTitle("Jobs");
   useEffect(() => {
     Object.assign(listView, { state, wanted });
@@ -117,54 +119,20 @@ interface Jobs {
 }
 
 /** The newest jobs in a state; "" stands for all states. */
-async function newest(state: JobState | "", wanted: number): Promise<Jobs> {
+async function newest(state: JobState | "", wanted: number, signal: AbortSignal): Promise<Jobs> {
   const jobs: JobView[] = [];
   let cursor: string | null = null;
   do {
     const limit = String(Math.min(REQUEST_MAX, wanted - jobs.length));
     const asked = new URLSearchParams({ limit, ...(state && { state }), ...(cursor && { cursor }) });
-    const page: JobList = await requestJson<JobList>("GET", `v1/jobs?${asked}`);
+    const page: JobList = await requestJson<JobList>("GET", `v1/jobs?${asked}`, { signal });
     jobs.push(...page.items);
     cursor = page.next_cursor;
   } while (cursor && jobs.length < wanted);
   return { state, jobs, more: cursor !== null };
 }
 
-/** Polls all jobs that are shown: the running one may be older than many that wait. */
-function useJobs(state: JobState | "", wanted: number) {
-  const [found, setFound] = useState<Jobs | null>(null);
-  const [problem, setProblem] = useState<Problem | null>(null);
-  useEffect(() => {
-    let timer = 0;
-    let stopped = false;
-    const look = async () => {
-      let wait = IDLE_MS;
-      try {
-        if (!document.hidden) {
-          const now = await newest(state, wanted);
-          if (stopped) return;
-          setFound(now);
-          setProblem(null);
-          // The longer the list, the less often.
-          if (now.jobs.some((job) => !isOver(job))) wait = BUSY_MS * Math.ceil(now.jobs.length / PAGE);
-        }
-      } catch (error) {
-        if (!stopped) setProblem(asProblem(error));
-      }
-      if (!stopped) timer = window.setTimeout(look, wait);
-    };
-    const shown = () => {
-      if (document.hidden) return;
-      window.clearTimeout(timer);
-      void look();
-    };
-    void look();
-    document.addEventListener("visibilitychange", shown);
-    return () => {
-      stopped = true;
-      window.clearTimeout(timer);
-      document.removeEventListener("visibilitychange", shown);
-    };
-  }, [state, wanted]);
-  return { found, problem };
+/** How long the list is shown before it is loaded again: the longer it is, the longer. */
+function lasting({ jobs }: Jobs): number {
+  return jobs.every(isOver) ? IDLE_MS : BUSY_MS * Math.ceil(jobs.length / PAGE);
 }

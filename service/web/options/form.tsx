@@ -1,7 +1,8 @@
 // Preset and options, from the service's description of them.
-import { useEffect, useMemo, useState } from "preact/hooks";
+import { useMemo } from "preact/hooks";
 import type { FieldProblem, OptionsView } from "schemas";
-import { asProblem, type Problem, requestJson } from "../api/http";
+import { once, useLoaded } from "../api/hooks";
+import { requestJson } from "../api/http";
 import { ProblemBox } from "../parts/problem_box";
 import { type Field, fieldsOf, parsed, presetValue, type Values, words } from "./schema";
 
@@ -23,21 +24,16 @@ interface Props {
 let loaded: Promise<OptionsView> | null = null;
 
 /** The description of the options, requested once. */
-function useOptions(): { view: OptionsView | null; problem: Problem | null } {
-  const [view, setView] = useState<OptionsView | null>(null);
-  const [problem, setProblem] = useState<Problem | null>(null);
-  useEffect(() => {
-    loaded ??= requestJson<OptionsView>("GET", "v1/options");
-    loaded.then(setView, (error) => {
-      loaded = null;
-      setProblem(asProblem(error));
-    });
-  }, []);
-  return { view, problem };
+function loadOptions(): Promise<OptionsView> {
+  loaded ??= requestJson<OptionsView>("GET", "v1/options").catch((error) => {
+    loaded = null;
+    throw error;
+  });
+  return loaded;
 }
 
 export function OptionsForm({ values, onChange, base, problems = [] }: Props) {
-  const { view, problem } = useOptions();
+  const { value: view, problem } = useLoaded(loadOptions, once, []);
   const fields = useMemo(() => view && fieldsOf(view.json_schema), [view]);
   if (problem) return <ProblemBox problem={problem} />;
   if (!view || !fields) return <p class="soft">Loading the options …</p>;

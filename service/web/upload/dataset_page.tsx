@@ -1,8 +1,9 @@
 // An image set: its upload, its check, and the form that submits a job.
-import { useCallback, useEffect, useState } from "preact/hooks";
+import { useState } from "preact/hooks";
 import type { DatasetView, JobView } from "schemas";
 import { count, duration } from "../../../biresnerf/viewer/widgets/numbers";
-import { asProblem, pause, type Problem, requestJson } from "../api/http";
+import { useAttempt, useLoaded } from "../api/hooks";
+import { requestJson } from "../api/http";
 import { Store, useStore } from "../api/store";
 import { nameLabel } from "../jobs/state";
 import { OptionsForm } from "../options/form";
@@ -20,11 +21,10 @@ const POLL_MS = 700;
 const NO_TRANSFER = new Store<Transfer | null>(null);
 
 export function DatasetPage({ id }: { id: string }) {
-  const { dataset, problem, refresh } = useDataset(id);
   const [, rerender] = useState(0);
   const transfer = useStore<Transfer | null>((transfers.get(id) as Store<Transfer | null> | undefined) ?? NO_TRANSFER);
+  const { value: dataset, problem } = useDataset(id, transfer?.phase);
   useTitle(dataset ? `${dataset.name} · new job` : "New job");
-  useEffect(refresh, [transfer?.phase]);
   if (problem) return <ProblemBox problem={problem} />;
   if (!dataset) return <p class="soft">Loading …</p>;
   const interrupted = dataset.state === "open" && (!transfer || transfer.phase === "stopped");
@@ -47,34 +47,12 @@ export function DatasetPage({ id }: { id: string }) {
   );
 }
 
-function useDataset(id: string) {
-  const [dataset, setDataset] = useState<DatasetView | null>(null);
-  const [problem, setProblem] = useState<Problem | null>(null);
-  const [reload, setReload] = useState(0);
-  useEffect(() => {
-    let stopped = false;
-    void (async () => {
-      while (!stopped) {
-        try {
-          const seen = await requestJson<DatasetView>("GET", `v1/datasets/${id}`);
-          if (stopped) return;
-          setDataset(seen);
-          setProblem(null);
-          if (seen.state !== "finalizing" && seen.state !== "open") return;
-        } catch (error) {
-          const failure = asProblem(error);
-          if (stopped) return;
-          setProblem(failure);
-          if (!failure.transient) return;
-        }
-        await pause(POLL_MS);
-      }
-    })();
-    return () => {
-      stopped = true;
-    };
-  }, [id, reload]);
-  return { dataset, problem, refresh: useCallback(() => setReload((n) => n + 1), []) };
+function useDataset(id: string, phase: string | undefined) {
+  return useLoaded(
+    (signal) => requestJson<DatasetView>("GET", `v1/datasets/${id}`, { signal }),
+    ({ state }) => (state === "finalizing" || state === "open" ? POLL_MS : null),
+    [id, phase],
+  );
 }
 
 function Progress({ transfer }: { transfer: Transfer }) {
@@ -105,22 +83,20 @@ function Progress({ transfer }: { transfer: Transfer }) {
 
 function Submit({ dataset }: { dataset: DatasetView }) {
   const [values, setValues] = useState<Values>({ preset: "balanced" });
-  const [problem, setProblem] = useState<Problem | null>(null);
-  const [busy, setBusy] = useState(false);
-  const submit = async (event: Event) => {
-    event.preventDefault();
-    setBusy(true);
-    setProblem(null);
-    try {
-      const json = { dataset_id: dataset.id, options: values, labels: nameLabel(dataset.name) };
-      location.hash = `#/jobs/${(await requestJson<JobView>("POST", "v1/jobs", { json })).id}`;
-    } catch (error) {
-      setProblem(asProblem(error));
-      setBusy(false);
-    }
+  const { attempt, busy, problem } = useAttempt();
+  const submit = async () => {
+    const json = { dataset_id: dataset.id, options: values, labels: nameLabel(dataset.name) };
+    location.hash = `#/jobs/${(await requestJson<JobView>("POST", "v1/jobs", { json })).id}`;
   };
   return (
-    <form class="card" onSubmit={submit} aria-label="Options">
+    <form
+      class="card"
+      aria-label="Options"
+      onSubmit={(event) => {
+        event.preventDefault();
+        void attempt(submit);
+      }}
+    >
       <h2>Options</h2>
       <OptionsForm values={values} onChange={setValues} problems={problem?.errors ?? []} />
       {problem && <ProblemBox problem={problem} />}

@@ -1,7 +1,7 @@
 // Where image sets are dropped or chosen.
 import { useEffect, useRef, useState } from "preact/hooks";
-import { asProblem, type Problem } from "../api/http";
-import { READ_FORMATS } from "../formats";
+import { useAttempt } from "../api/hooks";
+import formats from "../formats.json";
 import { percent } from "../parts/format";
 import { ProblemBox } from "../parts/problem_box";
 import { type Chosen, fromDrop, fromInput, type Gathered } from "./gather";
@@ -16,20 +16,17 @@ interface Props {
 export function DropZone({ onChosen, compact = false }: Props) {
   const [over, setOver] = useState(false);
   const [status, setStatus] = useState("");
-  const [problem, setProblem] = useState<Problem | null>(null);
-  const take = async (gathered: Promise<Gathered>) => {
+  const { attempt, problem } = useAttempt();
+  const take = async (gathered: Gathered | Promise<Gathered>) => {
     setOver(false);
-    setProblem(null);
     setStatus("Reading …");
-    try {
+    const done = await attempt(async () => {
       const chosen = await gathered;
       if (!chosen.files.length) setStatus("It holds no files.");
       else if (onChosen) await onChosen(chosen.files);
       else location.hash = `#/datasets/${await begin(chosen, (share) => setStatus(`Reading … ${percent(share)}`))}`;
-    } catch (error) {
-      setStatus("");
-      setProblem(asProblem(error));
-    }
+    });
+    if (!done) setStatus("");
   };
   return (
     <section
@@ -48,12 +45,12 @@ export function DropZone({ onChosen, compact = false }: Props) {
       <div class="drop-words">
         <p class="drop-lead">Drop a folder of images, a COLMAP model with its images, or an archive</p>
         <p class="soft">
-          {READ_FORMATS}; zip, tar, tar.gz. Without poses, COLMAP finds them.
+          {formats.read}; zip, tar, tar.gz. Without poses, COLMAP finds them.
         </p>
       </div>
       <div class="drop-buttons">
-        <FileButton label="Choose a folder" folder onFiles={(files) => void take(Promise.resolve(fromInput(files)))} />
-        <FileButton label="Choose files" onFiles={(files) => void take(Promise.resolve(fromInput(files)))} />
+        <FileButton label="Choose a folder" folder onFiles={(files) => void take(fromInput(files))} />
+        <FileButton label="Choose files" onFiles={(files) => void take(fromInput(files))} />
       </div>
       <p class="drop-status" role="status">
         {status}

@@ -60,7 +60,7 @@ export async function deleteRejected(upload: string): Promise<Problem | null> {
   const { state, error } = await requestJson<UploadView>("GET", `v1/uploads/${upload}`);
   if (state !== "rejected" || !error) return null;
   await requestJson("DELETE", `v1/uploads/${upload}`, { headers: TUS });
-  return new Problem(422, error.code, "The archive was rejected", error.detail, error.hint, error.where);
+  return new Problem({ ...error, status: 422, title: "The archive was rejected" });
 }
 
 async function sendPieces(upload: string, file: File, state: Store<Transfer>): Promise<void> {

@@ -19,7 +19,7 @@ export const transfers = new Map<string, Store<Transfer>>();
 function checkLimits(chosen: readonly Chosen[], bytes: number, limits: SizeLimits): void {
   const refuse = (detail: string, errors: { pointer: string; detail: string }[] = []) => {
     const hint = "Send fewer or smaller files, or ask the operator for a higher limit.";
-    throw new Problem(0, "too_much", "The upload exceeds the limits of this service", detail, hint, "", errors);
+    throw new Problem({ status: 0, code: "too_much", title: "The upload exceeds the limits of this service", detail, hint, errors });
   };
   if (isArchive(chosen)) {
     if (bytes > limits.max_archive_bytes) {
@@ -74,7 +74,8 @@ export async function resume(dataset: DatasetView, chosen: Chosen[]): Promise<vo
   const lacking = dataset.missing.filter((path) => !have.has(path));
   if (lacking.length) {
     const detail = `${lacking.length} of the missing files are not among those chosen, for example ${lacking[0]}.`;
-    throw new Problem(0, "other_files", "Different files", detail, "Choose the folder that was sent before.");
+    const hint = "Choose the folder that was sent before.";
+    throw new Problem({ status: 0, code: "other_files", title: "Different files", detail, hint });
   }
   const entries = chosen.map((item) => ({ ...item, sha256: null }));
   const wanted = unlisted ? { ...dataset, missing: [...have] } : dataset;
@@ -157,7 +158,8 @@ async function sendFile(dataset: string, entry: Entry, state: Store<Transfer>): 
       await put("PUT", `v1/datasets/${dataset}/files/${path}`, headers, entry.file, onSent);
     });
   } catch (error) {
-    throw asProblem(error).at(entry.path);
+    const problem = asProblem(error);
+    throw new Problem({ ...problem, where: problem.where || entry.path });
   }
   onSent(entry.file.size);
   state.change({ filesDone: state.value.filesDone + 1 });
