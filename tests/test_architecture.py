@@ -80,7 +80,7 @@ VIOLATIONS = [
     ("workers/store/files.py", "import workers.jobs.jobs", "inside the job engine"),
     ("workers/run/child.py", "import workers.queue.slot", "inside the job engine"),
     ("service/http/problems.py", "import service.intake.unpack", "inside the web process"),
-    ("service/answers/downloads.py", "import service.routes.jobs", "inside the web process"),
+    ("service/responses/downloads.py", "import service.routes.jobs", "inside the web process"),
     ("biresnerf/pipeline.py", "import biresnerf.studies.tables", "nothing needs the studies"),
     ("service/http/problems.py", "def f():\n    import torch", "never loads torch"),
     ("workers/jobs/jobs.py", "import biresnerf.geometry.lie", "only the job child"),

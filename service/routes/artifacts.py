@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from urllib.parse import quote
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter
 from fastapi.responses import Response, StreamingResponse
 
 from biresnerf.report import Report
 from biresnerf.wire.jobs import job_url
 from biresnerf.wire.results import ArtifactList, ArtifactView
-from service.answers.downloads import ANSWERS, Asked, answer_with, find_artifact
 from service.http.access import Caller, ReadCaller
 from service.http.dependencies import JobId
 from service.http.problems import ProblemError, declared
+from service.responses.downloads import (
+    DOWNLOAD_RESPONSES,
+    DownloadConditions,
+    artifact_response,
+    find_artifact,
+)
 from workers.records import Artifact
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
@@ -35,17 +40,17 @@ async def list_artifacts(job_id: JobId, caller: ReadCaller) -> ArtifactList:
     return ArtifactList(items=items)
 
 
-@router.get("/artifacts/{name:path}", response_class=StreamingResponse, responses=ANSWERS)
-@router.head("/artifacts/{name:path}", response_class=StreamingResponse, responses=ANSWERS)
+@router.get("/artifacts/{name:path}", response_class=StreamingResponse, responses=DOWNLOAD_RESPONSES)
+@router.head("/artifacts/{name:path}", response_class=StreamingResponse, responses=DOWNLOAD_RESPONSES)
 async def get_artifact(
-    job_id: JobId, name: str, request: Request, caller: ReadCaller, asked: Asked
+    job_id: JobId, name: str, caller: ReadCaller, conditions: DownloadConditions
 ) -> Response:
     """One file. Its strong ETag is the SHA-256 of its bytes.
 
     If files are stored in a bucket and the operator has enabled it, the response is a redirect to the bucket.
     """
     artifact = await find_artifact(caller.jobs, job_id, name)
-    return await answer_with(caller.service, artifact, asked, reading=request.method == "GET")
+    return await artifact_response(caller.service, artifact, conditions)
 
 
 @router.get("/report", response_model=Report, responses=declared("expired", "result_not_ready"))

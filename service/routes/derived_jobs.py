@@ -10,11 +10,11 @@ from fastapi.responses import Response
 
 from biresnerf.wire.jobs import ForkJob, JobList, JobView, NewExport, job_url
 from biresnerf.wire.results import IMAGE_COLUMNS, ImageList, ImageRow
-from service.answers.job_answers import POLL_S, IdempotencyKey, job_answer
 from service.http.access import Caller, JobWriter, ReadCaller
 from service.http.dependencies import JobId
 from service.http.problems import declared, wrong_field
 from service.intake.json_body import JsonRoute
+from service.responses.job_responses import POLL_S, IdempotencyKey, job_response
 from service.routes.artifacts import find_report, whole_file
 from workers.jobs.derived_jobs import DerivedJobs
 
@@ -118,7 +118,7 @@ async def fork_job(
     job, new = await _derived(caller).fork(
         job_id, changes, body.from_stage, labels=body.labels, idempotency_key=idempotency_key
     )
-    return job_answer(job, status=202, new=new)
+    return job_response(job, status=202, new=new)
 
 
 @router.post(
@@ -136,7 +136,7 @@ async def export_job(job_id: JobId, caller: JobWriter, body: NewExport) -> Respo
     returns the same export.
     """
     job, new = await _derived(caller).export(job_id, body.formats)
-    return job_answer(job, status=200 if job.final else 202, new=new)
+    return job_response(job, status=200 if job.final else 202, new=new)
 
 
 @router.get("/exports", tags=["results"])

@@ -9,19 +9,19 @@ from fastapi.responses import Response
 from pydantic import AwareDatetime
 
 from biresnerf.wire.jobs import CancelJob, JobList, JobState, JobTexts, JobView, NewJob
-from service.answers.job_answers import (
-    POLL_S,
-    IdempotencyKey,
-    job_answer,
-    job_etag,
-    preferred_wait_s,
-    waited_for,
-)
 from service.http.access import JobWriter, ReadCaller
 from service.http.dependencies import IfNoneMatch, JobId, Paged
 from service.http.http_conditionals import none_match
 from service.http.problems import ProblemError, declared, wrong_field
 from service.intake.json_body import JsonRoute, json_content, read_json, validate
+from service.responses.job_responses import (
+    POLL_S,
+    IdempotencyKey,
+    job_etag,
+    job_response,
+    preferred_wait_s,
+    waited_for,
+)
 from service.routes.one_shot import PLAIN, TEXTS, submit_form
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=JsonRoute)
@@ -94,10 +94,10 @@ async def submit_job(
         )
     wait_s = preferred_wait_s(prefer)
     if not wait_s:
-        return job_answer(job, status=202, new=new)
+        return job_response(job, status=202, new=new)
     job = await waited_for(caller.jobs, job.id, wait_s, caller.service.closing)
     applied = {"Preference-Applied": f"wait={wait_s:g}"}
-    return job_answer(job, status=200 if job.final else 202, new=new, headers=applied)
+    return job_response(job, status=200 if job.final else 202, new=new, headers=applied)
 
 
 @router.get("")
@@ -146,7 +146,7 @@ async def get_job(
     headers = {} if job.final else {"Retry-After": POLL_S}
     if not none_match(if_none_match, job_etag(job)):
         return Response(status_code=304, headers={"ETag": job_etag(job), **headers})
-    return job_answer(job, headers=headers)
+    return job_response(job, headers=headers)
 
 
 @router.post(
@@ -159,7 +159,7 @@ async def get_job(
 async def cancel_job(job_id: JobId, caller: JobWriter, body: CancelJob = _DISCARD) -> Response:
     """Cancels a job, with a partial result if requested. A job that has ended stays as it is."""
     job = await caller.jobs.cancel(job_id, keep_partial=body.keep_partial)
-    return job_answer(job, status=200 if job.final else 202)
+    return job_response(job, status=200 if job.final else 202)
 
 
 @router.delete("/{job_id}", status_code=204, responses=declared("state_conflict"))

@@ -10,18 +10,23 @@ from datetime import UTC, datetime
 from typing import Annotated
 from urllib.parse import quote
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Query
 from fastapi.responses import Response, StreamingResponse
 
 from biresnerf.wire.results import NewShare, ShareView
-from service.answers.downloads import ANSWERS, Asked, answer_with, find_artifact
 from service.http.access import JobWriter
 from service.http.dependencies import CurrentService, JobId
 from service.http.problems import ProblemError, declared
 from service.intake.json_body import JsonRoute
+from service.responses.downloads import (
+    DOWNLOAD_RESPONSES,
+    DownloadConditions,
+    artifact_response,
+    find_artifact,
+)
 
 router = APIRouter(prefix="/v1", tags=["results"], route_class=JsonRoute)
-_SHARED = {**ANSWERS, **declared("expired", "link_expired")}
+_SHARED = {**DOWNLOAD_RESPONSES, **declared("expired", "link_expired")}
 
 
 @router.post("/jobs/{job_id}/shares", status_code=201)
@@ -47,14 +52,13 @@ async def get_shared(
     name: str,
     expires: Annotated[int, Query(ge=0, lt=2**40)],
     signed: Annotated[str, Query(alias="signature", max_length=100)],
-    request: Request,
     service: CurrentService,
-    asked: Asked,
+    conditions: DownloadConditions,
 ) -> Response:
     """The file of a link created by `POST /v1/jobs/{id}/shares`. Needs no key."""
     _require_signature(service.stores.share_key, job_id, name, expires, signed)
     artifact = await find_artifact(service.stores.jobs, job_id, name)
-    return await answer_with(service, artifact, asked, reading=request.method == "GET")
+    return await artifact_response(service, artifact, conditions)
 
 
 def _signature(key: bytes, job_id: str, name: str, expires: int) -> str:

@@ -40,7 +40,7 @@ def job_etag(job: JobView) -> str:
     return f'W/"{job.revision}-{job.queue_position or 0}"'
 
 
-def job_answer(
+def job_response(
     job: JobView, *, status: int = 200, new: bool = True, headers: dict[str, str] | None = None
 ) -> Response:
     """The response; ``new`` is False if an earlier request created the job."""

@@ -6,7 +6,7 @@ import base64
 from typing import Annotated, Any
 from urllib.parse import quote
 
-from fastapi import Depends, Header, Query
+from fastapi import Depends, Header, Query, Request
 from fastapi.responses import Response, StreamingResponse
 
 from service.http.dependencies import IfNoneMatch, Service
@@ -19,9 +19,9 @@ _BINARY: dict[str, Any] = {
     # Each file has its own media type, which the list of artifacts contains.
     "content": {"*/*": {"schema": {"description": "The bytes."}}}
 }
-ANSWERS: dict[int | str, dict[str, Any]] = {
+DOWNLOAD_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {"description": "The file.", **_BINARY},
-    206: {"description": "The bytes asked for.", **_BINARY},
+    206: {"description": "The requested bytes.", **_BINARY},
     304: {"description": "Not modified."},
     307: {
         "description": "The file is at the signed address in `Location`, for some minutes and without a key.",
@@ -39,6 +39,7 @@ class Conditions:
 
     def __init__(
         self,
+        request: Request,
         range_: Annotated[str | None, Header(alias="Range", description="`bytes=first-last`")] = None,
         if_range: Annotated[str | None, Header()] = None,
         if_none_match: IfNoneMatch = None,
@@ -48,10 +49,10 @@ class Conditions:
         ] = True,
     ) -> None:
         self.range, self.if_range, self.if_none_match = range_, if_range, if_none_match
-        self.redirect = redirect
+        self.redirect, self.reading = redirect, request.method == "GET"
 
 
-Asked = Annotated[Conditions, Depends()]
+DownloadConditions = Annotated[Conditions, Depends()]
 
 
 async def find_artifact(jobs: JobStore, job_id: str, name: str) -> Artifact:
@@ -62,26 +63,28 @@ async def find_artifact(jobs: JobStore, job_id: str, name: str) -> Artifact:
     raise ProblemError("not_found", f"The job has no file {name[:200]!r}.")
 
 
-async def answer_with(service: Service, artifact: Artifact, asked: Conditions, *, reading: bool) -> Response:
-    """The response to a GET (``reading``) or HEAD of the file."""
+async def artifact_response(service: Service, artifact: Artifact, conditions: Conditions) -> Response:
+    """The response to a GET or HEAD of the file."""
     etag = f'"{artifact.sha256}"'
     headers = _headers(artifact, etag)
-    if not none_match(asked.if_none_match, etag):
+    if not none_match(conditions.if_none_match, etag):
         return Response(status_code=304, headers=headers)
-    if reading and asked.redirect and service.settings.storage_presign:
+    if conditions.reading and conditions.redirect and service.settings.storage_presign:
         valid_s = service.settings.storage_presign_s
         found = await service.stores.files.signed_urls("GET", [artifact.key], valid_s)
         if found is not None:
             # A cache must not keep the address longer than it is valid.
             validators = {"ETag": etag, "Repr-Digest": headers["Repr-Digest"], "Cache-Control": "no-store"}
             return Response(status_code=307, headers={**validators, "Location": found[0]})
-    part = byte_range(asked.range, asked.if_range, etag, artifact.size) if reading else None
+    part = None
+    if conditions.reading:
+        part = byte_range(conditions.range, conditions.if_range, etag, artifact.size)
     first, last = part or (0, artifact.size - 1)
     headers["Content-Length"] = str(last - first + 1)
     if part:
         headers["Content-Range"] = f"bytes {first}-{last}/{artifact.size}"
     status = 206 if part else 200
-    if not reading:
+    if not conditions.reading:
         return Response(status_code=status, headers=headers, media_type=artifact.media_type)
     await service.stores.files.head(artifact.key)  # a missing file raises before the response begins
     content = service.stores.files.read(artifact.key, first, last + 1)

@@ -1,1 +1,0 @@
-"""What routes answer with: jobs, files of results, signed links."""

@@ -1,0 +1,1 @@
+"""Responses that several routes give: jobs, files of results."""
