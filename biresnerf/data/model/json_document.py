@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from biresnerf.data.model.text_file import read_text
+from biresnerf.data.model.text_file import invalid_file, read_text
 from biresnerf.errors import InputError
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -57,26 +57,24 @@ def read_json_object(path: Path) -> dict[str, Any]:
             is not JSON, has a key twice, is nested too deeply, or is not an object; ``pose_not_finite`` for NaN and
             Infinity.
     """
-
-    def invalid(what: str, hint: str) -> InputError:
-        return InputError("pose_file_invalid", what, where=path.name, hint=hint)
-
     text = read_text(path, MAX_JSON_BYTES)
     try:
         document = json.loads(text, object_pairs_hook=_object)
         not_finite = first_non_finite(document)
     except _DuplicateKeyError as error:
-        raise invalid(str(error), "Remove one of the two.") from None
+        raise invalid_file(path.name, str(error), "Remove one of the two.") from None
     except json.JSONDecodeError as error:
         what = f"not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}."
-        raise invalid(what, "The file may be cut off; export or copy it again.") from None
+        raise invalid_file(path.name, what, "The file may be cut off; export or copy it again.") from None
     except RecursionError:
-        raise invalid("nested too deeply.", "Export the poses again.") from None
+        raise invalid_file(path.name, "nested too deeply.", "Export the poses again.") from None
     except ValueError as error:  # numbers of thousands of digits
-        raise invalid(f"not readable: {error}.", "Export the poses again.") from None
+        raise invalid_file(path.name, f"not readable: {error}.", "Export the poses again.") from None
     if not isinstance(document, dict):
         what = f"holds a {type(document).__name__}, not an object with `frames`."
-        raise invalid(what, "Give a transforms.json as nerfstudio, instant-ngp or Blender write it.")
+        raise invalid_file(
+            path.name, what, "Give a transforms.json as nerfstudio, instant-ngp or Blender write it."
+        )
     if not_finite is not None:
         raise InputError(
             "pose_not_finite",

@@ -104,7 +104,6 @@ def refined_set(
     similarity: Similarity | None = None,
     pose_sources: Sequence[str] | None = None,
     flags: Sequence[tuple[str, ...]] | None = None,
-    timestamps_s: tuple[float, ...] | None = None,
 ) -> RefinedSet:
     """The set of ``dataset`` at refined poses [n, 4, 4], without points; what is left out is unknown or none.
 
@@ -112,7 +111,6 @@ def refined_set(
 
     Args:
         given: the poses before; those of the dataset where left out.
-        timestamps_s: of the images; those of the dataset where left out.
 
     Raises:
         ValueError: poses are not finite or not of all images.
@@ -147,7 +145,7 @@ def refined_set(
         image_ids,
         "none",
         similarity or Similarity.identity(),
-        _times(dataset) if timestamps_s is None else timestamps_s,
+        _times(dataset),
     )
 
 

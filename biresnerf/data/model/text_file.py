@@ -19,11 +19,11 @@ def read_bytes(path: Path, most_bytes: int) -> bytes:
         size = path.stat().st_size
         if size > most_bytes:
             what = f"{size / 2**20:.0f} MiB is more than a pose file may have ({most_bytes // 2**20} MiB)."
-            raise _invalid(path.name, what, "Leave out what does not describe cameras, or split the set.")
+            raise invalid_file(path.name, what, "Leave out what does not describe cameras, or split the set.")
         return path.read_bytes()
     except OSError as error:
         what = f"cannot be read: {error.strerror}."
-        raise _invalid(path.name, what, "Check the path and its permissions.") from None
+        raise invalid_file(path.name, what, "Check the path and its permissions.") from None
 
 
 def read_text(path: Path, most_bytes: int = MAX_TEXT_BYTES) -> str:
@@ -32,7 +32,7 @@ def read_text(path: Path, most_bytes: int = MAX_TEXT_BYTES) -> str:
         return read_bytes(path, most_bytes).decode("utf-8-sig")
     except UnicodeDecodeError:
         hint = "Save it in UTF-8, or export it again."
-        raise _invalid(path.name, "is not UTF-8 text.", hint) from None
+        raise invalid_file(path.name, "is not UTF-8 text.", hint) from None
 
 
 def finite_numbers(words: Sequence[str], where: str, hint: str) -> NDArray[np.float64]:
@@ -40,11 +40,12 @@ def finite_numbers(words: Sequence[str], where: str, hint: str) -> NDArray[np.fl
     try:
         values = np.array([float(word) for word in words], dtype=np.float64)
     except ValueError:
-        raise _invalid(where, "holds a word that is no number.", hint) from None
+        raise invalid_file(where, "holds a word that is no number.", hint) from None
     if not np.isfinite(values).all():
         raise InputError("pose_not_finite", "NaN or an infinite number.", where=where, hint=hint)
     return values
 
 
-def _invalid(where: str, what: str, hint: str) -> InputError:
+def invalid_file(where: str, what: str, hint: str) -> InputError:
+    """The error for a pose file of which ``what`` is wrong at ``where``."""
     return InputError("pose_file_invalid", what, where=where, hint=hint)

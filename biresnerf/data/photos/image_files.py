@@ -107,18 +107,11 @@ def open_image(path: Path, name: str) -> Image.Image:
     except Image.DecompressionBombError:
         raise _too_large(name) from None
     except DAMAGED as error:
-        try:
-            empty = path.stat().st_size == 0
-        except OSError:
-            empty = False
-        missing = isinstance(error, PermissionError)
-        what = (
-            "is an empty file."
-            if empty
-            else "may not be read."
-            if missing
-            else "is not an image that can be read."
-        )
+        what = "is not an image that can be read."
+        if isinstance(error, PermissionError):
+            what = "may not be read."
+        elif path.is_file() and path.stat().st_size == 0:
+            what = "is an empty file."
         raise InputError(
             "not_an_image",
             what,

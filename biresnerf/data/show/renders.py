@@ -53,7 +53,6 @@ def write_view(
     render: NDArray[np.generic],
     photo: NDArray[np.generic],
     depth: NDArray[np.floating] | None = None,
-    depth_range: tuple[float, float] | None = None,
 ) -> list[Path]:
     """Writes ``<stem>_render.png``, ``_photo.png``, ``_difference.png`` and, where given, ``_depth.png``.
 
@@ -65,8 +64,6 @@ def write_view(
         stem: see `picture_stems`.
         render, photo: [h, w, 3], of one size; uint8, or floats from 0 to 1.
         depth: [h, w], along the optical axis, in any unit; not finite or not positive where there is nothing.
-        depth_range: nearest and farthest depth of the ramp; give the same to all views to compare them.
-            Otherwise the view's own 2nd and 98th percentile.
 
     Returns:
         the files written.
@@ -80,7 +77,7 @@ def write_view(
     error = np.abs(rendered.astype(np.float64) - taken).mean(axis=2) / 255.0
     pictures = {"render": rendered, "photo": taken, "difference": ramp_colours(error / DIFFERENCE_AT_TOP)}
     if depth is not None:
-        pictures["depth"] = depth_picture(depth, depth_range)
+        pictures["depth"] = depth_picture(depth)
     written = []
     for kind, picture in pictures.items():
         path = folder / f"{stem}_{kind}.png"
@@ -101,7 +98,7 @@ def ramp_colours(values: NDArray[np.floating]) -> NDArray[np.uint8]:
 def depth_picture(
     depth: NDArray[np.floating], depth_range: tuple[float, float] | None = None
 ) -> NDArray[np.uint8]:
-    """Colours uint8 [h, w, 3] of a depth map, as `write_view` says."""
+    """Colours uint8 [h, w, 3] of a depth map; the ramp ends at its 2nd and 98th percentile where no range is given."""
     there = np.isfinite(depth) & (depth > 0)
     if not there.any():
         return np.broadcast_to(_NOTHING, (*depth.shape, 3)).copy()
@@ -110,7 +107,7 @@ def depth_picture(
     return np.where(there[..., None], ramp_colours(1.0 - share), _NOTHING)
 
 
-def write_orbit(path: Path, frames: Iterable[NDArray[np.generic]], fps: int = ORBIT_FRAMES_PER_S) -> int:
+def write_orbit(path: Path, frames: Iterable[NDArray[np.generic]]) -> int:
     """Writes a video (H.264, mp4, plays in browsers) of frames [h, w, 3] of one size; uint8, or floats 0 to 1.
 
     Frames are taken one by one, so that they may be rendered as they are written. An odd width or height gets
@@ -128,7 +125,7 @@ def write_orbit(path: Path, frames: Iterable[NDArray[np.generic]], fps: int = OR
             temporary,
             format="FFMPEG",
             mode="I",
-            fps=fps,
+            fps=ORBIT_FRAMES_PER_S,
             codec="libx264",
             pixelformat="yuv420p",
             quality=8,

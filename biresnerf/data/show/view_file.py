@@ -14,8 +14,6 @@ from biresnerf.frozen_model import FrozenModel
 VIEW, THUMBNAIL = "view.json", "thumbnail.jpg"
 CONTACT_SHEET, POINTS = "view/contact_sheet.jpg", "view/points_{source}.bin"
 
-PictureKind = Literal["render", "photo", "difference", "depth"]
-
 
 class ShownPictures(FrozenModel, allow_inf_nan=False):
     """A rendered view's files, relative to the result's folder."""

@@ -11,12 +11,12 @@ from PIL import Image
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.synthetic.scene import (
-    CAMERA_ANGLE_X,
     SHAPES,
     random_textures,
     render_shapes,
     synthetic_cameras,
     synthetic_focal,
+    write_blender_set,
 )
 from biresnerf.data.synthetic.shapes import Shape, Texture
 
@@ -114,15 +114,7 @@ def write_vase(folder: Path, n_views: int, size: int, seed: int) -> Path:
         Texture.glaze(np.random.default_rng([seed, 5, index]), base, _GLAZE_CONTRAST)
         for index, base in enumerate(_GLAZE)
     ]
-    poses = synthetic_cameras(n_views, seed)
-    (folder / "train").mkdir(parents=True, exist_ok=True)
-    for index, pose in enumerate(poses):
-        pixels = render_shapes(VASE, textures, pose, size, size, synthetic_focal(size))[0]
-        Image.fromarray(pixels).save(folder / "train" / f"r_{index}.png", compress_level=3)
-    frames = [
-        {"file_path": f"./train/r_{index}", "transform_matrix": matrix.tolist()}
-        for index, matrix in enumerate(file_from_world_from_cam(poses, np.eye(4), 1.0))
-    ]
-    path = folder / "transforms.json"
-    write_json(path, {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}, indent=1)
-    return path
+    poses, focal = synthetic_cameras(n_views, seed), synthetic_focal(size)
+    return write_blender_set(
+        folder, poses, (render_shapes(VASE, textures, pose, size, size, focal)[0] for pose in poses)
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -145,14 +145,19 @@ def write_synthetic_scene(folder: Path, n_views: int, size: int, seed: int) -> P
         the path of transforms.json, written last.
     """
     poses = synthetic_cameras(n_views, seed)
+    return write_blender_set(folder, poses, (render_synthetic(pose, size, seed)[0] for pose in poses))
+
+
+def write_blender_set(
+    folder: Path, poses: NDArray[np.float64], pictures: Iterable[NDArray[np.uint8]]
+) -> Path:
+    """Writes the picture of each pose [n, 4, 4] to train/, then transforms.json (Blender dialect); returns its path."""
     (folder / "train").mkdir(parents=True, exist_ok=True)
-    for index, pose in enumerate(poses):
-        picture = Image.fromarray(render_synthetic(pose, size, seed)[0])
-        picture.save(folder / "train" / f"r_{index}.png", compress_level=3)
-    matrices = file_from_world_from_cam(poses, np.eye(4), 1.0)
+    for index, picture in enumerate(pictures):
+        Image.fromarray(picture).save(folder / "train" / f"r_{index}.png", compress_level=3)
     frames = [
         {"file_path": f"./train/r_{index}", "transform_matrix": matrix.tolist()}
-        for index, matrix in enumerate(matrices)
+        for index, matrix in enumerate(file_from_world_from_cam(poses, np.eye(4), 1.0))
     ]
     path = folder / "transforms.json"
     write_json(path, {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}, indent=1)

@@ -112,6 +112,17 @@ def _cylinder(origin: Array, directions: Array, size: Array) -> tuple[Array, Arr
     return distance, normal
 
 
+def _waves(
+    rng: np.random.Generator, scales: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Wave numbers [waves], directions [waves, 3] and colours [waves, 3] of unit length."""
+    numbers = np.repeat(_WAVE_NUMBERS[:scales], _WAVES_EACH)
+    directions, tints = rng.normal(size=(2, len(numbers), 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    tints /= np.linalg.norm(tints, axis=1, keepdims=True)
+    return numbers, directions, tints
+
+
 @dataclass(frozen=True, eq=False)
 class Texture:
     """Colour as a function of the point: two base colours with a curved edge between, and waves."""
@@ -125,11 +136,7 @@ class Texture:
     @staticmethod
     def random(rng: np.random.Generator, scales: int = len(_WAVE_NUMBERS)) -> Texture:
         """A texture that no other draw resembles, of so many scales of detail, from the coarsest on."""
-        numbers = np.repeat(_WAVE_NUMBERS[:scales], _WAVES_EACH)
-        directions = rng.normal(size=(len(numbers), 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        tints = rng.normal(size=(len(numbers), 3))
-        tints /= np.linalg.norm(tints, axis=1, keepdims=True)
+        numbers, directions, tints = _waves(rng, scales)
         amplitudes = 0.20 * tints * (numbers[:, None] / _WAVE_NUMBERS[0]) ** -0.25
         first = rng.uniform(0.15, 0.85, 3)
         parts = (
@@ -144,11 +151,7 @@ class Texture:
     @staticmethod
     def glaze(rng: np.random.Generator, base: tuple[float, float, float], contrast: float) -> Texture:
         """One colour (0 to 1) that varies slowly by `contrast`, without any edge: next to nothing for features."""
-        numbers = np.repeat(_WAVE_NUMBERS[:2], _WAVES_EACH)
-        directions = rng.normal(size=(len(numbers), 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        tints = rng.normal(size=(len(numbers), 3))
-        tints /= np.linalg.norm(tints, axis=1, keepdims=True)
+        numbers, directions, tints = _waves(rng, 2)
         parts = (
             np.array([base, base]),
             np.zeros((2, 3)),

@@ -21,7 +21,7 @@ from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.text_file import finite_numbers, read_text
+from biresnerf.data.model.text_file import finite_numbers, invalid_file, read_text
 from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.errors import InputError
 from biresnerf.geometry.rigid import rigid_inverse
@@ -90,12 +90,15 @@ def read_cameras(file: Path) -> list[tuple[Lens, NDArray[np.float64] | None]]:
     ]
     counts = _numbers(lines[:1], 1, 2, f"{file.name} first line")[0]
     if not all(count == round(count) and count >= 0 for count in counts) or counts[0] > MAX_CAMERAS:
-        raise _invalid(f"{file.name} first line", "does not give the numbers of cameras and points.")
+        raise invalid_file(
+            f"{file.name} first line", "does not give the numbers of cameras and points.", _HINT
+        )
     cameras, points = int(counts[0]), int(counts[1])
     if len(lines) != 1 + _LINES_PER_CAMERA * cameras + _LINES_PER_POINT * points:
-        raise _invalid(
+        raise invalid_file(
             file.name,
             f"has {len(lines)} lines, which is not what {cameras} cameras and {points} points take.",
+            _HINT,
         )
     entries = []
     for index in range(cameras):
@@ -117,7 +120,7 @@ def _world_from_cam(
 
 def _numbers(lines: Sequence[Sequence[str]], rows: int, columns: int, where: str) -> NDArray[np.float64]:
     if len(lines) != rows or any(len(line) != columns for line in lines):
-        raise _invalid(where, f"is not {rows} lines of {columns} numbers.")
+        raise invalid_file(where, f"is not {rows} lines of {columns} numbers.", _HINT)
     return finite_numbers([word for line in lines for word in line], where, _HINT).reshape(rows, columns)
 
 
@@ -161,10 +164,6 @@ def _camera(lens: Lens, where: str, header: ImageHeader, _name: str) -> FrameCam
     centre = (header.width / 2, header.height / 2)
     model, params = ("RADIAL", (focal, *centre, k1, k2)) if k1 or k2 else ("SIMPLE_PINHOLE", (focal, *centre))
     return FrameCamera(camera_of_numbers(model, header.width, header.height, params, where))
-
-
-def _invalid(where: str, what: str) -> InputError:
-    return InputError("pose_file_invalid", what, where=where, hint=_HINT)
 
 
 def bundler_problem(camera: Camera) -> str | None:

@@ -18,7 +18,7 @@ from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
-from biresnerf.data.model.text_file import read_text
+from biresnerf.data.model.text_file import invalid_file, read_text
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 
@@ -31,6 +31,7 @@ GAUSSIAN_SPLATTING = Format(
     gives="poses, two focal lengths an image",
     checked_against="files written from its source; one real file",
 )
+_HINT = "Give the cameras.json that 3DGS wrote."
 _KEYS = ("img_name", "width", "height", "position", "rotation", "fx", "fy")
 
 
@@ -43,9 +44,9 @@ def parse_gaussian_splatting(_root: Path, file: Path) -> ParsedPoses:
     try:
         rows = json.loads(read_text(file))
     except (ValueError, RecursionError) as error:
-        raise _invalid(file.name, f"is not JSON: {error}.") from None
+        raise invalid_file(file.name, f"is not JSON: {error}.", _HINT) from None
     if not isinstance(rows, list):
-        raise _invalid(file.name, "is not a list of cameras.")
+        raise invalid_file(file.name, "is not a list of cameras.", _HINT)
     entries = tuple(_entry(row, f"{file.name} [{index}]") for index, row in enumerate(rows))
     if len({entry.name for entry in entries}) != len(entries):
         raise InputError("duplicate_image", "names an image twice.", where=file.name, hint="Remove one.")
@@ -56,7 +57,7 @@ def parse_gaussian_splatting(_root: Path, file: Path) -> ParsedPoses:
 def _entry(row: Any, where: str) -> PoseEntry:
     lacking = [key for key in _KEYS if not isinstance(row, dict) or key not in row]
     if lacking:
-        raise _invalid(where, f"has no {', '.join(lacking)}.")
+        raise invalid_file(where, f"has no {', '.join(lacking)}.", _HINT)
     name = image_name(str(row["img_name"]), f"{where}.img_name")
     centre = np.asarray(_numbers(row["position"], 3, f"{where}.position"))
     rotation = [_numbers(line, 3, f"{where}.rotation") for line in _listed(row["rotation"], 3, where)]
@@ -70,23 +71,19 @@ def _entry(row: Any, where: str) -> PoseEntry:
 
 def _listed(value: Any, count: int, where: str) -> list[Any]:
     if not isinstance(value, list) or len(value) != count:
-        raise _invalid(where, f"is not a list of {count}.")
+        raise invalid_file(where, f"is not a list of {count}.", _HINT)
     return value
 
 
 def _numbers(value: Any, count: int, where: str) -> list[float]:
     values = _listed(value, count, where)
     if any(isinstance(one, bool) or not isinstance(one, int | float) for one in values):
-        raise _invalid(where, "holds something other than numbers.")
+        raise invalid_file(where, "holds something other than numbers.", _HINT)
     if not all(abs(one) < 1e300 and math.isfinite(one) for one in values):
         raise InputError(
             "pose_not_finite", "NaN or an infinite number.", where=where, hint="Remove the camera."
         )
     return [float(one) for one in values]
-
-
-def _invalid(where: str, what: str) -> InputError:
-    return InputError("pose_file_invalid", what, where=where, hint="Give the cameras.json that 3DGS wrote.")
 
 
 CODECS = (Codec(GAUSSIAN_SPLATTING, parse=parse_gaussian_splatting, recognises=head_holds(b'"img_name"')),)

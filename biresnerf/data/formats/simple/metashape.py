@@ -21,7 +21,7 @@ from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
-from biresnerf.data.model.text_file import finite_numbers, read_text
+from biresnerf.data.model.text_file import finite_numbers, invalid_file, read_text
 from biresnerf.data.photos.named_images import few_names
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
@@ -109,10 +109,10 @@ def _chunk(file: Path) -> ElementTree.Element:
             raise ElementTree.ParseError("document types and entities are not read")
         tree = ElementTree.fromstring(text, parser=ElementTree.XMLParser(target=_Builder()))
     except (ElementTree.ParseError, xml.parsers.expat.ExpatError, ValueError) as error:
-        raise _invalid(file.name, f"is no XML that is read: {error}.") from None
+        raise invalid_file(file.name, f"is no XML that is read: {error}.", _HINT) from None
     chunks = [tree] if tree.tag == "chunk" else list(tree.iter("chunk"))
     if len(chunks) != 1:
-        raise _invalid(file.name, f"has {len(chunks)} chunks, not one.")
+        raise invalid_file(file.name, f"has {len(chunks)} chunks, not one.", _HINT)
     return chunks[0]
 
 
@@ -140,7 +140,7 @@ def _pose(entry: ElementTree.Element, where: str) -> NDArray[np.float64] | None:
         return None
     values = finite_numbers((transform.text or "").split(), where, _HINT)
     if len(values) != 16:
-        raise _invalid(where, f"the transform has {len(values)} numbers, not 16.")
+        raise invalid_file(where, f"the transform has {len(values)} numbers, not 16.", _HINT)
     return rigid_matrix(np.reshape(values, (4, 4)).tolist(), where)[0]
 
 
@@ -179,7 +179,7 @@ def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
     try:
         width, height = int(size["width"]), int(size["height"])
     except (KeyError, ValueError):
-        raise _invalid(where, "has no resolution of whole width and height.") from None
+        raise invalid_file(where, "has no resolution of whole width and height.", _HINT) from None
     return _colmap_camera(values, width, height, where)
 
 
@@ -200,10 +200,6 @@ def _colmap_camera(values: dict[str, float], width: int, height: int, where: str
     else:
         model, params = "PINHOLE", pinhole
     return camera_of_numbers(supported_model(model, where), width, height, params, where)
-
-
-def _invalid(where: str, what: str) -> InputError:
-    return InputError("pose_file_invalid", what, where=where, hint=_HINT)
 
 
 CODECS = (Codec(METASHAPE, parse=parse_metashape, recognises=head_holds(b"<chunk")),)

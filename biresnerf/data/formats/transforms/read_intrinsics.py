@@ -10,6 +10,7 @@ from biresnerf.data.formats.transforms.write_intrinsics import FOCAL_KEYS
 from biresnerf.data.model.camera import Camera
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
 from biresnerf.data.photos.image_files import ImageHeader
+from biresnerf.data.photos.orientation import same_shape
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import (
     COEFFICIENTS,
@@ -149,26 +150,19 @@ def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int,
     h = header.height if height is None else round(height)
     if (w, h) == (header.width, header.height):
         return w, h, []
-    sizes = f"{name} has {header.width} x {header.height} px"
-    where = fields.where("w")
     if w <= 0 or h <= 0:
-        raise InputError(
-            "intrinsics_invalid", f"w = {w}, h = {h}.", where=where, hint="Give the size in pixels."
-        )
-    if (w, h) == (header.height, header.width):
-        raise InputError(
-            "image_size_mismatch",
-            f"{sizes}, the file says {w} x {h}: turned by 90 degrees.",
-            where=where,
-            hint="Rotate the stored pixels (or tag them with EXIF's orientation), or exchange w and h, cx and cy.",
-        )
-    # Within one pixel of rounding, the image is a resized copy of the one the intrinsics were made for.
-    if min(abs(h * header.width / w - header.height), abs(w * header.height / h - header.width)) > 1.0:
+        hint = "Give the size in pixels."
+        raise InputError("intrinsics_invalid", f"w = {w}, h = {h}.", where=fields.where("w"), hint=hint)
+    turned = (w, h) == (header.height, header.width)
+    if turned or not same_shape(w, h, header.width, header.height):
+        how = "turned by 90 degrees" if turned else "not the same shape"
         raise InputError(
             "image_size_mismatch",
-            f"{sizes}, the file says {w} x {h}: not the same shape.",
-            where=where,
-            hint="Give the intrinsics of these images; cropped images need their own cx and cy.",
+            f"{name} has {header.width} x {header.height} px, the file says {w} x {h}: {how}.",
+            where=fields.where("w"),
+            hint="Rotate the stored pixels (or tag them with EXIF's orientation), or exchange w and h, cx and cy."
+            if turned
+            else "Give the intrinsics of these images; cropped images need their own cx and cy.",
         )
     scaled = f"{w} x {h} px in the file, {header.width} x {header.height} in the images"
     return w, h, [f"{scaled}: the intrinsics were scaled to the images"]

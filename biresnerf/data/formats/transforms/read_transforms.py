@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import posixpath
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -9,14 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, dataset_of
-from biresnerf.data.formats.transforms.older_nerfstudio import applied_transform_left_out
+from biresnerf.data.formats.colmap.read_model import model_forms, read_colmap_model
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.model.conventions import world_from_cam_of_file
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.model.json_document import read_json_object
 from biresnerf.data.model.pose_validation import ROTATION_WARNED, rigid_matrix
+from biresnerf.data.model.text_file import invalid_file
 from biresnerf.data.photos.mask_files import dynamic_mask, named_mask
 from biresnerf.data.photos.named_images import (
     find_images,
@@ -29,6 +32,11 @@ from biresnerf.errors import InputError
 _NGP_KEYS = frozenset(
     {"aabb_scale", "scale", "offset", "is_fisheye", "sharpness", "x_fov", "enable_depth_loading"}
 )
+# Older nerfstudio turned COLMAP's world by this, and did not write down that it had.
+_OLDER_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+_MODEL = "colmap/sparse/0"
+# Poses are taken for equal up to this, relative to the largest coordinate: files have 6 digits or more.
+_EQUAL = 1e-4
 _NERFSTUDIO_KEYS = frozenset({"camera_model", "applied_transform", "ply_file_path", "applied_scale"})
 
 
@@ -111,16 +119,12 @@ def _frame_objects(document: dict[str, Any], file: str) -> list[dict[str, Any]]:
     rows = document.get("frames")
     if not isinstance(rows, list):
         hint = "Give a transforms.json as nerfstudio, instant-ngp or Blender write it."
-        raise _invalid(f"{file} frames", "has no list of frames.", hint)
+        raise invalid_file(f"{file} frames", "has no list of frames.", hint)
     for index, row in enumerate(rows):
         if not isinstance(row, dict):
             hint = "Give file_path and transform_matrix in each frame."
-            raise _invalid(f"{file} frames[{index}]", "is not an object.", hint)
+            raise invalid_file(f"{file} frames[{index}]", "is not an object.", hint)
     return rows
-
-
-def _invalid(where: str, what: str, hint: str) -> InputError:
-    return InputError("pose_file_invalid", what, where=where, hint=hint)
 
 
 def _source_format(document: dict[str, Any], path: Path) -> SourceFormat:
@@ -130,7 +134,7 @@ def _source_format(document: dict[str, Any], path: Path) -> SourceFormat:
         matrix, _ = rigid_matrix(applied, f"{path.name} applied_transform")
     if isinstance(scale, bool) or not isinstance(scale, int | float) or not 1e-9 < scale < 1e9:
         hint = "Remove the key, or give the factor that was applied to the positions."
-        raise _invalid(f"{path.name} applied_scale", "is not a positive number.", hint)
+        raise invalid_file(f"{path.name} applied_scale", "is not a positive number.", hint)
     kept = {key: None if key == "frames" else value for key, value in document.items()}
     return SourceFormat(_dialect(document), path, kept, matrix, float(scale), files=(path,))
 
@@ -148,7 +152,7 @@ def _with_older_transform(parsed: ParsedPoses) -> ParsedPoses:
     """The same; older nerfstudio's transform is undone where a model beside the file shows it."""
     source, older = parsed.source, None
     if source.dialect == "nerfstudio" and source.document.get("applied_transform") is None:
-        older = applied_transform_left_out(source.files[0], parsed.entries)
+        older = _older_transform(source.files[0], parsed.entries)
     if older is None:
         return parsed
     note = (
@@ -163,6 +167,30 @@ def _with_older_transform(parsed: ParsedPoses) -> ParsedPoses:
         for entry in parsed.entries
     )
     return ParsedPoses(replace(source, applied_transform=older), entries, notes=(note, *parsed.notes))
+
+
+def _older_transform(file: Path, entries: Sequence[PoseEntry]) -> NDArray[np.float64] | None:
+    """The transform that ``file``, which names none, was made with, where the model beside it shows that it was.
+
+    nerfstudio itself takes this transform as soon as there is a model; here the model's poses must agree with the
+    frames' after it, as folders of other programs hold both files, too. None where they do not.
+    """
+    folder = file.parent / _MODEL
+    if not model_forms(folder):
+        return None
+    try:
+        images = read_colmap_model(folder).images.values()
+    except InputError:
+        return None  # not what is read; nothing is taken from it
+    by_name = {posixpath.basename(image.name): image.world_from_cam for image in images}
+    off, size, found = 0.0, 1.0, 0
+    for entry in entries:
+        pose = by_name.get(posixpath.basename(entry.name))
+        if pose is not None and entry.world_from_cam is not None:
+            expected = _OLDER_TRANSFORM @ pose
+            found, off = found + 1, max(off, float(np.abs(entry.world_from_cam - expected).max()))
+            size = max(size, float(np.abs(expected).max()))
+    return _OLDER_TRANSFORM if found and off <= _EQUAL * size else None
 
 
 def _names(entries: Sequence[PoseEntry]) -> list[str]:
