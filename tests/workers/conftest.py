@@ -31,6 +31,7 @@ from workers.settings.settings import Settings
 ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("counting_program.py")
 PATIENCE_S = 90.0
+SHORT_STALL = {"stall_s": 1.5}
 # The end of a check program that accepts the files.
 _FOUND = {
     **{"images": 1, "with_pose": 1, "without_pose": 0, "poses": "given", "cameras": 1},
@@ -89,11 +90,15 @@ def settings(database_url: str, tmp_path: Path) -> Settings:
 
 
 def quick_settings(data_dir: Path, **changes: object) -> Settings:
-    """Everything that production waits for, in tenths of a second; jobs count."""
+    """Everything that production waits for, in tenths of a second; jobs count.
+
+    But for the stall time, after which the database also ends transactions in which nothing happens: on a starved
+    machine every process is silent for seconds. Tests of what happens after it set `SHORT_STALL`.
+    """
     values = {
         "data_dir": data_dir,
         "beat_s": 0.3,
-        "stall_s": 1.5,
+        "stall_s": 20.0,
         "poll_s": 0.3,
         "janitor_s": 0.3,
         "stop_grace_s": 5.0,

@@ -13,7 +13,7 @@ import pytest
 from biresnerf.errors import InputError
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.datasets import DatasetView, ManifestEntry
-from tests.workers.conftest import ACCEPTED, quick_settings, ready_dataset
+from tests.workers.conftest import ACCEPTED, SHORT_STALL, quick_settings, ready_dataset
 from workers.engine import Stores, open_stores
 from workers.settings.errors import Conflict, LimitReached, NotFound
 from workers.settings.settings import Settings
@@ -183,10 +183,10 @@ async def test_many_checks_of_one_tenant_do_not_hold_up_anothers(database_url: s
     assert order[-1] != "b", order
 
 
-def checked_by(program: str, database_url: str, folder: Path) -> Settings:
+def checked_by(program: str, database_url: str, folder: Path, **changes: float) -> Settings:
     """Settings by which this program checks datasets."""
     return quick_settings(
-        folder / "data", database_url=database_url, check_command=(sys.executable, "-c", program)
+        folder / "data", database_url=database_url, check_command=(sys.executable, "-c", program), **changes
     )
 
 
@@ -198,9 +198,9 @@ async def finalized_dataset(stores: Stores) -> str:
     return dataset.id
 
 
-async def checking(database_url: str, folder: Path, program: str) -> DatasetView:
+async def checking(database_url: str, folder: Path, program: str, **changes: float) -> DatasetView:
     """The outcome of a check by this program."""
-    async with open_stores(checked_by(program, database_url, folder)) as stores:
+    async with open_stores(checked_by(program, database_url, folder, **changes)) as stores:
         return await stores.datasets.check(await finalized_dataset(stores))
 
 
@@ -208,7 +208,7 @@ async def test_a_check_longer_than_the_stall_time_comes_to_its_end_and_runs_once
     marks = tmp_path / "marks"
     mark = f"open({str(marks)!r}, 'a').write('x')"
     program = f"{mark}; import time; time.sleep(2.5); {ACCEPTED}"
-    assert (await checking(database_url, tmp_path, program)).state == "ready"
+    assert (await checking(database_url, tmp_path, program, **SHORT_STALL)).state == "ready"
     assert marks.read_text() == "x"
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.workers.conftest import PATIENCE_S, Counting, Slots, quick_settings
+from tests.workers.conftest import PATIENCE_S, Counting, Slots
 from workers.process.disk_space import DiskBudget
 from workers.settings.errors import LimitReached
 from workers.settings.settings import Settings
@@ -34,7 +34,7 @@ def test_the_reserve_is_never_given_out(tmp_path: Path):
 async def test_a_job_waits_for_a_host_with_room(
     settings: Settings, counting: Counting, slots: Slots, tmp_path: Path
 ):
-    full = quick_settings(settings.data_dir, database_url=settings.database_url, disk_reserve_bytes=2**60)
+    full = settings.model_copy(update={"disk_reserve_bytes": 2**60, "stall_s": 4.0})
     slots.start(full, "full")
     await counting.submit(steps=2, step_s=0.01)
     log = tmp_path / "slot-full.log"

@@ -9,7 +9,7 @@ import signal
 import psutil
 import pytest
 
-from tests.workers.conftest import Counting, Slots, died, quick_settings
+from tests.workers.conftest import Counting, Slots, died
 from workers.engine import Stores
 from workers.settings.settings import Settings
 
@@ -270,7 +270,7 @@ async def test_a_cancelled_job_of_a_dead_worker_ends_cancelled(
     first.kill()
     first.wait()
     await counting.stores.jobs.cancel(counting.id)
-    slots.start(quick_settings(settings.data_dir, database_url=settings.database_url), "b")
+    slots.start(settings, "b")
     assert (await counting.until_final()).state == "cancelled"
     assert len(counting.starts()) == 1
 

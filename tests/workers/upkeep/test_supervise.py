@@ -15,7 +15,15 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.workers.conftest import ROOT, Counting, Slots, environment, quick_settings, short_folder
+from tests.workers.conftest import (
+    ROOT,
+    SHORT_STALL,
+    Counting,
+    Slots,
+    environment,
+    quick_settings,
+    short_folder,
+)
 from workers.database.postgres_binaries import unprivileged_user
 from workers.engine import open_stores
 from workers.settings.settings import Settings
@@ -32,7 +40,7 @@ class Up:
 
     def __init__(self, folder: Path, slots: Slots) -> None:
         self._folder, self._slots = folder, slots
-        self.settings = quick_settings(folder / "data")
+        self.settings = quick_settings(folder / "data", **SHORT_STALL)
         self.process: subprocess.Popen[bytes] | None = None
 
     async def start(self, *arguments: str) -> Settings:
