@@ -6,8 +6,9 @@ last can write. The other gets `Fenced` and must leave without touching the queu
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from typing import Any, Literal, TypeVar
+import functools
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from typing import Any, Concatenate, Literal, ParamSpec, TypeAlias, TypeVar
 
 from psycopg import sql
 from psycopg.rows import DictRow
@@ -28,206 +29,190 @@ from workers.store.trash import discard
 PREVIEW_KEPT_S = 60.0  # after another one took its place: it may be on its way to somebody
 LOG_LINES_MAX = 20_000  # of one job
 _LOCKED = """
-    SELECT run_token, state, cancel_requested, keep_partial, log_lines, checkpoint, reusable, previews
+    SELECT id, run_token, state, stage, cancel_requested, keep_partial, log_lines, checkpoint, reusable, previews
     FROM jobs WHERE id = %s FOR UPDATE"""
+P = ParamSpec("P")
 T = TypeVar("T")
+_Write: TypeAlias = Callable[Concatenate["Ledger", Connection, DictRow, P], Awaitable[T]]
+_Fenced: TypeAlias = Callable[Concatenate["Ledger", P], Coroutine[Any, Any, T]]
+
+
+def _fenced(done: T) -> Callable[[_Write[P, T]], _Fenced[P, T]]:
+    """Runs a method of `Ledger` under the job's row lock, with the row, if the token still holds.
+
+    While the database is away it waits. ``done`` is the answer where an earlier try ended the attempt, though its
+    acknowledgement was lost.
+    """
+
+    def decorate(write: _Write[P, T]) -> _Fenced[P, T]:
+        @functools.wraps(write)
+        async def fenced(self: Ledger, /, *given: P.args, **named: P.kwargs) -> T:
+            async def once() -> T:
+                async with self._database.transaction() as connection:
+                    job = await connection.row(_LOCKED, self.claim.job_id)
+                    if job is None or job["run_token"] != self.claim.token:
+                        raise Fenced(f"job {self.claim.job_id} has a new owner")
+                    if job["state"] != "running":
+                        return done
+                    return await write(self, connection, job, *given, **named)
+
+            return await retry_while_unavailable(once)
+
+        return fenced
+
+    return decorate
 
 
 class Ledger:
-    """The fenced writes of one attempt. While the database is away each waits for it, without end."""
+    """The fenced writes of one attempt. Every method raises `Fenced`.
 
-    def __init__(self, database: Database, claim: Claim) -> None:
+    Files of other attempts are deleted once no process can still be writing them: after twice ``stall_s``.
+    """
+
+    def __init__(self, database: Database, claim: Claim, stall_s: float) -> None:
         self.claim = claim
-        self._database = database
-        self._stage: str | None = None
+        self._database, self._stall_s = database, stall_s
 
-    async def progress(self, now: Progress) -> None:
+    @_fenced(None)
+    async def progress(self, connection: Connection, job: DictRow, now: Progress) -> None:
         """Write the progress columns, and the options where they are reported; a new stage is also an event."""
         resolved = None if now.options is None else Jsonb(now.options.model_dump(mode="json"))
+        await connection.execute(
+            "UPDATE jobs SET stage = %s, fraction = greatest(fraction, %s), step = %s, steps_total = %s,"
+            " eta_s = %s, metrics = metrics || %s, message = %s,"
+            " resolved_options = coalesce(%s, resolved_options), revision = revision + 1,"
+            " updated_at = clock_timestamp() WHERE id = %s",
+            (
+                *(now.stage, now.fraction, now.step, now.steps_total, now.eta_s),
+                *(Jsonb(now.metrics), now.message, resolved, job["id"]),
+            ),
+        )
+        if now.stage != job["stage"]:
+            await add_event(connection, job["id"], "stage", {"stage": now.stage})
+        else:
+            await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job["id"],))
 
-        async def write(connection: Connection, job: DictRow) -> None:
-            await connection.execute(
-                "UPDATE jobs SET stage = %s, fraction = greatest(fraction, %s), step = %s, steps_total = %s,"
-                " eta_s = %s, metrics = metrics || %s, message = %s,"
-                " resolved_options = coalesce(%s, resolved_options), revision = revision + 1,"
-                " updated_at = clock_timestamp() WHERE id = %s",
-                (
-                    *(now.stage, now.fraction, now.step, now.steps_total, now.eta_s),
-                    *(Jsonb(now.metrics), now.message, resolved, self.claim.job_id),
-                ),
-            )
-            if now.stage != self._stage:
-                await add_event(connection, self.claim.job_id, "stage", {"stage": now.stage})
-            else:
-                await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (self.claim.job_id,))
+    @_fenced(None)
+    async def checkpoint(
+        self, connection: Connection, job: DictRow, prefix: str, files: Sequence[str], step: int
+    ) -> None:
+        """Point the job at a new checkpoint and have the one before deleted."""
+        await _discard_replaced(connection, job["checkpoint"], prefix)
+        await _set(connection, job, "checkpoint", {"prefix": prefix, "files": list(files)})
+        await add_event(connection, job["id"], "checkpoint", {"step": step})
 
-        await self._fenced(write)
-        self._stage = now.stage
-
-    async def checkpoint(self, prefix: str, files: Sequence[str], step: int) -> None:
-        """Point the job at a new checkpoint and give the one before to the trash."""
-
-        async def write(connection: Connection, job: DictRow) -> None:
-            await _discard_replaced(connection, job["checkpoint"], prefix)
-            await self._set(connection, "checkpoint", {"prefix": prefix, "files": list(files)})
-            await add_event(connection, self.claim.job_id, "checkpoint", {"step": step})
-
-        await self._fenced(write)
-
-    async def reusable(self, stage: ReusableStage, prefix: str, files: Sequence[str]) -> None:
+    @_fenced(None)
+    async def reusable(
+        self, connection: Connection, job: DictRow, stage: ReusableStage, prefix: str, files: Sequence[str]
+    ) -> None:
         """Keep the work of a stage for other jobs to start from, in the place of an earlier attempt's."""
+        await _discard_replaced(connection, job["reusable"].get(stage), prefix)
+        stages = {**job["reusable"], stage: {"prefix": prefix, "files": list(files)}}
+        await _set(connection, job, "reusable", stages)
 
-        async def write(connection: Connection, job: DictRow) -> None:
-            await _discard_replaced(connection, job["reusable"].get(stage), prefix)
-            stages = {**job["reusable"], stage: {"prefix": prefix, "files": list(files)}}
-            await self._set(connection, "reusable", stages)
-
-        await self._fenced(write)
-
-    async def preview(self, prefix: str, artifacts: Sequence[Artifact], now: Progress) -> None:
+    @_fenced(None)
+    async def preview(
+        self, connection: Connection, job: DictRow, prefix: str, artifacts: Sequence[Artifact], now: Progress
+    ) -> None:
         """Let the job show these files, in the place of those before."""
-
-        async def write(connection: Connection, job: DictRow) -> None:
-            await _discard_replaced(connection, job["previews"], prefix, after_s=PREVIEW_KEPT_S)
-            listed = [item.model_dump() for item in artifacts]
-            await self._set(connection, "previews", {"prefix": prefix, "artifacts": listed})
-            data = {"stage": now.stage, "step": now.step, "files": [item.name for item in artifacts]}
-            await add_event(connection, self.claim.job_id, "preview", data)
-
-        await self._fenced(write)
+        await _discard_replaced(connection, job["previews"], prefix, after_s=PREVIEW_KEPT_S)
+        listed = [item.model_dump() for item in artifacts]
+        await _set(connection, job, "previews", {"prefix": prefix, "artifacts": listed})
+        data = {"stage": now.stage, "step": now.step, "files": [item.name for item in artifacts]}
+        await add_event(connection, job["id"], "preview", data)
 
     async def log(self, lines: Sequence[str]) -> None:
         """Append lines to the job's log; what is more than `LOG_LINES_MAX` is in its log file alone."""
-        before: int | None = None
+        await self._append(lines, [])
 
-        async def write(connection: Connection, job: DictRow) -> None:
-            nonlocal before
-            if before is not None and job["log_lines"] != before:
-                return  # an earlier try got through, though its acknowledgement was lost
-            before = int(job["log_lines"])
-            room = LOG_LINES_MAX - before
-            kept = list(lines[: max(0, room)])
-            if kept and len(kept) == room:
-                kept[-1] = f"(the rest is in {LOG_NAME} alone)"
-            if not kept:
-                return
-            await connection.execute(
-                "INSERT INTO job_log (job_id, n, attempt, text)"
-                " SELECT %s, %s + place, %s, text FROM unnest(%s::text[]) WITH ORDINALITY AS fresh (text, place)",
-                (self.claim.job_id, before, self.claim.attempt, kept),
-            )
-            await connection.execute(
-                "UPDATE jobs SET log_lines = log_lines + %s WHERE id = %s", (len(kept), self.claim.job_id)
-            )
+    @_fenced(None)
+    async def _append(
+        self, connection: Connection, job: DictRow, lines: Sequence[str], lengths: list[int]
+    ) -> None:
+        """``lengths`` of the log before each try: where it grew, an earlier try got through."""
+        before = int(job["log_lines"])
+        lengths.append(before)
+        left = LOG_LINES_MAX - before
+        kept = list(lines[: max(0, left)])
+        if not kept or before != lengths[0]:
+            return
+        if len(kept) == left:
+            kept[-1] = f"(the rest is in {LOG_NAME} alone)"
+        await connection.execute(
+            "INSERT INTO job_log (job_id, n, attempt, text)"
+            " SELECT %s, %s + place, %s, text FROM unnest(%s::text[]) WITH ORDINALITY AS fresh (text, place)",
+            (job["id"], before, self.claim.attempt, kept),
+        )
+        await connection.execute(
+            "UPDATE jobs SET log_lines = log_lines + %s WHERE id = %s", (len(kept), job["id"])
+        )
 
-        await self._fenced(write)
-
-    async def wants_partial(self) -> bool:
+    @_fenced(False)
+    async def wants_partial(self, _: Connection, job: DictRow) -> bool:
         """Whether who cancelled the job wants what there is of its result."""
+        return bool(job["keep_partial"])
 
-        async def read(_: Connection, job: DictRow) -> bool:
-            return bool(job["keep_partial"])
-
-        return await self._fenced(read, done=False)
-
+    @_fenced(True)
     async def publish(
-        self, artifacts: Sequence[Artifact], verdict: VerdictName | None, keep: str, stall_s: float
-    ) -> bool:
-        """Make the result the job's one result; False where a cancellation was asked for first.
-
-        Files of other attempts are deleted once no process can still be writing them.
-        """
-
-        async def write(connection: Connection, job: DictRow) -> bool:
-            if job["cancel_requested"]:
-                return False
-            await connection.execute(
-                "UPDATE jobs SET verdict = %s WHERE id = %s", (verdict, self.claim.job_id)
-            )
-            await finish(connection, self.claim.job_id, "succeeded", None, artifacts)
-            await trash_attempts(connection, self.claim.job_id, keep, stall_s)
-            return True
-
-        return await self._fenced(write, done=True)
-
-    async def fail(self, error: JobError, artifacts: Sequence[Artifact], keep: str, stall_s: float) -> None:
-        """End the job as failed (or cancelled, if that was asked for)."""
-
-        async def write(connection: Connection, job: DictRow) -> None:
-            if job["cancel_requested"]:
-                await finish_cancelled(connection, self.claim.job_id, artifacts, keep, stall_s)
-                return
-            await finish(connection, self.claim.job_id, "failed", error, artifacts)
-            await trash_attempts(connection, self.claim.job_id, keep, stall_s)
-
-        await self._fenced(write, done=None)
-
-    async def cancelled(self, artifacts: Sequence[Artifact], keep: str, stall_s: float) -> None:
-        """End the job as cancelled, with what is wanted of the files."""
-
-        async def write(connection: Connection, job: DictRow) -> None:
-            await finish_cancelled(connection, self.claim.job_id, artifacts, keep, stall_s)
-
-        await self._fenced(write, done=None)
-
-    async def give_back(
-        self,
-        event: EventType,
-        data: dict[str, Any],
-        *,
-        counted: bool,
-        forget_checkpoint: bool = False,
-        smaller: dict[str, Any] | None = None,
-    ) -> bool:
-        """Back to the queue, the attempt counted or not; False if the job was cancelled instead.
-
-        ``smaller``: options that attempts to come use in the place of those asked for.
-        """
-
-        async def write(connection: Connection, job: DictRow) -> bool:
-            if job["cancel_requested"]:
-                await finish_cancelled(connection, self.claim.job_id)
-                return False
-            await requeue(
-                connection,
-                self.claim.job_id,
-                event,
-                data,
-                uncounted=not counted,
-                forget_checkpoint=forget_checkpoint,
-                smaller=smaller,
-            )
-            return True
-
-        return await self._fenced(write, done=True)
-
-    async def _set(
         self,
         connection: Connection,
-        column: Literal["checkpoint", "reusable", "previews"],
-        value: dict[str, Any],
+        job: DictRow,
+        artifacts: Sequence[Artifact],
+        verdict: VerdictName | None,
+    ) -> bool:
+        """Make the result the job's one result; False where a cancellation was asked for first."""
+        if job["cancel_requested"]:
+            return False
+        await connection.execute("UPDATE jobs SET verdict = %s WHERE id = %s", (verdict, job["id"]))
+        await finish(connection, job["id"], "succeeded", None, artifacts)
+        await trash_attempts(connection, job["id"], self.claim.name, self._stall_s)
+        return True
+
+    @_fenced(None)
+    async def fail(
+        self, connection: Connection, job: DictRow, error: JobError, artifacts: Sequence[Artifact]
     ) -> None:
-        update = sql.SQL("UPDATE jobs SET {} = %s WHERE id = %s").format(sql.Identifier(column))
-        await connection.execute(update, (Jsonb(value), self.claim.job_id))
+        """End the job as failed (or cancelled, if that was asked for)."""
+        if job["cancel_requested"]:
+            await finish_cancelled(connection, job["id"], artifacts, self.claim.name, self._stall_s)
+            return
+        await finish(connection, job["id"], "failed", error, artifacts)
+        await trash_attempts(connection, job["id"], self.claim.name, self._stall_s)
 
-    async def _fenced(
-        self, write: Callable[[Connection, DictRow], Awaitable[T]], *, done: T | None = None
-    ) -> T:
-        """Run ``write`` under the job's row lock, with the row, if the token still holds.
+    @_fenced(None)
+    async def cancelled(self, connection: Connection, job: DictRow, artifacts: Sequence[Artifact]) -> None:
+        """End the job as cancelled, with what is wanted of the files."""
+        await finish_cancelled(connection, job["id"], artifacts, self.claim.name, self._stall_s)
 
-        ``done`` is the answer where an earlier try got through, though its acknowledgement was lost.
-        """
+    @_fenced(True)
+    async def give_back(
+        self,
+        connection: Connection,
+        job: DictRow,
+        event: EventType,
+        data: Mapping[str, Any],
+        *,
+        uncounted: bool = False,
+        forget_checkpoint: bool = False,
+        smaller: Mapping[str, Any] | None = None,
+    ) -> bool:
+        """Back to the queue, see `requeue`; False if the job was cancelled instead."""
+        if job["cancel_requested"]:
+            await finish_cancelled(connection, job["id"])
+            return False
+        more = {"uncounted": uncounted, "forget_checkpoint": forget_checkpoint}
+        await requeue(connection, job["id"], event, data, **more, smaller=smaller)
+        return True
 
-        async def once() -> T:
-            async with self._database.transaction() as connection:
-                job = await connection.row(_LOCKED, self.claim.job_id)
-                if job is None or job["run_token"] != self.claim.token:
-                    raise Fenced(f"job {self.claim.job_id} has a new owner")
-                if job["state"] != "running":
-                    return done  # type: ignore[return-value]
-                return await write(connection, job)
 
-        return await retry_while_unavailable(once)
+async def _set(
+    connection: Connection,
+    job: DictRow,
+    column: Literal["checkpoint", "reusable", "previews"],
+    value: Mapping[str, Any],
+) -> None:
+    update = sql.SQL("UPDATE jobs SET {} = %s WHERE id = %s").format(sql.Identifier(column))
+    await connection.execute(update, (Jsonb(value), job["id"]))
 
 
 async def _discard_replaced(

@@ -56,7 +56,7 @@ class Attempt:
     ) -> None:
         self._claim, self._settings, self._files = claim, settings, files
         self._database, self._variables = database, variables
-        self._ledger = Ledger(database, claim)
+        self._ledger = Ledger(database, claim, settings.stall_s)
         self._folder, self._output, self._log = folder, folder / "output", folder / LOG_NAME
         self._stop_reason: StopReason | None = None
         self._stop = asyncio.Event()
@@ -154,11 +154,10 @@ class Attempt:
                     file.write(line)
 
     async def _conclude(self, status: int | None) -> bool:
-        keep = (self._claim.name, self._settings.stall_s)
         if status == 0:
             artifacts = await self._store(enough=lambda: self._stop_reason == "cancel")
-            if not await self._ledger.publish(artifacts, self._verdict(), *keep):
-                await self._ledger.cancelled(artifacts, *keep)
+            if not await self._ledger.publish(artifacts, self._verdict()):
+                await self._ledger.cancelled(artifacts)
             return False
         if status == EXIT_MEMORY or (status in (KILLED, *EXIT_ERRORS) and self._killed_for_memory(status)):
             return await self._ran_out_of_memory()
@@ -166,14 +165,14 @@ class Attempt:
             error = self._reported_error()
             if error.code in STALE_CHECKPOINT and self._claim.checkpoint is not None:
                 return await self._crashed(error.detail, forget_checkpoint=True)
-            await self._ledger.fail(error, await self._store(log_only=True), *keep)
+            await self._ledger.fail(error, await self._store(log_only=True))
             return False
         if self._stop_reason == "cancel":
             unwanted = not await self._ledger.wants_partial()
-            await self._ledger.cancelled(await self._store(log_only=unwanted), *keep)
+            await self._ledger.cancelled(await self._store(log_only=unwanted))
             return False
         if self._stop_reason == "shutdown":
-            return await self._ledger.give_back("requeued", {"why": "shutdown"}, counted=False)
+            return await self._ledger.give_back("requeued", {"why": "shutdown"}, uncounted=True)
         if self._timed_out:
             error = JobError(
                 code="timeout",
@@ -181,7 +180,7 @@ class Attempt:
                 hint="Ask for fewer steps or smaller images, or raise BIRESNERF_JOB_TIMEOUT_S.",
                 log_tail=log_tail(self._log),
             )
-            await self._ledger.fail(error, await self._store(), *keep)
+            await self._ledger.fail(error, await self._store())
             return False
         return await self._crashed(f"exit status {status}")
 
@@ -189,13 +188,10 @@ class Attempt:
         tail = log_tail(self._log)
         if self._claim.attempt < self._settings.max_attempts:
             data = {"how": how, "log_tail": tail}
-            return await self._ledger.give_back(
-                "attempt_crashed", data, counted=True, forget_checkpoint=forget_checkpoint
-            )
+            return await self._ledger.give_back("attempt_crashed", data, forget_checkpoint=forget_checkpoint)
         error = crashed_too_often(self._claim.attempt, tail)
         error = error.model_copy(update={"detail": f"{error.detail} The last time: {how}."})
-        artifacts = await self._store(log_only=True)
-        await self._ledger.fail(error, artifacts, self._claim.name, self._settings.stall_s)
+        await self._ledger.fail(error, await self._store(log_only=True))
         return False
 
     def _killed_for_memory(self, status: int) -> bool:
@@ -209,7 +205,7 @@ class Attempt:
 
     async def _ran_out_of_memory(self) -> bool:
         """Once more with less, from the start: a checkpoint is of the sizes that were too large."""
-        tail, keep = log_tail(self._log), (self._claim.name, self._settings.stall_s)
+        tail = log_tail(self._log)
         smaller: dict[str, Any] = {}
         if self._claim.kind == "refine":
             # Until the process reports its options, assume a CPU, which takes less than a GPU.
@@ -217,11 +213,9 @@ class Attempt:
         if smaller and not self._claim.smaller and self._claim.attempt < self._settings.max_attempts:
             data = {"why": "out_of_memory", "options": smaller, "log_tail": tail}
             return await self._ledger.give_back(
-                "retried_smaller", data, counted=True, forget_checkpoint=True, smaller=smaller
+                "retried_smaller", data, forget_checkpoint=True, smaller=smaller
             )
-        await self._ledger.fail(
-            out_of_memory(self._claim.smaller, tail), await self._store(log_only=True), *keep
-        )
+        await self._ledger.fail(out_of_memory(self._claim.smaller, tail), await self._store(log_only=True))
         return False
 
     def _verdict(self) -> VerdictName | None:

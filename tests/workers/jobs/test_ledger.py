@@ -18,6 +18,7 @@ from workers.settings.errors import Unavailable
 
 pytestmark = pytest.mark.anyio
 FILE = Artifact(name="report.json", key="k", size=3, sha256="s", media_type="application/json")
+STALL_S = 60.0
 ERROR = JobError(code="timeout", detail="too long")
 
 
@@ -32,7 +33,7 @@ async def ledger(stores: Stores, database: Database) -> Ledger:
     job, _ = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"))
     claim = await claim_job(database, job.id, max_attempts=3)
     assert claim is not None
-    return Ledger(database, claim)
+    return Ledger(database, claim, STALL_S)
 
 
 async def events(stores: Stores, ledger: Ledger) -> list[str]:
@@ -114,7 +115,7 @@ async def test_what_got_through_though_its_answer_was_lost_is_written_once(
 
     monkeypatch.setattr(database, "transaction", loses_each_first_answer)
     await ledger.log(["one"])
-    assert await ledger.publish([FILE], "improved", "1-x", 60.0)
+    assert await ledger.publish([FILE], "improved")
     monkeypatch.undo()
     assert [line.text for line in await stores.jobs.log(ledger.claim.job_id)] == ["one"]
     assert (await events(stores, ledger)).count("succeeded") == 1
@@ -145,10 +146,10 @@ async def test_nothing_is_written_once_another_attempt_owns_the_job(database: Da
         ledger.reusable("coarse", "jobs/x/1", ["a"]),
         ledger.log(["one"]),
         ledger.wants_partial(),
-        ledger.publish([FILE], None, "1-x", 60.0),
-        ledger.fail(ERROR, [], "1-x", 60.0),
-        ledger.cancelled([], "1-x", 60.0),
-        ledger.give_back("requeued", {}, counted=True),
+        ledger.publish([FILE], None),
+        ledger.fail(ERROR, []),
+        ledger.cancelled([]),
+        ledger.give_back("requeued", {}),
     ):
         with pytest.raises(Fenced):
             await write
@@ -158,9 +159,9 @@ async def test_nothing_is_written_once_another_attempt_owns_the_job(database: Da
 
 async def test_a_cancellation_that_came_first_outweighs_each_other_end(stores: Stores, ledger: Ledger):
     await stores.jobs.cancel(ledger.claim.job_id)
-    assert not await ledger.publish([FILE], None, "1-x", 60.0)
+    assert not await ledger.publish([FILE], None)
     assert (await stores.jobs.get(ledger.claim.job_id)).state == "running", "the caller ends it"
-    await ledger.fail(ERROR, [], "1-x", 60.0)
+    await ledger.fail(ERROR, [])
     job = await stores.jobs.get(ledger.claim.job_id)
     assert (job.state, job.error) == ("cancelled", None)
 
@@ -169,13 +170,13 @@ async def test_a_job_given_back_starts_from_its_checkpoint_unless_that_is_forgot
     database: Database, ledger: Ledger
 ):
     await ledger.checkpoint("jobs/x/1", ["a"], 10)
-    assert await ledger.give_back("requeued", {"why": "shutdown"}, counted=False)
+    assert await ledger.give_back("requeued", {"why": "shutdown"}, uncounted=True)
     again = await claim_job(database, ledger.claim.job_id, max_attempts=3)
     assert again is not None
     assert (again.attempt, again.checkpoint) == (1, {"prefix": "jobs/x/1", "files": ["a"]})
     smaller = {"max_image_size": 100}
-    await Ledger(database, again).give_back(
-        "retried_smaller", {}, counted=True, forget_checkpoint=True, smaller=smaller
+    await Ledger(database, again, STALL_S).give_back(
+        "retried_smaller", {}, forget_checkpoint=True, smaller=smaller
     )
     last = await claim_job(database, ledger.claim.job_id, max_attempts=3)
     assert last is not None
