@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from datetime import datetime
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field
 
-from biresnerf.wire.base import Record
+from biresnerf.wire.base import Page, Record
 from biresnerf.wire.datasets import FileView, UploadView
 from biresnerf.wire.jobs import JobEvent, JobView, PriorityName
 from biresnerf.wire.results import ResultFile
@@ -59,13 +59,6 @@ class Upload(UploadView):
 
 T = TypeVar("T")
 Model = TypeVar("Model", bound=BaseModel)
-
-
-class Page(Record, Generic[T]):
-    """One page of a listing; ``next_cursor`` is opaque and none at the end."""
-
-    items: tuple[T, ...]
-    next_cursor: str | None = None
 
 
 # The end of a query for one page, newest first; its parameters come from `newest_first`.

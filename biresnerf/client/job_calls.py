@@ -111,7 +111,7 @@ class JobCalls(Transport):
 
     async def exports(self, job_id: str) -> list[JobView]:
         """All exports of the job, oldest first."""
-        return parse(await self._ask(Call("GET", f"{job_url(job_id)}/exports")), JobList).items
+        return list(parse(await self._ask(Call("GET", f"{job_url(job_id)}/exports")), JobList).items)
 
     async def log(self, job_id: str, *, after: int = 0, limit: int = _LOG_LINES) -> list[LogLine]:
         """What the job's process has written, from the line after number ``after``."""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterable, Mapping
 from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Protocol, Self, TypeVar
+from typing import Any, BinaryIO, Self, TypeVar
 
 import anyio
 import anyio.to_thread
@@ -17,6 +17,7 @@ from pydantic import BaseModel, ValidationError
 
 from biresnerf.client.errors import ServiceError
 from biresnerf.client.retries import Again, Retries, RetryPolicy
+from biresnerf.wire.base import Page
 
 _CHUNK_BYTES = 2**18
 _CONNECT_S, _WRITE_S, _ANSWER_S = 30.0, 120.0, 120.0
@@ -24,7 +25,7 @@ _PAGE_ITEMS = 200
 # The service certainly did not receive the request.
 _NOT_SENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 Model = TypeVar("Model", bound=BaseModel)
-Item = TypeVar("Item", covariant=True)
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -49,15 +50,6 @@ class Call:
     headers: Mapping[str, str] = field(default_factory=dict)
     again: Again = "always"
     answer_s: float = _ANSWER_S
-
-
-class PageOf(Protocol[Item]):
-    """One page of a listing; ``next_cursor`` is None on the last one."""
-
-    @property
-    def items(self) -> Sequence[Item]: ...
-    @property
-    def next_cursor(self) -> str | None: ...
 
 
 class _Bearer(httpx.Auth):
@@ -161,13 +153,13 @@ class Transport:
             except httpx.TransportError as error:
                 raise _unreachable(self.url, call, error) from None
 
-    async def _collect(self, call: Call, kind: type[PageOf[Item]], limit: int | None) -> list[Item]:
+    async def _collect(self, call: Call, kind: type[Page[Item]], limit: int | None) -> list[Item]:
         """The first ``limit`` items of a paged listing, or all of them."""
         found: list[Item] = []
         params = dict(call.params)
         while True:
             params["limit"] = _PAGE_ITEMS if limit is None else min(_PAGE_ITEMS, limit - len(found))
-            page: Any = parse(await self._ask(replace(call, params=params)), kind)  # type: ignore[type-var]
+            page = parse(await self._ask(replace(call, params=params)), kind)
             found += page.items
             if page.next_cursor is None or (limit is not None and len(found) >= limit):
                 return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Generic, Self, TypeVar
 
 from pydantic import ConfigDict, Field, StringConstraints
 
@@ -14,6 +14,28 @@ class Record(FrozenModel):
 
     # Responses contain every field, those with a default too, so their schemas call all fields required.
     model_config = ConfigDict(json_schema_serialization_defaults_required=True)
+
+
+T = TypeVar("T")
+
+
+class Page(Record, Generic[T]):
+    """One page of a list."""
+
+    items: tuple[T, ...]
+    next_cursor: str | None = Field(None, description="Opaque; null on the last page.")
+
+
+class Links(Record):
+    """Paths of something and of its parts."""
+
+    self: str
+
+    @classmethod
+    def below(cls, path: str, **others: str) -> Self:
+        """The links of what is at ``path``: each part below it under its own name, but for the ``others``."""
+        parts = cls.model_fields.keys() - {"self", *others}
+        return cls(self=path, **others, **{part: f"{path}/{part}" for part in parts})
 
 
 LABELS_MOST, LABEL_LENGTH = 20, 100

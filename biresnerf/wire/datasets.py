@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 from urllib.parse import quote
 
 from pydantic import ConfigDict, Field, StringConstraints
 
 from biresnerf.report import IntrinsicsSource
-from biresnerf.wire.base import Record
+from biresnerf.wire.base import Links, Page, Record
 from biresnerf.wire.problems import JobError
 
 DatasetState = Literal["open", "finalizing", "ready", "rejected", "expired"]
@@ -43,20 +43,13 @@ class CheckReport(Record):
     warnings: tuple[str, ...] = Field(examples=[[]])
 
 
-class DatasetLinks(Record):
+class DatasetLinks(Links):
     """Paths of the parts of a dataset."""
 
-    self: str
     files: str
     archive: str
     uploads: str
     finalize: str
-
-    @classmethod
-    def of(cls, dataset: dict[str, Any]) -> DatasetLinks:
-        """The links of the dataset with these fields."""
-        here = dataset_url(dataset["id"])
-        return cls(self=here, **{part: f"{here}/{part}" for part in cls.model_fields if part != "self"})
 
 
 class DatasetView(Record):
@@ -79,14 +72,11 @@ class DatasetView(Record):
         description="When its files are deleted unless it is used; null while a job uses it, or if they are kept.",
     )
     revision: int = Field(0, examples=[63])
-    links: DatasetLinks = Field(default_factory=DatasetLinks.of)
+    links: DatasetLinks = Field(default_factory=lambda fields: DatasetLinks.below(dataset_url(fields["id"])))
 
 
-class DatasetList(Record):
+class DatasetList(Page[DatasetView]):
     """A page of datasets, newest first."""
-
-    items: list[DatasetView]
-    next_cursor: str | None = None
 
 
 class NewDataset(Record):
@@ -113,11 +103,8 @@ class FileView(Record):
     created_at: datetime
 
 
-class FileList(Record):
+class FileList(Page[FileView]):
     """A page of a dataset's files, by path."""
-
-    items: list[FileView]
-    next_cursor: str | None = None
 
 
 class UploadView(Record):

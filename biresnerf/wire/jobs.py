@@ -12,7 +12,7 @@ from biresnerf.options.formats import ExportName
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.report import VerdictName
 from biresnerf.stages import ReusableStage, Stage
-from biresnerf.wire.base import Labels, Record
+from biresnerf.wire.base import Labels, Links, Page, Record
 from biresnerf.wire.datasets import dataset_url
 from biresnerf.wire.problems import JobError
 from biresnerf.wire.webhooks import JobWebhook
@@ -49,10 +49,9 @@ class JobProgress(Record):
     eta_s: float | None = Field(None, examples=[71.5])
 
 
-class JobLinks(Record):
+class JobLinks(Links):
     """Paths of the parts of a job."""
 
-    self: str
     dataset: str
     events: str
     artifacts: str
@@ -62,15 +61,6 @@ class JobLinks(Record):
     exports: str
     cancel: str
     fork: str
-
-    @classmethod
-    def of(cls, job: dict[str, Any]) -> JobLinks:
-        """The links of the job with these fields."""
-        here = job_url(job["id"])
-        parts = cls.model_fields.keys() - {"self", "dataset"}
-        return cls(
-            self=here, dataset=dataset_url(job["dataset_id"]), **{part: f"{here}/{part}" for part in parts}
-        )
 
 
 class JobView(Record):
@@ -127,7 +117,11 @@ class JobView(Record):
     )
     labels: dict[str, str] = Field({}, examples=[{"run": "a"}])
     revision: int = Field(0, examples=[17])
-    links: JobLinks = Field(default_factory=JobLinks.of)
+    links: JobLinks = Field(
+        default_factory=lambda fields: JobLinks.below(
+            job_url(fields["id"]), dataset=dataset_url(fields["dataset_id"])
+        )
+    )
 
     @property
     def final(self) -> bool:
@@ -154,11 +148,8 @@ class LogLine(Record):
     text: str
 
 
-class JobList(Record):
+class JobList(Page[JobView]):
     """A page of jobs, newest first."""
-
-    items: list[JobView]
-    next_cursor: str | None = Field(None, description="Opaque; null on the last page.")
 
 
 class JobTexts(Record):

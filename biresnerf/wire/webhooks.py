@@ -6,12 +6,12 @@ import base64
 import binascii
 import secrets
 from datetime import datetime
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 from urllib.parse import quote
 
 from pydantic import AfterValidator, ConfigDict, Field, StringConstraints
 
-from biresnerf.wire.base import Record
+from biresnerf.wire.base import Links, Page, Record
 
 WebhookEvent = Literal[
     "job.queued", "job.started", "job.succeeded", "job.failed", "job.cancelled", "dataset.validated"
@@ -49,19 +49,12 @@ def _is_secret(text: str) -> str:
 Secret = Annotated[str, AfterValidator(_is_secret)]
 
 
-class WebhookLinks(Record):
+class WebhookLinks(Links):
     """Paths of the parts of a webhook."""
 
-    self: str
     deliveries: str
     test: str
     rotate: str
-
-    @classmethod
-    def of(cls, webhook: dict[str, Any]) -> WebhookLinks:
-        """The links of the webhook with these fields."""
-        here = webhook_url(webhook["id"])
-        return cls(self=here, deliveries=f"{here}/deliveries", test=f"{here}/test", rotate=f"{here}/secret")
 
 
 class WebhookView(Record):
@@ -82,7 +75,11 @@ class WebhookView(Record):
         None, description="Until then messages are also signed with the previous secret."
     )
     created_at: datetime
-    links: WebhookLinks = Field(default_factory=WebhookLinks.of)
+    links: WebhookLinks = Field(
+        default_factory=lambda fields: WebhookLinks.below(
+            webhook_url(fields["id"]), rotate=f"{webhook_url(fields['id'])}/secret"
+        )
+    )
 
 
 class WebhookAttempt(Record):
@@ -95,17 +92,10 @@ class WebhookAttempt(Record):
     error: str | None = None
 
 
-class DeliveryLinks(Record):
+class DeliveryLinks(Links):
     """Paths of the parts of a delivery."""
 
-    self: str
     redeliver: str
-
-    @classmethod
-    def of(cls, delivery: dict[str, Any]) -> DeliveryLinks:
-        """The links of the delivery with these fields."""
-        here = delivery_path(delivery["webhook_id"], delivery["id"])
-        return cls(self=here, redeliver=f"{here}/redeliver")
 
 
 class DeliveryView(Record):
@@ -123,7 +113,9 @@ class DeliveryView(Record):
         description="The message, byte for byte.",
     )
     attempts: tuple[WebhookAttempt, ...] = ()
-    links: DeliveryLinks = Field(default_factory=DeliveryLinks.of)
+    links: DeliveryLinks = Field(
+        default_factory=lambda fields: DeliveryLinks.below(delivery_path(fields["webhook_id"], fields["id"]))
+    )
 
 
 class JobWebhook(Record):
@@ -175,18 +167,12 @@ class WebhookWithSecret(WebhookView):
     secret: str = Field(examples=["whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSwMfKQ9r8GKYo="])
 
 
-class WebhookList(Record):
+class WebhookList(Page[WebhookView]):
     """A page of webhooks, newest first."""
 
-    items: list[WebhookView]
-    next_cursor: str | None = Field(None, description="Opaque; null on the last page.")
 
-
-class DeliveryList(Record):
+class DeliveryList(Page[DeliveryView]):
     """A page of deliveries, newest first."""
-
-    items: list[DeliveryView]
-    next_cursor: str | None = None
 
 
 def webhook_url(webhook_id: str) -> str:

@@ -15,12 +15,12 @@ from fastapi import Depends, Header, Query, Request, Response
 from fastapi import Path as PathParameter
 from pydantic import AfterValidator, BaseModel
 
+from biresnerf.wire.base import Page
 from service.http.metrics import WebMetrics
 from service.http.problems import ProblemError
 from workers.engine import Stores
 from workers.process.disk_space import DiskBudget, upload_disk_budget
 from workers.process.turns import Turns
-from workers.records import Page
 from workers.settings.settings import Settings
 
 # Archives that one process unpacks at a time; each takes a core and memory.

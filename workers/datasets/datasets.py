@@ -10,6 +10,7 @@ from typing import Any
 from psycopg.types.json import Jsonb
 
 from biresnerf.errors import InputError
+from biresnerf.wire.base import Page
 from biresnerf.wire.datasets import DatasetState, DatasetView, ManifestEntry
 from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import cursor_place, new_id
@@ -27,7 +28,7 @@ from workers.datasets.dataset_rows import (
 from workers.jobs.job_rows import jobs_of_dataset
 from workers.jobs.quotas import require_byte_quota
 from workers.process.waiting import retry_while_unavailable
-from workers.records import NEWEST_FIRST, DatasetFile, Page, newest_first, page_of, record_from_row
+from workers.records import NEWEST_FIRST, DatasetFile, newest_first, page_of, record_from_row
 from workers.settings.errors import Conflict, Expired, LimitReached, NotFound
 from workers.settings.settings import Settings
 from workers.store.files import FileStore, StoredFile

@@ -9,6 +9,7 @@ from psycopg.types.json import Jsonb
 
 from biresnerf.options.formats import ExportName
 from biresnerf.stages import ReusableStage
+from biresnerf.wire.base import Page
 from biresnerf.wire.jobs import JobView, WantedStage
 from workers.database.database import Connection
 from workers.database.ids import new_id
@@ -17,7 +18,7 @@ from workers.jobs.job_rows import JOB, asked_columns, fingerprint_of, job_from_r
 from workers.jobs.job_states import insert_job, queue_job
 from workers.jobs.jobs import JobStore
 from workers.jobs.quotas import require_room, submitting_for
-from workers.records import PRIORITIES, Page
+from workers.records import PRIORITIES
 from workers.settings.errors import Conflict, Expired
 from workers.store.files import FileStore
 from workers.store.trash import discard, rescue

@@ -11,6 +11,7 @@ from typing import Any
 from psycopg.types.json import Jsonb
 
 from biresnerf.options.refine_options import RefineOptions
+from biresnerf.wire.base import Page
 from biresnerf.wire.jobs import JobEvent, JobState, JobView, LogLine, PriorityName
 from biresnerf.wire.webhooks import JobWebhook
 from workers.database.database import Connection, Database, OwnedStore
@@ -34,7 +35,6 @@ from workers.records import (
     PRIORITIES,
     Artifact,
     JobUpdate,
-    Page,
     newest_first,
     page_of,
 )

@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from biresnerf.wire.base import Page
 from biresnerf.wire.webhooks import DeliveryView, JobWebhook, WebhookEvent, WebhookView, new_secret
 from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import new_id
-from workers.records import NEWEST_FIRST, Page, newest_first, page_of, record_from_row
+from workers.records import NEWEST_FIRST, newest_first, page_of, record_from_row
 from workers.settings.errors import Conflict, LimitReached
 from workers.settings.settings import Settings
 from workers.webhooks.outbound import Policy, checked_url
