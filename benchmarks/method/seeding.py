@@ -21,13 +21,13 @@ import numpy as np
 from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.guessed_lens import guess_lens
 from biresnerf.data.photos.image_files import read_header
 from biresnerf.data.photos.images import load_images
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.seeding.seed_poses import seed_poses
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.photos.images import ImageSet
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene_frame import scene_frame

@@ -86,7 +86,7 @@ def finished(stages: TwoStages) -> bool:
 
 def photos_set(photos: list[np.ndarray]) -> ImageSet:
     """An `ImageSet` of these uint8 [h, w, 3] arrays; cameras do not matter."""
-    from biresnerf.data.model.camera import Camera
+    from biresnerf.geometry.camera.camera_models import Camera
 
     heights, widths = [p.shape[0] for p in photos], [p.shape[1] for p in photos]
     return ImageSet(

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset, Frame, IntrinsicsSource, SourceFormat
 from biresnerf.data.model.pose_validation import refuse_coinciding
 from biresnerf.data.model.safe_names import refuse_outside
@@ -29,6 +28,7 @@ from biresnerf.data.photos.orientation import (
     turned_header,
 )
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera
 
 _IMAGES = "images/"
 

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid import rigid_inverse
 
 SensorType = Literal["CAMERA", "IMU"]

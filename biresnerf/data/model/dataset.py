@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import ColmapModel
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.report import IntrinsicsSource, PoseSource
 
 # Guesses from other images: worth trying, not worth believing.

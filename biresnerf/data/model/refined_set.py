@@ -10,10 +10,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import ColmapModel, no_points
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.result_model import model_at_poses, model_of_poses, with_points
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity
 

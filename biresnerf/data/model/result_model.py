@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
     NO_POINT,
     ColmapFrame,
@@ -23,6 +22,7 @@ from biresnerf.data.model.colmap_scene import (
     no_points,
     rigid_pose_of,
 )
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid import rigid_inverse
 
 

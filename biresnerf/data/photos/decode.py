@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Frame
 from biresnerf.data.photos.image_files import DAMAGED, header_of, open_image
 from biresnerf.data.photos.orientation import INVERSE, turned, turned_size
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera
 
 T = TypeVar("T", bound=np.generic)
 _ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})

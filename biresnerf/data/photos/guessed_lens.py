@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import IntrinsicsSource
 from biresnerf.data.photos.image_files import ImageHeader
+from biresnerf.geometry.camera.camera_models import Camera
 
 GUESSED_FOCAL = 1.2  # of the long side, as COLMAP guesses: a field of view of 45 degrees, a normal lens
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)

@@ -11,12 +11,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_files import quiet_pillow
 from biresnerf.data.photos.masks import load_mask, shrink_mask
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import Background
 
 T = TypeVar("T", bound=np.generic)

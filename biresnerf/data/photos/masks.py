@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.photos.decode import as_stored
 from biresnerf.data.photos.image_files import DAMAGED, header_of, open_image, quiet_pillow, read_header
 from biresnerf.data.photos.orientation import same_shape, turned, turned_size
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera
 
 # JPEG and lossy WebP keep no exact black; what they store lies on the nearer side of the middle.
 _LOSSY, _LOSSY_BLACK_BELOW = frozenset({"JPEG", "MPO", "WEBP"}), 128

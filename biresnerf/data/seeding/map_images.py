@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.image_order import natural_order, pose_distances
 from biresnerf.data.photos.decode import decode
@@ -22,6 +21,7 @@ from biresnerf.data.points.tracks import KEPT, keep_tracks
 from biresnerf.data.seeding.colmap_child import DATABASE
 from biresnerf.data.seeding.colmap_process import run_colmap
 from biresnerf.data.seeding.seeding_progress import OnSeeding, SeedingWatch
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.focus import focus_point
 from biresnerf.options.refine_options import SeedingEffort
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from biresnerf.geometry.camera.camera_models import full_parameters
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.camera.distortion import (
     Coefficients,
     coefficients_of,
@@ -28,19 +28,6 @@ from biresnerf.geometry.camera.lens import lens_reach
 ABOVE, BELOW, TANGENTIAL = slice(0, 4), slice(4, 7), slice(7, 9)
 # Radians from the axis: closer to it, series replace quotients with a gradient of 0 / 0.
 _NEAR_AXIS = 1e-8
-
-
-class CameraDescription(Protocol):
-    """What `Intrinsics.from_cameras` asks of a camera: COLMAP's model and parameters, size in px."""
-
-    @property
-    def model(self) -> str: ...
-    @property
-    def width(self) -> int: ...
-    @property
-    def height(self) -> int: ...
-    @property
-    def params(self) -> tuple[float, ...]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +58,13 @@ class Intrinsics:
     some_fisheye: bool
 
     @staticmethod
-    def from_cameras(cameras: Sequence[CameraDescription]) -> Intrinsics:
+    def from_cameras(cameras: Sequence[Camera]) -> Intrinsics:
         """The intrinsics of images whose cameras are given one by one, at the size they are used at.
 
         Raises:
             ValueError: a model is not supported or has the wrong number of parameters.
         """
-        full = [full_parameters(camera.model, camera.params) for camera in cameras]
+        full = [camera.full() for camera in cameras]
         coefficients = [coefficients_of(f) for f in full]
         count = len(full)
         table = torch.tensor([f[:4] for f in full], dtype=torch.float64).reshape(count, 4)

@@ -9,6 +9,7 @@ Lengths are in pixels; the centre of the first pixel lies at (0.5, 0.5).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 # All models of COLMAP 4.2 by their ids (src/colmap/sensor/models.h).
@@ -103,3 +104,31 @@ def _holds(model: str, full: FullParameters) -> bool:
     if (model in FISHEYE_MODELS) != full.fisheye or ("f" in names and full.fx != full.fy):
         return False
     return all(name in names for name in COEFFICIENTS if getattr(full, name) != 0.0)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics: COLMAP model name, image size (px) and parameters in COLMAP's order.
+
+    Pixels; the centre of the first pixel lies at (0.5, 0.5).
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def full(self) -> FullParameters:
+        """These intrinsics with all coefficients written out, and whether they are a fisheye's."""
+        return full_parameters(self.model, self.params)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the same picture resampled to ``width`` x ``height`` px.
+
+        The true ratios are used, so a model with one focal length may have to become one with two.
+        """
+        a, b = width / self.width, height / self.height
+        p = self.full()
+        scaled = p._replace(fx=p.fx * a, fy=p.fy * b, cx=p.cx * a, cy=p.cy * b)
+        model, params = smallest_model(scaled, self.model)
+        return Camera(model, width, height, params)

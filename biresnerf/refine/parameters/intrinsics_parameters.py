@@ -9,12 +9,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset, IntrinsicsSource
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.field.adam_state import adam_state, load_adam_state
 from biresnerf.geometry.camera.camera import Intrinsics
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, FullParameters
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera, FullParameters
 from biresnerf.options.refine_options import RefineIntrinsics
 from biresnerf.refine.parameters.pose_parameters import dolly_directions
 

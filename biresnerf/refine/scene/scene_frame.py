@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.scene.shared_views import nearest_shared

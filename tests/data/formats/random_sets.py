@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
     ColmapFrame,
     ColmapImage,
@@ -20,7 +19,7 @@ from biresnerf.data.model.colmap_scene import (
 )
 from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
 from biresnerf.data.model.result_model import model_of_poses, with_points
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity
 

@@ -14,10 +14,9 @@ from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.result_formats import formats_given_back, write_result_formats
 from biresnerf.data.formats.simple.llff import LLFF, parse_llff
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes, write_transforms
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.refined_set import refined_set
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
 from biresnerf.geometry.perturb import perturb_poses
 from tests.data.formats.random_sets import random_camera, random_model, random_poses
 from tests.data.formats.readers import ours, seen_points, through_json_frame

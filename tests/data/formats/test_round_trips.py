@@ -18,11 +18,10 @@ from biresnerf.data.formats.simple.bundler import bundler_problem, write_bundler
 from biresnerf.data.formats.simple.trajectory import write_kitti, write_tum
 from biresnerf.data.formats.transforms.instant_ngp import write_transforms_ngp
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.refined_set import refined_set
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
 from tests.data.formats.random_sets import HEIGHT, WIDTH, random_camera, random_poses
 from tests.data.scenes import write_image
 

@@ -13,11 +13,11 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.photos.images import load_images
 from biresnerf.data.photos.masks import load_mask, refuse_unfit_mask, shrink_mask, write_masks
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera
 from tests.data.scenes import HEIGHT, WIDTH, assert_complete, nerfstudio_scene, save, textured_arc
 
 CAMERA = Camera("SIMPLE_PINHOLE", WIDTH, HEIGHT, (20.0, WIDTH / 2, HEIGHT / 2))

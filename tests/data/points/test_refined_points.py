@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import NO_POINT, ColmapModel, ColmapPoints, no_points
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.refined_set import refined_set
@@ -22,7 +21,7 @@ from biresnerf.data.points.refined_points import (
     with_points_of,
 )
 from biresnerf.data.points.tracks import Tracks
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points, rays_of_pixels
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.image_order import pose_distances
 from biresnerf.data.seeding import cached_mapping as remembered_mapping
@@ -20,6 +19,7 @@ from biresnerf.data.seeding.match_poses import carry_model
 from biresnerf.data.seeding.seed_poses import Seeding, seed_poses
 from biresnerf.data.synthetic.scene import synthetic_focal
 from biresnerf.errors import Interrupted, RefinementError
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import rotation_angle_deg, rotation_between_deg
 from biresnerf.geometry.similarity import Similarity, align_by_spread

@@ -14,12 +14,12 @@ from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding import colmap_process
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.data.synthetic.scene import synthetic_focal
 from biresnerf.errors import InputError, Interrupted, RefinementError
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error, rotation_between_deg
 from tests.data.scenes import arc_poses, assert_complete, plain_features, textured_arc, write_image

@@ -7,9 +7,9 @@ import torch
 
 pytest.importorskip("triton", reason="the CUDA backend's kernels need Triton, which exists for Linux only")
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.field.cuda.lens import directions_in_cam
 from biresnerf.geometry.camera import camera
+from biresnerf.geometry.camera.camera_models import Camera
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 

@@ -15,7 +15,6 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.geometry.camera.camera import (
     Intrinsics,
     directions_in_cam,
@@ -27,6 +26,7 @@ from biresnerf.geometry.camera.camera_models import (
     FISHEYE_MODELS,
     MODEL_IDS,
     MODEL_PARAMETERS,
+    Camera,
     full_parameters,
 )
 from biresnerf.geometry.camera.lens import lens_problem

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.synthetic.scene import synthetic_cameras, synthetic_focal
 from biresnerf.field.radiance_field import Rendering
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refine.lost.pose_certainty import unsure_deg
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.parameters.rigid_bodies import RigidBodies

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.field.radiance_field import PositionGradient
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refine.views.evaluation import render_view
 from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.synthetic.scene import synthetic_cameras
 from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.refine.parameters.camp_preconditioner import (
     camp_preconditioner,

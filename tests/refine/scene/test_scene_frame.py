@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.points.tracks import Tracks
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.scene.scene_depth import matched_depth
 from biresnerf.refine.scene.scene_frame import scene_frame

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.synthetic.scene import synthetic_cameras
 from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refine.scene.scene_frame import scene_frame
 from biresnerf.refine.scene.shared_views import FARTHEST, NEAREST, SPACING, nearest_shared, shared_shares
 from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set

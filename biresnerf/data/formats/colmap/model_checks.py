@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
     NO_POINT,
     SENSOR_TYPES,
@@ -23,7 +22,7 @@ from biresnerf.data.model.colmap_scene import (
 )
 from biresnerf.data.model.pose_validation import MAX_COORDINATE
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import COLMAP_MODELS, MODEL_IDS, MODEL_PARAMETERS
+from biresnerf.geometry.camera.camera_models import COLMAP_MODELS, MODEL_IDS, MODEL_PARAMETERS, Camera
 from biresnerf.geometry.camera.lens import lens_problem
 
 MAX_SIDE_PX = 10**6

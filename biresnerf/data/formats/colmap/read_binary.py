@@ -23,7 +23,6 @@ from biresnerf.data.formats.colmap.model_checks import (
     rigid_pose,
     sensor_type,
 )
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
     ColmapFrame,
     ColmapImage,
@@ -32,7 +31,7 @@ from biresnerf.data.model.colmap_scene import (
     RigidPose,
     Sensor,
 )
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
 
 Row = TypeVar("Row")
 _U64, _U32, _U8 = struct.Struct("<Q"), struct.Struct("<I"), struct.Struct("<B")

@@ -15,7 +15,6 @@ import numpy as np
 from biresnerf.data.formats.colmap import read_binary as colmap_binary
 from biresnerf.data.formats.colmap import read_text as colmap_text
 from biresnerf.data.formats.colmap.model_checks import broken, check_images, check_rigs, check_tracks
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
     NO_POINT,
     ColmapFrame,
@@ -30,6 +29,7 @@ from biresnerf.data.model.colmap_scene import (
     rigid_pose_of,
 )
 from biresnerf.data.model.text_file import read_bytes, read_text
+from biresnerf.geometry.camera.camera_models import Camera
 
 MAX_TABLE_BYTES = 2 * 2**30
 _SUFFIXES: dict[ModelForm, str] = {"binary": ".bin", "text": ".txt"}

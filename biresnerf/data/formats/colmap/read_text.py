@@ -23,7 +23,6 @@ from biresnerf.data.formats.colmap.model_checks import (
     sensor_type,
     supported_model,
 )
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import (
     SENSOR_TYPES,
     ColmapFrame,
@@ -34,6 +33,7 @@ from biresnerf.data.model.colmap_scene import (
     Sensor,
     no_points,
 )
+from biresnerf.geometry.camera.camera_models import Camera
 
 T = TypeVar("T")
 _MAX_ID = 2**63 - 1

@@ -17,13 +17,13 @@ from biresnerf.data.formats.bind_images import FrameCamera, ParsedPoses, PoseEnt
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
 from biresnerf.data.model.atomic_file import write_text
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.text_file import finite_numbers, invalid_file, read_text
 from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.options.formats import Format
 

@@ -13,12 +13,12 @@ from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, in_order
 from biresnerf.data.formats.codec import Codec, WriteContext
 from biresnerf.data.formats.simple.bundler import bundler_problem, refuse_lenses
 from biresnerf.data.model.atomic_file import whole_file
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.text_file import read_bytes
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.formats import Format
 
 LLFF = Format(

@@ -22,7 +22,6 @@ from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.simple.bundler import write_bundler
 from biresnerf.data.model.atomic_file import whole_file, write_json
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.colmap_scene import ColmapImage
 from biresnerf.data.model.dataset import Frame
 from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
@@ -30,6 +29,7 @@ from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_files import quiet_pillow
 from biresnerf.data.show.renders import picture_stems
 from biresnerf.errors import InputError, Interrupted
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points, rays_of_pixels
 from biresnerf.options.formats import Format
 

@@ -14,11 +14,10 @@ import numpy as np
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.transforms.read_transforms import bind_transforms, parse_transforms
 from biresnerf.data.model.atomic_file import write_json
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import COEFFICIENTS
+from biresnerf.geometry.camera.camera_models import COEFFICIENTS, Camera
 from biresnerf.geometry.focus import focus_point
 from biresnerf.options.formats import Format
 

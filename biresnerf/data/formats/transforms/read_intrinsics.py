@@ -7,7 +7,6 @@ from typing import Any
 
 from biresnerf.data.formats.bind_images import FrameCamera
 from biresnerf.data.formats.transforms.write_intrinsics import FOCAL_KEYS
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
 from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.data.photos.orientation import same_shape
@@ -16,6 +15,7 @@ from biresnerf.geometry.camera.camera_models import (
     COEFFICIENTS,
     FISHEYE_MODELS,
     MODEL_IDS,
+    Camera,
     FullParameters,
     smallest_model,
 )

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from biresnerf.data.model.camera import Camera
-from biresnerf.geometry.camera.camera_models import COEFFICIENTS
+from biresnerf.geometry.camera.camera_models import COEFFICIENTS, Camera
 
 FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 

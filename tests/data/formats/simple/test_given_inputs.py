@@ -7,9 +7,9 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.refined_set import refined_set
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera
 from tests.data.formats.simple import trajectories
 from tests.data.formats.simple.trajectories import GIVEN_CAMERA, NAMES, assert_at_truth, truth
 from tests.data.scenes import HEIGHT, WIDTH, write_image

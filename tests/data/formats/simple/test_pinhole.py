@@ -15,9 +15,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.simple.pinhole import pinhole_camera, undistorted, write_pinhole
-from biresnerf.data.model.camera import Camera
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points
 from tests.data.formats.random_sets import random_camera, random_result
 from tests.data.formats.readers import bundler_cameras, ours, seen_points, through_bundler

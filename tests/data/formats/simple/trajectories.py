@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.geometry.camera.camera_models import Camera
 from tests.data.formats.colmap.colmap_files import write_tables
 from tests.data.scenes import HEIGHT, WIDTH, opengl_poses, write_image
 

@@ -13,8 +13,8 @@ from PIL import Image
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.refined_set import refined_set
+from biresnerf.geometry.camera.camera_models import Camera
 from tests.data.scenes import (
     HEIGHT,
     WIDTH,

@@ -15,9 +15,8 @@ from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
 from biresnerf.data.model.atomic_file import whole_file
-from biresnerf.data.model.camera import Camera
 from biresnerf.data.model.refined_set import refined_set
-from biresnerf.geometry.camera.camera_models import smallest_model
+from biresnerf.geometry.camera.camera_models import Camera, smallest_model
 from biresnerf.geometry.perturb import perturb_poses
 from tests.data.scenes import blender_scene, nerfstudio_scene, opengl_poses, save, write_image
 
