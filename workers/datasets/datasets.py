@@ -69,8 +69,7 @@ class DatasetStore(OwnedStore):
 
     async def get(self, dataset_id: str) -> DatasetView:
         """The dataset; raises `NotFound`."""
-        async with self._database.transaction() as connection:
-            return await self._required(connection, dataset_id)
+        return await self._database.run(self._required, dataset_id)
 
     async def list(
         self, *, state: DatasetState | None = None, limit: int = 50, cursor: str | None = None

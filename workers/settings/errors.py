@@ -17,7 +17,7 @@ class NotFound(EngineError):
 
 
 class Expired(EngineError):
-    """Its retention time is over and its files were deleted."""
+    """The files were deleted after their retention time."""
 
     def __init__(self, detail: str) -> None:
         super().__init__("expired", detail)
