@@ -261,10 +261,10 @@ def match_files(
     notes = []
     for rule, key in (
         ("by the same name in another Unicode form", lambda name: unicodedata.normalize("NFC", name)),
-        ("by path without extension", lambda name: posixpath.splitext(name)[0]),
         ("by file name alone", posixpath.basename),
         ("by file name, whatever its case", lambda name: posixpath.basename(name).casefold()),
         ("by file name without extension", lambda name: PurePosixPath(name).stem.casefold()),
+        ("by path without extension", lambda name: posixpath.splitext(name)[0]),
     ):
         open_names = _unique([name for name in names if name not in found], key)
         open_files = _unique([file for file in files if file not in found.values()], key)

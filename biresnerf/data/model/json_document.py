@@ -94,6 +94,11 @@ def read_model(model: type[Model], path: Path, *, code: str, hint: str) -> Model
     try:
         return model.model_validate(read_json_object(path))
     except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
-        raise InputError(code, f"{first['msg']}.", where=f"{path.name} {field}", hint=hint) from None
+        raise first_problem(error, path, code=code, hint=hint) from None
+
+
+def first_problem(error: ValidationError, path: Path, *, code: str, hint: str) -> InputError:
+    """The error for the first wrong field of the JSON file ``path``."""
+    first = error.errors()[0]
+    field = ".".join(str(part) for part in first["loc"])
+    return InputError(code, f"{first['msg']}.", where=f"{path.name} {field}".rstrip(), hint=hint)

@@ -9,19 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.colmap_scene import (
-    NO_POINT,
-    ColmapFrame,
-    ColmapImage,
-    ColmapModel,
-    ColmapPoints,
-    ColmapRig,
-    RigidPose,
-    Sensor,
-    matrix_of_pose,
-    no_points,
-    rigid_pose_of,
-)
+from biresnerf.data.model import colmap_scene as colmap
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid import rigid_inverse
 
@@ -31,26 +19,28 @@ def model_of_poses(
     cameras: Sequence[Camera],
     camera_indices: Sequence[int],
     world_from_cam: NDArray[np.float64],
-) -> ColmapModel:
+) -> colmap.ColmapModel:
     """A model without points or rigs; ids are positions counted from 1."""
     cam_from_world = rigid_inverse(world_from_cam)
     images = {
-        number: _unseeing(number, name, camera + 1, rigid_pose_of(pose))
+        number: _unseeing(number, name, camera + 1, colmap.rigid_pose_of(pose))
         for number, (name, camera, pose) in enumerate(
             zip(names, camera_indices, cam_from_world, strict=True), start=1
         )
     }
-    return ColmapModel(Path(), "binary", dict(enumerate(cameras, start=1)), images, no_points(), {}, {})
+    return colmap.ColmapModel(
+        Path(), "binary", dict(enumerate(cameras, start=1)), images, colmap.no_points(), {}, {}
+    )
 
 
 def model_at_poses(
-    given: ColmapModel,
+    given: colmap.ColmapModel,
     names: Sequence[str],
     cameras: Sequence[Camera],
     camera_indices: Sequence[int],
     world_from_cam: NDArray[np.float64],
     changed: NDArray[np.bool_],
-) -> ColmapModel:
+) -> colmap.ColmapModel:
     """The caller's model with refined poses and lenses; all ids, names, features and points as given.
 
     Images that did not change (``changed`` [n] false) keep their numbers to the bit. Images that the model did not
@@ -72,7 +62,7 @@ def model_at_poses(
             number = by_name[name].camera_id
             lenses[number], lens_ids[index] = cameras[index], number
     for row, (name, index) in enumerate(zip(names, camera_indices, strict=True)):
-        pose = rigid_pose_of(cam_from_world[row])
+        pose = colmap.rigid_pose_of(cam_from_world[row])
         image = by_name.get(name)
         if image is None:
             if index not in lens_ids:
@@ -89,13 +79,13 @@ def model_at_poses(
     return replace(given, cameras=lenses, images=images, rigs=rigs, frames=frames)
 
 
-def _unseeing(number: int, name: str, camera_id: int, pose: RigidPose) -> ColmapImage:
-    return ColmapImage(number, name, camera_id, pose, np.zeros((0, 2)), np.zeros(0, np.int64))
+def _unseeing(number: int, name: str, camera_id: int, pose: colmap.RigidPose) -> colmap.ColmapImage:
+    return colmap.ColmapImage(number, name, camera_id, pose, np.zeros((0, 2)), np.zeros(0, np.int64))
 
 
 def _rigs_and_frames(
-    given: ColmapModel, images: dict[int, ColmapImage], moved: set[int]
-) -> tuple[dict[int, ColmapRig], dict[int, ColmapFrame]]:
+    given: colmap.ColmapModel, images: dict[int, colmap.ColmapImage], moved: set[int]
+) -> tuple[dict[int, colmap.ColmapRig], dict[int, colmap.ColmapFrame]]:
     """The given frames at their images' new poses, and one more for each image that had none."""
     if not given.rigs:
         return {}, {}
@@ -111,24 +101,24 @@ def _rigs_and_frames(
     for image in images.values():
         if image.id in placed:
             continue
-        sensor: Sensor = ("CAMERA", image.camera_id)
+        sensor: colmap.Sensor = ("CAMERA", image.camera_id)
         rig = next(
             (rig for rig in rigs.values() if sensor == rig.reference or sensor in rig.sensor_from_rig), None
         )
         if rig is None:
-            rig = ColmapRig(max(rigs) + 1, sensor, {})
+            rig = colmap.ColmapRig(max(rigs) + 1, sensor, {})
             rigs[rig.id] = rig
         new_pose = _rig_from_world(rig, [(sensor, image.id)], images)
         if new_pose is None:  # a sensor of unknown pose in its rig: COLMAP cannot represent this
             continue
         number = max(frames, default=0) + 1
-        frames[number] = ColmapFrame(number, rig.id, new_pose, ((sensor, image.id),))
+        frames[number] = colmap.ColmapFrame(number, rig.id, new_pose, ((sensor, image.id),))
     return rigs, frames
 
 
 def _rig_from_world(
-    rig: ColmapRig, taken: Sequence[tuple[Sensor, int]], images: dict[int, ColmapImage]
-) -> RigidPose | None:
+    rig: colmap.ColmapRig, taken: Sequence[tuple[colmap.Sensor, int]], images: dict[int, colmap.ColmapImage]
+) -> colmap.RigidPose | None:
     """The rig's pose by what its reference took, else by the first sensor whose place in the rig is known."""
     for sensor, image in taken:
         if sensor == rig.reference:
@@ -136,14 +126,14 @@ def _rig_from_world(
     for sensor, image in taken:
         sensor_from_rig = rig.sensor_from_rig.get(sensor)
         if sensor_from_rig is not None:
-            rig_from_sensor = rigid_inverse(matrix_of_pose(sensor_from_rig))
-            return rigid_pose_of(rig_from_sensor @ matrix_of_pose(images[image].cam_from_world))
+            rig_from_sensor = rigid_inverse(colmap.matrix_of_pose(sensor_from_rig))
+            return colmap.rigid_pose_of(rig_from_sensor @ colmap.matrix_of_pose(images[image].cam_from_world))
     return None
 
 
-def with_points(model: ColmapModel, points: ColmapPoints) -> ColmapModel:
+def with_points(model: colmap.ColmapModel, points: colmap.ColmapPoints) -> colmap.ColmapModel:
     """The model with other points: features stay, and say which of these points they see."""
-    ids = {number: np.full(len(image.point3d_ids), NO_POINT) for number, image in model.images.items()}
+    ids = {number: np.full(len(image.point3d_ids), colmap.NO_POINT) for number, image in model.images.items()}
     owners = np.repeat(points.ids, np.diff(points.track_starts))
     for owner, image, feature in zip(
         owners.tolist(), points.track_image_ids.tolist(), points.track_point2d_indices.tolist(), strict=True

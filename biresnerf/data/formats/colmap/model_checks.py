@@ -9,17 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.colmap_scene import (
-    NO_POINT,
-    SENSOR_TYPES,
-    ColmapFrame,
-    ColmapImage,
-    ColmapPoints,
-    ColmapRig,
-    RigidPose,
-    Sensor,
-    SensorType,
-)
+from biresnerf.data.model import colmap_scene as colmap
 from biresnerf.data.model.pose_validation import MAX_COORDINATE
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import COLMAP_MODELS, MODEL_IDS, MODEL_PARAMETERS, Camera
@@ -42,20 +32,22 @@ def refuse_repeated(table: dict[int, Any], number: int, what: str) -> None:
         raise broken(f"{what} {number}", "two rows have this id")
 
 
-def sensor_type(kind: int, where: str) -> SensorType:
+def sensor_type(kind: int, where: str) -> colmap.SensorType:
     """The sensor's type by COLMAP's number."""
-    if not 0 <= kind < len(SENSOR_TYPES):
+    if not 0 <= kind < len(colmap.SENSOR_TYPES):
         raise broken(where, f"{kind} is no type of sensor")
-    return SENSOR_TYPES[kind]
+    return colmap.SENSOR_TYPES[kind]
 
 
-def rig_of_sensors(number: int, sensors: Sequence[tuple[Sensor, RigidPose | None]], where: str) -> ColmapRig:
+def rig_of_sensors(
+    number: int, sensors: Sequence[tuple[colmap.Sensor, colmap.RigidPose | None]], where: str
+) -> colmap.ColmapRig:
     """The rig of these sensors with ``sensor_from_rig``; the first is the reference. Each may be listed once."""
     names = [sensor for sensor, _ in sensors]
     for index, (kind, sensor_id) in enumerate(names):
         if (kind, sensor_id) in names[:index]:
             raise broken(where, f"the sensor {kind} {sensor_id} is listed twice")
-    return ColmapRig(number, names[0] if names else None, dict(sensors[1:]))
+    return colmap.ColmapRig(number, names[0] if names else None, dict(sensors[1:]))
 
 
 def model_name_of_id(model_id: int, where: str) -> str:
@@ -122,14 +114,14 @@ def image_name(raw: bytes | str, where: str) -> str:
     return name
 
 
-def rigid_pose(numbers: Sequence[float], where: str) -> RigidPose:
+def rigid_pose(numbers: Sequence[float], where: str, hint: str = _HINT) -> colmap.RigidPose:
     """The pose of a quaternion (w, x, y, z) and a translation. Raises InputError unless it is rigid and finite."""
     values = np.array(numbers, dtype=np.float64)
     if not np.isfinite(values).all():
         raise broken(where, "NaN or an infinite number in the pose", "pose_not_finite", "Remove the image.")
     length = float(np.linalg.norm(np.clip(values[:4], -9.0, 9.0)))  # a square overflows
     if abs(length - 1.0) > QUAT_LENGTH_ERROR:
-        raise broken(where, f"the quaternion has length {length:.3g}, not 1", "pose_not_rotation")
+        raise broken(where, f"the quaternion has length {length:.3g}, not 1", "pose_not_rotation", hint)
     if np.abs(values[4:]).max() > MAX_COORDINATE:
         raise broken(
             where,
@@ -137,7 +129,7 @@ def rigid_pose(numbers: Sequence[float], where: str) -> RigidPose:
             "pose_out_of_range",
             "Move the scene's origin near the scene.",
         )
-    return RigidPose(values[:4], values[4:])
+    return colmap.RigidPose(values[:4], values[4:])
 
 
 def points_of_records(
@@ -148,17 +140,17 @@ def points_of_records(
     lengths: NDArray[np.int64],
     elements: NDArray[np.int64],
     file: str,
-) -> ColmapPoints:
+) -> colmap.ColmapPoints:
     """The points of parsed columns; ``elements`` [k, 2] has image ids and features of all tracks in a row."""
     if len(np.unique(ids)) != len(ids) or (ids < 0).any():
         raise broken(file, "two points have the same id, or an id is out of range")
     if not (np.isfinite(xyz).all() and np.isfinite(errors).all()):
         raise broken(file, "a point's position or error is no finite number", "pose_not_finite")
     starts = np.concatenate([np.zeros(1, np.int64), np.cumsum(lengths)])
-    return ColmapPoints(ids, xyz, rgb, errors, starts, elements[:, 0].copy(), elements[:, 1].copy())
+    return colmap.ColmapPoints(ids, xyz, rgb, errors, starts, elements[:, 0].copy(), elements[:, 1].copy())
 
 
-def check_images(images: dict[int, ColmapImage], cameras: dict[int, Camera], file: str) -> None:
+def check_images(images: dict[int, colmap.ColmapImage], cameras: dict[int, Camera], file: str) -> None:
     """Raises InputError for images without camera and names that stand twice."""
     names: dict[str, int] = {}
     for image in images.values():
@@ -172,13 +164,13 @@ def check_images(images: dict[int, ColmapImage], cameras: dict[int, Camera], fil
             )
 
 
-def check_tracks(images: dict[int, ColmapImage], points: ColmapPoints, file: str) -> None:
+def check_tracks(images: dict[int, colmap.ColmapImage], points: colmap.ColmapPoints, file: str) -> None:
     """Raises InputError where an image's features and the points' tracks do not say the same."""
     observed = 0
     for image in images.values():
-        if (image.point3d_ids < NO_POINT).any():
+        if (image.point3d_ids < colmap.NO_POINT).any():
             raise broken(f"{file} image {image.id}", "a point's id is out of range")
-        observed += int((image.point3d_ids != NO_POINT).sum())
+        observed += int((image.point3d_ids != colmap.NO_POINT).sum())
     seen_by = np.repeat(points.ids, np.diff(points.track_starts))
     order = np.argsort(points.track_image_ids, kind="stable")
     image_ids, firsts = np.unique(points.track_image_ids[order], return_index=True)
@@ -193,10 +185,10 @@ def check_tracks(images: dict[int, ColmapImage], points: ColmapPoints, file: str
 
 
 def check_rigs(
-    rigs: dict[int, ColmapRig],
-    frames: dict[int, ColmapFrame],
+    rigs: dict[int, colmap.ColmapRig],
+    frames: dict[int, colmap.ColmapFrame],
     cameras: dict[int, Camera],
-    images: dict[int, ColmapImage],
+    images: dict[int, colmap.ColmapImage],
     file: str,
 ) -> None:
     """Raises InputError for rigs, frames and images that do not fit together."""

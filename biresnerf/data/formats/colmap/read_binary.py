@@ -12,25 +12,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from biresnerf.data.formats.colmap.model_checks import (
-    broken,
-    camera_of_numbers,
-    image_name,
-    model_name_of_id,
-    points_of_records,
-    refuse_repeated,
-    rig_of_sensors,
-    rigid_pose,
-    sensor_type,
-)
-from biresnerf.data.model.colmap_scene import (
-    ColmapFrame,
-    ColmapImage,
-    ColmapPoints,
-    ColmapRig,
-    RigidPose,
-    Sensor,
-)
+from biresnerf.data.formats.colmap import model_checks as checks
+from biresnerf.data.model import colmap_scene as colmap
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
 
 Row = TypeVar("Row")
@@ -63,7 +46,7 @@ class _Bytes:
     def take(self, form: struct.Struct, what: str) -> tuple[Any, ...]:
         """The values of ``form``, which are ``what``."""
         if self.left < form.size:
-            raise broken(self.file, f"ends in the middle of {what}, at byte {len(self.data)}")
+            raise checks.broken(self.file, f"ends in the middle of {what}, at byte {len(self.data)}")
         values = form.unpack_from(self.data, self.at)
         self.at += form.size
         return values
@@ -73,7 +56,9 @@ class _Bytes:
         at = self.at
         (number,) = self.take(form, f"the number of {what}")
         if number * least_bytes > self.left:
-            raise broken(self.file, f"names {number} {what} at byte {at}, but only {self.left} bytes follow")
+            raise checks.broken(
+                self.file, f"names {number} {what} at byte {at}, but only {self.left} bytes follow"
+            )
         return int(number)
 
     def array(self, dtype: np.dtype[Any], number: int) -> np.ndarray:
@@ -86,7 +71,7 @@ class _Bytes:
         """The bytes up to the next NUL."""
         end = self.data.find(b"\0", self.at, self.at + _MAX_NAME_BYTES)
         if end < 0:
-            raise broken(self.file, f"the name of {what} has no end")
+            raise checks.broken(self.file, f"the name of {what} has no end")
         name = self.data[self.at : end]
         self.at = end + 1
         return name
@@ -94,7 +79,7 @@ class _Bytes:
     def finish(self) -> None:
         """Refuses bytes after the last record."""
         if self.left:
-            raise broken(self.file, f"{self.left} bytes follow the last record")
+            raise checks.broken(self.file, f"{self.left} bytes follow the last record")
 
 
 def _table(
@@ -105,7 +90,7 @@ def _table(
     table: dict[int, Row] = {}
     for index in range(source.count(_U64, least_bytes, f"{kind}s")):
         number, row = parse(source, f"{kind} {index + 1}")
-        refuse_repeated(table, number, f"{file} {kind}")
+        checks.refuse_repeated(table, number, f"{file} {kind}")
         table[number] = row
     source.finish()
     return table
@@ -117,32 +102,32 @@ def parse_cameras(data: bytes, file: str) -> dict[int, Camera]:
     def camera(source: _Bytes, what: str) -> tuple[int, Camera]:
         number, model_id, width, height = source.take(_CAMERA, what)
         where = f"{file} camera {number}"
-        model = model_name_of_id(model_id, where)
+        model = checks.model_name_of_id(model_id, where)
         form = struct.Struct(f"<{len(MODEL_PARAMETERS[model])}d")
         params = source.take(form, f"the parameters of camera {number}")
-        return number, camera_of_numbers(model, width, height, params, where)
+        return number, checks.camera_of_numbers(model, width, height, params, where)
 
     return _table(data, file, "camera", _CAMERA.size, camera)
 
 
-def parse_images(data: bytes, file: str) -> dict[int, ColmapImage]:
+def parse_images(data: bytes, file: str) -> dict[int, colmap.ColmapImage]:
     """The registered images by id."""
 
-    def image(source: _Bytes, what: str) -> tuple[int, ColmapImage]:
+    def image(source: _Bytes, what: str) -> tuple[int, colmap.ColmapImage]:
         number, *pose, camera_id = source.take(_IMAGE, what)
         where = f"{file} image {number}"
-        name = image_name(source.name(f"image {number}"), where)
+        name = checks.image_name(source.name(f"image {number}"), where)
         points = source.array(_POINT_2D, source.count(_U64, _POINT_2D.itemsize, f"points of image {number}"))
         if not np.isfinite(points["xy"]).all():
-            raise broken(where, "a feature's position is no finite number", code="pose_not_finite")
+            raise checks.broken(where, "a feature's position is no finite number", code="pose_not_finite")
         ids = points["id"].astype(np.int64)  # COLMAP's mark of no point, 2^64 - 1, becomes NO_POINT
         xy = points["xy"].astype(np.float64)
-        return number, ColmapImage(number, name, camera_id, rigid_pose(pose, where), xy, ids)
+        return number, colmap.ColmapImage(number, name, camera_id, checks.rigid_pose(pose, where), xy, ids)
 
     return _table(data, file, "image", _IMAGE.size + 1 + _U64.size, image)
 
 
-def parse_points(data: bytes, file: str) -> ColmapPoints:
+def parse_points(data: bytes, file: str) -> colmap.ColmapPoints:
     """The 3D points in the file's order."""
     source = _Bytes(data, file)
     number = source.count(_U64, _POINT.size, "points")
@@ -150,7 +135,7 @@ def parse_points(data: bytes, file: str) -> ColmapPoints:
     flat, tracks = records.view(np.uint8).reshape(number, _POINT_3D.itemsize), []
     for index in range(number):
         if source.left < _POINT.size:
-            raise broken(file, f"ends in the middle of point {index + 1}, at byte {len(data)}")
+            raise checks.broken(file, f"ends in the middle of point {index + 1}, at byte {len(data)}")
         at = source.at
         source.at += _POINT.size - _U64.size
         length = source.count(_U64, 2 * _U32.size, f"track elements of point {index + 1}")
@@ -158,7 +143,7 @@ def parse_points(data: bytes, file: str) -> ColmapPoints:
         tracks.append(source.array(np.dtype("<u4"), 2 * length))
     source.finish()
     elements = np.concatenate(tracks).reshape(-1, 2) if tracks else np.zeros((0, 2), np.uint32)
-    return points_of_records(
+    return checks.points_of_records(
         records["id"].astype(np.int64),
         records["xyz"].astype(np.float64),
         records["rgb"].copy(),
@@ -169,42 +154,48 @@ def parse_points(data: bytes, file: str) -> ColmapPoints:
     )
 
 
-def parse_rigs(data: bytes, file: str) -> dict[int, ColmapRig]:
+def parse_rigs(data: bytes, file: str) -> dict[int, colmap.ColmapRig]:
     """The rigs by id."""
 
-    def rig(source: _Bytes, what: str) -> tuple[int, ColmapRig]:
+    def rig(source: _Bytes, what: str) -> tuple[int, colmap.ColmapRig]:
         number, sensors = source.take(_RIG, what)
         where = f"{file} rig {number}"
         if sensors * _SENSOR.size > source.left:
-            raise broken(where, f"names {sensors} sensors, but only {source.left} bytes follow")
-        listed: list[tuple[Sensor, RigidPose | None]] = [(_sensor(source, where), None)] if sensors else []
+            raise checks.broken(where, f"names {sensors} sensors, but only {source.left} bytes follow")
+        listed: list[tuple[colmap.Sensor, colmap.RigidPose | None]] = (
+            [(_sensor(source, where), None)] if sensors else []
+        )
         for _ in range(sensors - 1):
             sensor = _sensor(source, where)
             (has_pose,) = source.take(_U8, f"a sensor of rig {number}")
             if has_pose > 1:
-                raise broken(where, "a yes or no is neither")
-            pose = rigid_pose(source.take(_POSE, f"a pose of rig {number}"), where) if has_pose else None
+                raise checks.broken(where, "a yes or no is neither")
+            pose = (
+                checks.rigid_pose(source.take(_POSE, f"a pose of rig {number}"), where) if has_pose else None
+            )
             listed.append((sensor, pose))
-        return number, rig_of_sensors(number, listed, where)
+        return number, checks.rig_of_sensors(number, listed, where)
 
     return _table(data, file, "rig", _RIG.size, rig)
 
 
-def _sensor(source: _Bytes, where: str) -> Sensor:
+def _sensor(source: _Bytes, where: str) -> colmap.Sensor:
     kind, number = source.take(_SENSOR, "a sensor")
-    return sensor_type(kind, where), number
+    return checks.sensor_type(kind, where), number
 
 
-def parse_frames(data: bytes, file: str) -> dict[int, ColmapFrame]:
+def parse_frames(data: bytes, file: str) -> dict[int, colmap.ColmapFrame]:
     """The frames by id."""
 
-    def frame(source: _Bytes, what: str) -> tuple[int, ColmapFrame]:
+    def frame(source: _Bytes, what: str) -> tuple[int, colmap.ColmapFrame]:
         number, rig_id, *pose, data_count = source.take(_FRAME, what)
         where = f"{file} frame {number}"
         if data_count * _DATA_ID.size > source.left:
-            raise broken(where, f"names {data_count} images, but only {source.left} bytes follow")
+            raise checks.broken(where, f"names {data_count} images, but only {source.left} bytes follow")
         taken = [source.take(_DATA_ID, f"frame {number}") for _ in range(data_count)]
-        data_ids = tuple(((sensor_type(kind, where), sensor), data_id) for kind, sensor, data_id in taken)
-        return number, ColmapFrame(number, rig_id, rigid_pose(pose, where), data_ids)
+        data_ids = tuple(
+            ((checks.sensor_type(kind, where), sensor), data_id) for kind, sensor, data_id in taken
+        )
+        return number, colmap.ColmapFrame(number, rig_id, checks.rigid_pose(pose, where), data_ids)
 
     return _table(data, file, "frame", _FRAME.size, frame)

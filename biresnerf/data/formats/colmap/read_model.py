@@ -15,30 +15,18 @@ import numpy as np
 from biresnerf.data.formats.colmap import read_binary as colmap_binary
 from biresnerf.data.formats.colmap import read_text as colmap_text
 from biresnerf.data.formats.colmap.model_checks import broken, check_images, check_rigs, check_tracks
-from biresnerf.data.model.colmap_scene import (
-    NO_POINT,
-    ColmapFrame,
-    ColmapImage,
-    ColmapModel,
-    ColmapPoints,
-    ColmapRig,
-    ModelForm,
-    RigidPose,
-    matrix_of_pose,
-    no_points,
-    rigid_pose_of,
-)
+from biresnerf.data.model import colmap_scene as colmap
 from biresnerf.data.model.text_file import read_bytes, read_text
 from biresnerf.geometry.camera.camera_models import Camera
 
 MAX_TABLE_BYTES = 2 * 2**30
-_SUFFIXES: dict[ModelForm, str] = {"binary": ".bin", "text": ".txt"}
+_SUFFIXES: dict[colmap.ModelForm, str] = {"binary": ".bin", "text": ".txt"}
 # An image's pose by images.bin and by frames.bin are the same motion, up to this much: radians, and the share of
 # the distance.
 _SAME_POSE = 1e-3
 
 
-def model_forms(folder: Path) -> tuple[ModelForm, ...]:
+def model_forms(folder: Path) -> tuple[colmap.ModelForm, ...]:
     """The forms in which ``folder`` holds a model, binary first, as COLMAP reads them."""
     return tuple(
         form
@@ -47,7 +35,7 @@ def model_forms(folder: Path) -> tuple[ModelForm, ...]:
     )
 
 
-def read_colmap_model(folder: Path) -> ColmapModel:
+def read_colmap_model(folder: Path) -> colmap.ColmapModel:
     """The model in ``folder``; binary where it holds both forms, and a note says so.
 
     Raises:
@@ -63,14 +51,14 @@ def read_colmap_model(folder: Path) -> ColmapModel:
     notes = [f"the binary model in {folder.name} was read and the text model beside it was not"]
     notes = notes if len(forms) > 1 else []
     cameras: dict[int, Camera] = tables.read("cameras")
-    images: dict[int, ColmapImage] = tables.read("images")
-    points: ColmapPoints | None = tables.read("points3D")
-    rigs: dict[int, ColmapRig] | None = tables.read("rigs")
-    frames: dict[int, ColmapFrame] | None = tables.read("frames")
+    images: dict[int, colmap.ColmapImage] = tables.read("images")
+    points: colmap.ColmapPoints | None = tables.read("points3D")
+    rigs: dict[int, colmap.ColmapRig] | None = tables.read("rigs")
+    frames: dict[int, colmap.ColmapFrame] | None = tables.read("frames")
     check_images(images, cameras, tables.file("images"))
     if points is None:
         notes.append(f"{tables.file('points3D')} is missing: the model is taken without points")
-        points, images = no_points(), {number: _unseeing(image) for number, image in images.items()}
+        points, images = colmap.no_points(), {number: _unseeing(image) for number, image in images.items()}
     check_tracks(images, points, tables.file("points3D"))
     if (rigs is None) != (frames is None):
         there, lacking = ("frames", "rigs") if rigs is None else ("rigs", "frames")
@@ -84,13 +72,13 @@ def read_colmap_model(folder: Path) -> ColmapModel:
                 f"{tables.file('images')} and {tables.file('frames')} have different poses for {len(moved)} "
                 f"images ({moved[0]}, ...); the frames' were taken, as COLMAP does"
             )
-    return ColmapModel(folder, form, cameras, images, points, rigs, frames, tuple(notes))
+    return colmap.ColmapModel(folder, form, cameras, images, points, rigs, frames, tuple(notes))
 
 
 class _Tables:
     """The files of a model in one form."""
 
-    def __init__(self, folder: Path, form: ModelForm) -> None:
+    def __init__(self, folder: Path, form: colmap.ModelForm) -> None:
         self.folder, self.form = folder, form
 
     def file(self, table: str) -> str:
@@ -107,13 +95,15 @@ class _Tables:
         return getattr(colmap_text, parser)(read_text(path, MAX_TABLE_BYTES), path.name)
 
 
-def _unseeing(image: ColmapImage) -> ColmapImage:
-    return replace(image, point3d_ids=np.full(len(image.point3d_ids), NO_POINT))
+def _unseeing(image: colmap.ColmapImage) -> colmap.ColmapImage:
+    return replace(image, point3d_ids=np.full(len(image.point3d_ids), colmap.NO_POINT))
 
 
 def _with_poses_of_frames(
-    rigs: dict[int, ColmapRig], frames: dict[int, ColmapFrame], images: dict[int, ColmapImage]
-) -> tuple[dict[int, ColmapImage], list[str]]:
+    rigs: dict[int, colmap.ColmapRig],
+    frames: dict[int, colmap.ColmapFrame],
+    images: dict[int, colmap.ColmapImage],
+) -> tuple[dict[int, colmap.ColmapImage], list[str]]:
     """The images with their frame's pose where their own is another; and the names of these."""
     images, moved = dict(images), []
     for frame in frames.values():
@@ -126,14 +116,16 @@ def _with_poses_of_frames(
                 cam_from_rig = rig.sensor_from_rig[sensor]
                 if cam_from_rig is None:
                     continue
-                cam_from_world = rigid_pose_of(matrix_of_pose(cam_from_rig) @ matrix_of_pose(cam_from_world))
+                cam_from_world = colmap.rigid_pose_of(
+                    colmap.matrix_of_pose(cam_from_rig) @ colmap.matrix_of_pose(cam_from_world)
+                )
             if not _same(cam_from_world, images[data_id].cam_from_world):
                 images[data_id] = replace(images[data_id], cam_from_world=cam_from_world)
                 moved.append(images[data_id].name)
     return images, moved
 
 
-def _same(one: RigidPose, other: RigidPose) -> bool:
+def _same(one: colmap.RigidPose, other: colmap.RigidPose) -> bool:
     unit, unit_other = (pose.quat_wxyz / np.linalg.norm(pose.quat_wxyz) for pose in (one, other))
     turned = 2.0 * min(np.linalg.norm(unit - unit_other), np.linalg.norm(unit + unit_other))
     far = max(1.0, float(np.linalg.norm(one.translation)))

@@ -12,27 +12,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.colmap.model_checks import (
-    broken,
-    camera_of_numbers,
-    image_name,
-    points_of_records,
-    refuse_repeated,
-    rig_of_sensors,
-    rigid_pose,
-    sensor_type,
-    supported_model,
-)
-from biresnerf.data.model.colmap_scene import (
-    SENSOR_TYPES,
-    ColmapFrame,
-    ColmapImage,
-    ColmapPoints,
-    ColmapRig,
-    RigidPose,
-    Sensor,
-    no_points,
-)
+from biresnerf.data.formats.colmap import model_checks as checks
+from biresnerf.data.model import colmap_scene as colmap
 from biresnerf.geometry.camera.camera_models import Camera
 
 T = TypeVar("T")
@@ -48,14 +29,14 @@ class _Words:
 
     def word(self, what: str) -> str:
         if self.at >= len(self.words):
-            raise broken(self.where, f"the line ends before {what}")
+            raise checks.broken(self.where, f"the line ends before {what}")
         self.at += 1
         return self.words[self.at - 1]
 
     def integer(self, what: str) -> int:
         word = self.word(what)
         if not (word.isascii() and word.isdecimal() and len(word) < 20) or int(word) > _MAX_ID:
-            raise broken(self.where, f"{what} is {word[:40]!r}, not a whole number")
+            raise checks.broken(self.where, f"{what} is {word[:40]!r}, not a whole number")
         return int(word)
 
     def numbers(self, count: int, what: str) -> list[float]:
@@ -64,7 +45,9 @@ class _Words:
 
     def finish(self) -> None:
         if self.at < len(self.words):
-            raise broken(self.where, f"{len(self.words) - self.at} words more than the line should have")
+            raise checks.broken(
+                self.where, f"{len(self.words) - self.at} words more than the line should have"
+            )
 
 
 def floats(words: list[str], where: str, what: str) -> NDArray[np.float64]:
@@ -72,14 +55,14 @@ def floats(words: list[str], where: str, what: str) -> NDArray[np.float64]:
     try:
         return np.array([float(word) for word in words], dtype=np.float64)
     except ValueError:
-        raise broken(where, f"{what}: not a number") from None
+        raise checks.broken(where, f"{what}: not a number") from None
 
 
 def _integers(words: list[str], where: str, what: str) -> NDArray[np.int64]:
     try:
         return np.array([int(word) for word in words], dtype=np.int64)
     except (ValueError, OverflowError):
-        raise broken(where, f"{what}: not a whole number") from None
+        raise checks.broken(where, f"{what}: not a whole number") from None
 
 
 def _lines(text: str, file: str) -> Iterator[tuple[str, str]]:
@@ -96,7 +79,7 @@ def _table(text: str, file: str, parse: Callable[[_Words], tuple[int, T]]) -> di
         words = _Words(line, where)
         number, row = parse(words)
         words.finish()
-        refuse_repeated(table, number, f"{where}: id")
+        checks.refuse_repeated(table, number, f"{where}: id")
         table[number] = row
     return table
 
@@ -106,17 +89,17 @@ def parse_cameras(text: str, file: str) -> dict[int, Camera]:
 
     def camera(words: _Words) -> tuple[int, Camera]:
         number = words.integer("the camera's id")
-        model = supported_model(words.word("the camera's model"), words.where)
+        model = checks.supported_model(words.word("the camera's model"), words.where)
         width, height = words.integer("the width"), words.integer("the height")
         params = words.numbers(len(words.words) - words.at, "the parameters")
-        return number, camera_of_numbers(model, width, height, params, words.where)
+        return number, checks.camera_of_numbers(model, width, height, params, words.where)
 
     return _table(text, file, camera)
 
 
-def parse_images(text: str, file: str) -> dict[int, ColmapImage]:
+def parse_images(text: str, file: str) -> dict[int, colmap.ColmapImage]:
     """The registered images by id: two lines each, of which the second, with the features, may be empty."""
-    images: dict[int, ColmapImage] = {}
+    images: dict[int, colmap.ColmapImage] = {}
     lines = iter(enumerate(text.split("\n"), start=1))
     for number_of_line, line in lines:
         where = f"{file} line {number_of_line}"
@@ -127,31 +110,31 @@ def parse_images(text: str, file: str) -> dict[int, ColmapImage]:
         number, pose = words.integer("the image's id"), words.numbers(7, "the pose")
         camera_id = words.integer("the camera's id")
         if len(parts) < 10:
-            raise broken(where, "the line ends before the image's name")
-        name = image_name(parts[9], where)
+            raise checks.broken(where, "the line ends before the image's name")
+        name = checks.image_name(parts[9], where)
         _, features = next(lines, (0, ""))
         xy, ids = _features(features, f"{file} line {number_of_line + 1}")
-        refuse_repeated(images, number, f"{where}: id")
-        images[number] = ColmapImage(number, name, camera_id, rigid_pose(pose, where), xy, ids)
+        checks.refuse_repeated(images, number, f"{where}: id")
+        images[number] = colmap.ColmapImage(number, name, camera_id, checks.rigid_pose(pose, where), xy, ids)
     return images
 
 
 def _features(line: str, where: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     words = line.split()
     if len(words) % 3:
-        raise broken(
+        raise checks.broken(
             where,
             "not a list of x, y, point id; each image has two lines, the second may be empty",
             hint="Write an empty line after each image that has no features.",
         )
     numbers = floats(words, where, "a feature").reshape(-1, 3)
     if not np.isfinite(numbers).all():
-        raise broken(where, "a feature's position is no finite number", "pose_not_finite")
+        raise checks.broken(where, "a feature's position is no finite number", "pose_not_finite")
     ids = ["-1" if word in _NO_POINT_WORDS else word for word in words[2::3]]
     return numbers[:, :2].copy(), _integers(ids, where, "a point's id")
 
 
-def parse_points(text: str, file: str) -> ColmapPoints:
+def parse_points(text: str, file: str) -> colmap.ColmapPoints:
     """The 3D points in the file's order."""
     ids: list[int] = []
     values: list[list[float]] = []
@@ -160,21 +143,21 @@ def parse_points(text: str, file: str) -> ColmapPoints:
     for line, where in _lines(text, file):
         words = line.split()
         if len(words) < 8 or len(words) % 2:
-            raise broken(where, "not an id, three coordinates, a colour, an error and a track")
+            raise checks.broken(where, "not an id, three coordinates, a colour, an error and a track")
         try:
             ids.append(int(words[0]))
             values.append([float(word) for word in words[1:8]])
             elements += [int(word) for word in words[8:]]
         except ValueError:
-            raise broken(where, "holds a word that is no number, or no whole one") from None
+            raise checks.broken(where, "holds a word that is no number, or no whole one") from None
         lengths.append(len(words) // 2 - 4)
     if not ids:
-        return no_points()
+        return colmap.no_points()
     numbers = np.array(values)
     rgb = numbers[:, 3:6]
     if not ((rgb >= 0) & (rgb <= 255) & (rgb == np.round(rgb))).all():
-        raise broken(file, "a point's colour is not three whole numbers from 0 to 255")
-    return points_of_records(
+        raise checks.broken(file, "a point's colour is not three whole numbers from 0 to 255")
+    return checks.points_of_records(
         _bounded(ids, file),
         numbers[:, :3].copy(),
         rgb.astype(np.uint8),
@@ -187,47 +170,50 @@ def parse_points(text: str, file: str) -> ColmapPoints:
 
 def _bounded(ids: list[int], file: str) -> NDArray[np.int64]:
     if any(not 0 <= number <= _MAX_ID for number in ids):
-        raise broken(file, "an id is out of range")
+        raise checks.broken(file, "an id is out of range")
     return np.array(ids, dtype=np.int64)
 
 
-def _sensor(words: _Words) -> Sensor:
+def _sensor(words: _Words) -> colmap.Sensor:
     name = words.word("a sensor's type")
     number = words.integer("a sensor's id")
-    return sensor_type(SENSOR_TYPES.index(name) if name in SENSOR_TYPES else -1, words.where), number
+    kind = colmap.SENSOR_TYPES.index(name) if name in colmap.SENSOR_TYPES else -1
+    return checks.sensor_type(kind, words.where), number
 
 
-def _pose(words: _Words, what: str) -> RigidPose:
-    return rigid_pose(words.numbers(7, what), words.where)
+def _pose(words: _Words, what: str) -> colmap.RigidPose:
+    return checks.rigid_pose(words.numbers(7, what), words.where)
 
 
-def parse_rigs(text: str, file: str) -> dict[int, ColmapRig]:
+def parse_rigs(text: str, file: str) -> dict[int, colmap.ColmapRig]:
     """The rigs by id."""
 
-    def rig(words: _Words) -> tuple[int, ColmapRig]:
+    def rig(words: _Words) -> tuple[int, colmap.ColmapRig]:
         number, sensors = words.integer("the rig's id"), words.integer("the number of sensors")
-        listed: list[tuple[Sensor, RigidPose | None]] = [(_sensor(words), None)] if sensors else []
+        listed: list[tuple[colmap.Sensor, colmap.RigidPose | None]] = (
+            [(_sensor(words), None)] if sensors else []
+        )
         for _ in range(min(sensors, len(words.words)) - 1):
             sensor = _sensor(words)
             has_pose = words.word("whether a sensor has a pose")
             if has_pose not in ("0", "1"):
-                raise broken(words.where, "a yes or no is neither")
+                raise checks.broken(words.where, "a yes or no is neither")
             listed.append((sensor, _pose(words, "a sensor's pose") if has_pose == "1" else None))
-        return number, rig_of_sensors(number, listed, words.where)
+        return number, checks.rig_of_sensors(number, listed, words.where)
 
     return _table(text, file, rig)
 
 
-def parse_frames(text: str, file: str) -> dict[int, ColmapFrame]:
+def parse_frames(text: str, file: str) -> dict[int, colmap.ColmapFrame]:
     """The frames by id."""
 
-    def frame(words: _Words) -> tuple[int, ColmapFrame]:
+    def frame(words: _Words) -> tuple[int, colmap.ColmapFrame]:
         number, rig_id = words.integer("the frame's id"), words.integer("the rig's id")
         pose = _pose(words, "the frame's pose")
         count = words.integer("the number of images")
         if 3 * count > len(words.words):
-            raise broken(words.where, f"names {count} images, but the line is shorter")
+            raise checks.broken(words.where, f"names {count} images, but the line is shorter")
         data_ids = tuple((_sensor(words), words.integer("an image's id")) for _ in range(count))
-        return number, ColmapFrame(number, rig_id, pose, data_ids)
+        return number, colmap.ColmapFrame(number, rig_id, pose, data_ids)
 
     return _table(text, file, frame)

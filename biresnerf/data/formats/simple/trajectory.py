@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntry, match_files
 from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.colmap.model_checks import rigid_pose
 from biresnerf.data.formats.simple.camera_file import read_camera_file
 from biresnerf.data.formats.simple.llff import rows_by_name
 from biresnerf.data.model.atomic_file import write_text
-from biresnerf.data.model.conventions import quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from biresnerf.data.model.colmap_scene import matrix_of_pose
+from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
@@ -66,7 +68,6 @@ KITTI = Format(
 TIMES_OF_IMAGES = "rgb.txt"  # of TUM's sets
 MAX_POSES = 100_000
 MAX_TIME_APART_S = 0.02  # between an image and its pose, as in TUM's own tools
-_QUAT_LENGTH_ERROR = 1e-2
 _HINT = "Give lines of `time x y z qx qy qz qw` (TUM), or of 12 numbers, [R | t] by rows (KITTI)."
 _HEAD = "# timestamp tx ty tz qx qy qz qw: camera to world, OpenCV axes (x right, y down, z forward), the input's frame"
 _COLUMNS: dict[int, str] = {8: "tum", 12: "kitti"}
@@ -94,13 +95,15 @@ class Trajectory:
             if len(words) not in _COLUMNS or len(words) != columns:
                 raise _invalid(where, f"has {len(words)} numbers, not 8 (TUM) or 12 (KITTI) as every line.")
             values = finite_numbers(words, where, _HINT)
-            rows = _tum_rows(values, where) if columns == 8 else values.reshape(3, 4)
-            self.poses.append(rigid_matrix(rows.tolist(), where)[0])
+            if columns == 8:
+                time, *centre, x, y, z, w = values.tolist()
+                self.times_s.append(time)
+                self.poses.append(matrix_of_pose(rigid_pose([w, x, y, z, *centre], where, _HINT)))
+            else:
+                self.poses.append(rigid_matrix(values.reshape(3, 4).tolist(), where)[0])
             self.lines.append(number)
             if len(self.poses) > MAX_POSES:
                 raise _invalid(where, f"more than {MAX_POSES} poses are not read.")
-            if columns == 8:
-                self.times_s.append(float(values[0]))
         if not self.poses:
             raise _invalid(file.name, "holds no pose.")
         self.dialect = _COLUMNS[columns]
@@ -235,15 +238,6 @@ def _nearest(taken: dict[str, float], times: Sequence[float]) -> dict[str, int]:
     for index, (apart, name) in best.items():
         found[name] = min(found.get(name, (math.inf, -1)), (apart, index))
     return {name: index for name, (_, index) in found.items()}
-
-
-def _tum_rows(values: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    x, y, z, w = values[4:]
-    length = float(np.linalg.norm(np.clip(values[4:], -9.0, 9.0)))  # a square overflows
-    if abs(length - 1.0) > _QUAT_LENGTH_ERROR:
-        raise _invalid(where, f"the quaternion has length {length:.3g}, not 1.", "pose_not_rotation")
-    rotation = rotation_from_quat_wxyz(np.array([w, x, y, z]))
-    return np.column_stack([rotation, values[1:4]])
 
 
 def _invalid(where: str, what: str, code: str = "pose_file_invalid") -> InputError:
