@@ -77,6 +77,11 @@ VIOLATIONS = [
         "import biresnerf.refine.verdict.verdict",
         "inside the optimiser",
     ),
+    (
+        "biresnerf/refine/adjustment/evidence.py",
+        "import biresnerf.refine.scene.scene",
+        "inside the optimiser",
+    ),
     ("workers/store/files.py", "import workers.jobs.jobs", "inside the job engine"),
     ("workers/run/child.py", "import workers.queue.slot", "inside the job engine"),
     ("service/http/problems.py", "import service.intake.unpack", "inside the web process"),

@@ -1,0 +1,120 @@
+"""What cameras are adjusted to, and how well they are known before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.points.tracks import Tracks
+from biresnerf.geometry.camera.camera import Intrinsics
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Small patches of photos on the surface that the field sees there, and the photos that should show them as well.
+
+    Attributes:
+        host: int64 [p], the photo that each patch was taken from.
+        rays: float64 [p, k, 3], of its pixels in the host camera's axes, z = 1.
+        inverse_depth: float64 [p, k], along z, in the inverse of the poses' unit; its scale is estimated anew.
+        point: int64 [m], ascending: the patch of each comparison.
+        target: int64 [m], the photo that it is compared with.
+        photos: the photos, see `PatchPhotos`.
+    """
+
+    host: NDArray[np.int64]
+    rays: Array
+    inverse_depth: Array
+    point: NDArray[np.int64]
+    target: NDArray[np.int64]
+    photos: PatchPhotos
+
+    def __len__(self) -> int:
+        return len(self.host)
+
+    def of(self, chosen: NDArray[np.bool_]) -> Patches:
+        """The chosen [p] patches alone."""
+        kept = chosen[self.point]
+        number = np.cumsum(chosen) - 1
+        return Patches(
+            self.host[chosen], self.rays[chosen], self.inverse_depth[chosen],
+            number[self.point[kept]], self.target[kept], self.photos,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class PatchPhotos:
+    """Photos of an ideal pinhole camera, row by row, one after the other.
+
+    Attributes:
+        values: float32 [total_px, channels], 0 to 1.
+        offsets: int64 [n + 1], where each begins.
+        widths, heights: int64 [n], px.
+    """
+
+    values: NDArray[np.float32]
+    offsets: NDArray[np.int64]
+    widths: NDArray[np.int64]
+    heights: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the poses are adjusted to.
+
+    Attributes:
+        intrinsics: of all images at full size, without distortion: `biresnerf.refine.adjustment.ideal` makes them.
+        tracks: None where there are none.
+        patches: None where there are none.
+    """
+
+    intrinsics: Intrinsics
+    tracks: Tracks | None = None
+    patches: Patches | None = None
+
+    def __post_init__(self) -> None:
+        if self.intrinsics.distorted or self.intrinsics.some_fisheye:
+            raise ValueError("evidence is of ideal pinhole cameras: straighten photos and tracks first")
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """Poses that are known before, with the standard deviations of their errors.
+
+    Attributes:
+        world_from_cam: [n, 4, 4].
+        rotation: rad [n], of each component of the rotation vector. Infinite: not known. Zero: the camera is fixed.
+        position: [n], of each coordinate, in the poses' unit.
+    """
+
+    world_from_cam: Array
+    rotation: Array
+    position: Array
+
+    @classmethod
+    def equal(cls, world_from_cam: Array, rotation: float, position: float) -> PosePrior:
+        """All cameras known equally well."""
+        n = len(world_from_cam)
+        return cls(world_from_cam, np.full(n, rotation), np.full(n, position))
+
+    @property
+    def fixed(self) -> NDArray[np.bool_]:
+        """Cameras [n] that are known exactly."""
+        return (self.rotation <= 0) | (self.position <= 0)
+
+
+@dataclass(frozen=True)
+class NoiseLevels:
+    """How far residuals are from zero at poses without error: standard deviations.
+
+    Attributes:
+        track_px: of either coordinate of an observation.
+        patch: of a patch's comparison, in the noise expected of its pixels.
+    """
+
+    track_px: float = 1.0
+    patch: float = 1.0

@@ -1,0 +1,1 @@
+"""The adjustment's inner loops, compiled. `reference` defines what they compute; nothing here decides anything."""

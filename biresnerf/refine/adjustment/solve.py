@@ -1,0 +1,125 @@
+"""Levenberg-Marquardt over all cameras: terms without their own unknowns, and what is known of the poses before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.refine.adjustment.cameras import Cameras
+from biresnerf.refine.adjustment.evidence import PosePrior
+from biresnerf.refine.adjustment.term import Linearised, Term
+
+Array = NDArray[np.float64]
+
+ROUNDS = 8  # of measuring the noise; it falls with the residuals, and with it what counts as wrong
+STEPS = 10  # of each round, at most
+DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e6
+CONVERGED = 1e-7  # a lower relative gain ends a round
+SETTLED = 1e-3  # a lower relative change of all noise levels ends the rounds
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """The prior as a quadratic cost of cameras.
+
+    Attributes:
+        mean: the cameras before.
+        weight: inverse variances [6n]; zero where nothing is known.
+        free: which of the 6n unknowns may move.
+    """
+
+    mean: Cameras
+    weight: Array
+    free: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, prior: PosePrior) -> Prior:
+        deviation = np.repeat(np.stack([prior.rotation, prior.position], 1), 3, axis=1)
+        free = ~np.repeat(prior.fixed, 6)
+        usable = np.isfinite(deviation) & (deviation > 0)
+        weight = np.where(usable, 1 / np.where(usable, deviation, 1.0) ** 2, 0.0).reshape(-1)
+        return cls(Cameras.of(prior.world_from_cam), weight, free)
+
+    def cost(self, cameras: Cameras) -> float:
+        return float((self.weight * cameras.apart(self.mean).reshape(-1) ** 2).sum())
+
+    def right(self, cameras: Cameras) -> Array:
+        """Half the gradient [6n], to first order in the rotations' distance."""
+        return np.asarray(self.weight * cameras.apart(self.mean).reshape(-1))
+
+
+def minimise(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> Cameras:
+    """Cameras of the least robust cost that is found from here; the terms' unknowns and noise levels follow."""
+    for round in range(ROUNDS):
+        changes = [term.measure(cameras) for term in terms]
+        if round > 0 and max(changes, default=0.0) < SETTLED:
+            break
+        cameras = _descend(cameras, terms, prior)
+    return cameras
+
+
+def _descend(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> Cameras:
+    """Steps at fixed noise levels."""
+    damping, cost = DAMPING, total_cost(cameras, terms, prior)
+    for _ in range(STEPS):
+        linear = [term.linearise(cameras, damping) for term in terms]
+        better = None
+        while better is None and damping < MOST_DAMPING:
+            better = _step(cameras, terms, prior, linear, damping, cost)
+            damping = damping * 10 if better is None else max(damping / 10, LEAST_DAMPING)
+        if better is None:
+            break
+        gain = cost - better[1]
+        cameras, cost = better
+        if gain < CONVERGED * cost:
+            break
+    return cameras
+
+
+def _step(
+    cameras: Cameras,
+    terms: Sequence[Term],
+    prior: Prior,
+    linear: Sequence[Linearised],
+    damping: float,
+    cost: float,
+) -> tuple[Cameras, float] | None:
+    """Cameras and cost after a step that lowers it, the terms' unknowns moved along; None where it does not."""
+    system, right = normal_equations(cameras, linear, prior)
+    motion = np.zeros(len(right))
+    free = prior.free & (np.diagonal(system) > 0)
+    if not free.any():
+        return None
+    part = system[np.ix_(free, free)]
+    part = part + np.diag(damping * np.diagonal(part))
+    try:
+        motion[free] = -np.linalg.solve(part, right[free])
+    except np.linalg.LinAlgError:
+        return None
+    if not np.isfinite(motion).all():
+        return None
+    steps = motion.reshape(-1, 6)
+    moved = cameras.moved(steps)
+    unknowns = [term.stepped(at, steps) for term, at in zip(terms, linear, strict=True)]
+    after = prior.cost(moved) + sum(t.cost(moved, u) for t, u in zip(terms, unknowns, strict=True))
+    if not after < cost:
+        return None
+    for term, found in zip(terms, unknowns, strict=True):
+        term.unknowns = found
+    return moved, after
+
+
+def total_cost(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> float:
+    """The robust cost of all terms and of leaving the prior."""
+    return prior.cost(cameras) + sum(term.cost(cameras, term.unknowns) for term in terms)
+
+
+def normal_equations(cameras: Cameras, linear: Sequence[Linearised], prior: Prior) -> tuple[Array, Array]:
+    """Of the cameras alone: matrix [6n, 6n] and half the gradient [6n]."""
+    system, right = np.diag(prior.weight), prior.right(cameras)
+    for at in linear:
+        system, right = system + at.system, right + at.right
+    return system, right
