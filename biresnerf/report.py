@@ -14,6 +14,7 @@ IntrinsicsSource = Literal["given", "exif", "colmap", "guessed", "refined"]
 PoseSource = Literal[
     "given", "colmap", "matches-incremental", "matches-global", "neighbours", "nearest-view", "forward-facing"
 ]
+CandidateName = Literal["input", "matched", "refined", "adjusted-tracks", "adjusted-patches", "adjusted"]
 VerdictName = Literal["improved", "unchanged", "kept_input", "inconclusive", "failed_check"]
 Finding = Literal["better", "worse", "same", "open"]
 _VERDICT_WORDS: dict[VerdictName, str] = {
@@ -210,6 +211,22 @@ class TrialReport(FrozenModel):
     )
 
 
+class CandidateReport(FrozenModel):
+    """Poses that the result could have held, judged by evidence that none was fitted to: tracks and patches left out.
+
+    A misfit is the median over cameras of their mean robust square, in units of the measured noise: about 1 at poses
+    that are as exact as the evidence, 9 where nothing fits.
+    """
+
+    name: CandidateName = Field(
+        description="input: as given or seeded; matched: COLMAP's own model; refined: by the field; adjusted: all "
+        "cameras at once, to tracks of feature matches, to patches of photos, or to both."
+    )
+    track_misfit: float | None = Field(None, examples=[1.1], description="None without feature matches.")
+    patch_misfit: float | None = Field(None, examples=[1.3])
+    chosen: bool = False
+
+
 class SimilarityReport(FrozenModel):
     """x_in_input = scale * rotation @ x_in_optimised + translation: ties the optimised poses to the input's frame."""
 
@@ -243,6 +260,10 @@ class Report(FrozenModel):
     start_trials: tuple[TrialReport, ...] = Field(
         (),
         description="The poses that were tried to start from, if there was a choice; the given ones first.",
+    )
+    candidates: tuple[CandidateReport, ...] = Field(
+        (),
+        description="The poses that were compared at the end; one of them is the refined ones of the verdict.",
     )
     steps_done: int = Field(examples=[2000])
     switch_step: int | None = Field(None, examples=[700], description="The step at which stage 2 began.")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
+from biresnerf.refine.adjustment.paired import paired, student_quantile
 from biresnerf.refine.verdict.verdict import (
     EPIPOLAR_MATTERS,
     FITS_BELOW,
@@ -17,8 +18,6 @@ from biresnerf.refine.verdict.verdict import (
     Findings,
     decide,
     failed_checks,
-    paired,
-    student_quantile,
 )
 from biresnerf.report import EpipolarEvidence, HeldOutEvidence
 
