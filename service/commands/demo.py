@@ -25,7 +25,7 @@ import click
 from biresnerf.client.scene import look_at
 from biresnerf.commands.jobs.follow_job import fetch, require_success
 from biresnerf.commands.jobs.job_progress import JobProgressView, SendingView, watch
-from biresnerf.commands.jobs.service_options import Service, service_at
+from biresnerf.commands.jobs.service_options import service_at
 from biresnerf.errors import BiresnerfError, InputError
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.report import Report
@@ -119,7 +119,7 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def _send_and_fetch(url: str, scene: Path, target: Path, options: RefineOptions) -> None:
-    with service_at(Service(url)) as client:
+    with service_at(url, None) as client:
         with SendingView() as view:
             job = client.submit(scene, options, on_progress=view.sending)
         with JobProgressView() as progress:

@@ -19,7 +19,6 @@ from psycopg.types.json import Jsonb
 from biresnerf.wire.datasets import CheckReport
 from biresnerf.wire.problems import JobError
 from workers.database.database import Database
-from workers.datasets.dataset_rows import take_lease, without_lease
 from workers.process.turns import Turns
 from workers.process.waiting import retry_while_unavailable
 from workers.run.child import Child, log_tail
@@ -68,11 +67,21 @@ class Checker:
     async def unfinished(self) -> tuple[str, ...]:
         """Ids of ``finalizing`` datasets that no process checks; removes folders of processes that died."""
         await asyncio.to_thread(_sweep, self._settings.scratch_dir / CHECKS)
-        return await without_lease(self._database, "datasets", "finalizing")
+        rows = await self._database.fetch(
+            "SELECT id FROM datasets WHERE state = 'finalizing'"
+            " AND coalesce(check_until < clock_timestamp(), true) ORDER BY created_at"
+        )
+        return tuple(row["id"] for row in rows)
 
     async def _take(self, dataset_id: str, token: uuid.UUID) -> bool:
-        lease_s = 2 * self._settings.beat_s
-        return await take_lease(self._database, "datasets", dataset_id, "finalizing", token, lease_s)
+        """Take or renew the lease. A lease, not a lock: who is frozen or cut off loses it."""
+        rows = await self._database.fetch(
+            "UPDATE datasets SET check_token = %s, check_until = clock_timestamp() + make_interval(secs => %s)"
+            " WHERE id = %s AND state = 'finalizing'"
+            " AND (check_token = %s OR check_until IS NULL OR check_until < clock_timestamp()) RETURNING id",
+            *(token, 2 * self._settings.beat_s, dataset_id, token),
+        )
+        return bool(rows)
 
     async def _check(self, dataset_id: str, token: uuid.UUID) -> None:
         rows = await retry_while_unavailable(
@@ -90,8 +99,8 @@ class Checker:
         await retry_while_unavailable(
             lambda: self._database.fetch(
                 "UPDATE datasets SET state = %s, report = %s, error = %s, revision = revision + 1,"
-                " lease_token = NULL, leased_until = NULL"
-                " WHERE id = %s AND state = 'finalizing' AND lease_token = %s",
+                " check_token = NULL, check_until = NULL"
+                " WHERE id = %s AND state = 'finalizing' AND check_token = %s",
                 *(("rejected", None, found) if isinstance(outcome, JobError) else ("ready", found, None)),
                 *(dataset_id, token),
             )

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-import uuid
-from typing import Literal
 
 from biresnerf.errors import InputError
 from biresnerf.wire.datasets import DatasetState
-from workers.database.database import Connection, Database
+from workers.database.database import Connection
 from workers.records import DatasetFile
 from workers.settings.errors import Conflict, LimitReached
 from workers.settings.settings import Settings
@@ -98,36 +96,6 @@ async def lock_dataset(connection: Connection, dataset_id: str, tenant: str | No
     row = await connection.required_row(f"No dataset {dataset_id}.", sql, dataset_id, tenant)
     state: DatasetState = row["state"]
     return state
-
-
-async def take_lease(
-    database: Database,
-    table: Literal["datasets", "uploads"],
-    row_id: str,
-    state: str,
-    token: uuid.UUID,
-    lease_s: float,
-) -> bool:
-    """Take or renew the right to work on a row in this state; it ends if the process dies or is frozen."""
-    rows = await database.fetch(
-        f"UPDATE {table} SET lease_token = %s, leased_until = clock_timestamp() + make_interval(secs => %s)"
-        " WHERE id = %s AND state = %s"
-        " AND (lease_token = %s OR leased_until IS NULL OR leased_until < clock_timestamp()) RETURNING id",
-        *(token, lease_s, row_id, state, token),
-    )
-    return bool(rows)
-
-
-async def without_lease(
-    database: Database, table: Literal["datasets", "uploads"], state: str
-) -> tuple[str, ...]:
-    """Ids of rows in this state that no process works on, oldest first."""
-    rows = await database.fetch(
-        f"SELECT id FROM {table} WHERE state = %s"
-        " AND coalesce(leased_until < clock_timestamp(), true) ORDER BY created_at",
-        state,
-    )
-    return tuple(row["id"] for row in rows)
 
 
 def file_key(folder: str, path: str) -> str:

@@ -69,7 +69,8 @@ class DatasetStore(OwnedStore):
 
     async def get(self, dataset_id: str) -> DatasetView:
         """The dataset; raises `NotFound`."""
-        return await self._database.run(self._required, dataset_id)
+        async with self._database.transaction() as connection:
+            return await self._required(connection, dataset_id)
 
     async def list(
         self, *, state: DatasetState | None = None, limit: int = 50, cursor: str | None = None

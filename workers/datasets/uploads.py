@@ -17,7 +17,7 @@ from biresnerf.wire.datasets import UploadKind
 from biresnerf.wire.problems import JobError
 from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import new_id
-from workers.datasets.dataset_rows import MINE, file_key, require_open, take_lease, without_lease
+from workers.datasets.dataset_rows import MINE, file_key, require_open
 from workers.jobs.quotas import require_byte_quota
 from workers.records import Upload, record_from_row
 from workers.settings.errors import Conflict, LimitReached, NotFound
@@ -87,7 +87,8 @@ class UploadStore(OwnedStore):
 
     async def get(self, upload_id: str) -> Upload:
         """The upload; raises `NotFound` (also where it expired)."""
-        return await self._database.run(self._required, upload_id)
+        async with self._database.transaction() as connection:
+            return await self._required(connection, upload_id)
 
     async def of_dataset(self, dataset_id: str) -> tuple[Upload, ...]:
         """The dataset's uploads that are not yet stored, oldest first."""
@@ -173,15 +174,20 @@ class UploadStore(OwnedStore):
 
     async def take(self, upload_id: str, token: uuid.UUID) -> bool:
         """Take or renew the lease to add a received upload to its dataset; it expires if the process dies."""
-        lease_s = 2 * self._settings.beat_s
-        return await take_lease(self._database, "uploads", upload_id, "received", token, lease_s)
+        rows = await self._database.fetch(
+            "UPDATE uploads SET take_token = %s, take_until = clock_timestamp() + make_interval(secs => %s)"
+            " WHERE id = %s AND state = 'received'"
+            " AND (take_token = %s OR take_until IS NULL OR take_until < clock_timestamp()) RETURNING id",
+            *(token, 2 * self._settings.beat_s, upload_id, token),
+        )
+        return bool(rows)
 
     async def conclude(self, upload_id: str, token: uuid.UUID, error: JobError | None) -> None:
         """``received`` becomes ``stored``, or ``rejected`` with the error; the pieces go to the trash."""
         async with self._database.transaction() as connection:
             row = await connection.row(
-                "UPDATE uploads SET state = %s, error = %s, lease_token = NULL, leased_until = NULL"
-                " WHERE id = %s AND state = 'received' AND lease_token = %s RETURNING folder",
+                "UPDATE uploads SET state = %s, error = %s, take_token = NULL, take_until = NULL"
+                " WHERE id = %s AND state = 'received' AND take_token = %s RETURNING folder",
                 "stored" if error is None else "rejected",
                 None if error is None else Jsonb(error.model_dump()),
                 upload_id,
@@ -203,7 +209,11 @@ class UploadStore(OwnedStore):
 
     async def untaken(self) -> tuple[str, ...]:
         """Ids of received uploads that no process is adding to their dataset."""
-        return await without_lease(self._database, "uploads", "received")
+        rows = await self._database.fetch(
+            "SELECT id FROM uploads WHERE state = 'received'"
+            " AND coalesce(take_until < clock_timestamp(), true) ORDER BY created_at"
+        )
+        return tuple(row["id"] for row in rows)
 
     async def delete(self, upload_id: str) -> None:
         """Delete an upload in any state; raises `NotFound`. Files it added to the dataset stay."""

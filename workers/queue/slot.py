@@ -23,7 +23,7 @@ from workers.database.database import Database, open_database
 from workers.database.job_queue import Entry
 from workers.database.notifications import Listener
 from workers.database.statistics import announce_slot
-from workers.jobs.claim import Fenced, cancel_requested, claim_job, input_bytes
+from workers.jobs.claim import Claim, Fenced, cancel_requested, claim_job, input_bytes
 from workers.process.disk_space import job_disk_budget
 from workers.process.waiting import first_done, retry_while_unavailable
 from workers.process.watchdog import run_process
@@ -114,8 +114,8 @@ class Slot:
         self._lock.remember(worker_id)
         await retry_while_unavailable(lambda: announce_slot(database, HOST, self._name, worker_id))
         # Time for a second try, on another connection, before a janitor takes the job back.
-        answer_s = self._settings.stall_s / 3
-        heartbeat = Heartbeat(database.url, self._settings.beat_s, worker_id, answer_s=answer_s)
+        in_time_s = self._settings.stall_s / 3
+        heartbeat = Heartbeat(database.url, self._settings.beat_s, worker_id, answer_s=in_time_s)
         heartbeat.start()
         try:
             yield worker_id
@@ -166,9 +166,7 @@ class Slot:
         attempt = Attempt(database, self._files, self._settings, claim, folder, self._variables())
         watching = asyncio.create_task(self._stop_when_asked(database, listener, entry, attempt))
         try:
-            about: dict[str, str | int] = {"job": claim.job_id, "number": claim.attempt}
-            with span("attempt", parent=claim.trace, attributes=about):  # part of the trace of its submission
-                return 0.0 if await attempt.run() else None
+            return 0.0 if await self._traced(attempt, claim) else None
         finally:
             watching.cancel()
 
@@ -197,6 +195,14 @@ class Slot:
             log.warning("the job waits: %s", full.detail)
             return False
         return True
+
+    async def _traced(self, attempt: Attempt, claim: Claim) -> bool:
+        """Run the attempt, as part of the trace of its submission."""
+        if self._settings.traces == "off":
+            return await attempt.run()
+        about_it: dict[str, str | int] = {"job": claim.job_id, "number": claim.attempt}
+        with span("attempt", parent=claim.trace, about=about_it):
+            return await attempt.run()
 
     def _variables(self) -> Mapping[str, str]:
         """Which device and how many cores the job of this slot may use."""

@@ -17,7 +17,7 @@ class NotFound(EngineError):
 
 
 class Expired(EngineError):
-    """The files were deleted after their retention time."""
+    """Its retention time is over and its files were deleted."""
 
     def __init__(self, detail: str) -> None:
         super().__init__("expired", detail)

@@ -1,7 +1,7 @@
 """OpenTelemetry traces, if the operator wants them: a request, what it submits, each attempt and its stages.
 
-Without ``BIRESNERF_TRACES=otlp`` OpenTelemetry is not set up, and everything here does nothing. OpenTelemetry's own
-variables say where the spans go (``OTEL_EXPORTER_OTLP_ENDPOINT`` …).
+Without ``BIRESNERF_TRACES=otlp`` nothing of OpenTelemetry is set up, and everything here does nothing. Where
+the spans go is said by OpenTelemetry's own variables (``OTEL_EXPORTER_OTLP_ENDPOINT`` …).
 """
 
 from __future__ import annotations
@@ -48,25 +48,25 @@ def set_up_traces(process: str, settings: Settings) -> None:
 
 
 def flush_traces() -> None:
-    """Sends what is recorded, or gives up within seconds; for processes that a signal ends."""
+    """Sends what is recorded, or gives up within seconds; for ends by a signal, where nothing else would."""
     if _provider is not None:
         _provider.force_flush(_FLUSH_MS)
 
 
 @contextlib.contextmanager
 def span(
-    name: str, *, parent: str | None = None, attributes: Mapping[str, str | int] | None = None
+    name: str, *, parent: str | None = None, about: Mapping[str, str | int] | None = None
 ) -> Iterator[None]:
     """A span around the block, below the current one, or below ``parent`` (a W3C traceparent)."""
     if _provider is None:
         yield
         return
+    attributes = {f"{_NAME}.{key}": value for key, value in (about or {}).items()}
     from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
     above = TraceContextTextMapPropagator().extract({"traceparent": parent}) if parent else None
     tracer = _provider.get_tracer(_NAME)
-    named = {f"{_NAME}.{key}": value for key, value in (attributes or {}).items()}
-    with tracer.start_as_current_span(name, context=above, attributes=named):
+    with tracer.start_as_current_span(name, context=above, attributes=attributes):
         yield
 
 

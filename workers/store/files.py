@@ -76,7 +76,7 @@ class FileStore:
         content = head if incoming.ended else incoming.all_with(head)
         attributes = self._place.attributes(media_type)
         try:
-            with _engine_errors(f"Cannot store {key}"):
+            with _told(f"Cannot store {key}"):
                 # A small file in one request; a large one in parts, of which few are in memory.
                 await obstore.put_async(
                     self._store,
@@ -117,7 +117,7 @@ class FileStore:
         """A copy that the store makes by itself; raises `NotFound` where there is no ``source``."""
         _checked(source)
         try:
-            with _engine_errors(f"Cannot copy {source}"):
+            with _told(f"Cannot copy {source}"):
                 await obstore.copy_async(self._store, source, _checked(target))
         except FileNotFoundError:
             raise NotFound(f"No file {source}.") from None
@@ -126,7 +126,7 @@ class FileStore:
     async def head(self, key: str) -> StoredFile:
         """Size, ETag and time of a file; raises `NotFound`."""
         try:
-            with _engine_errors(f"Cannot look at {key}"):
+            with _told(f"Cannot look at {key}"):
                 meta = await obstore.head_async(self._store, _checked(key))
         except FileNotFoundError:
             raise NotFound(f"No file {key}.") from None
@@ -142,7 +142,7 @@ class FileStore:
         while start < stop:
             until = min(stop, start + self._place.window_bytes)
             try:
-                with _engine_errors(f"Cannot read {key}"):
+                with _told(f"Cannot read {key}"):
                     result = await obstore.get_async(self._store, key, options={"range": (start, until)})
                     async for chunk in result.stream(min_chunk_size=CHUNK_BYTES):
                         yield bytes(chunk)
@@ -153,20 +153,20 @@ class FileStore:
     async def list(self, prefix: str) -> list[StoredFile]:
         """All files whose key starts with the folder ``prefix``, sorted by key."""
         found: list[StoredFile] = []
-        with _engine_errors(f"Cannot list {prefix}"):
+        with _told(f"Cannot list {prefix}"):
             async for batch in obstore.list(self._store, prefix=_checked(prefix.rstrip("/"))):
                 found += [_stored(meta["path"], meta) for meta in batch]
         return sorted(found, key=lambda file: file.key)
 
     async def delete(self, key: str) -> None:
         """Delete a file; one that is not there is no error."""
-        with contextlib.suppress(FileNotFoundError), _engine_errors(f"Cannot delete {key}"):
+        with contextlib.suppress(FileNotFoundError), _told(f"Cannot delete {key}"):
             await obstore.delete_async(self._store, _checked(key))
 
     async def delete_prefix(self, prefix: str, *, keep: str | None = None) -> None:
         """Delete all under the folder ``prefix``, except the sub-folder named ``keep``."""
         folder = _checked(prefix.rstrip("/"))
-        with contextlib.suppress(FileNotFoundError), _engine_errors(f"Cannot delete {prefix}"):
+        with contextlib.suppress(FileNotFoundError), _told(f"Cannot delete {prefix}"):
             await self._place.delete_folder(folder, keep)
 
     async def sha256(self, key: str) -> str:
@@ -189,7 +189,7 @@ class FileStore:
 
     async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
         """An address for each key, good for ``valid_s`` and one method; none where the place cannot."""
-        with _engine_errors("Cannot sign an address"):
+        with _told("Cannot sign an address"):
             return await self._place.signed_urls(method, [_checked(key) for key in keys], valid_s)
 
     async def healthy(self) -> bool:
@@ -277,8 +277,8 @@ class _Measured:
 
 
 @contextlib.contextmanager
-def _engine_errors(what: str) -> Iterator[None]:
-    """Raises the engine's errors for the store's own; ``what`` could not be done."""
+def _told(what: str) -> Iterator[None]:
+    """The store's own errors in the engine's words."""
     try:
         yield
     except BaseError as error:

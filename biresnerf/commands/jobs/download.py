@@ -9,7 +9,7 @@ import click
 
 from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.jobs.follow_job import fetch
-from biresnerf.commands.jobs.service_options import JOB, JobName, Service, service_at, service_options
+from biresnerf.commands.jobs.service_options import JOB, JobName, service_at, service_options
 
 
 @click.command("download")
@@ -24,7 +24,8 @@ def download_command(
     names: tuple[str, ...],
     output: Path,
     replace: bool,
-    service: Service,
+    url: str | None,
+    api_key: str | None,
     as_json: bool,
 ) -> None:
     """Download the result of JOB, or some of its files.
@@ -32,7 +33,7 @@ def download_command(
     NAME may hold * and ?; a folder stands for all files in it. Files that are there already are skipped, interrupted
     downloads are resumed. A running job has previews, a cancelled or failed one whatever it has written.
     """
-    with service_at(service, job) as client:
+    with service_at(url, api_key, job) as client:
         found = client.job(job.id)
         files = fetch(client, found, output, names=names or ("*",), replace=replace)
     document = {"job": found, "files": [str(path) for path in files]}

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import print_json
-from biresnerf.commands.empty_folder import require_empty
 from biresnerf.commands.jobs.job_progress import BytesView, JobProgressView, watch
 
 if TYPE_CHECKING:
@@ -29,42 +27,29 @@ timeout_option = click.option(
 )
 
 
-class Follow(NamedTuple):
-    """How far a command follows the job that it has queued: until it is over, and its files are in ``output``."""
-
-    wait: bool
-    timeout_s: float | None
-    output: Path | None
-
-
 def follow_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a click command `--wait`, `--timeout` and `--output`, as ``follow``. The output must be empty."""
-
-    @functools.wraps(command)
-    def with_follow(wait: bool, timeout_s: float | None, output: Path | None, **named: Any) -> Any:
-        if output is not None:
-            require_empty(output)
-        return command(follow=Follow(wait, timeout_s, output), **named)
-
+    """Give a click command `--wait`, `--timeout` and `--output`."""
     wait = click.option("--wait", is_flag=True, help="Show progress until the job is over.")
     output = click.option(
         "--output", "-o", type=click.Path(path_type=Path), help="Download the result here; implies --wait."
     )
-    return wait(timeout_option(output(with_follow)))
+    return wait(timeout_option(output(command)))
 
 
-def see_through(client: Client, job: JobView, follow: Follow, *, as_json: bool) -> None:
+def see_through(
+    client: Client, job: JobView, *, wait: bool, timeout_s: float | None, output: Path | None, as_json: bool
+) -> None:
     """Print the job's address, then wait for it and fetch its files if asked to. Raises `JobFailed`."""
     if not as_json:
         click.echo(f"{client.url}{job.links.self}")
-    if follow.wait or follow.timeout_s is not None or follow.output is not None:
-        job = waited_for(client, job, follow.timeout_s, as_json=as_json)
+    if wait or timeout_s is not None or output is not None:
+        job = waited_for(client, job, timeout_s, as_json=as_json)
         if as_json:
             print_json(job)
         require_success(job)
-        if follow.output is not None:
-            count = len(fetch(client, job, follow.output))
-            click.echo(f"{count} files in {os.path.relpath(follow.output)}", err=as_json)
+        if output is not None:
+            count = len(fetch(client, job, output))
+            click.echo(f"{count} files in {os.path.relpath(output)}", err=as_json)
     elif as_json:
         print_json(job)
 

@@ -11,7 +11,7 @@ from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option, print_json, show, table
 from biresnerf.commands.jobs.follow_job import require_success, timeout_option, waited_for
 from biresnerf.commands.jobs.job_progress import left_of, numbers_of, stage_of
-from biresnerf.commands.jobs.service_options import JOB, JobName, Service, service_at, service_options
+from biresnerf.commands.jobs.service_options import JOB, JobName, service_at, service_options
 from biresnerf.wire.jobs import JobState, JobView
 
 if TYPE_CHECKING:
@@ -24,12 +24,12 @@ _LOG_EVERY_S = 1.0
 @click.argument("job", type=JOB)
 @service_options
 @json_option
-def status_command(job: JobName, service: Service, as_json: bool) -> None:
+def status_command(job: JobName, url: str | None, api_key: str | None, as_json: bool) -> None:
     """Show the state of JOB.
 
     JOB is an id, or an address as `submit` prints it.
     """
-    with service_at(service, job) as client:
+    with service_at(url, api_key, job) as client:
         found = client.job(job.id)
     show(found, described(found), as_json=as_json)
 
@@ -64,7 +64,7 @@ def described(job: JobView) -> str:
 @service_options
 @json_option
 def list_command(
-    state: JobState | None, label: str | None, limit: int, service: Service, as_json: bool
+    state: JobState | None, label: str | None, limit: int, url: str | None, api_key: str | None, as_json: bool
 ) -> None:
     """List jobs, newest first."""
     wanted = None
@@ -73,7 +73,7 @@ def list_command(
         if not separator:
             raise click.BadParameter(f"{label!r} is not NAME=VALUE", param_hint="--label")
         wanted = (name, value)
-    with service_at(service) as client:
+    with service_at(url, api_key) as client:
         found = client.jobs(state=state, label=wanted, limit=limit)
     rows = [
         (
@@ -94,12 +94,14 @@ def list_command(
 @timeout_option
 @service_options
 @json_option
-def wait_command(job: JobName, timeout_s: float | None, service: Service, as_json: bool) -> None:
+def wait_command(
+    job: JobName, timeout_s: float | None, url: str | None, api_key: str | None, as_json: bool
+) -> None:
     """Show the progress of JOB until it is over.
 
     The exit status is 0 if it succeeded and 3 if not. Ctrl-C stops waiting; the job continues.
     """
-    with service_at(service, job) as client:
+    with service_at(url, api_key, job) as client:
         over = waited_for(client, client.job(job.id), timeout_s, as_json=as_json)
         if as_json:
             print_json(over)
@@ -114,12 +116,14 @@ def wait_command(job: JobName, timeout_s: float | None, service: Service, as_jso
 @click.option("--after", type=click.IntRange(0), default=0, help="Only lines after this number.")
 @service_options
 @json_option
-def logs_command(job: JobName, follow: bool, after: int, service: Service, as_json: bool) -> None:
+def logs_command(
+    job: JobName, follow: bool, after: int, url: str | None, api_key: str | None, as_json: bool
+) -> None:
     """Print the log of JOB."""
     if follow and as_json:
         raise click.UsageError("--follow and --json exclude each other; see `biresnerf wait --json`.")
     lines = []
-    with service_at(service, job) as client:
+    with service_at(url, api_key, job) as client:
         while True:
             # The state first: lines written between the two requests are not missed.
             over = client.job(job.id).final
@@ -155,11 +159,12 @@ def cancel_command(
     keep_partial: bool,
     wait: bool,
     timeout_s: float | None,
-    service: Service,
+    url: str | None,
+    api_key: str | None,
     as_json: bool,
 ) -> None:
     """Stop JOB. Does nothing if it is over already."""
-    with service_at(service, job) as client:
+    with service_at(url, api_key, job) as client:
         found = client.cancel(job.id, keep_partial=keep_partial)
         if (wait or timeout_s is not None) and not found.final:
             found = waited_for(client, found, timeout_s, as_json=as_json)
@@ -171,11 +176,11 @@ def cancel_command(
 @click.argument("jobs", metavar="JOB...", nargs=-1, required=True, type=JOB)
 @service_options
 @json_option
-def delete_command(jobs: tuple[JobName, ...], service: Service, as_json: bool) -> None:
+def delete_command(jobs: tuple[JobName, ...], url: str | None, api_key: str | None, as_json: bool) -> None:
     """Delete jobs that are over, with their results and exports."""
     deleted: list[Any] = []
     for job in jobs:
-        with service_at(service, job) as client:
+        with service_at(url, api_key, job) as client:
             client.delete_job(job.id)
         deleted.append(job.id)
         if not as_json:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,13 +26,6 @@ class JobName(NamedTuple):
     url: str | None = None
 
 
-class Service(NamedTuple):
-    """The service that a command line names, if it names one, and the key for it."""
-
-    url: str | None = None
-    api_key: str | None = None
-
-
 class _JobParameter(click.ParamType):
     name = "job"
 
@@ -50,12 +42,7 @@ JOB = _JobParameter()
 
 
 def service_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a click command `--url` and `--api-key`, as ``service``."""
-
-    @functools.wraps(command)
-    def with_service(url: str | None, api_key: str | None, **named: Any) -> Any:
-        return command(service=Service(url, api_key), **named)
-
+    """Give a click command `--url` and `--api-key`, as ``url`` and ``api_key``."""
     url = click.option(
         "--url",
         envvar="BIRESNERF_URL",
@@ -66,11 +53,11 @@ def service_options(command: Callable[..., Any]) -> Callable[..., Any]:
         envvar="BIRESNERF_API_KEY",
         help="Prefer BIRESNERF_API_KEY: other users can see command lines.",
     )
-    return url(key(with_service))
+    return url(key(command))
 
 
 @contextmanager
-def service_at(service: Service, job: JobName | None = None) -> Iterator[Client]:
+def service_at(url: str | None, api_key: str | None, job: JobName | None = None) -> Iterator[Client]:
     """A client of the service in the job's address, at `--url`, or on this machine. Errors become exit codes."""
     try:
         from biresnerf.client import Client, JobFailed, ServiceError
@@ -81,8 +68,8 @@ def service_at(service: Service, job: JobName | None = None) -> Iterator[Client]
             hint="Install it with: pip install 'biresnerf[client]'",
         ) from None
     try:
-        url = (job.url if job is not None else None) or service.url or DEFAULT_URL
-        with Client(url, api_key=service.api_key, on_pause=_tell_pause) as client:
+        chosen = (job.url if job is not None else None) or url or DEFAULT_URL
+        with Client(chosen, api_key=api_key, on_pause=_tell_pause) as client:
             yield client
     except ServiceError as error:
         raise CommandFailed(with_code(error), exit_code_of(error)) from None

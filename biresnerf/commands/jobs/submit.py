@@ -11,9 +11,10 @@ import click
 
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option
-from biresnerf.commands.jobs.follow_job import Follow, follow_options, see_through
+from biresnerf.commands.empty_folder import require_empty
+from biresnerf.commands.jobs.follow_job import follow_options, see_through
 from biresnerf.commands.jobs.job_progress import SendingView
-from biresnerf.commands.jobs.service_options import Service, service_at, service_options
+from biresnerf.commands.jobs.service_options import service_at, service_options
 from biresnerf.commands.settings_option import settings_option
 
 if TYPE_CHECKING:
@@ -59,8 +60,11 @@ def submit_command(
     path: Path,
     preset: str | None,
     settings: dict[str, Any],
-    follow: Follow,
-    service: Service,
+    wait: bool,
+    timeout_s: float | None,
+    output: Path | None,
+    url: str | None,
+    api_key: str | None,
     as_json: bool,
     **how: Any,
 ) -> None:
@@ -72,9 +76,11 @@ def submit_command(
     from biresnerf.options.refine_options import parse_options
 
     options = parse_options({**settings, **({"preset": preset} if preset else {})})
-    with service_at(service) as client:
+    if output is not None:
+        require_empty(output)
+    with service_at(url, api_key) as client:
         job = submitted(client, path, options, **how)
-        see_through(client, job, follow, as_json=as_json)
+        see_through(client, job, wait=wait, timeout_s=timeout_s, output=output, as_json=as_json)
 
 
 def submitted(client: Client, path: Path, options: RefineOptions, **how: Any) -> JobView:

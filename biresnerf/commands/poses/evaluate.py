@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.answers import print_json
 from biresnerf.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ _TITLES = {
 @click.command("evaluate")
 @click.argument("result", type=click.Path(path_type=Path))
 @click.argument("truth", type=click.Path(path_type=Path))
-@json_option
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")
 @click.option("--paper-compat", is_flag=True, help="Add the alignment of BARF's and BAA-NGP's code.")
 def evaluate_command(result: Path, truth: Path, as_json: bool, paper_compat: bool) -> None:
     """Measure the poses of RESULT against those of TRUTH.

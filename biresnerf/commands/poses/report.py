@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import click
 
-from biresnerf.commands.answers import json_option, show
 from biresnerf.errors import BiresnerfError
 
 
 @click.command("report")
 @click.argument("result", type=click.Path(path_type=Path))
 @click.option("--title", help="Title of the page. Default: the number of images.")
-@json_option
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object: the file and its size.")
 def report_command(result: Path, title: str | None, as_json: bool) -> None:
     """Write the report.html of RESULT again, from the files in it.
 
@@ -25,5 +25,7 @@ def report_command(result: Path, title: str | None, as_json: bool) -> None:
     if notes:
         raise BiresnerfError(notes[0])
     page = result / REPORT_HTML
-    size = page.stat().st_size
-    show({"file": str(page), "bytes": size}, f"{page} written ({size / 1e6:.1f} MB)", as_json=as_json)
+    if as_json:
+        click.echo(json.dumps({"file": str(page), "bytes": page.stat().st_size}))
+    else:
+        click.echo(f"{page} written ({page.stat().st_size / 1e6:.1f} MB)")

@@ -20,6 +20,7 @@ from biresnerf.data.seeding.colmap_pairs import (
     matched_pairs,
     write_position_priors,
 )
+from biresnerf.data.seeding.colmap_tracks import keep_from_mapping, write_tracks
 
 DATABASE = "database.db"
 SAYS = "seeding: "  # before lines meant for the job's log; all others are COLMAP's own
@@ -27,7 +28,6 @@ SAYS = "seeding: "  # before lines meant for the job's log; all others are COLMA
 FAINTEST_PEAK, LEAST_SEEN = 0.003, 10
 ENOUGH_PLACED = 0.8  # of the images: where all poses are given, no other way of mapping is tried then
 INTRINSICS_FROM = 0.5  # of the images: a model of fewer does not say what the lens is
-MOST_OBSERVATIONS = 200_000  # of the tracks handed on: checkpoints carry them, 16 bytes each
 
 
 def main(request_path: Path) -> None:
@@ -58,12 +58,14 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     numbers = extract_features(request, database, images)
     say(f"features of {count} images found")
     match_features(request, database, work)
-    write_tracks(database, work)
+    tracks = write_tracks(database, work)
     if request["cam_from_world"]:
         drop_contradicting_pairs(database, request["cam_from_world"])
         write_position_priors(database, request["cam_from_world"], request["position_deviation"])
     matches = matched_pairs(database)
     say(f"{len(matches)} pairs of images match")
+    if tracks is not None:
+        keep_from_mapping(database, tracks)
 
     answer: list[dict[str, Any]] = []
     largest: Any = None
@@ -118,30 +120,6 @@ def extract_features(request: dict[str, Any], database: Path, images: Path) -> l
     opened.close()
     firsts = [camera["names"][0] if camera["names"] else "" for camera in request["cameras"]]
     return [camera_of.get(name, -1) for name in firsts]
-
-
-def write_tracks(database_path: Path, work: Path) -> None:
-    """The tracks through all verified matches, thinned by whole points: images by their number, the order of names."""
-    import numpy as np
-    import pycolmap
-
-    from biresnerf.data.points.tracks import KEPT, Tracks
-
-    database = pycolmap.Database.open(database_path)
-    names = {image.image_id: image.name for image in database.read_all_images()}
-    number = {image: i for i, (_, image) in enumerate(sorted((name, image) for image, name in names.items()))}
-    features = {image: np.asarray(database.read_keypoints(image))[:, :2] for image in names}
-    images, xy = [np.zeros((0, 2), np.int64)], [np.zeros((0, 2, 2))]
-    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
-        found = np.asarray(geometry.inlier_matches).reshape(-1, 2)
-        a, b = pycolmap.pair_id_to_image_pair(pair)
-        images.append(np.tile(np.array([[number[a], number[b]]]), (len(found), 1)))
-        xy.append(np.stack([features[a][found[:, 0]], features[b][found[:, 1]]], axis=1))
-    database.close()
-    tracks = Tracks.of_matches(np.concatenate(images), np.concatenate(xy))
-    if tracks is not None:
-        arrays: dict[str, Any] = tracks.thinned(MOST_OBSERVATIONS, len(names)).kept()
-        np.savez(work / KEPT, **arrays)
 
 
 def map_incrementally(

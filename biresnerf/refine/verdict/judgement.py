@@ -100,8 +100,10 @@ def judge_poses(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Ju
     if np.isfinite(after.world_from_cam).all():
         moved = moved_px(before, after, images)
         if scene.tracks is not None:
-            independent = not scene.start.matched.any()
-            epipolar = compare_on_matches(before, after, scene.tracks, independent=independent)
+            placed = np.array([frame.pose_source not in GUESSES for frame in dataset.frames])
+            epipolar = compare_on_matches(
+                before, after, scene.tracks, placed, started_from_matches=bool(scene.start.matched.any())
+            )
         if moved >= MEASURABLE_PX:
             heldout = compare_on_unseen_views(
                 before, after, images, scene.held_out, optimiser.options, optimiser.device, optimiser.threads,

@@ -13,20 +13,18 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project
 from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.geometry.epipolar import epipolar_angles
 from biresnerf.geometry.focus import focus_point
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.refine.scene.scene_depth import track_rays
+from biresnerf.refine.adjustment.paired import paired
+from biresnerf.refine.lost.own_matches import LEAST_PX, OwnMatches
 from biresnerf.refine.start.frozen_trials import FrozenTrials, TrialScores, joined
-from biresnerf.refine.verdict.verdict import EPIPOLAR_MATTERS, PSNR_MATTERS, SSIM_MATTERS, paired
+from biresnerf.refine.verdict.verdict import EPIPOLAR_MATTERS, PSNR_MATTERS, SSIM_MATTERS
 from biresnerf.refine.views.held_out_views import unseen_rounds
 from biresnerf.report import EpipolarEvidence, HeldOutEvidence
 
 Array = NDArray[np.float64]
 
-MATCHES_OF_IMAGE = 8  # an image with fewer is not used
 LEAST_MATCHED = 4  # images
-LEAST_PX = 0.05  # errors below it are equal: matches are not that exact
 MOTION_GRID = 5  # points across and down
 
 
@@ -57,7 +55,7 @@ class HeldOutComparison:
 
 @dataclass(frozen=True, eq=False)
 class EpipolarComparison:
-    """Median error of each image's matches [n] (px, full size) with either rig; NaN where it has too few."""
+    """Median error of all of each image's matches [n] (px, full size) with either rig; NaN where it has too few."""
 
     before: Array
     after: Array
@@ -105,42 +103,50 @@ def compare_on_unseen_views(
 
 
 def compare_on_matches(
-    before: Rig, after: Rig, tracks: Tracks, *, independent: bool
+    before: Rig, after: Rig, tracks: Tracks, placed: NDArray[np.bool_], *, started_from_matches: bool
 ) -> EpipolarComparison | None:
     """Each image's median epipolar error with either rig; None where too few images have matches.
 
+    The evidence is of points that were left out of every estimate, where they know half of the images that all points
+    know. Images without a pose before say nothing: any pose is better than a guess.
+
     Args:
-        independent: whether the rig `after` has not been made from these matches.
+        placed: which images [n] had more than a guess for a pose before.
+        started_from_matches: whether points not left out had a part in the rig `after`.
     """
-    old, new = (_image_errors(rig, tracks) for rig in (before, after))
-    known = np.isfinite(old) & np.isfinite(new)
+    old, new = _errors_px(before, after, tracks)
+    counted = placed if placed.any() else ~placed
+    judging, figures = tracks.split()[1], (old, new)
+    if judging is not None:
+        left_out = _errors_px(before, after, judging)
+        enough = max(LEAST_MATCHED, _known(figures, counted).sum() / 2)
+        judging, figures = (
+            (judging, left_out) if _known(left_out, counted).sum() >= enough else (None, figures)
+        )
+    known = _known(figures, counted)
     if known.sum() < LEAST_MATCHED:
         return None
-    gains = np.log2(np.maximum(old[known], LEAST_PX) / np.maximum(new[known], LEAST_PX))
-    comparison = paired(old[known], new[known], EPIPOLAR_MATTERS, gains)
-    medians = {"before": float(np.median(old[known])), "after": float(np.median(new[known]))}
+    one, other = (errors[known] for errors in figures)
+    gains = np.log2(np.maximum(one, LEAST_PX) / np.maximum(other, LEAST_PX))
+    comparison = paired(one, other, EPIPOLAR_MATTERS, gains)
+    medians = {"before": float(np.median(one)), "after": float(np.median(other))}
     sides = [max(camera.width, camera.height) for camera in after.cameras]
     evidence = EpipolarEvidence(
-        matches=len(tracks.pairs()[0]),
-        independent=independent,
+        matches=len((judging or tracks).pairs()[0]),
+        independent=judging is not None or not started_from_matches,
         error_px=comparison.model_copy(update=medians),
         share_of_image=medians["after"] / float(np.median(sides)),
     )
     return EpipolarComparison(old, new, evidence)
 
 
-def _image_errors(rig: Rig, tracks: Tracks) -> Array:
-    intrinsics = Intrinsics.from_cameras(rig.cameras)
-    rays, pairs = track_rays(intrinsics, tracks), tracks.pairs()
-    (a, b), (ray_a, ray_b) = (tracks.image[side] for side in pairs), (rays[side] for side in pairs)
-    focal = ((intrinsics.fx + intrinsics.fy) / 2).numpy()
-    errors = epipolar_angles(rig.world_from_cam, a, b, ray_a, ray_b) * (focal[a] + focal[b]) / 2
-    medians = np.full(len(rig.cameras), np.nan)
-    for image in range(len(medians)):
-        own = errors[((a == image) | (b == image)) & np.isfinite(errors)]
-        if len(own) >= MATCHES_OF_IMAGE:
-            medians[image] = np.median(own)
-    return medians
+def _errors_px(before: Rig, after: Rig, tracks: Tracks) -> tuple[Array, Array]:
+    old, new = (OwnMatches(tracks, rig.cameras).errors_px(rig.world_from_cam) for rig in (before, after))
+    return old, new
+
+
+def _known(errors: tuple[Array, Array], counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return np.isfinite(errors[0]) & np.isfinite(errors[1]) & counted
 
 
 def moved_px(before: Rig, after: Rig, images: ImageSet) -> float:

@@ -15,8 +15,9 @@ from biresnerf.progress import Monitor
 from biresnerf.refine.start import frozen_trials
 from biresnerf.refine.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refine.verdict.judgement import Judgement, judge_poses
-from biresnerf.refine.verdict.pose_evidence import Rig, moved_px
+from biresnerf.refine.verdict.pose_evidence import Rig, compare_on_matches, moved_px
 from biresnerf.refine.views.held_out_views import held_out_views, unseen_rounds, unseen_views
+from biresnerf.report import EpipolarEvidence
 from tests.refine.tiny_scene import CPU, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 pytestmark = pytest.mark.slow
@@ -179,3 +180,25 @@ def test_trainings_are_the_same_again(scene):
     )
     first, again = trials.score(dataset.world_from_cam), trials.score(dataset.world_from_cam)
     np.testing.assert_array_equal(first.psnr, again.psnr)
+
+
+def test_matches_of_points_left_out_judge_and_photos_placed_by_a_guess_do_not(scene, noisy):
+    dataset, truth = scene[0], scene[0].world_from_cam
+    cameras = tuple(dataset.camera_of(i) for i in range(VIEWS))
+    tracks = true_matches(dataset)
+    guessed = np.arange(VIEWS) < VIEWS // 2
+    worse = np.where(guessed[:, None, None], truth, noisy)
+    before = np.where(guessed[:, None, None], noisy, truth)  # the guesses gain, the placed ones lose
+
+    def found(placed: np.ndarray, tracks: Tracks, *, started: bool) -> EpipolarEvidence:
+        rigs = Rig(before, cameras), Rig(worse, cameras)
+        return compare_on_matches(*rigs, tracks, placed, started_from_matches=started).evidence
+
+    judged_by_all = found(~guessed, tracks, started=True)
+    assert judged_by_all.error_px.finding != "better"
+    assert judged_by_all.error_px.count == VIEWS - VIEWS // 2
+    assert judged_by_all.independent
+    assert judged_by_all.matches == len(tracks.split()[1].pairs()[0])
+    few = tracks.where(tracks.point < 12 * VIEWS)  # too few points to spare any
+    assert not found(~guessed, few, started=True).independent
+    assert found(~guessed, few, started=False).independent

@@ -65,7 +65,7 @@ async def test_beyond_its_places_a_key_is_told_to_wait_whichever_way_it_sends(
 
 
 async def lease(service: Service, upload: str) -> dict[str, Any]:
-    sql = "SELECT lease_token, leased_until FROM uploads WHERE id = %s"
+    sql = "SELECT take_token, take_until FROM uploads WHERE id = %s"
     (row,) = await service.stores.uploads._database.fetch(sql, upload)
     return row
 
@@ -89,10 +89,10 @@ async def test_an_archive_that_waits_for_its_turn_stays_its_takers(database_url:
                 await asyncio.sleep(0.02)
             taken = renewed = await lease(service, upload)
             async with asyncio.timeout(20):
-                while renewed["leased_until"] == taken["leased_until"]:
+                while renewed["take_until"] == taken["take_until"]:
                     await asyncio.sleep(0.05)
                     renewed = await lease(service, upload)
-            assert renewed["lease_token"] == taken["lease_token"]
+            assert renewed["take_token"] == taken["take_token"]
             assert not await service.stores.uploads.take(upload, uuid.uuid4())
             assert (await http.get(f"/v1/datasets/{dataset}")).json()["files"] == 0
         while (await http.get(address)).json()["state"] != "stored":

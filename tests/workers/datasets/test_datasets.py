@@ -222,7 +222,7 @@ async def test_a_check_whose_lease_went_to_another_process_decides_nothing(datab
         while not list(folder.glob("*/log.txt")):
             await asyncio.sleep(0.02)
         await stores.jobs._database.fetch(
-            "UPDATE datasets SET lease_token = gen_random_uuid(), leased_until = now() + interval '1 h'"
+            "UPDATE datasets SET check_token = gen_random_uuid(), check_until = now() + interval '1 h'"
         )
         while list(folder.iterdir()):
             await asyncio.sleep(0.05)
@@ -267,7 +267,7 @@ async def test_a_check_that_a_dead_process_began_is_taken_over(stores: Stores):
     await stores.datasets.add_file(dataset.id, "a", chunks(b"x"))
     await stores.datasets.finalize(dataset.id)
     await stores.jobs._database.fetch(
-        "UPDATE datasets SET lease_token = gen_random_uuid(), leased_until = now() + interval '1 s'"
+        "UPDATE datasets SET check_token = gen_random_uuid(), check_until = now() + interval '1 s'"
     )
     assert await stores.datasets.unfinished() == (), "its owner may live yet"
     assert (await stores.datasets.check(dataset.id)).state == "ready"

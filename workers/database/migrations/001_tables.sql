@@ -44,7 +44,7 @@ CREATE TABLE api_keys (
     last_used_at timestamptz
 );
 
--- `lease_token`, `leased_until`: who checks the dataset, and until when without a sign of life.
+-- `check_token`, `check_until`: who checks the dataset, and until when without a sign of life.
 -- `expires_at` is kept up to date by the dispatcher, which alone deletes by it; null is never.
 CREATE TABLE datasets (
     id text PRIMARY KEY,
@@ -56,8 +56,8 @@ CREATE TABLE datasets (
     error jsonb,
     revision bigint NOT NULL DEFAULT 0,
     stored_bytes bigint NOT NULL DEFAULT 0,
-    lease_token uuid,
-    leased_until timestamptz,
+    check_token uuid,
+    check_until timestamptz,
     created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
     touched_at timestamptz NOT NULL DEFAULT clock_timestamp(),
     expires_at timestamptz,
@@ -79,7 +79,7 @@ CREATE TABLE dataset_files (
 CREATE INDEX dataset_files_content ON dataset_files (sha256, size);
 
 -- Uploads under way. Their bytes lie below `folder` in the file store, which goes to the trash with the row.
--- `lease_token`, `leased_until`: who brings a received upload into its dataset, and until when without a sign of life.
+-- `take_token`, `take_until`: who brings a received upload into its dataset, and until when without a sign of life.
 -- `brought`: bytes that the dataset has already, and that are counted there.
 CREATE TABLE uploads (
     id text PRIMARY KEY,
@@ -93,8 +93,8 @@ CREATE TABLE uploads (
     brought bigint NOT NULL DEFAULT 0 CHECK (brought BETWEEN 0 AND size),
     folder text NOT NULL,
     error jsonb,
-    lease_token uuid,
-    leased_until timestamptz,
+    take_token uuid,
+    take_until timestamptz,
     created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
     expires_at timestamptz NOT NULL,
     CHECK ((kind = 'archive') = (path IS NULL))
