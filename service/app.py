@@ -78,8 +78,8 @@ def create_app(settings: Settings) -> FastAPI:
             swept = await asyncio.to_thread(sweep_staging, service.staging_dir)
             if swept:
                 logger.info("removed %d unfinished uploads", swept)
-            service.keep_running(asyncio.create_task(_repeat(_finish_checks, service)))
-            service.keep_running(asyncio.create_task(_repeat(_finish_uploads, service)))
+            service.keep_running(_repeat(_finish_checks, service))
+            service.keep_running(_repeat(_finish_uploads, service))
             await log_access(service)
             try:
                 yield

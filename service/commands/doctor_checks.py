@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from pydantic import ValidationError
 
 from biresnerf.commands.machine.machine_checks import Check, Found
 from service.web_page import FOLDER
-from workers.database.embedded_postgres import EmbeddedPostgres
+from workers.database.reach_database import reached_database
 from workers.process.disk_space import DiskBudget
 from workers.settings.errors import SetupError
 from workers.settings.settings import Settings
@@ -25,33 +24,21 @@ def database() -> Found:
         settings = Settings()
     except ValidationError as error:
         return Found("settings", "broken", f"{error.error_count()} are invalid", "`biresnerf up` lists them.")
-    try:
-        if settings.database_url is not None:
-            return _configured(settings.require_database_url())
-        return _embedded()
-    except (SetupError, psycopg.Error) as error:
-        return Found("database", "broken", str(error), "docs/operations.md")
-
-
-def _configured(url: str) -> Found:
-    with psycopg.connect(url, connect_timeout=_CONNECT_S) as connection:
-        return Found("database", "good", f"{_version(connection)} at BIRESNERF_DATABASE_URL")
-
-
-def _embedded() -> Found:
-    home = Path(tempfile.mkdtemp(prefix="biresnerf-doctor-"))
-    home.chmod(0o711)  # if root starts the database, it runs as another user
-    postgres = EmbeddedPostgres(home / "postgres")
-    try:
-        with psycopg.connect(postgres.start(), connect_timeout=_CONNECT_S) as connection:
-            return Found("database", "good", f"a private {_version(connection)} starts")
-    finally:
-        postgres.stop()
-        shutil.rmtree(home, ignore_errors=True)
-
-
-def _version(connection: psycopg.Connection) -> str:
-    return f"PostgreSQL {connection.info.server_version // 10_000}"
+    # If root starts the database, it runs as another user, who must reach its folder.
+    with tempfile.TemporaryDirectory(prefix="biresnerf-doctor-", ignore_cleanup_errors=True) as home:
+        Path(home).chmod(0o711)
+        try:
+            with (
+                reached_database(settings.model_copy(update={"data_dir": Path(home)}), migrated=False) as url,
+                psycopg.connect(url, connect_timeout=_CONNECT_S) as connection,
+            ):
+                version = f"PostgreSQL {connection.info.server_version // 10_000}"
+        except (SetupError, psycopg.Error) as error:
+            return Found("database", "broken", str(error), "docs/operations.md")
+    where = f"a private {version} starts"
+    if settings.database_url is not None:
+        where = f"{version} at BIRESNERF_DATABASE_URL"
+    return Found("database", "good", where)
 
 
 def disk() -> Found:

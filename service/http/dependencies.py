@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -87,9 +87,10 @@ class Service:
         """The disk space that uploads may still use."""
         return upload_disk_budget(self.settings)
 
-    def keep_running(self, task: asyncio.Task[Any]) -> None:
-        """Keeps a reference to a task that outlives its request, so that it is not garbage-collected."""
-        self.background.add(task)
+    def keep_running(self, work: Coroutine[Any, Any, object], name: str | None = None) -> None:
+        """Runs work that outlives its request."""
+        task = asyncio.create_task(work, name=name)
+        self.background.add(task)  # else it could be garbage-collected
         task.add_done_callback(self.background.discard)
 
 

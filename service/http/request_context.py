@@ -80,18 +80,19 @@ class RequestContext:
             _refuse_other_sites(request)
             with log_context(request_id=request_id(request)):
                 await self._app(scope, receive, send_with_headers)
-        except ProblemError as problem:
-            await render(problem, request)(scope, receive, send_with_headers)
+            return
+        except ProblemError as error:
+            problem = error
         except asyncio.CancelledError:
             if started or not _stopping(request):
                 raise
             # A request cut off by the shutdown was not served; another process can serve it.
-            stopping = ProblemError("unavailable", "The service is stopping.")
-            await render(stopping, request)(scope, receive, send_with_headers)
+            problem = ProblemError("unavailable", "The service is stopping.")
         except Exception as error:
             if started:
                 raise
-            await render(_unexpected(error, request), request)(scope, receive, send_with_headers)
+            problem = _unexpected(error, request)
+        await render(problem, request)(scope, receive, send_with_headers)
 
 
 def _refuse_ambiguous(request: Request) -> None:

@@ -103,7 +103,7 @@ def begin_taking(service: Service, upload_id: str) -> None:
         except (ProblemError, EngineError, OSError) as error:
             logger.warning("upload %s is received but not stored yet: %s", upload_id, error)
 
-    service.keep_running(asyncio.create_task(take(), name=f"take {upload_id}"))
+    service.keep_running(take(), name=f"take {upload_id}")
 
 
 async def take_upload(service: Service, upload_id: str) -> None:

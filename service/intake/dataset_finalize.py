@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from biresnerf.errors import InputError
+from biresnerf.errors import Fault, InputError
 from biresnerf.wire.datasets import DatasetView
 from biresnerf.wire.safe_paths import NameSet
 from service.http.access import Caller
@@ -33,7 +33,7 @@ async def begin_check(caller: Caller, dataset_id: str) -> DatasetView:
             break
     dataset = await store.finalize(dataset_id)
     if dataset.state == "finalizing":
-        caller.service.keep_running(asyncio.create_task(store.check(dataset_id), name=f"check {dataset_id}"))
+        caller.service.keep_running(store.check(dataset_id), name=f"check {dataset_id}")
     return dataset
 
 
@@ -44,8 +44,7 @@ async def finish_check(caller: Caller, dataset_id: str) -> DatasetView:
             await asyncio.shield(task)
     dataset = await caller.datasets.check(dataset_id)
     if dataset.state == "rejected":
-        error = dataset.error
-        if error is None:
-            raise ProblemError("dataset_invalid", "The check rejected the dataset.")
-        raise ProblemError.of(error)
+        raise ProblemError.of(
+            dataset.error or Fault(code="dataset_invalid", detail="The check rejected the dataset.")
+        )
     return dataset

@@ -27,7 +27,6 @@ _CALLBACKS = (
     *("on_part_data", "on_part_end", "on_end"),
 )
 _FIELD_BYTES_MAX = 256 * 1024
-_HEADER_BYTES_MAX = 8 * 1024
 _LOCK = ".in-use"
 # A client that sends nothing for this long only occupies a connection and a folder.
 IDLE_S = 60.0
@@ -184,15 +183,9 @@ class Form:
 
     def _on_header_field(self, data: bytes, start: int, end: int) -> None:
         self._header_name += data[start:end]
-        self._guard_header(self._header_name)
 
     def _on_header_value(self, data: bytes, start: int, end: int) -> None:
         self._header_value += data[start:end]
-        self._guard_header(self._header_value)
-
-    def _guard_header(self, value: bytes) -> None:
-        if len(value) > _HEADER_BYTES_MAX or len(self._headers) > 16:
-            raise ProblemError("malformed_body", "The header of a form field is too large.")
 
     def _on_header_end(self) -> None:
         self._headers[self._header_name.lower()] = self._header_value

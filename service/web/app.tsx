@@ -1,7 +1,7 @@
 // The service's page at `/`; the part of the URL after `#` selects the view.
 import { render } from "preact";
 import { useEffect, useRef, useState } from "preact/hooks";
-import { apiKey, forgetKey, keyRequired } from "./api/http";
+import { apiKey, keyRequired, setKey } from "./api/http";
 import { useStore } from "./api/store";
 import { JobPage } from "./job/page";
 import { JobsPage } from "./jobs/list";
@@ -49,7 +49,7 @@ function App() {
           </a>
           <a href="docs">API</a>
           {key && (
-            <button class="plain-link" onClick={forgetKey}>
+            <button class="plain-link" onClick={() => setKey(null)}>
               Forget the key
             </button>
           )}

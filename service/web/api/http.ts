@@ -9,15 +9,12 @@ export const apiKey = new Store<string | null>(sessionStorage.getItem(KEY_ITEM))
 /** Why the service rejected the request without (or with) this key; null while no key is needed. */
 export const keyRequired = new Store<string | null>(null);
 
-export function useKey(key: string): void {
-  sessionStorage.setItem(KEY_ITEM, key);
+/** Uses a key from now on; null forgets it. */
+export function setKey(key: string | null): void {
+  if (key === null) sessionStorage.removeItem(KEY_ITEM);
+  else sessionStorage.setItem(KEY_ITEM, key);
   apiKey.set(key);
   keyRequired.set(null);
-}
-
-export function forgetKey(): void {
-  sessionStorage.removeItem(KEY_ITEM);
-  apiKey.set(null);
 }
 
 interface ProblemFields {

@@ -1,6 +1,6 @@
 // Asks for an API key where the service requires one.
 import { useState } from "preact/hooks";
-import { useKey } from "../api/http";
+import { setKey } from "../api/http";
 import { useTitle } from "./title";
 
 export function KeyForm({ error }: { error: string }) {
@@ -11,7 +11,7 @@ export function KeyForm({ error }: { error: string }) {
       class="card key-form"
       onSubmit={(event) => {
         event.preventDefault();
-        if (text.trim()) useKey(text.trim());
+        if (text.trim()) setKey(text.trim());
       }}
     >
       <h1>This service requires an API key</h1>

@@ -18,6 +18,8 @@ const INTRINSICS: Record<string, string> = {
   guessed: "guessed, and refined with the poses",
 };
 
+const UNKNOWN = ["Images", "Poses", "Cameras", "Masks"];
+
 export function CheckTable({ dataset }: { dataset: DatasetView }) {
   const { report } = dataset;
   const checking = dataset.state === "finalizing";
@@ -41,7 +43,12 @@ export function CheckTable({ dataset }: { dataset: DatasetView }) {
               {dataset.error.detail}
             </Line>
           )}
-          {report ? <Found dataset={dataset} /> : !rejected && <Unknown />}
+          {report && <Found dataset={dataset} />}
+          {!report && !rejected && UNKNOWN.map((name) => (
+            <Line key={name} mark="wait" name={name}>
+              <span class="soft">not known yet</span>
+            </Line>
+          ))}
         </tbody>
       </table>
     </section>
@@ -72,18 +79,6 @@ function Found({ dataset }: { dataset: DatasetView }) {
       {report.warnings.map((warning) => (
         <Line key={warning} mark="note" name="Warning">
           {warning}
-        </Line>
-      ))}
-    </>
-  );
-}
-
-function Unknown() {
-  return (
-    <>
-      {["Images", "Poses", "Cameras", "Masks"].map((name) => (
-        <Line key={name} mark="wait" name={name}>
-          <span class="soft">not known yet</span>
         </Line>
       ))}
     </>

@@ -13,20 +13,13 @@ interface Started {
   upload: string;
 }
 
-interface ArchiveSent {
-  dataset: string;
-  upload: string;
+interface ArchiveSent extends Started {
   /** Resolves when the last byte has arrived. */
   sent: Promise<void>;
 }
 
 /** Starts sending an archive, or continues with the same file, into `dataset` or a new one. */
-export async function sendArchive(
-  file: File,
-  name: string,
-  state: Store<Transfer>,
-  dataset?: string,
-): Promise<ArchiveSent> {
+export async function sendArchive(file: File, name: string, state: Store<Transfer>, dataset?: string): Promise<ArchiveSent> {
   const item = `biresnerf-upload ${file.name} ${file.size} ${file.lastModified}`;
   const known = await resumable(item);
   const started = known && (dataset ?? known.dataset) === known.dataset ? known : await create(file, name, dataset);
@@ -70,11 +63,7 @@ async function sendPieces(upload: string, file: File, state: Store<Transfer>): P
     await retrying(state, async () => {
       offset = await offsetOf(upload); // the service knows what has arrived
       if (offset >= file.size) return;
-      const headers = {
-        ...TUS,
-        "Upload-Offset": String(offset),
-        "Content-Type": "application/offset+octet-stream",
-      };
+      const headers = { ...TUS, "Upload-Offset": String(offset), "Content-Type": "application/offset+octet-stream" };
       const piece = file.slice(offset, offset + PIECE_BYTES);
       const response = await put("PATCH", `v1/uploads/${upload}`, headers, piece, (sent) =>
         state.change({ bytesDone: offset + sent }),
