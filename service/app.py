@@ -26,7 +26,7 @@ from service.http.metrics import WebMetrics
 from service.http.observe import Observed, is_probe
 from service.http.problems import ProblemError, problem_of
 from service.http.request_context import RequestContext, render
-from service.intake.archive_import import take_upload
+from service.intake.archive_import import import_upload
 from service.intake.json_body import validation_problem
 from service.intake.uploads import sweep_staging
 from service.routes import (
@@ -142,7 +142,7 @@ async def _finish_checks(service: Service) -> None:
 async def _finish_uploads(service: Service) -> None:
     """Finishes uploads that another process received but did not store; deletes those that expired."""
     for upload_id in await service.stores.uploads.untaken():
-        await take_upload(service, upload_id)
+        await import_upload(service, upload_id)
     await service.stores.uploads.expire()
 
 

@@ -1,7 +1,7 @@
-"""The page for people: what `hatch_build.py` built of service/web, sent as it lies there.
+"""The web page: the files that `hatch_build.py` builds from service/web.
 
-Names of files hold a digest of what is in them, so browsers keep them for good; index.html, which names them, is
-asked for each time.
+File names contain a digest of the content, so browsers may cache them for a year; index.html, which refers to them, is
+revalidated on each visit.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MEDIA_TYPES = {
     ".svg": "image/svg+xml",
     ".txt": "text/plain",
 }
-# Best first; the build writes both beside the file where they save something.
+# Best first; the build writes a compressed copy of a file where that is smaller.
 _ENCODINGS = {"br": ".br", "gzip": ".gz"}
 _SAFE = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
 
@@ -37,11 +37,11 @@ router = APIRouter(include_in_schema=False)
 @router.get("/")
 @router.head("/")
 async def index(request: Request) -> Response:
-    """The page; what it shows is after the `#` of its address, so this is all of it."""
+    """The page; the part of its address after `#`, which only the browser sees, selects the view."""
     if not (FOLDER / "index.html").is_file():
         raise ProblemError(
             "unavailable",
-            "The page was not built; the interface under /v1 and its description at /docs are there.",
+            "The page was not built; only the API under /v1 and its documentation at /docs are available.",
             hint="Run `make web` in the source tree, or install a wheel.",
         )
     headers = {"Content-Security-Policy": CSP, "Cache-Control": "no-cache", "X-Frame-Options": "DENY"}
@@ -54,16 +54,16 @@ async def part(name: str, request: Request) -> Response:
     """A script, a style sheet or the icon."""
     if not _NAME.fullmatch(name) or not (FOLDER / name).is_file():
         raise ProblemError("not_found", "The page has no such part; load it again.")
-    lasting = "no-cache" if name == "licences.txt" else "public, max-age=31536000, immutable"
-    return _file(name, request, {"Cache-Control": lasting})
+    caching = "no-cache" if name == "licences.txt" else "public, max-age=31536000, immutable"
+    return _file(name, request, {"Cache-Control": caching})
 
 
 def _file(name: str, request: Request, headers: dict[str, str]) -> Response:
-    path, sent = FOLDER / name, {**_SAFE, **headers, "Vary": "Accept-Encoding"}
-    taken = {item.split(";")[0].strip() for item in request.headers.get("accept-encoding", "").split(",")}
+    path, headers = FOLDER / name, {**_SAFE, **headers, "Vary": "Accept-Encoding"}
+    accepted = {item.split(";")[0].strip() for item in request.headers.get("accept-encoding", "").split(",")}
     for encoding, suffix in _ENCODINGS.items():
         packed = FOLDER / (name + suffix)
-        if encoding in taken and packed.is_file():
-            path, sent["Content-Encoding"] = packed, encoding
+        if encoding in accepted and packed.is_file():
+            path, headers["Content-Encoding"] = packed, encoding
             break
-    return FileResponse(path, media_type=_MEDIA_TYPES[Path(name).suffix], headers=sent)
+    return FileResponse(path, media_type=_MEDIA_TYPES[Path(name).suffix], headers=headers)

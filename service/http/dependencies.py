@@ -128,7 +128,7 @@ def next_link(request: Request, cursor: str | None) -> dict[str, str]:
 
 
 class Paging:
-    """The part of a listing that was asked for, and the response with it."""
+    """The requested page of a listing, and the response with it."""
 
     def __init__(
         self,
@@ -140,7 +140,7 @@ class Paging:
         self.limit, self.cursor = limit, cursor
         self._request, self._response = request, response
 
-    def answer(self, model: type[Listing], page: Page[Any]) -> Listing:
+    def respond(self, model: type[Listing], page: Page[Any]) -> Listing:
         """The page as ``model``, with the `Link` header to the next one."""
         self._response.headers.update(next_link(self._request, page.next_cursor))
         return model.model_validate({"items": page.items, "next_cursor": page.next_cursor})

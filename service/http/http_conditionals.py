@@ -24,7 +24,7 @@ def _opaque(etag: str) -> str:
 
 
 def byte_range(header: str | None, if_range: str | None, etag: str, size: int) -> tuple[int, int] | None:
-    """First and last byte of the part asked for; None means the whole file.
+    """First and last byte of the requested part; None means the whole file.
 
     A range of another unit, several ranges and a stale `If-Range` get the whole file, as the RFC allows.
 

@@ -103,7 +103,7 @@ def _refuse_ambiguous(request: Request) -> None:
     if "content-length" in request.headers and "transfer-encoding" in request.headers:
         detail = "Content-Length and Transfer-Encoding exclude each other."
         raise ProblemError("malformed_request", detail, headers=close)
-    # The parser limits only a head that arrives in pieces; one that came whole is measured here.
+    # The parser limits only headers that arrive in pieces; those that arrive at once are measured here.
     head = [request.scope["raw_path"], request.scope["query_string"], *sum(request.scope["headers"], ())]
     if sum(map(len, head)) > HEAD_BYTES_MAX:
         detail = f"The head of the request is larger than {HEAD_BYTES_MAX} bytes."
@@ -113,7 +113,7 @@ def _refuse_ambiguous(request: Request) -> None:
 def _refuse_other_sites(request: Request) -> None:
     """Refuse requests of other sites' pages: a browser would send their forms to a service on this machine."""
     if request.method not in _SAFE and request.headers.get("sec-fetch-site") == "cross-site":
-        raise ProblemError("cross_site", "Requests from pages of other sites are not taken.")
+        raise ProblemError("cross_site", "Requests from pages of other sites are refused.")
 
 
 def _stopping(request: Request) -> bool:

@@ -33,7 +33,7 @@ _UNPACK_MEMORY_BYTES = 1536 * 2**20
 _KEPT_FOLDERS = {"images"}
 
 
-async def take_archive(
+async def import_archive(
     service: Service, dataset_id: str, archive: Path, upload_id: str | None = None
 ) -> DatasetView:
     """Unpacks ``archive``, which is alone in a staging folder, in a child process; then stores what came out.
@@ -94,19 +94,19 @@ def _files_below(root: Path) -> list[Path]:
     return sorted(path for path in root.rglob("*") if path.is_file())
 
 
-def begin_taking(service: Service, upload_id: str) -> None:
+def start_import(service: Service, upload_id: str) -> None:
     """Adds a received upload to its dataset, in the background."""
 
-    async def take() -> None:
+    async def start() -> None:
         try:
-            await take_upload(service, upload_id)
+            await import_upload(service, upload_id)
         except (ProblemError, EngineError, OSError) as error:
             logger.warning("upload %s is received but not stored yet: %s", upload_id, error)
 
-    service.keep_running(take(), name=f"take {upload_id}")
+    service.keep_running(start(), name=f"import {upload_id}")
 
 
-async def take_upload(service: Service, upload_id: str) -> None:
+async def import_upload(service: Service, upload_id: str) -> None:
     """Adds a received upload to its dataset unless another process does so; its state holds the outcome.
 
     Errors of the service (storage unavailable, disk full) are raised; the upload stays received and is retried.
@@ -153,7 +153,7 @@ async def _add_to_dataset(service: Service, upload: Upload) -> None:
         return
     async with staging_folder(service.staging_dir) as folder:
         archive = folder / "archive"
-        await write_stream(capped(uploads.content(upload), upload.size, room=service.disk_budget), archive)
+        await write_stream(capped(uploads.content(upload), upload.size, budget=service.disk_budget), archive)
         if upload.sha256 is not None:
             found = await asyncio.to_thread(file_sha256, archive)
             if found != upload.sha256:
@@ -162,10 +162,10 @@ async def _add_to_dataset(service: Service, upload: Upload) -> None:
                     f"What arrived has SHA-256 {found}, announced was {upload.sha256}.",
                     hint="Send the archive again.",
                 )
-        await take_archive(service, upload.dataset_id, archive, upload.id)
+        await import_archive(service, upload.dataset_id, archive, upload.id)
 
 
-async def settle_uploads(service: Service, dataset_id: str) -> None:
+async def import_received(service: Service, dataset_id: str) -> None:
     """Waits until everything received is in the dataset.
 
     Raises:
@@ -177,7 +177,7 @@ async def settle_uploads(service: Service, dataset_id: str) -> None:
         if not received:
             break
         for upload in received:
-            await take_upload(service, upload.id)
+            await import_upload(service, upload.id)
         await asyncio.sleep(_POLL_S)
     for upload in pending:
         give_up = f"or give it up: DELETE /v1/uploads/{upload.id}"

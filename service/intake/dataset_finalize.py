@@ -9,7 +9,7 @@ from biresnerf.wire.datasets import DatasetView
 from biresnerf.wire.safe_paths import NameSet
 from service.http.access import Caller
 from service.http.problems import ProblemError, problem_of
-from service.intake.archive_import import settle_uploads
+from service.intake.archive_import import import_received
 
 
 async def begin_check(caller: Caller, dataset_id: str) -> DatasetView:
@@ -20,7 +20,7 @@ async def begin_check(caller: Caller, dataset_id: str) -> DatasetView:
     """
     store = caller.datasets
     await store.get(dataset_id)  # the caller's own, before anything is done to it
-    await settle_uploads(caller.service, dataset_id)
+    await import_received(caller.service, dataset_id)
     names, cursor = NameSet(), None
     while True:
         page = await store.files(dataset_id, cursor=cursor)

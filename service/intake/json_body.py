@@ -92,7 +92,7 @@ def _no_constant(name: str) -> float:
 def _no_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     values = dict(pairs)
     if len(values) < len(pairs):
-        raise ValueError("A key is there twice")
+        raise ValueError("A key occurs twice")
     return values
 
 

@@ -39,19 +39,21 @@ def raw_request(*media_types: str) -> dict[str, Any]:
     return {"requestBody": {"required": True, "content": dict.fromkeys(media_types, content)}}
 
 
-def limited_body(request: Request, limit_bytes: int, room: DiskBudget | None = None) -> AsyncIterator[bytes]:
+def limited_body(
+    request: Request, limit_bytes: int, budget: DiskBudget | None = None
+) -> AsyncIterator[bytes]:
     """The body of the request as `capped` passes it; refused at once where its Content-Length exceeds the limits."""
     announced = request.headers.get("content-length", "")
     if announced.isdigit():
         if int(announced) > limit_bytes:
             raise _too_large(limit_bytes)
-        if room is not None:
-            room.require(int(announced))
-    return capped(request.stream(), limit_bytes, room=room)
+        if budget is not None:
+            budget.require(int(announced))
+    return capped(request.stream(), limit_bytes, budget=budget)
 
 
 async def capped(
-    stream: AsyncIterator[bytes], limit_bytes: int, idle_s: float = IDLE_S, room: DiskBudget | None = None
+    stream: AsyncIterator[bytes], limit_bytes: int, idle_s: float = IDLE_S, budget: DiskBudget | None = None
 ) -> AsyncIterator[bytes]:
     """The stream, with limits on its size and on the time between two chunks.
 
@@ -72,8 +74,8 @@ async def capped(
         total += len(chunk)
         if total > limit_bytes:
             raise _too_large(limit_bytes)
-        if room is not None and total - checked_at >= _CHECK_EVERY_BYTES:
-            await asyncio.to_thread(room.require)
+        if budget is not None and total - checked_at >= _CHECK_EVERY_BYTES:
+            await asyncio.to_thread(budget.require)
             checked_at = total
         yield chunk
 
@@ -116,7 +118,7 @@ def sweep_staging(root: Path) -> int:
         except BlockingIOError:
             continue
         except OSError:
-            # Without a lock file the folder is either brand new or half removed; its age tells which.
+            # Without a lock file the folder is either brand new or half removed; its age shows which.
             if _younger_than(folder, 3600):
                 continue
         shutil.rmtree(folder, ignore_errors=True)
@@ -195,7 +197,7 @@ class Form:
         _, parameters = parse_options_header(self._headers.get(b"content-disposition", b""))
         self._field = parameters.get(b"name", b"").decode(errors="replace")
         if self._field in self.texts or (self._field == self._file_field and self.has_file):
-            raise _bad_field(self._field, "The field is there twice.")
+            raise _bad_field(self._field, "The field occurs twice.")
         if self._field == self._file_field:
             self.has_file = True
             self._out = self._target.open("xb")

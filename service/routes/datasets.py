@@ -8,7 +8,7 @@ import re
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import Response
 
 from biresnerf.wire.datasets import (
     DatasetList,
@@ -23,7 +23,7 @@ from biresnerf.wire.safe_paths import checked_path
 from service.http.access import DatasetWriter, ReadCaller
 from service.http.dependencies import DatasetId, Paged, next_link, service_of
 from service.http.problems import ProblemError, declared
-from service.intake.archive_import import take_archive
+from service.intake.archive_import import import_archive
 from service.intake.dataset_finalize import begin_check, finish_check
 from service.intake.json_body import JSON_BYTES_MAX, JsonRoute
 from service.intake.uploads import limited_body, raw_request, staging_folder, write_stream
@@ -64,7 +64,7 @@ async def create_dataset(caller: DatasetWriter, body: NewDataset, response: Resp
 async def list_datasets(caller: ReadCaller, paging: Paged, state: DatasetState | None = None) -> DatasetList:
     """Datasets, newest first."""
     page = await caller.datasets.list(state=state, limit=paging.limit, cursor=paging.cursor)
-    return paging.answer(DatasetList, page)
+    return paging.respond(DatasetList, page)
 
 
 @router.get("/{dataset_id}")
@@ -94,7 +94,7 @@ async def list_files(
     return FileList(items=page.items, next_cursor=page.next_cursor)
 
 
-_TAKES = (
+_UPLOAD_PROBLEMS = (
     *("body_timeout", "dataset_not_open", "body_too_large", "too_many_files"),
     *("unsafe_path", "storage_full", "quota_exhausted", "too_many_uploads"),
 )
@@ -104,7 +104,7 @@ _TAKES = (
     "/{dataset_id}/files/{path:path}",
     status_code=201,
     response_model=FileView,
-    responses=declared("malformed_body", "file_exists", "digest_mismatch", *_TAKES)
+    responses=declared("malformed_body", "file_exists", "digest_mismatch", *_UPLOAD_PROBLEMS)
     | {204: {"description": "The file existed; its content was replaced."}},
     openapi_extra=raw_request("application/octet-stream"),
 )
@@ -114,23 +114,16 @@ async def put_file(
     request: Request,
     caller: DatasetWriter,
     repr_digest: Annotated[str | None, Header(description="`sha-256=:BASE64:`")] = None,
-    if_none_match: Annotated[str | None, Header(description="`*`: do not replace an existing file.")] = None,
-) -> Response:
+    if_none_match: Annotated[str, Header(description="`*`: do not replace an existing file.")] = "",
+) -> FileView | Response:
     """Uploads one file as raw bytes. Repeating the request changes nothing."""
-    limit = caller.service.settings.max_file_bytes
-    safe = checked_path(path)
-    body = limited_body(request, limit, caller.service.disk_budget)
+    safe, sha256 = checked_path(path), _announced_digest(repr_digest)
+    body = limited_body(request, caller.service.settings.max_file_bytes, caller.service.disk_budget)
     with caller.sending():
         file, new = await caller.datasets.add_file(
-            dataset_id,
-            safe,
-            body,
-            sha256=_announced_digest(repr_digest),
-            overwrite=(if_none_match or "").strip() != "*",
+            dataset_id, safe, body, sha256=sha256, overwrite=if_none_match.strip() != "*"
         )
-    if not new:
-        return Response(status_code=204)
-    return JSONResponse(file.model_dump(mode="json"), status_code=201)
+    return file if new else Response(status_code=204)
 
 
 def _announced_digest(header: str | None) -> str | None:
@@ -154,7 +147,7 @@ def _announced_digest(header: str | None) -> str | None:
 @router.post(
     "/{dataset_id}/archive",
     responses=declared(
-        "archive_too_large", "archive_rejected", "name_collision", "validation_timeout", *_TAKES
+        "archive_too_large", "archive_rejected", "name_collision", "validation_timeout", *_UPLOAD_PROBLEMS
     ),
     openapi_extra=raw_request("application/zip", "application/x-tar", "application/gzip"),
 )
@@ -168,33 +161,29 @@ async def upload_archive(dataset_id: DatasetId, request: Request, caller: Datase
     with caller.sending():
         async with staging_folder(caller.service.staging_dir) as folder:
             await write_stream(body, folder / "archive")
-            return await take_archive(caller.service, dataset_id, folder / "archive")
+            return await import_archive(caller.service, dataset_id, folder / "archive")
 
 
 @router.post(
     "/{dataset_id}/finalize",
-    response_model=DatasetView,
     responses=declared("dataset_not_complete", "dataset_invalid", "name_collision")
     | {202: {"model": DatasetView, "description": "In progress (with `Prefer: respond-async`)."}},
 )
 async def finalize_dataset(
     dataset_id: DatasetId,
     caller: DatasetWriter,
+    response: Response,
     prefer: Annotated[str, Header(description="`respond-async`: respond at once.")] = "",
-) -> Response:
+) -> DatasetView:
     """Freezes the files and checks them: poses, intrinsics, names, and every pixel.
 
     Responds when the check is done: 200 with a `ready` dataset, or 422 with what is wrong and how to fix it
     (the dataset is then `rejected` and accepts neither files nor jobs).
     """
     view = await begin_check(caller, dataset_id)
-    if "respond-async" in prefer.lower() and view.state == "finalizing":
-        body = view.model_dump(mode="json")
-        headers = {
-            "Location": dataset_url(dataset_id),
-            "Retry-After": "2",
-            "Preference-Applied": "respond-async",
-        }
-        return JSONResponse(body, status_code=202, headers=headers)
-    checked = await finish_check(caller, dataset_id)
-    return JSONResponse(checked.model_dump(mode="json"))
+    if "respond-async" not in prefer.lower() or view.state != "finalizing":
+        return await finish_check(caller, dataset_id)
+    response.status_code = 202
+    response.headers.update({"Location": dataset_url(dataset_id), "Retry-After": "2"})
+    response.headers["Preference-Applied"] = "respond-async"
+    return view

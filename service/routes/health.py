@@ -17,12 +17,8 @@ from workers.settings.errors import Unavailable
 from workers.upkeep.monitor import Need
 
 router = APIRouter(tags=["service"])
-_CODES: dict[Need, str] = {
-    "database": "database_unavailable",
-    "storage": "storage_unavailable",
-    "queue": "queue_unavailable",
-}
-_LACKING = ("database_unavailable", "storage_unavailable", "queue_unavailable", "unavailable")
+_NEEDS: tuple[Need, ...] = ("database", "storage", "queue")  # what the others depend on first
+_LACKING = (*(f"{need}_unavailable" for need in _NEEDS), "unavailable")
 
 
 @router.get("/livez")
@@ -53,9 +49,9 @@ async def _require_everything(service: Service) -> None:
     if not lacking:
         service.started.set()
         return
-    need = min(lacking, key=list(_CODES).index)
+    need = min(lacking, key=_NEEDS.index)
     found = [FieldProblem(pointer=f"check/{name}", detail=why) for name, why in lacking.items()]
-    raise ProblemError(_CODES[need], lacking[need], errors=found)
+    raise ProblemError(f"{need}_unavailable", lacking[need], errors=found)
 
 
 @router.get(

@@ -119,7 +119,7 @@ async def list_jobs(
         limit=paging.limit,
         cursor=paging.cursor,
     )
-    return paging.answer(JobList, page)
+    return paging.respond(JobList, page)
 
 
 def _label(text: str | None) -> tuple[str, str] | None:

@@ -11,7 +11,7 @@ from fastapi import Request
 from biresnerf.wire.jobs import JobTexts, JobView
 from service.http.access import Caller
 from service.http.problems import wrong_field
-from service.intake.archive_import import file_sha256, take_archive
+from service.intake.archive_import import file_sha256, import_archive
 from service.intake.dataset_finalize import begin_check, finish_check
 from service.intake.json_body import load_json, validate
 from service.intake.uploads import Form, limited_body, staging_folder
@@ -60,7 +60,7 @@ async def _submit_received(
     dataset = await datasets.create("one-shot")
     used = False
     try:
-        await take_archive(caller.service, dataset.id, archive)
+        await import_archive(caller.service, dataset.id, archive)
         await begin_check(caller, dataset.id)
         await finish_check(caller, dataset.id)
         job, used = await caller.jobs.submit(

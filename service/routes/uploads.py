@@ -14,20 +14,20 @@ from email.utils import format_datetime
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import Response
 
 from biresnerf.wire.datasets import UploadView, upload_url
 from biresnerf.wire.safe_paths import checked_path
 from service.http.access import DatasetWriter, ReadCaller
 from service.http.dependencies import DatasetId, UploadId
 from service.http.problems import ProblemError, declared
-from service.intake.archive_import import begin_taking
+from service.intake.archive_import import start_import
 from service.intake.uploads import limited_body, raw_request
 from workers.records import Upload
 
 VERSION = "1.0.0"
 CONTENT_TYPE = "application/offset+octet-stream"
-SPEAKS = {"Tus-Resumable": VERSION}
+TUS_HEADERS = {"Tus-Resumable": VERSION}
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _METADATA = (
     "`name BASE64` pairs with commas between. `path`: the upload is this one file; without it, an archive. "
@@ -35,11 +35,11 @@ _METADATA = (
 )
 
 
-def _speak_tus(
+def _check_tus_version(
     request: Request, tus_resumable: Annotated[str, Header(description="`1.0.0`; optional for GET.")] = ""
 ) -> None:
     """Adds the protocol version to every response, errors included; requests that tus defines must name it."""
-    request.state.extra_headers = SPEAKS
+    request.state.extra_headers = TUS_HEADERS
     if request.method not in {"GET", "OPTIONS"} and tus_resumable.strip() != VERSION:
         raise ProblemError(
             "precondition_failed",
@@ -52,12 +52,12 @@ def _speak_tus(
 router = APIRouter(
     prefix="/v1",
     tags=["uploads"],
-    dependencies=[Depends(_speak_tus)],
+    dependencies=[Depends(_check_tus_version)],
     responses=declared("precondition_failed", "storage_unavailable"),
 )
 
 
-def _where(upload: Upload) -> dict[str, str]:
+def _upload_headers(upload: Upload) -> dict[str, str]:
     return {
         "Upload-Offset": str(upload.received),
         "Upload-Length": str(upload.size),
@@ -80,7 +80,6 @@ async def describe_uploads(dataset_id: DatasetId, caller: ReadCaller) -> Respons
 @router.post(
     "/datasets/{dataset_id}/uploads",
     status_code=201,
-    response_model=UploadView,
     responses=declared(
         *("dataset_not_open", "invalid_request", "unsafe_path", "body_too_large"),
         *("too_many_files", "storage_full", "quota_exhausted"),
@@ -89,9 +88,10 @@ async def describe_uploads(dataset_id: DatasetId, caller: ReadCaller) -> Respons
 async def create_upload(
     dataset_id: DatasetId,
     caller: DatasetWriter,
+    response: Response,
     upload_length: Annotated[int, Header(ge=0, lt=2**62, description="Size of the upload in bytes.")],
     upload_metadata: Annotated[str, Header(description=_METADATA, max_length=8192)] = "",
-) -> Response:
+) -> UploadView:
     """A new resumable upload of one archive (zip, tar, tar.gz) or one large file."""
     metadata = _metadata(upload_metadata)
     path, sha256 = metadata.get("path"), metadata.get("sha256")
@@ -106,9 +106,9 @@ async def create_upload(
         sha256=sha256,
     )
     if upload.state == "received":
-        begin_taking(caller.service, upload.id)
-    headers = {"Location": upload_url(upload.id), **_where(upload)}
-    return JSONResponse(upload.model_dump(mode="json"), status_code=201, headers=headers)
+        start_import(caller.service, upload.id)
+    response.headers.update({"Location": upload_url(upload.id), **_upload_headers(upload)})
+    return upload
 
 
 def _metadata(header: str) -> dict[str, str]:
@@ -127,7 +127,7 @@ def _metadata(header: str) -> dict[str, str]:
 @router.head("/uploads/{upload_id}")
 async def head_upload(upload_id: UploadId, caller: ReadCaller) -> Response:
     """The offset at which the upload continues (`Upload-Offset`)."""
-    return Response(status_code=200, headers=_where(await caller.uploads.get(upload_id)))
+    return Response(status_code=200, headers=_upload_headers(await caller.uploads.get(upload_id)))
 
 
 @router.get("/uploads/{upload_id}")
@@ -164,8 +164,8 @@ async def append_upload(
     with caller.sending():
         upload = await uploads.append(upload_id, upload_offset, body)
     if upload.state == "received":
-        begin_taking(caller.service, upload_id)
-    return Response(status_code=204, headers=_where(upload))
+        start_import(caller.service, upload_id)
+    return Response(status_code=204, headers=_upload_headers(upload))
 
 
 @router.delete("/uploads/{upload_id}", status_code=204)

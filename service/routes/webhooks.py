@@ -43,7 +43,7 @@ async def list_webhooks(
 ) -> WebhookList:
     """Lists the webhooks for all jobs, or those of one job; newest first."""
     page = await caller.webhooks.list(job_id=job, limit=paging.limit, cursor=paging.cursor)
-    return paging.answer(WebhookList, page)
+    return paging.respond(WebhookList, page)
 
 
 @router.get("/{webhook_id}")
@@ -83,7 +83,7 @@ async def test_webhook(webhook_id: WebhookId, caller: JobWriter, response: Respo
 async def list_deliveries(webhook_id: WebhookId, caller: ReadCaller, paging: Paged) -> DeliveryList:
     """Messages sent and waiting, newest first, with the time and status of every attempt."""
     page = await caller.webhooks.deliveries(webhook_id, limit=paging.limit, cursor=paging.cursor)
-    return paging.answer(DeliveryList, page)
+    return paging.respond(DeliveryList, page)
 
 
 @router.get("/{webhook_id}/deliveries/{delivery_id}")
