@@ -44,13 +44,11 @@ def byte_range(header: str | None, if_range: str | None, etag: str, size: int) -
     first_text, last_text = match.groups()
     if first_text == "":
         first, last = max(size - int(last_text), 0), size - 1
-        empty = int(last_text) == 0
     else:
         first, last = int(first_text), min(int(last_text), size - 1) if last_text else size - 1
-        empty = False
         if last_text and int(last_text) < first:
             raise ProblemError("bad_range", f"The range {header[:100]!r} ends before it begins.")
-    if empty or first >= size:
+    if first >= size:
         raise ProblemError(
             "range_not_satisfiable",
             f"The file has {size} bytes.",

@@ -8,7 +8,7 @@ from collections.abc import AsyncGenerator, AsyncIterator
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query
-from fastapi.sse import EventSourceResponse
+from fastapi.responses import StreamingResponse
 
 from service.http.access import ReadCaller
 from service.http.dependencies import JobId, Service
@@ -51,7 +51,13 @@ _STREAM: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.get("/events", response_class=EventSourceResponse, responses=_STREAM)
+class EventStream(StreamingResponse):
+    """Server-sent events."""
+
+    media_type = "text/event-stream"
+
+
+@router.get("/events", response_class=EventStream, responses=_STREAM)
 async def follow_job(
     job_id: JobId,
     caller: ReadCaller,
@@ -59,14 +65,14 @@ async def follow_job(
         int | None, Query(ge=0, le=2**31, description="Replay what came after this event.")
     ] = None,
     last_event_id: Annotated[str | None, Header(description="Sent by browsers when they reconnect.")] = None,
-) -> EventSourceResponse:
+) -> EventStream:
     """Streams the events of a job: all, or those after the event `after` or `Last-Event-ID`."""
     start = _start(after, last_event_id)
     updates = caller.jobs.subscribe(job_id, after=start, heartbeat_s=KEEP_ALIVE_S)
     # Read the first update before the response begins, so that a missing job is a 404, not an empty stream.
     first = await anext(updates, None)
     headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
-    return EventSourceResponse(_stream(first, updates, caller.service), headers=headers)
+    return EventStream(_stream(first, updates, caller.service), headers=headers)
 
 
 def _start(after: int | None, last_event_id: str | None) -> int:

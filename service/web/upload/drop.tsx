@@ -1,5 +1,5 @@
 // Where image sets are dropped or chosen.
-import { useEffect, useRef, useState } from "preact/hooks";
+import { useState } from "preact/hooks";
 import { useAttempt } from "../api/hooks";
 import formats from "../formats.json";
 import { percent } from "../parts/format";
@@ -60,22 +60,19 @@ export function DropZone({ onChosen, compact = false }: Props) {
   );
 }
 
-function FileButton(props: { label: string; folder?: boolean; onFiles: (files: FileList) => void }) {
-  const input = useRef<HTMLInputElement>(null);
-  useEffect(() => {
-    if (props.folder) input.current?.setAttribute("webkitdirectory", "");
-  }, [props.folder]);
+function FileButton({ label, folder = false, onFiles }: { label: string; folder?: boolean; onFiles: (files: FileList) => void }) {
+  const directory = { webkitdirectory: folder }; // not in the types of Preact
   return (
-    <label class={props.folder ? "act primary" : "act"}>
-      {props.label}
+    <label class={folder ? "act primary" : "act"}>
+      {label}
       <input
-        ref={input}
+        {...directory}
         class="unseen"
         type="file"
         multiple
         onChange={(event) => {
           const { files } = event.currentTarget;
-          if (files?.length) props.onFiles(files);
+          if (files?.length) onFiles(files);
           event.currentTarget.value = "";
         }}
       />
