@@ -10,14 +10,14 @@ from concurrent.futures import Future
 from contextlib import ExitStack
 from queue import SimpleQueue
 from types import TracebackType
-from typing import Any, Concatenate, ParamSpec, TypeAlias, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeAlias, TypeVar, Unpack
 
 import anyio
 from anyio.from_thread import start_blocking_portal
 
 from biresnerf.client.client import AsyncClient
-from biresnerf.client.errors import ServiceError
 from biresnerf.client.events import StreamEvent
+from biresnerf.client.transport import ClientOptions
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -45,16 +45,9 @@ class Client:
     thread, and may use the client. Ctrl-C, or an error in a callback, cancels the request under way.
     """
 
-    def __init__(
-        self,
-        url: str,
-        *,
-        api_key: str | None = None,
-        patience_s: float = 60.0,
-        on_pause: Callable[[ServiceError, float], object] | None = None,
-    ) -> None:
+    def __init__(self, url: str, **options: Unpack[ClientOptions]) -> None:
         """See `AsyncClient`; ``on_pause`` is called in the client's own thread."""
-        self._client = AsyncClient(url, api_key=api_key, patience_s=patience_s, on_pause=on_pause)
+        self._client = AsyncClient(url, **options)
         self.url = self._client.url
         stack = ExitStack()
         self._portal = stack.enter_context(start_blocking_portal())

@@ -8,7 +8,7 @@ from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Self, TypeVar
+from typing import Any, BinaryIO, Self, TypedDict, TypeVar
 
 import anyio
 import anyio.to_thread
@@ -63,6 +63,14 @@ class _Bearer(httpx.Auth):
         if (url.scheme, url.host, url.port) == (service.scheme, service.host, service.port):
             request.headers["Authorization"] = self._header
         yield request
+
+
+class ClientOptions(TypedDict, total=False):
+    """What a client takes besides the address of its service, see `Transport`."""
+
+    api_key: str | None
+    patience_s: float
+    on_pause: Callable[[ServiceError, float], object] | None
 
 
 class Transport:

@@ -46,7 +46,7 @@ class Checker:
         self._turns = Turns(1)  # decoding a thousand photos is enough work for one machine
 
     async def check(self, dataset_id: str) -> None:
-        """Until the dataset is not ``finalizing`` any more, through our check or another process's."""
+        """Returns once the dataset is not ``finalizing`` any more, after our check or another process's."""
         token = uuid.uuid4()
         owned = await retry_while_unavailable(
             lambda: self._database.fetch("SELECT tenant FROM datasets WHERE id = %s", dataset_id)
@@ -118,7 +118,7 @@ async def check_files(
 ) -> CheckReport | JobError:
     """Run the check program on the files, given as (key, path). Its crash or timeout rejects them too.
 
-    Where it is killed (by the kernel, say, for another process's hunger) it is tried once more.
+    Where it is killed (perhaps by the kernel, because another process took too much memory) it is tried once more.
     """
     parent = settings.scratch_dir / CHECKS
     parent.mkdir(parents=True, exist_ok=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import uuid
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from psycopg import sql
@@ -67,31 +68,34 @@ async def start_attempt(connection: Connection, job_id: str, token: uuid.UUID) -
     return row
 
 
-async def requeue(
-    connection: Connection,
-    job_id: str,
-    event: EventType,
-    data: Mapping[str, Any],
-    *,
-    fence: bool = False,
-    uncounted: bool = False,
-    forget_checkpoint: bool = False,
-    smaller: Mapping[str, Any] | None = None,
-) -> None:
-    """Set the job back to queued. The caller puts its queue entry back.
+@dataclass(frozen=True)
+class Requeue:
+    """Why a job goes back to the queue, as an event, and with what changes.
 
-    Args:
+    Attributes:
         fence: drop the token, so that the attempt that ran it can write no more.
         uncounted: the attempt does not count.
-        smaller: options that attempts to come use in the place of those asked for.
+        forget_checkpoint: start over.
+        smaller: options that later attempts use in the place of those asked for.
     """
+
+    event: EventType
+    data: Mapping[str, Any]
+    fence: bool = False
+    uncounted: bool = False
+    forget_checkpoint: bool = False
+    smaller: Mapping[str, Any] = field(default_factory=dict)
+
+
+async def requeue(connection: Connection, job_id: str, how: Requeue) -> None:
+    """Set the job back to queued. The caller puts its queue entry back."""
     await connection.execute(
         "UPDATE jobs SET state = 'queued', attempt = attempt - %s, eta_s = NULL,"
         " run_token = CASE WHEN %s THEN NULL ELSE run_token END,"
         " checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END, smaller = smaller || %s WHERE id = %s",
-        (int(uncounted), fence, forget_checkpoint, Jsonb(dict(smaller or {})), job_id),
+        (int(how.uncounted), how.fence, how.forget_checkpoint, Jsonb(dict(how.smaller)), job_id),
     )
-    await add_event(connection, job_id, event, data)
+    await add_event(connection, job_id, how.event, how.data)
 
 
 async def take_back(connection: Connection, entry_id: int) -> None:
@@ -116,7 +120,7 @@ async def take_back(connection: Connection, entry_id: int) -> None:
         await finish_cancelled(connection, job["id"])
         await job_queue.abort(connection, entry_id)
         return
-    await requeue(connection, job["id"], "requeued", {"why": "worker_lost"}, fence=True)
+    await requeue(connection, job["id"], Requeue("requeued", {"why": "worker_lost"}, fence=True))
     await job_queue.put_back(connection, entry_id)
 
 
@@ -132,7 +136,7 @@ async def requeue_lost(connection: Connection, silent_s: float) -> None:
     ):
         log.warning("job %s was lost by the queue; queueing it again", job["id"])
         await _enqueue(connection, job)
-        await requeue(connection, job["id"], "requeued", {"why": "lost"}, fence=True)
+        await requeue(connection, job["id"], Requeue("requeued", {"why": "lost"}, fence=True))
 
 
 async def offer_held_jobs(connection: Connection) -> None:

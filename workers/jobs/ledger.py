@@ -17,11 +17,10 @@ from psycopg.types.json import Jsonb
 from biresnerf.progress import Progress
 from biresnerf.report import VerdictName
 from biresnerf.stages import ReusableStage
-from biresnerf.wire.jobs import EventType
 from biresnerf.wire.problems import JobError
 from workers.database.database import Connection, Database
 from workers.jobs.claim import Claim, Fenced
-from workers.jobs.job_states import add_event, finish, finish_cancelled, requeue, trash_attempts
+from workers.jobs.job_states import Requeue, add_event, finish, finish_cancelled, requeue, trash_attempts
 from workers.process.waiting import retry_while_unavailable
 from workers.records import LOG_NAME, Artifact
 from workers.store.trash import discard
@@ -185,23 +184,12 @@ class Ledger:
         await finish_cancelled(connection, job["id"], artifacts, self.claim.name, self._stall_s)
 
     @_fenced(True)
-    async def give_back(
-        self,
-        connection: Connection,
-        job: DictRow,
-        event: EventType,
-        data: Mapping[str, Any],
-        *,
-        uncounted: bool = False,
-        forget_checkpoint: bool = False,
-        smaller: Mapping[str, Any] | None = None,
-    ) -> bool:
-        """Back to the queue, see `requeue`; False if the job was cancelled instead."""
+    async def give_back(self, connection: Connection, job: DictRow, how: Requeue) -> bool:
+        """Back to the queue; False if the job was cancelled instead."""
         if job["cancel_requested"]:
             await finish_cancelled(connection, job["id"])
             return False
-        more = {"uncounted": uncounted, "forget_checkpoint": forget_checkpoint}
-        await requeue(connection, job["id"], event, data, **more, smaller=smaller)
+        await requeue(connection, job["id"], how)
         return True
 
 

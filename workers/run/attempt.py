@@ -19,6 +19,7 @@ from biresnerf.report import Verdict, VerdictName
 from biresnerf.wire.problems import JobError
 from workers.database.database import Database
 from workers.jobs.claim import Claim, Fenced, crashed_too_often
+from workers.jobs.job_states import Requeue
 from workers.jobs.ledger import Ledger
 from workers.process.waiting import first_done, retry_while_unavailable
 from workers.records import LOG_NAME, Artifact
@@ -172,7 +173,7 @@ class Attempt:
             await self._ledger.cancelled(await self._store(log_only=unwanted))
             return False
         if self._stop_reason == "shutdown":
-            return await self._ledger.give_back("requeued", {"why": "shutdown"}, uncounted=True)
+            return await self._ledger.give_back(Requeue("requeued", {"why": "shutdown"}, uncounted=True))
         if self._timed_out:
             error = JobError(
                 code="timeout",
@@ -188,7 +189,9 @@ class Attempt:
         tail = log_tail(self._log)
         if self._claim.attempt < self._settings.max_attempts:
             data = {"how": how, "log_tail": tail}
-            return await self._ledger.give_back("attempt_crashed", data, forget_checkpoint=forget_checkpoint)
+            return await self._ledger.give_back(
+                Requeue("attempt_crashed", data, forget_checkpoint=forget_checkpoint)
+            )
         error = crashed_too_often(self._claim.attempt, tail)
         error = error.model_copy(update={"detail": f"{error.detail} The last time: {how}."})
         await self._ledger.fail(error, await self._store(log_only=True))
@@ -213,7 +216,7 @@ class Attempt:
         if smaller and not self._claim.smaller and self._claim.attempt < self._settings.max_attempts:
             data = {"why": "out_of_memory", "options": smaller, "log_tail": tail}
             return await self._ledger.give_back(
-                "retried_smaller", data, forget_checkpoint=True, smaller=smaller
+                Requeue("retried_smaller", data, forget_checkpoint=True, smaller=smaller)
             )
         await self._ledger.fail(out_of_memory(self._claim.smaller, tail), await self._store(log_only=True))
         return False

@@ -12,6 +12,7 @@ from workers.database.database import Database
 from workers.engine import Stores
 from workers.jobs import ledger as ledgers
 from workers.jobs.claim import Fenced, claim_job
+from workers.jobs.job_states import Requeue
 from workers.jobs.ledger import Ledger
 from workers.records import Artifact
 from workers.settings.errors import Unavailable
@@ -149,7 +150,7 @@ async def test_nothing_is_written_once_another_attempt_owns_the_job(database: Da
         ledger.publish([FILE], None),
         ledger.fail(ERROR, []),
         ledger.cancelled([]),
-        ledger.give_back("requeued", {}),
+        ledger.give_back(Requeue("requeued", {})),
     ):
         with pytest.raises(Fenced):
             await write
@@ -170,13 +171,13 @@ async def test_a_job_given_back_starts_from_its_checkpoint_unless_that_is_forgot
     database: Database, ledger: Ledger
 ):
     await ledger.checkpoint("jobs/x/1", ["a"], 10)
-    assert await ledger.give_back("requeued", {"why": "shutdown"}, uncounted=True)
+    assert await ledger.give_back(Requeue("requeued", {"why": "shutdown"}, uncounted=True))
     again = await claim_job(database, ledger.claim.job_id, max_attempts=3)
     assert again is not None
     assert (again.attempt, again.checkpoint) == (1, {"prefix": "jobs/x/1", "files": ["a"]})
     smaller = {"max_image_size": 100}
     await Ledger(database, again, STALL_S).give_back(
-        "retried_smaller", {}, forget_checkpoint=True, smaller=smaller
+        Requeue("retried_smaller", {}, forget_checkpoint=True, smaller=smaller)
     )
     last = await claim_job(database, ledger.claim.job_id, max_attempts=3)
     assert last is not None
