@@ -79,14 +79,14 @@ Assignment: TypeAlias = tuple[list[tuple[str, PoseEntry]], list[str]]
 
 @dataclass(frozen=True, eq=False)
 class ParsedPoses:
-    """What a pose file says: names, poses and lenses.
+    """The content of a pose file: names, poses and lenses.
 
     Attributes:
         source: the format, and the files that were read.
         entries: in the file's order.
-        assign: which entry belongs to which image file, given the names of those files, sorted; by the entries' names
-            where left out. Raises InputError where that cannot be decided.
-        named: whether the file itself says which images its poses are for.
+        assign: matches entries to image files, given the sorted names of those files; by the entries' names where
+            left out. Raises InputError where that cannot be decided.
+        named: whether the file itself names the images of its poses.
         notes: for the user.
     """
 

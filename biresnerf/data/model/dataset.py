@@ -1,4 +1,4 @@
-"""What the reader hands on: cameras, frames and where they came from. Frozen, numpy only."""
+"""An image set in memory: cameras, frames and how the input was written. Frozen, numpy only."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Frame:
         orientation: EXIF orientation (1 to 8) by which stored pixels are turned first; camera, pose and mask are
             for the turned picture. 1 where they are for pixels as stored.
         mask_inverted: the mask means the opposite: pixels count where it is black (instant-ngp's dynamic_mask_*).
-        timestamp_s: when it was taken, where a trajectory said so.
+        timestamp_s: when it was taken, if a trajectory gave the time.
     """
 
     name: str

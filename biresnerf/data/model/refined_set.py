@@ -33,7 +33,7 @@ class RefinedImage:
         world_from_cam: float64 [4, 4], refined, in the caller's world; OpenCV axes.
         given: its pose before, float64 [4, 4]; None where there was none.
         pose_source: who found the pose that the optimisation started from.
-        flags: what is to be known of it: ``fixed``, ``held_out``, ``lost``, ``repaired``, ...
+        flags: notable facts about it: ``fixed``, ``held_out``, ``lost``, ``repaired``, ...
         path: the file; None where it is not known.
         orientation: as `biresnerf.data.model.dataset.Frame` has it.
     """
@@ -51,7 +51,7 @@ class RefinedImage:
 
 @dataclass(frozen=True, eq=False)
 class RefinedSet:
-    """Poses that have been refined, with all that writers ask of a set.
+    """Poses that have been refined, with everything that writers need.
 
     Attributes:
         cameras: intrinsics at full size.
@@ -168,6 +168,6 @@ def _model(
 
 
 def _times(dataset: Dataset) -> tuple[float, ...] | None:
-    """When the images were taken, where the input says it of all of them."""
+    """When the images were taken, if the input gives it for all of them."""
     times = tuple(frame.timestamp_s for frame in dataset.frames if frame.timestamp_s is not None)
     return times if len(times) == len(dataset) else None

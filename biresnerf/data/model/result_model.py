@@ -119,7 +119,7 @@ def _rigs_and_frames(
 def _rig_from_world(
     rig: colmap.ColmapRig, taken: Sequence[tuple[colmap.Sensor, int]], images: dict[int, colmap.ColmapImage]
 ) -> colmap.RigidPose | None:
-    """The rig's pose by what its reference took, else by the first sensor whose place in the rig is known."""
+    """The rig's pose from the image of its reference sensor, else of the first sensor with a known pose in the rig."""
     for sensor, image in taken:
         if sensor == rig.reference:
             return images[image].cam_from_world

@@ -35,7 +35,7 @@ DAMAGED: tuple[type[Exception], ...] = (
 
 
 class FocalPlane(NamedTuple):
-    """EXIF's focal plane resolution: px per mm of the sensor, of a picture of `width` x `height` px (0: not said)."""
+    """EXIF's focal plane resolution: px per mm of the sensor, of a picture of `width` x `height` px (0: unknown)."""
 
     px_per_mm_x: float
     px_per_mm_y: float
@@ -44,7 +44,7 @@ class FocalPlane(NamedTuple):
 
 
 class ImageHeader(NamedTuple):
-    """What a file says of its picture, as stored; EXIF's claims are unchecked but positive.
+    """The header of a stored picture; EXIF values are unchecked but positive.
 
     Attributes:
         width, height: stored size, px.
@@ -146,7 +146,7 @@ def header_of(image: Image.Image) -> ImageHeader:
 
 
 def stored_size(image: Image.Image) -> tuple[int, int]:
-    """Width and height (px) of the pixels as stored; Pillow tells those of a turned TIFF as shown."""
+    """Width and height (px) of the pixels as stored; Pillow gives those of a turned TIFF as shown."""
     if isinstance(image, TiffImageFile):
         return int(image.tag_v2[_TIFF_WIDTH]), int(image.tag_v2[_TIFF_HEIGHT])
     return image.size

@@ -154,7 +154,7 @@ def uniform_background(
 ) -> NDArray[np.float32] | None:
     """Black or white, float32 [3] of 0 or 1, where nearly all borders of ``images`` [h, w, 3] show it.
 
-    Only pixels that count are looked at; images whose border is masked have no say.
+    Only pixels that count are looked at; images with a wholly masked border are ignored.
     """
     black, white, asked = 0, 0, 0
     for image, counting in zip(images, counts, strict=True):

@@ -18,7 +18,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 
 # JPEG and lossy WebP keep no exact black; what they store lies on the nearer side of the middle.
 _LOSSY, _LOSSY_BLACK_BELOW = frozenset({"JPEG", "MPO", "WEBP"}), 128
-LEAST_SHARE = 1e-3  # of a photo's pixels must count: from fewer nothing can be said about it
+LEAST_SHARE = 1e-3  # of a photo's pixels must count: fewer are too few to measure anything
 _WHOLLY = 1 - 1e-6
 
 

@@ -1,4 +1,4 @@
-"""``view.json``: what of a result there is to be looked at, for the service's page and report.html."""
+"""``view.json``: the pictures and points of a result, for the service's page and report.html."""
 
 from __future__ import annotations
 

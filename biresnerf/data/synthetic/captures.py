@@ -28,7 +28,7 @@ TABLE_SCENE = (
 )
 # Walls far away show patches, not grain.
 _TABLE_SCALES, _ROOM_SCALES = 4, 2
-# Nothing but its spout and a glaze that hardly changes tells one side of it from another.
+# Its sides differ only by the spout and a glaze that hardly changes.
 VASE = (
     Shape("cylinder", (0.0, 0.0, -0.85), (0.36, 0.36, 0.08), (0.0, 0.0)),
     Shape("sphere", (0.0, 0.0, -0.25), (0.62, 0.62, 0.62), (0.0, 0.0)),

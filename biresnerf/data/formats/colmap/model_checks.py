@@ -1,4 +1,4 @@
-"""What a COLMAP model must be, table by table and as a whole, binary or text."""
+"""Checks of a COLMAP model, table by table and as a whole, binary or text."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _HINT = "Export the model again with COLMAP, or copy it again: it may be cut off
 
 
 def broken(where: str, what: str, code: str = "pose_file_invalid", hint: str = _HINT) -> InputError:
-    """The error for a model that says ``what`` at ``where``."""
+    """The error for a model of which ``what`` is wrong at ``where``."""
     return InputError(code, f"{what}.", where=where, hint=hint)
 
 
@@ -151,7 +151,7 @@ def points_of_records(
 
 
 def check_images(images: dict[int, colmap.ColmapImage], cameras: dict[int, Camera], file: str) -> None:
-    """Raises InputError for images without camera and names that stand twice."""
+    """Raises InputError for images without camera and repeated names."""
     names: dict[str, int] = {}
     for image in images.values():
         where = f"{file} image {image.id}"
@@ -165,7 +165,7 @@ def check_images(images: dict[int, colmap.ColmapImage], cameras: dict[int, Camer
 
 
 def check_tracks(images: dict[int, colmap.ColmapImage], points: colmap.ColmapPoints, file: str) -> None:
-    """Raises InputError where an image's features and the points' tracks do not say the same."""
+    """Raises InputError where an image's features and the points' tracks contradict each other."""
     observed = 0
     for image in images.values():
         if (image.point3d_ids < colmap.NO_POINT).any():

@@ -1,7 +1,7 @@
 """COLMAP's binary tables, parsed field by field; nothing is allocated before the file is known to hold it.
 
-Layouts: src/colmap/scene/reconstruction_io_binary.cc; little-endian throughout. Whether the tables fit each
-other is `biresnerf.data.formats.colmap.model_checks`' to say.
+Layouts: src/colmap/scene/reconstruction_io_binary.cc; little-endian throughout. `model_checks` compares the tables
+with each other.
 """
 
 from __future__ import annotations

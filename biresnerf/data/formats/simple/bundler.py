@@ -52,7 +52,7 @@ _CENTRED_PX = 1e-6
 
 
 def parse_bundler(root: Path, file: Path) -> ParsedPoses:
-    """The cameras of a bundle file; those whose focal length is 0 have no pose.
+    """The cameras of a bundle file; those with a focal length of 0 have no pose.
 
     list.txt, beside the images or the file, says which image each camera is; without it their order by name does.
 

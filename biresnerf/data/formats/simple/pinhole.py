@@ -127,7 +127,7 @@ def write_pinhole(refined: RefinedSet, folder: Path, should_stop: Callable[[], b
 
 
 def _names(refined: RefinedSet) -> list[str]:
-    """Plain file names: 3DGS looks for a name's last part only, and tells views apart by what is before its dot."""
+    """Plain file names: 3DGS uses the last part of a name, and only what is before its first dot identifies a view."""
     paths = [PurePosixPath(image.file_name) for image in refined.images]
     labels = {path.name.split(".")[0].casefold() for path in paths}
     stems = [path.stem for path in paths]

@@ -76,7 +76,7 @@ _NAMED_TIME = re.compile(r"#\s*([-+0-9.eE]+)\s+(\S.*\S|\S)\s*$")
 
 
 class Trajectory:
-    """Poses in the file's order; ``times_s`` and ``names`` (of images, by time) where the file says them."""
+    """Poses in the file's order; ``times_s`` and the names of images by time where the file has them."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -117,7 +117,7 @@ class Trajectory:
             self.name_of_time[time] = match[2]
 
     def names(self) -> list[str]:
-        """A name for each pose: the image's where the file says it, else the time, else the line's number from 0."""
+        """A name for each pose: the image's where the file has one, else the time, else the pose's number from 0."""
         if not self.times_s:
             return [str(index) for index in range(len(self.poses))]
         return [self.name_of_time.get(time, f"{time:.17g}") for time in self.times_s]
@@ -196,7 +196,7 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
 
 
 def _times_of_images(names: Sequence[str], root: Path) -> tuple[dict[str, float], str]:
-    """When each image was taken, s, where rgb.txt or its own name says so."""
+    """When each image was taken, s, as rgb.txt or its own name gives it."""
     times: dict[str, float] = {}
     table = root / TIMES_OF_IMAGES
     if table.is_file():

@@ -13,6 +13,7 @@ import numpy as np
 
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.transforms.read_transforms import bind_transforms, parse_transforms
+from biresnerf.data.formats.transforms.write_intrinsics import lens_values, ngp_coefficients
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.model.refined_set import RefinedSet
@@ -41,9 +42,6 @@ INNER_SHARE = 0.9  # of the unit cube, for what the cameras look at
 POINTS_INSIDE = 0.98  # of the points that the box must hold
 # What its image reader decodes, of what we read.
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp"})
-_PERSPECTIVE = ("k1", "k2", "p1", "p2")
-# In a fisheye k3, k4 lie where a perspective lens has p1, p2, and the key read last wins: these must not be there.
-_FISHEYE = ("k1", "k2", "k3", "k4")
 
 
 def write_transforms_ngp(refined: RefinedSet, path: Path) -> None:
@@ -73,12 +71,10 @@ def write_transforms_ngp(refined: RefinedSet, path: Path) -> None:
 
 def _lens(camera: Camera) -> dict[str, Any]:
     full = camera.full()
-    names = _FISHEYE if full.fisheye else _PERSPECTIVE
-    if any(getattr(full, name) for name in COEFFICIENTS if name not in names):
+    lacking = [name for name in COEFFICIENTS if name not in ngp_coefficients(full)]
+    if any(getattr(full, name) for name in lacking):
         raise _impossible(f"it has no lens with all coefficients of {camera.model}")
-    values: dict[str, Any] = {"w": camera.width, "h": camera.height}
-    values |= {"fl_x": full.fx, "fl_y": full.fy, "cx": full.cx, "cy": full.cy}
-    values |= {name: getattr(full, name) for name in names}
+    values = {key: value for key, value in lens_values(camera).items() if key not in lacking}
     return {**values, "is_fisheye": True} if full.fisheye else values
 
 

@@ -50,13 +50,14 @@ class Fields:
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
-            raise InputError(
-                "intrinsics_invalid",
-                f"{_short(value)} is not a usable number.",
-                where=self.where(key),
-                hint="Give a number (pixels for lengths).",
+            raise self.invalid(
+                key, f"{_short(value)} is not a usable number.", "Give a number (pixels for lengths)."
             )
         return float(value)
+
+    def invalid(self, key: str, detail: str, hint: str) -> InputError:
+        """The error for a value of ``key`` that no lens has."""
+        return InputError("intrinsics_invalid", detail, where=self.where(key), hint=hint)
 
 
 def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCamera:
@@ -76,12 +77,8 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
         preferred = "PINHOLE"
     problem = lens_problem(full, width, height)
     if problem is not None:
-        raise InputError(
-            "intrinsics_invalid",
-            problem,
-            where=fields.where("k1"),
-            hint="Check the coefficients k1, k2, ... and p1, p2, or undistort the images.",
-        )
+        hint = "Check the coefficients k1, k2, ... and p1, p2, or undistort the images."
+        raise fields.invalid("k1", problem, hint)
     model, params = smallest_model(full, preferred)
     camera = Camera(model, width, height, params).resized(header.width, header.height)
     shared = not any(fields.own(key) for key in ("fl_x", "fl_y", "camera_angle_x", "x_fov"))
@@ -151,8 +148,7 @@ def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int,
     if (w, h) == (header.width, header.height):
         return w, h, []
     if w <= 0 or h <= 0:
-        hint = "Give the size in pixels."
-        raise InputError("intrinsics_invalid", f"w = {w}, h = {h}.", where=fields.where("w"), hint=hint)
+        raise fields.invalid("w", f"w = {w}, h = {h}.", "Give the size in pixels.")
     turned = (w, h) == (header.height, header.width)
     if turned or not same_shape(w, h, header.width, header.height):
         how = "turned by 90 degrees" if turned else "not the same shape"
@@ -193,11 +189,10 @@ def _parameters(
     coefficients = _coefficients(fields, model, fisheye)
     fx, key_x = _focal(fields, ("fl_x", "camera_angle_x", "x_fov"), width)
     fy, key_y = _focal(fields, ("fl_y", "camera_angle_y", "y_fov"), height)
-    if key_x != "fl_x" and key_y != "fl_y":
-        # camera_angle_y and y_fov come from rounded angles of square pixels: one focal length serves both
-        # axes.
-        fy = fx if fx is not None else fy
-    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
+    # camera_angle_y and y_fov come from rounded angles of square pixels: one focal length serves both axes.
+    if fy is None or (fx is not None and key_x != "fl_x" and key_y != "fl_y"):
+        fy = fx
+    fx = fy if fx is None else fx
     assert fx is not None, "a frame without focal length has a guessed lens"
     assert fy is not None
     cx, cy = fields.get("cx"), fields.get("cy")
@@ -206,12 +201,8 @@ def _parameters(
         notes.append("cx or cy is not given; the image centre was taken")
     cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
     if not (-width < cx < 2 * width and -height < cy < 2 * height):
-        raise InputError(
-            "intrinsics_invalid",
-            f"the principal point ({cx:g}, {cy:g}) lies far outside the image.",
-            where=fields.where("cx"),
-            hint="Give cx and cy in pixels from the top left corner.",
-        )
+        detail = f"the principal point ({cx:g}, {cy:g}) lies far outside the image."
+        raise fields.invalid("cx", detail, "Give cx and cy in pixels from the top left corner.")
     return FullParameters(fx, fy, cx, cy, **coefficients, fisheye=fisheye), notes
 
 
@@ -230,13 +221,8 @@ def _focal(fields: Fields, keys: tuple[str, str, str], size: int) -> tuple[float
             fits = 0.0 < angle < math.pi
             focal = 0.5 * size / math.tan(0.5 * angle) if fits else 0.0
         if not fits or not 1e-3 * size < focal < 1e5 * size:
-            raise InputError(
-                "intrinsics_invalid",
-                f"{value:g} is not a focal length."
-                if key == keys[0]
-                else f"{value:g} is not an angle of view.",
-                where=fields.where(key),
-                hint="Give a positive focal length in pixels, or camera_angle_x in radians below pi.",
-            )
+            what = "a focal length" if key == keys[0] else "an angle of view"
+            hint = "Give a positive focal length in pixels, or camera_angle_x in radians below pi."
+            raise fields.invalid(key, f"{value:g} is not {what}.", hint)
         return focal, key
     return None, None

@@ -32,7 +32,7 @@ from biresnerf.errors import InputError
 _NGP_KEYS = frozenset(
     {"aabb_scale", "scale", "offset", "is_fisheye", "sharpness", "x_fov", "enable_depth_loading"}
 )
-# Older nerfstudio turned COLMAP's world by this, and did not write down that it had.
+# Older nerfstudio turned COLMAP's world by this without writing it into the file.
 _OLDER_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 _MODEL = "colmap/sparse/0"
 # Poses are taken for equal up to this, relative to the largest coordinate: files have 6 digits or more.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from biresnerf.geometry.camera.camera_models import COEFFICIENTS, Camera
+from biresnerf.geometry.camera.camera_models import COEFFICIENTS, Camera, FullParameters
 
 FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 
@@ -22,11 +22,13 @@ def lens_values(camera: Camera) -> dict[str, Any]:
     p = camera.full()
     values: dict[str, Any] = {"w": camera.width, "h": camera.height}
     values |= {"fl_x": p.fx, "fl_y": p.fy, "cx": p.cx, "cy": p.cy}
-    # instant-ngp would take p1 and p2 of a fisheye for its k3 and k4.
-    names = ["k1", "k2", "k3", "k4"] if p.fisheye else ["k1", "k2", "p1", "p2"]
-    if camera.model == "FULL_OPENCV":
-        names += ["k3", "k4", "k5", "k6"]
+    names = ngp_coefficients(p) if camera.model != "FULL_OPENCV" else COEFFICIENTS
     return values | {name: getattr(p, name) for name in names}
+
+
+def ngp_coefficients(lens: FullParameters) -> tuple[str, ...]:
+    """The coefficients that instant-ngp knows. It would take p1 and p2 of a fisheye for its k3 and k4."""
+    return ("k1", "k2", "k3", "k4") if lens.fisheye else ("k1", "k2", "p1", "p2")
 
 
 def says_lens(place: dict[str, Any]) -> bool:
