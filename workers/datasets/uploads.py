@@ -108,7 +108,7 @@ class UploadStore(OwnedStore):
         """
         upload = await self.get(upload_id)
         if upload.received != start or upload.kind == "signed":
-            raise _elsewhere(upload)
+            raise _offset_mismatch(upload)
         gathered = bytearray()
         with self._sharing():
             try:
@@ -155,7 +155,7 @@ class UploadStore(OwnedStore):
                 )
                 return await self._required(connection, upload.id)
         await self._files.delete(key)
-        raise _elsewhere(await self.get(upload.id))
+        raise _offset_mismatch(await self.get(upload.id))
 
     async def content(self, upload: Upload) -> AsyncIterator[bytes]:
         """All bytes received, in order.
@@ -242,5 +242,5 @@ class UploadStore(OwnedStore):
         return record_from_row(Upload, row)
 
 
-def _elsewhere(upload: Upload) -> Conflict:
+def _offset_mismatch(upload: Upload) -> Conflict:
     return Conflict("offset_mismatch", f"The upload goes on at byte {upload.received}, state {upload.state}.")

@@ -1,4 +1,4 @@
-"""What a tenant may still have: looked up in the transaction that takes it, so that no two take the same."""
+"""Quotas of tenants, checked in the transaction that uses them up, so that no two requests take the last place."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from workers.settings.errors import Conflict, LimitReached
 
 
 async def submitting_for(connection: Connection, dataset_id: str, seen_by: str | None) -> str:
-    """Whose a job on the dataset is. That tenant's submits take turns from here to the end of the transaction.
+    """The tenant of jobs on the dataset, whose submits take turns from here to the end of the transaction.
 
     So no two of them take its last place, or the same idempotency key. Other tenants' do not wait for them: at the
     limit of the whole queue as many jobs more can get in as submits run at that moment.

@@ -1,4 +1,4 @@
-"""What a job's process finds in its folder: the order, its input, and what it goes on from."""
+"""Fills the folder of a job's process: the order, its input, and the checkpoint to resume from."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ async def stage_job(database: Database, files: FileStore, claim: Claim, folder: 
             "SELECT key, path FROM dataset_files WHERE dataset_id = %s", claim.dataset_id
         )
         await files.stage(((row["key"], row["path"]) for row in rows), folder / "input")
-    await files.stage(_gone_on_from(claim), folder / "output")
+    await files.stage(_resumed_files(claim), folder / "output")
     (folder / "job.json").write_text(json.dumps(order, indent=1))
 
 
@@ -42,7 +42,7 @@ def _needs_photos(names: list[str]) -> bool:
     return any("photos" in formats()[name].needs for name in names)
 
 
-def _gone_on_from(claim: Claim) -> Iterator[tuple[str, str]]:
+def _resumed_files(claim: Claim) -> Iterator[tuple[str, str]]:
     """The last checkpoint; before there is one, the work of stages that is to be taken over."""
     if claim.checkpoint is not None:
         parts = [claim.checkpoint]

@@ -65,20 +65,20 @@ def waited_for(client: Client, job: JobView, timeout_s: float | None, *, as_json
         with JobProgressView() as view:
             return watch(client, job, view, timeout_s)
     except KeyboardInterrupt:
-        _tell_how_to_come_back(client, job)
+        _print_how_to_wait_again(client, job)
         raise click.exceptions.Exit(exit_codes.SIGINT) from None
     except JobNotOver:
         if as_json:
             print_json(client.job(job.id))
-        _tell_how_to_come_back(client, job)
+        _print_how_to_wait_again(client, job)
         raise click.exceptions.Exit(exit_codes.NOT_OVER) from None
     except ServiceError as error:
         if error.retryable:
-            _tell_how_to_come_back(client, job)
+            _print_how_to_wait_again(client, job)
         raise
 
 
-def _tell_how_to_come_back(client: Client, job: JobView) -> None:
+def _print_how_to_wait_again(client: Client, job: JobView) -> None:
     address = f"{client.url}{job.links.self}"
     click.echo(f"The job continues. To wait again: biresnerf wait {address}", err=True)
     click.echo(f"To stop it: biresnerf cancel {address}", err=True)

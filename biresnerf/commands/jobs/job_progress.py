@@ -57,7 +57,7 @@ class JobProgressView(_View):
             TextColumn("left {task.fields[left]}"),
             TimeElapsedColumn(),
         )
-        self._stage, self._said = "", 0.0
+        self._stage, self._printed_at = "", 0.0
         if self._bar is not None:
             self._task = self._bar.add_task("job", total=1.0, stage="waiting", numbers="", left="?")
 
@@ -69,8 +69,8 @@ class JobProgressView(_View):
             self._bar.update(self._task, completed=fraction, stage=stage, numbers=numbers, left=left)
             return
         now = time.monotonic()
-        if stage != self._stage or now - self._said >= _LINE_EVERY_S:
-            self._stage, self._said = stage, now
+        if stage != self._stage or now - self._printed_at >= _LINE_EVERY_S:
+            self._stage, self._printed_at = stage, now
             self.note(f"{stage:<10} {100 * fraction:3.0f} %  {numbers}  left {left}")
 
 
@@ -84,7 +84,7 @@ class BytesView(_View):
             DownloadColumn(),
             TimeElapsedColumn(),
         )
-        self._title, self._done, self._said, self._lock = title, 0, time.monotonic(), Lock()
+        self._title, self._done, self._printed_at, self._lock = title, 0, time.monotonic(), Lock()
         if self._bar is not None:
             self._task = self._bar.add_task(title, total=None)
 
@@ -99,8 +99,8 @@ class BytesView(_View):
             self._bar.update(self._task, description=self._title, completed=self._done, total=total)
             return
         now = time.monotonic()
-        if now - self._said >= _LINE_EVERY_S:
-            self._said = now
+        if now - self._printed_at >= _LINE_EVERY_S:
+            self._printed_at = now
             self.note(f"{self._title} {self._done / 1e6:.1f} of {total / 1e6:.1f} MB")
 
 

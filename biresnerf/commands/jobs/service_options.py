@@ -69,7 +69,7 @@ def service_at(url: str | None, api_key: str | None, job: JobName | None = None)
         ) from None
     try:
         chosen = (job.url if job is not None else None) or url or DEFAULT_URL
-        with Client(chosen, api_key=api_key, on_pause=_tell_pause) as client:
+        with Client(chosen, api_key=api_key, on_pause=_print_pause) as client:
             yield client
     except ServiceError as error:
         raise CommandFailed(with_code(error), exit_code_of(error)) from None
@@ -77,7 +77,7 @@ def service_at(url: str | None, api_key: str | None, job: JobName | None = None)
         raise CommandFailed(str(error), exit_codes.JOB) from None
 
 
-def _tell_pause(error: ServiceError, seconds: float) -> None:
+def _print_pause(error: ServiceError, seconds: float) -> None:
     if seconds >= 2.0:
         click.echo(f"trying again in {seconds:.0f} s: {error.detail}", err=True)
 

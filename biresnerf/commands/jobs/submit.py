@@ -96,11 +96,11 @@ def submitted(client: Client, path: Path, options: RefineOptions, **how: Any) ->
         try:
             return client.submit(path, options, on_progress=note, **how)
         except KeyboardInterrupt:
-            _tell_how_to_resume(last, how.get("resume"))
+            _print_how_to_resume(last, how.get("resume"))
             raise click.exceptions.Exit(exit_codes.SIGINT) from None
 
 
-def _tell_how_to_resume(last: Sending | None, resumed: str | None) -> None:
+def _print_how_to_resume(last: Sending | None, resumed: str | None) -> None:
     if last is None or last.dataset_id is None:
         click.echo("Stopped before anything was sent.", err=True)
         return

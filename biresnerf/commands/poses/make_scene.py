@@ -35,9 +35,9 @@ class MadeScene:
     truth: Path
 
     def __str__(self) -> str:
-        said = f", of which the COLMAP model in sparse/0 has {self.with_pose}"
-        without = said if self.with_pose < self.images else ""
-        return f"{self.images} views in {self.folder}{without}, true poses in {self.truth}"
+        partial = f", of which the COLMAP model in sparse/0 has {self.with_pose}"
+        posed = partial if self.with_pose < self.images else ""
+        return f"{self.images} views in {self.folder}{posed}, true poses in {self.truth}"
 
 
 @click.command("make-scene")
