@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.geometry.focus import focus_point
-from biresnerf.geometry.lie import se3_exp
+from biresnerf.geometry.lie import se3_exp, so3_exp
 
 RIG_DISTANCE = 4.0  # of the cameras from the scene in the Blender sets that BARF's noise levels were made for
 LOST_DEG = (45.0, 180.0)
@@ -48,8 +48,7 @@ def perturb_poses(world_from_cam: NDArray[np.float64], noise: float, seed: int) 
 
 def turn_in_place(world_from_cam: NDArray[np.float64], index: int, angle_deg: float) -> NDArray[np.float64]:
     """Poses [n, 4, 4] with camera `index` turned about its own vertical axis; 180 turns it to face backwards."""
-    angle = np.radians(angle_deg)
-    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turn = _rotations(np.array([0.0, np.radians(angle_deg), 0.0]))
     moved = np.array(world_from_cam, dtype=np.float64)
     moved[index, :3, :3] = moved[index, :3, :3] @ turn
     return moved
@@ -66,11 +65,7 @@ def orbit_away(world_from_cam: NDArray[np.float64], indices: list[int], seed: in
     for index in indices:
         axis = random.normal(size=3)
         angle = np.radians(random.uniform(*LOST_DEG))
-        rotation, _ = se3_exp(
-            torch.from_numpy(axis / np.linalg.norm(axis) * angle)[None],
-            torch.zeros(1, 3, dtype=torch.float64),
-        )
-        turn = rotation[0].numpy()
+        turn = _rotations(axis / np.linalg.norm(axis) * angle)
         poses[index, :3, :3] = turn @ poses[index, :3, :3]
         poses[index, :3, 3] = turn @ (poses[index, :3, 3] - focus) + focus
     return poses
@@ -90,7 +85,7 @@ def drift_like_a_phone(world_from_cam: NDArray[np.float64], seed: int) -> NDArra
     rate = np.zeros(count)
     for k in range(1, count):
         rate[k] = HEADING_KEPT * rate[k - 1] + random.normal(0.0, np.radians(HEADING_STEP_DEG))
-    heading = _turns(up / np.linalg.norm(up) * np.cumsum(rate)[:, None])
+    heading = _rotations(up / np.linalg.norm(up) * np.cumsum(rate)[:, None])
     steps = np.diff(poses[:, :3, 3], axis=0)
     lost = random.normal(0.0, STEP_LOST, steps.shape) * np.linalg.norm(steps, axis=1, keepdims=True)
     scale = 1.0 + random.normal(0.0, SCALE_ERROR)
@@ -98,13 +93,12 @@ def drift_like_a_phone(world_from_cam: NDArray[np.float64], seed: int) -> NDArra
     moved = poses.copy()
     moved[1:, :3, 3] = poses[0, :3, 3] + np.cumsum(walked, axis=0)
     moved[:, :3, 3] += random.normal(0.0, JITTER_OF_DISTANCE * distance, (count, 3))
-    jitter = _turns(random.normal(0.0, np.radians(JITTER_DEG), (count, 3)))
+    jitter = _rotations(random.normal(0.0, np.radians(JITTER_DEG), (count, 3)))
     moved[:, :3, :3] = jitter @ heading @ poses[:, :3, :3]
     return moved
 
 
-def _turns(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotations [n, 3, 3] by vectors [n, 3] (rad)."""
-    rotation, _ = se3_exp(torch.from_numpy(vectors), torch.zeros(len(vectors), 3, dtype=torch.float64))
-    turns: NDArray[np.float64] = rotation.numpy()
-    return turns
+def _rotations(rotvec: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation matrices [..., 3, 3] of rotation vectors [..., 3] (rad)."""
+    rotations: NDArray[np.float64] = so3_exp(torch.from_numpy(rotvec)).numpy()
+    return rotations

@@ -81,14 +81,11 @@ class Similarity:
             1.0 / self.scale, self.rotation.T.copy(), -(self.rotation.T @ self.translation) / self.scale
         )
 
-    def compose(self, b_from_a: Similarity) -> Similarity:
-        """``c_from_b.compose(b_from_a)`` is ``c_from_a``; also written ``c_from_b @ b_from_a``."""
+    def __matmul__(self, b_from_a: Similarity) -> Similarity:
+        """``c_from_b @ b_from_a`` is ``c_from_a``."""
         return Similarity(
             self.scale * b_from_a.scale, self.rotation @ b_from_a.rotation, self.apply(b_from_a.translation)
         )
-
-    def __matmul__(self, b_from_a: Similarity) -> Similarity:
-        return self.compose(b_from_a)
 
 
 def align_by_spread(a_from_cam: Array, b_from_cam: Array) -> Similarity:
@@ -198,9 +195,7 @@ def _rotation_of(correlation: Array, turn: Array) -> Array:
     """Rotation maximising ``trace(rotation^T correlation)``; `turn` decides what a rank of one leaves free."""
     left, values, right_t = np.linalg.svd(correlation)
     if values[1] > _LINE_BELOW * values[0]:
-        sign = np.sign(np.linalg.det(left) * np.linalg.det(right_t))
-        rotation_of_plane: Array = left @ np.diag([1.0, 1.0, sign]) @ right_t
-        return rotation_of_plane
+        return _proper(left, right_t)
     # Complete both directions of the line to right-handed frames, then turn about the line by the angle that
     # brings the cameras closest.
     left[:, 2] *= np.linalg.det(left)
@@ -214,9 +209,13 @@ def _rotation_of(correlation: Array, turn: Array) -> Array:
 
 def _nearest_rotation(matrix: Array) -> Array:
     left, _, right_t = np.linalg.svd(matrix)
-    rotation: Array = (
-        left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right_t))]) @ right_t
-    )
+    return _proper(left, right_t)
+
+
+def _proper(left: Array, right_t: Array) -> Array:
+    """The product of two orthogonal matrices, the last axis between them negated where it would be a reflection."""
+    sign = np.sign(np.linalg.det(left) * np.linalg.det(right_t))
+    rotation: Array = left @ np.diag([1.0, 1.0, sign]) @ right_t
     return rotation
 
 
