@@ -12,11 +12,7 @@ type Quaternion = readonly [number, number, number, number];
 export const centreOf = (pose: Matrix): Triple => [pose[0][3], pose[1][3], pose[2][3]];
 
 /** Column of the rotation: 0 right, 1 down, 2 forward, in the world. */
-export const axisOf = (pose: Matrix, column: 0 | 1 | 2): Triple => [
-  pose[0][column],
-  pose[1][column],
-  pose[2][column],
-];
+export const axisOf = (pose: Matrix, column: 0 | 1 | 2): Triple => [pose[0][column], pose[1][column], pose[2][column]];
 
 export const minus = (a: Triple, b: Triple): Triple => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
 export const plus = (a: Triple, b: Triple): Triple => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];

@@ -60,16 +60,12 @@ interface Scale {
 
 /** Caps do not depend on the data, except in world units, which have no absolute size. */
 export function scaleOf(by: ColourBy, spread: number): Scale {
-  switch (by) {
-    case "moved_deg":
-      return { label: "turned", unit: "°", caps: [10, 1, 3, 30, 90], signed: false };
-    case "moved_units":
-      return { label: "moved", unit: "units", caps: unitCaps(spread), signed: false };
-    case "delta_psnr":
-      return { label: "PSNR gain", unit: "dB", caps: [3, 1, 10], signed: true };
-    case "source":
-      return { label: "pose from", unit: "", caps: [], signed: false };
-  }
+  return {
+    moved_deg: { label: "turned", unit: "°", caps: [10, 1, 3, 30, 90], signed: false },
+    moved_units: { label: "moved", unit: "units", caps: unitCaps(spread), signed: false },
+    delta_psnr: { label: "PSNR gain", unit: "dB", caps: [3, 1, 10], signed: true },
+    source: { label: "source of the pose", unit: "", caps: [], signed: false },
+  }[by];
 }
 
 /** Round numbers near a tenth of the cameras' spread, in world units. */
@@ -78,22 +74,9 @@ function unitCaps(spread: number): number[] {
   return [1, 0.1, 10, 100].map((times) => Number((times * power).toPrecision(1)));
 }
 
-function valueOf(camera: SceneCamera, by: ColourBy): number | null {
-  switch (by) {
-    case "moved_deg":
-      return camera.moved_deg;
-    case "moved_units":
-      return camera.moved_units;
-    case "delta_psnr":
-      return camera.delta_psnr;
-    case "source":
-      return null;
-  }
-}
-
 export function colourOf(camera: SceneCamera, by: ColourBy, cap: number, kinds: readonly string[], dark: boolean): Colour {
   if (by === "source") return kindColour(camera.source, kinds);
-  const value = valueOf(camera, by);
+  const value = camera[by];
   if (value === null || !Number.isFinite(value)) return UNKNOWN;
   return by === "delta_psnr" ? signedColour(value / cap, dark) : rampColour(value / cap, dark);
 }

@@ -17,12 +17,10 @@ interface SceneChoice {
 
 export const FIRST_CHOICE: SceneChoice = { lines: 1, before: true, by: "moved_deg", caps: {}, layer: null };
 
-const COLOURS: readonly { value: ColourBy; text: string }[] = [
-  { value: "moved_deg", text: "turned (°)" },
-  { value: "moved_units", text: "moved (units)" },
-  { value: "delta_psnr", text: "PSNR gain (dB)" },
-  { value: "source", text: "source of the pose" },
-];
+const COLOURS = (["moved_deg", "moved_units", "delta_psnr", "source"] as const).map((value) => {
+  const { label, unit } = scaleOf(value, 1);
+  return { value, text: unit ? `${label} (${unit})` : label };
+});
 
 const LAYERS: Readonly<Record<PointLayer["source"], string>> = {
   given: "the input's points",
@@ -52,7 +50,7 @@ export function SceneControls(props: {
   const caps = [...scale.caps].sort((a, b) => a - b);
   return (
     <div class="scene-controls">
-      <Pick label="Colour" value={choice.by} onChange={(by) => onChange({ by })} options={COLOURS} />
+      <Pick<ColourBy> label="Colour" value={choice.by} onChange={(by) => onChange({ by })} options={COLOURS} />
       {caps.length > 0 && (
         <Pick
           label="up to"

@@ -4,13 +4,15 @@ import { useId } from "preact/hooks";
 import type { Verdict } from "schemas";
 import { VERDICTS } from "./words";
 
-/** Radio buttons that look like one bar. */
-export function Choice<T extends string | number>(props: {
+interface OptionsProps<T extends string | number> {
   label: string;
   value: T;
   options: readonly { value: T; text: string }[];
   onChange: (value: T) => void;
-}) {
+}
+
+/** Radio buttons that look like one bar. */
+export function Choice<T extends string | number>(props: OptionsProps<T>) {
   const name = useId();
   return (
     <fieldset class="choice">
@@ -32,12 +34,7 @@ export function Choice<T extends string | number>(props: {
   );
 }
 
-export function Pick<T extends string | number>(props: {
-  label: string;
-  value: T;
-  options: readonly { value: T; text: string }[];
-  onChange: (value: T) => void;
-}) {
+export function Pick<T extends string | number>(props: OptionsProps<T>) {
   return (
     <label class="pick">
       <span>{props.label}</span>

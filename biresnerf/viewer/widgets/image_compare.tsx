@@ -39,12 +39,7 @@ export function ImageCompare({ names, views, centres, urlOf, selected, onSelect 
   return (
     <section class="compare" aria-label="Render against photo">
       <div class="compare-controls">
-        <Choice
-          label="Show"
-          value={mode}
-          onChange={setMode}
-          options={MODES}
-        />
+        <Choice label="Show" value={mode} onChange={setMode} options={MODES} />
       </div>
       {view ? (
         <Picture view={view} name={names[view.image] ?? ""} mode={mode} urlOf={urlOf} />
@@ -89,12 +84,7 @@ function Picture(props: { view: ShownView; name: string; mode: Mode; urlOf: Imag
             render
           </span>
           <span class="compare-edge" style={{ left: `${100 * at}%` }} aria-hidden="true" />
-          <Slider
-            value={at}
-            label="Swipe between photo and render"
-            text={`${Math.round(100 * at)} % photo`}
-            onChange={setAt}
-          />
+          <Slider value={at} label="Swipe between photo and render" text={`${Math.round(100 * at)} % photo`} onChange={setAt} />
         </div>
       ) : (
         <div class="compare-frame" style={frame}>

@@ -1,8 +1,12 @@
 // Numbers for display.
 
+type Maybe = number | null | undefined;
+
+const known = (value: Maybe): value is number => value != null && Number.isFinite(value);
+
 /** Significant digits, without an exponent unless the value is tiny or huge. */
-export function short(value: number | null | undefined, digits = 3): string {
-  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+export function short(value: Maybe, digits = 3): string {
+  if (!known(value)) return "–";
   if (value === 0) return "0";
   const size = Math.abs(value);
   if (size >= 1e6 || size < 1e-4) return value.toExponential(digits - 1);
@@ -10,14 +14,11 @@ export function short(value: number | null | undefined, digits = 3): string {
   return value.toFixed(Math.min(decimals, 6));
 }
 
-export const fixed = (value: number | null | undefined, decimals: number): string =>
-  value === null || value === undefined || !Number.isFinite(value) ? "–" : value.toFixed(decimals);
+export const fixed = (value: Maybe, decimals: number): string => (known(value) ? value.toFixed(decimals) : "–");
 
 /** With its sign, and a true minus. */
-export const signed = (value: number | null | undefined, decimals: number): string =>
-  value === null || value === undefined || !Number.isFinite(value)
-    ? "–"
-    : `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(decimals)}`;
+export const signed = (value: Maybe, decimals: number): string =>
+  known(value) ? `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(decimals)}` : "–";
 
 export const count = (value: number, one: string, many = `${one}s`): string =>
   `${value.toLocaleString("en-GB")} ${value === 1 ? one : many}`;

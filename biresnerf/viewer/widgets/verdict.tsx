@@ -99,11 +99,15 @@ function Evidence(props: {
       </div>
       <Interval difference={d} least={props.least} unit={unit} />
       <div class="soft">
-        gain {signed(d.difference, 2)} {unit}
-        {d.low !== null && d.high !== null && `, 95 % interval ${signed(d.low, 2)} to ${signed(d.high, 2)}`}. {props.note}
+        gain {gainOf(d, unit)}. {props.note}
       </div>
     </div>
   );
+}
+
+function gainOf({ difference, low, high }: PairedDifference, unit: string): string {
+  const interval = low !== null && high !== null ? `, 95 % interval ${signed(low, 2)} to ${signed(high, 2)}` : "";
+  return `${signed(difference, 2)} ${unit}${interval}`;
 }
 
 const WIDTH = 260;
@@ -114,9 +118,8 @@ function Interval({ difference: d, least, unit }: { difference: PairedDifference
   const ends = [d.difference, d.low ?? d.difference, d.high ?? d.difference];
   const reach = 1.15 * Math.max(2 * least, ...ends.map(Math.abs));
   const x = (value: number) => WIDTH / 2 + (value / reach) * (WIDTH / 2 - 6);
-  const text = `Gain ${signed(d.difference, 2)} ${unit}${d.low !== null && d.high !== null ? `, 95 % interval ${signed(d.low, 2)} to ${signed(d.high, 2)}` : ""}`;
   return (
-    <svg class="interval" viewBox={`0 0 ${WIDTH} ${HEIGHT}`} preserveAspectRatio="xMinYMid" role="img" aria-label={text}>
+    <svg class="interval" viewBox={`0 0 ${WIDTH} ${HEIGHT}`} preserveAspectRatio="xMinYMid" role="img" aria-label={`Gain ${gainOf(d, unit)}`}>
       <rect class="interval-band" x={x(-least)} width={x(least) - x(-least)} y={3} height={HEIGHT - 6} rx={2} />
       <line class="interval-axis" x1={0} x2={WIDTH} y1={HEIGHT / 2} y2={HEIGHT / 2} />
       <line class="interval-zero" x1={x(0)} x2={x(0)} y1={2} y2={HEIGHT - 2} />
