@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,16 +24,12 @@ class Metric:
     tested: bool = False
 
 
-def _most(values: Sequence[float]) -> float:
-    return float(max(values))
-
-
 # Rotation and translation as BARF and BAA-NGP define them, after BARF's alignment.
 METRICS = (
     Metric("start_deg", "start °", 2, lambda o: o.before.aligned.rotation_deg.mean),
     Metric("rotation_deg", "rotation °", 3, lambda o: o.after.aligned.rotation_deg.mean, tested=True),
     Metric("rotation_median_deg", "median", 3, lambda o: o.after.aligned.rotation_deg.median),
-    Metric("rotation_max_deg", "max", 2, lambda o: o.after.aligned.rotation_deg.max, _most),
+    Metric("rotation_max_deg", "max", 2, lambda o: o.after.aligned.rotation_deg.max, max),
     Metric("not_found", "over 1°", 1, lambda o: float(o.not_found)),
     Metric("translation", "t ×100", 3, lambda o: o.after.aligned.translation_table.mean, tested=True),
     Metric("centre_percent", "centre %", 3, lambda o: o.after.aligned.centre_percent.mean),
@@ -44,7 +40,7 @@ METRICS = (
     Metric("coarse_s", "stage 1 s", 1, lambda o: o.seconds["coarse"]),
     Metric("fine_s", "stage 2 s", 1, lambda o: o.seconds["fine"]),
     Metric("optimisation_s", "both s", 1, lambda o: o.optimisation_s, tested=True),
-    Metric("peak_mb", "memory MB", 0, lambda o: o.peak_memory_bytes / 2**20, _most),
+    Metric("peak_mb", "memory MB", 0, lambda o: o.peak_memory_bytes / 2**20, max),
     Metric("steps", "steps", 0, lambda o: float(o.options.steps)),
     # A method of one stage has no switch.
     Metric("switch_step", "switch", 0, lambda o: float(o.switch_step or 0) if o.switch_reason else None),
@@ -131,13 +127,13 @@ def rows_of(entries: Sequence[Entry]) -> tuple[Row, ...]:
                 variant=variant,
                 seeds=tuple(entry.start.seed for entry in group if entry.result.outcome is not None),
                 failed=len(group) - len(outcomes),
-                values={metric.key: _joined(metric, outcomes) for metric in METRICS},
+                values={metric.key: _over_seeds(metric, outcomes) for metric in METRICS},
             )
         )
     return tuple(rows)
 
 
-def _joined(metric: Metric, outcomes: Sequence[Outcome]) -> float | None:
+def _over_seeds(metric: Metric, outcomes: Sequence[Outcome]) -> float | None:
     values = [value for value in map(metric.of, outcomes) if value is not None]
     return metric.over_seeds(values) if values else None
 
@@ -208,40 +204,20 @@ def paired_wilcoxon(first: Sequence[float], other: Sequence[float]) -> PairedTes
     )
 
 
-def failures_of(entries: Sequence[Entry]) -> tuple[Failure, ...]:
-    """The runs that ended in an error."""
-    return tuple(
-        Failure(
-            scene=entry.scene,
-            start=entry.start.label,
-            seed=entry.start.seed,
-            variant=entry.variant,
-            error=entry.result.error,
-        )
-        for entry in entries
-        if entry.result.error is not None
-    )
-
-
-def notes_of(entries: Sequence[Entry]) -> tuple[str, ...]:
+def notes_of(entry: Entry) -> Iterator[str]:
     """Notes on the tables: which views were scored, why LPIPS is absent, how equal time was reached."""
-    notes: dict[str, None] = {}
-    for entry in entries:
-        outcome, equal = entry.result.outcome, entry.result.cell.equal_time
-        if outcome is not None and outcome.views is not None:
-            notes[f"{entry.scene}: PSNR and SSIM over {outcome.views.count} {outcome.views.kind} views"] = (
-                None
-            )
-            if outcome.views.lpips_absent:
-                notes[f"no LPIPS: {outcome.views.lpips_absent}"] = None
-        if equal is not None:
-            took = f", took {outcome.optimisation_s:.1f} s" if outcome is not None else ""
-            notes[
-                f"{entry.scene}, {entry.start.label}, seed {entry.start.seed}, {entry.variant}: "
-                f"{equal.seconds:.1f} s at {equal.calibration_ms_per_step:.1f} ms a step "
-                f"(measured over {equal.calibration_steps} steps) gave {entry.result.cell.options.steps} steps{took}"
-            ] = None
-    return tuple(notes)
+    outcome, equal = entry.result.outcome, entry.result.cell.equal_time
+    if outcome is not None and outcome.views is not None:
+        yield f"{entry.scene}: PSNR and SSIM over {outcome.views.count} {outcome.views.kind} views"
+        if outcome.views.lpips_absent:
+            yield f"no LPIPS: {outcome.views.lpips_absent}"
+    if equal is not None:
+        took = f", took {outcome.optimisation_s:.1f} s" if outcome is not None else ""
+        yield (
+            f"{entry.scene}, {entry.start.label}, seed {entry.start.seed}, {entry.variant}: "
+            f"{equal.seconds:.1f} s at {equal.calibration_ms_per_step:.1f} ms a step "
+            f"(measured over {equal.calibration_steps} steps) gave {entry.result.cell.options.steps} steps{took}"
+        )
 
 
 def make_tables(
@@ -259,6 +235,12 @@ def make_tables(
         rows=rows,
         summaries=summaries_of(rows),
         differences=differences_of(entries),
-        failures=failures_of(entries),
-        notes=notes_of(entries),
+        failures=tuple(
+            Failure(
+                scene=e.scene, start=e.start.label, seed=e.start.seed, variant=e.variant, error=e.result.error
+            )
+            for e in entries
+            if e.result.error is not None
+        ),
+        notes=tuple(dict.fromkeys(note for entry in entries for note in notes_of(entry))),
     )
