@@ -1,1 +1,1 @@
-"""Pure mathematics of rotations, poses and cameras. Opens no files; knows nothing of images."""
+"""Pure mathematics of rotations, poses and cameras. Opens no files and has no images."""

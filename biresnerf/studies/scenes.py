@@ -102,7 +102,7 @@ def with_poses(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> Dataset
 
 
 def starting_rig(truth: NDArray[np.float64], start: Perturbation) -> StartingRig:
-    """True poses [n, 4, 4] perturbed as `start` says; deterministic for a seed."""
+    """True poses [n, 4, 4] perturbed by `start`; deterministic for a seed."""
     from biresnerf.geometry.perturb import orbit_away, perturb_poses, turn_in_place
 
     count = len(truth)

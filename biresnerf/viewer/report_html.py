@@ -16,7 +16,7 @@ from pathlib import Path
 from PIL import Image
 
 from biresnerf.data.formats.simple.poses_json import POSES
-from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.show.view_file import VIEW, ViewFile, read_view_file
 from biresnerf.errors import InputError
 from biresnerf.report import Report
@@ -27,7 +27,7 @@ BUNDLE = Path(__file__).parent / "dist"
 MOST_BYTES = 8_000_000
 MOST_VIDEO_BYTES = 2_000_000
 PICTURE_PX, QUALITY = 640, 82  # long side and JPEG quality of an embedded picture
-_MEDIA = {".jpg": "image/jpeg", ".mp4": "video/mp4", ".bin": "application/octet-stream"}
+_MEDIA = {".jpg": "image/jpeg", ".bin": "application/octet-stream"}
 NOT_BUILT = (
     "report.html was not written: its viewer is not built. Run `make web`, then `biresnerf report OUT`."
 )
@@ -72,8 +72,7 @@ def write_report_html(folder: Path, report: Report, title: str | None = None) ->
         licences=_as_script(licences),
         script=_inside("script", script),
     )
-    with whole_file(folder / REPORT_HTML) as temporary:
-        temporary.write_text(page, "utf-8")
+    write_text(folder / REPORT_HTML, page)
     return ()
 
 
@@ -118,12 +117,12 @@ def _embedded(folder: Path, view: ViewFile | None) -> tuple[dict[str, str], list
             over += 1
             continue
         spent += len(content)
-        files[name] = f"data:{media};base64,{base64.b64encode(content).decode('ascii')}"
+        files[name] = _data_url(media, content)
     left_out = []
     if view.orbit is not None and (folder / view.orbit).is_file():
         video = (folder / view.orbit).read_bytes()
         if len(video) <= min(MOST_VIDEO_BYTES, MOST_BYTES - spent):
-            files[view.orbit] = f"data:video/mp4;base64,{base64.b64encode(video).decode('ascii')}"
+            files[view.orbit] = _data_url("video/mp4", video)
         else:
             left_out.append(f"The orbit video ({len(video) / 1e6:.1f} MB): {view.orbit}")
     if over:
@@ -133,6 +132,10 @@ def _embedded(folder: Path, view: ViewFile | None) -> tuple[dict[str, str], list
     if missing:
         left_out.append(f"{missing} files that view.json lists but that are missing.")
     return files, left_out
+
+
+def _data_url(media: str, content: bytes) -> str:
+    return f"data:{media};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def _wanted(view: ViewFile) -> Iterator[str]:
@@ -190,5 +193,4 @@ style-src 'unsafe-inline'; img-src data: blob:; media-src data:; base-uri 'none'
 <script type="application/json" id="licences">{licences}</script>
 <script>{script}</script>
 </body>
-</html>
-"""
+</html>"""

@@ -1,1 +1,1 @@
-"""Published methods that ours is compared with. Loaded only when a run asks for one; tables and plots are above."""
+"""Published methods to compare with, loaded only by runs that use one."""

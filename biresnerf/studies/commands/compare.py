@@ -88,11 +88,8 @@ def comparison_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def shared_settings(given: dict[str, Any]) -> dict[str, Any]:
     """Refinement options of all variants, from the command line."""
-    settings = dict(given["settings"])
-    for key, value in (("preset", given["preset"]), ("max_image_size", given["size"])):
-        if value is not None:
-            settings[key] = value
-    return settings
+    named = {"preset": given["preset"], "max_image_size": given["size"]}
+    return given["settings"] | {key: value for key, value in named.items() if value is not None}
 
 
 def chosen_variants(given: dict[str, Any]) -> tuple[Variant, ...]:
@@ -154,7 +151,7 @@ def make_plan(
 
 def run_and_write(plan: Plan, given: dict[str, Any]) -> list[Entry]:
     """Run unfinished cells, write tables.md and tables.json, and print one of them."""
-    from biresnerf.data.model.atomic_file import whole_file
+    from biresnerf.data.model.atomic_file import write_text
     from biresnerf.studies.markdown import as_markdown
     from biresnerf.studies.plan import Runner, run_plan
     from biresnerf.studies.tables import make_tables
@@ -166,16 +163,13 @@ def run_and_write(plan: Plan, given: dict[str, Any]) -> list[Entry]:
     )
     variants = {variant.name: variant.settings for variant in plan.variants}
     tables = make_tables(entries, variants, plan.settings, describe_machine())
-    for name, text in (
-        (TABLES_JSON, tables.model_dump_json(indent=1)),
-        (TABLES_MARKDOWN, as_markdown(tables)),
-    ):
-        with whole_file(output / name) as temporary:
-            temporary.write_text(text, "utf-8")
+    markdown = as_markdown(tables)
+    write_text(output / TABLES_JSON, tables.model_dump_json(indent=1))
+    write_text(output / TABLES_MARKDOWN, markdown)
     if given["as_json"]:
         print_json(tables)
     else:
-        click.echo(as_markdown(tables))
+        click.echo(markdown)
     return entries
 
 
