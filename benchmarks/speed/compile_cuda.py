@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +26,6 @@ from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldShape
 from biresnerf.field.reference.field import ReferenceField
 
-PLANS = (
-    plans.forward,
-    plans.viewing,
-    plans.backward,
-    plans.density,
-    plans.update_pose,
-    plans.update_reconstruction,
-)
 POINTERS = {torch.float32: "*fp32", torch.int32: "*i32", torch.int64: "*i64", torch.uint8: "*u8"}
 CUOBJDUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
 
@@ -46,11 +39,12 @@ def _launches() -> dict[tuple[Any, ...], Launch]:
         for reconstructing in (False, True):
             field.reconstructing = reconstructing
             workspace = Workspace(field, Capacity(256, 1024, 768, 8))
-            for plan in PLANS[: None if reconstructing else -1]:
-                for launch in plan(workspace):
-                    if isinstance(launch, Launch):
-                        constants = [launch.arguments[p.name] for p in launch.kernel.params if p.is_constexpr]
-                        found.setdefault((launch.kernel.fn.__name__, *constants), launch)
+            made = [plan(workspace) for plan in (plans.forward, plans.viewing, plans.backward, plans.density)]
+            made += [plans.update(workspace, name) for name in workspace.modules]
+            for launch in chain.from_iterable(made):
+                if isinstance(launch, Launch):
+                    constants = [launch.arguments[p.name] for p in launch.kernel.params if p.is_constexpr]
+                    found.setdefault((launch.kernel.fn.__name__, *constants), launch)
     return found
 
 

@@ -11,17 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from biresnerf.field.grid_field import BETA1, BETA2, EPSILON
 from biresnerf.field.grid_levels import HASH_PRIMES, GridLevels
-from biresnerf.field.radiance_field import (
-    BETA1,
-    BETA2,
-    EPSILON,
-    FieldShape,
-    Marching,
-    PositionGradient,
-    Rays,
-    Rendering,
-)
+from biresnerf.field.radiance_field import FieldShape, Marching, PositionGradient, Rays, Rendering
 from biresnerf.field.reference import operations as reference
 from biresnerf.field.reference.field import ReferenceField
 from biresnerf.field.spherical_harmonics import spherical_harmonics
@@ -98,7 +90,7 @@ class UnrolledField(ReferenceField):
         super().__init__(shape, seed, device)
         self._table_adam = {
             name: torch.optim.Adam([table], betas=(BETA1, BETA2), eps=EPSILON, fused=True)
-            for name, table in (("pose", self.pose_table), ("reconstruction", self.reconstruction_table))
+            for name, table in self.tables.items()
         }
 
     def _features(self, x: Tensor, gradient: PositionGradient) -> Tensor:

@@ -8,9 +8,9 @@ reconstruction module (high resolution, hashed). How the second joins in stage 2
 - `replace`: the networks start afresh on the reconstruction module alone. The pose-estimation module's columns are
   zero from then on, and it learns no more.
 - `residual`: the reconstruction module has networks of its own; their outputs, zero at first, are added to the others'
-  before density and colour are made of them.
+  before density and colour are computed.
 
-A field of one encoding has its grid in the place of the pose-estimation module, and no levels in the other.
+A field of one encoding has it as the pose-estimation module; its other grid has no levels.
 """
 
 from __future__ import annotations
@@ -25,26 +25,25 @@ from torch import Tensor
 from biresnerf.field.adam_state import adam_state, load_adam_state
 from biresnerf.field.coarse_to_fine import level_mixing
 from biresnerf.field.grid_levels import FEATURES
-from biresnerf.field.radiance_field import (
-    BETA1,
-    BETA2,
-    EPSILON,
-    HIDDEN,
-    OUTPUTS,
-    TABLE_INIT,
-    FieldRates,
-    FieldShape,
-    RadianceField,
-)
+from biresnerf.field.radiance_field import FieldRates, FieldShape, RadianceField
 from biresnerf.field.spherical_harmonics import VIEW_FEATURES
+
+MODULES = ("pose", "reconstruction")
+HIDDEN, OUTPUTS = 64, 16
+TABLE_INIT = 1e-4  # uniform +-1e-4, as tiny-cuda-nn
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 
 
 class GridField(RadianceField):
-    """Parameters and optimiser state; backends add `render`, `density` and the table update."""
+    """Parameters and optimiser state; backends add `render`, `density` and the table update.
+
+    `grids`, `tables`, `moments` and `steps` have an entry for each of `MODULES`.
+    """
 
     def __init__(self, shape: FieldShape, seed: int, device: torch.device) -> None:
         self.shape, self.device, self.unbounded = shape, device, shape.unbounded
         self.reconstructing = False
+        self.grids = dict(zip(MODULES, (shape.pose_grid, shape.reconstruction_grid), strict=True))
         self._generator = torch.Generator().manual_seed(seed)
         self.pose_table = self._uniform(shape.pose_grid.entries, FEATURES, TABLE_INIT)
         self.reconstruction_table = self._uniform(shape.reconstruction_grid.entries, FEATURES, TABLE_INIT)
@@ -57,13 +56,13 @@ class GridField(RadianceField):
             with torch.no_grad():
                 self.reconstruction_head[0][0] = 0.0  # the density's row
                 self.reconstruction_head[-1].zero_()  # the colour
+        self.tables = dict(zip(MODULES, (self.pose_table, self.reconstruction_table), strict=True))
         self.moments = {
-            name: (torch.zeros_like(table), torch.zeros_like(table))
-            for name, table in (("pose", self.pose_table), ("reconstruction", self.reconstruction_table))
+            name: (torch.zeros_like(table), torch.zeros_like(table)) for name, table in self.tables.items()
         }
-        self.steps = {"pose": 0, "reconstruction": 0}
+        self.steps = dict.fromkeys(MODULES, 0)
         # Mixing the levels' features is linear, so it is done in the first layer's columns: the backends compute
-        # with networks[0] = first @ mixing, and what is learnt is `first`.
+        # with networks[0] = first @ mixing, and `first` is optimised.
         self._first = self.networks[0]
         self._mixing: Tensor | None = None
         if shape.broadcast:
@@ -93,6 +92,11 @@ class GridField(RadianceField):
     def _adam(self, parameters: list[Tensor]) -> torch.optim.Optimizer:
         fused = True if self.device.type == "cuda" else None  # one launch instead of a dozen
         return torch.optim.Adam(parameters, betas=(BETA1, BETA2), eps=EPSILON, fused=fused)
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """The encodings in use."""
+        return MODULES if self.reconstructing else MODULES[:1]
 
     @abstractmethod
     def _update_table(self, name: str, rates: np.ndarray) -> None:
@@ -150,15 +154,19 @@ class GridField(RadianceField):
         optimiser.step()
         optimiser.zero_grad(set_to_none=True)
 
-    def _learnt(self) -> list[Tensor]:
-        return [self._first, *self.networks[1:]]
+    def discard_gradients(self) -> None:
+        weights = (*self.networks, self.reconstruction_columns, *self.reconstruction_head)
+        for parameter in (*self.tables.values(), *weights):
+            parameter.grad = None
 
     def _tensors(self) -> dict[str, Tensor]:
         """Tables, weights and the tables' moments, shared."""
-        tensors = {"pose_table": self.pose_table, "reconstruction_table": self.reconstruction_table}
+        tensors = {f"{name}_table": table for name, table in self.tables.items()}
         for name, (first, second) in self.moments.items():
             tensors[f"{name}_moment1"], tensors[f"{name}_moment2"] = first, second
-        tensors |= {f"network{i}": weight.detach() for i, weight in enumerate(self._learnt())}
+        tensors |= {
+            f"network{i}": weight.detach() for i, weight in enumerate([self._first, *self.networks[1:]])
+        }
         tensors["reconstruction_columns"] = self.reconstruction_columns.detach()
         head = enumerate(self.reconstruction_head)
         return tensors | {f"reconstruction_head{i}": weight.detach() for i, weight in head}
@@ -167,16 +175,15 @@ class GridField(RadianceField):
         state = self._tensors()
         state.update(adam_state("adam_networks", self._networks_adam))
         state.update(adam_state("adam_columns", self._columns_adam))
-        counters = [self.steps["pose"], self.steps["reconstruction"], int(self.reconstructing)]
-        state["counters"] = torch.tensor(counters)
+        state["counters"] = torch.tensor([*self.steps.values(), int(self.reconstructing)])
         return state
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         with torch.no_grad():
             for name, tensor in self._tensors().items():
                 tensor.copy_(state[name])
-        pose, reconstruction, reconstructing = state["counters"].tolist()
-        self.steps = {"pose": pose, "reconstruction": reconstruction}
+        *steps, reconstructing = state["counters"].tolist()
+        self.steps = dict(zip(MODULES, steps, strict=True))
         self.reconstructing = bool(reconstructing)
         if self._replaced:
             self._forget_first_layer()

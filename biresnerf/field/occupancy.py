@@ -1,4 +1,4 @@
-"""Which cells of the scene hold anything: the grid that lets ray marching skip empty space.
+"""The occupancy grid: which cells of the scene are not empty, so that ray marching can skip the others.
 
 As NerfAcc and BAA-NGP: a running maximum of density times step, decaying by 0.95 per update; a cell is occupied
 above min(mean, 0.01). Everything counts as occupied until the first update with `prune`.
@@ -85,7 +85,7 @@ class OccupancyGrid:
     def _prune(self, dilate: bool) -> None:
         bound = self.thickness.mean().clamp(max=THRESHOLD)
         occupied = (self.thickness > bound).to(torch.uint8).reshape(self.side, self.side, self.side)
-        # A camera that is still off needs density one cell away, or it gets no gradient.
+        # A camera whose pose is still wrong needs density one cell away, or it gets no gradient.
         self.occupied = dilated(occupied) if dilate else occupied
 
     @property
@@ -102,7 +102,7 @@ class OccupancyGrid:
 
 
 class DeviceOccupancyGrid(OccupancyGrid):
-    """The same rule without the host ever asking how many cells it concerns; takes a generator on the grid's device."""
+    """The same rule without the host ever waiting for the number of cells; takes a generator on the grid's device."""
 
     def _look(self, field: RadianceField, step: float, generator: torch.Generator, looked_at: float) -> None:
         count = self.side**3

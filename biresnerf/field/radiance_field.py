@@ -10,16 +10,12 @@ from torch import Tensor
 from biresnerf.field.grid_levels import GridLevels
 from biresnerf.options.refine_options import Wiring
 
-HIDDEN, OUTPUTS = 64, 16
-TABLE_INIT = 1e-4  # uniform +-1e-4, as tiny-cuda-nn
-BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
-
 
 @dataclass(frozen=True)
 class FieldShape:
-    """What a field on grids is made of. `unbounded` scenes are contracted outside the inner box [-1, 1]^3.
+    """The parts of a field on grids. `unbounded` scenes are contracted outside the inner box [-1, 1]^3.
 
-    `wiring` says how the second grid joins the first in stage 2 (`GridField`).
+    `wiring`: how the second grid joins the first in stage 2 (`GridField`).
     `broadcast`: levels of the first grid open from coarse to fine, closed ones repeating the finest open one
     (`coarse_to_fine.level_mixing`).
     """
@@ -35,7 +31,7 @@ class FieldShape:
 class Rays:
     """Rays in the unit frame: origin, unit direction, background colour [rays, 3], jitter in [0, 1).
 
-    `jitter` says where in their interval samples start: [rays], or [rays, samples] for a stratified field.
+    `jitter` is where in their interval samples start: [rays], or [rays, samples] for a stratified field.
 
     Only the first `trained` rays give gradients to the field; all give gradients to origin and direction.
     """
@@ -94,7 +90,7 @@ class Rendering:
 
 
 class RadianceField(ABC):
-    """What the joint optimisation asks of a field, whatever it is made of.
+    """The interface between the joint optimisation and every kind of field.
 
     Attributes:
         unbounded: whether space outside the inner box [-1, 1]^3 is contracted.
@@ -120,7 +116,7 @@ class RadianceField(ABC):
     def density_of_first(self, count: Tensor, position: Tensor) -> Tensor:
         """Density [n] at positions [n, 3], of which only the first `count` [1] matter; no gradient.
 
-        The others' densities mean nothing. A backend that can leaves them out without asking the device for `count`.
+        The others' densities are arbitrary. A backend may leave them out if it need not wait for `count`.
         """
         return self.density(position)
 
@@ -130,20 +126,20 @@ class RadianceField(ABC):
 
     @abstractmethod
     def discard_gradients(self) -> None:
-        """Forget the gradients of the last backward."""
+        """Discard the gradients of the last backward."""
 
     @abstractmethod
     def state(self) -> dict[str, Tensor]:
-        """Everything `load_state` needs to go on exactly as before, as flat named tensors."""
+        """Everything that `load_state` needs to continue exactly, as flat named tensors."""
 
     @abstractmethod
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Restore what `state` returned, in place."""
 
     def start_reconstruction(self) -> None:
-        """From here on the reconstruction module takes part (the switch to stage 2); an error where there is none."""
+        """Add the reconstruction module (the switch to stage 2); an error if there is none."""
         raise RuntimeError("this field has no second stage")
 
     @abstractmethod
     def reach(self, progress: float) -> None:
-        """Tell the share of the run that is done, 0 to 1: a field that opens from coarse to fine follows it."""
+        """Set the completed share of the run, 0 to 1; a field that opens from coarse to fine follows it."""

@@ -15,20 +15,8 @@ from biresnerf.field.cpu.matrix_blocks import CHANNELS, from_tiles
 from biresnerf.field.cpu.samples import Composited, Samples, segments
 from biresnerf.field.cpu.segments import render_segments
 from biresnerf.field.cpu.segments_backward import render_segments_backward
-from biresnerf.field.grid_field import GridField
-from biresnerf.field.grid_levels import GridLevels
-from biresnerf.field.radiance_field import (
-    BETA1,
-    BETA2,
-    EPSILON,
-    HIDDEN,
-    OUTPUTS,
-    FieldShape,
-    Marching,
-    PositionGradient,
-    Rays,
-    Rendering,
-)
+from biresnerf.field.grid_field import BETA1, BETA2, EPSILON, HIDDEN, OUTPUTS, GridField
+from biresnerf.field.radiance_field import FieldShape, Marching, PositionGradient, Rays, Rendering
 from biresnerf.field.spherical_harmonics import VIEW_FEATURES
 
 f4 = np.float32
@@ -63,19 +51,13 @@ class CpuField(GridField):
         super().__init__(shape, seed, device)
         self.workers = workers
         self._buffers = Buffers()
-        sizes = [np.diff(grid.offset) for grid in (shape.pose_grid, shape.reconstruction_grid)]
-        largest = int(np.concatenate(sizes).max())
+        largest = int(np.concatenate([np.diff(grid.offset) for grid in self.grids.values()]).max())
         self._scratch = np.zeros((workers, 2 * largest), f4)
         self._pending: tuple[Samples, np.ndarray] | None = None
 
-    def _grids(self) -> list[tuple[GridLevels, np.ndarray]]:
-        grids = [(self.shape.pose_grid, self.pose_table.numpy())]
-        if self.reconstructing:
-            grids.append((self.shape.reconstruction_grid, self.reconstruction_table.numpy()))
-        return grids
-
     def _width(self) -> int:
-        return -CHANNELS * (-sum(grid.width for grid, _ in self._grids()) // CHANNELS)  # whole register tiles
+        width = sum(self.grids[name].width for name in self.modules)
+        return -CHANNELS * (-width // CHANNELS)  # whole register tiles
 
     def _weights(self) -> list[np.ndarray]:
         """The five layers as contiguous arrays; input columns padded to whole tiles, colour rows to 4."""
@@ -96,11 +78,12 @@ class CpuField(GridField):
         features = self._buffers.take(f"{role} features", width, n)
         jacobians, row = [], 0
         smoothings = (gradient.pose_smoothing, gradient.reconstruction_smoothing)
-        for i, (grid, table) in enumerate(self._grids()):
-            jacobian = self._buffers.take(f"{role} jacobian {i}", grid.levels, 6, n)
+        for name, smoothing in zip(self.modules, smoothings, strict=False):
+            grid, words = self.grids[name], self.tables[name].numpy().reshape(-1).view(np.uint64)
+            jacobian = self._buffers.take(f"{role} jacobian {name}", grid.levels, 6, n)
             encoding.encode(
-                x, table.reshape(-1).view(np.uint64), grid.scale, grid.stride, grid.hashed, grid.offset,
-                f4(smoothings[i]), features[row : row + grid.width], jacobian,
+                x, words, grid.scale, grid.stride, grid.hashed, grid.offset, f4(smoothing),
+                features[row : row + grid.width], jacobian,
             )  # fmt: skip
             jacobians.append(jacobian)
             row += grid.width
@@ -197,9 +180,8 @@ class CpuField(GridField):
         first = torch.from_numpy(gradients[0])
         self.networks[0].grad = first[:, :low].clone()
         if self.reconstructing:
-            self.reconstruction_columns.grad = first[
-                :, low : low + self.shape.reconstruction_grid.width
-            ].clone()
+            high = self.shape.reconstruction_grid.width
+            self.reconstruction_columns.grad = first[:, low : low + high].clone()
         for weight, gradient in zip(self.networks[1:4], gradients[1:4], strict=True):
             weight.grad = torch.from_numpy(gradient)
         self.networks[4].grad = torch.from_numpy(gradients[4][:3].copy())
@@ -211,29 +193,19 @@ class CpuField(GridField):
         # Kept samples lie without gaps from each segment's first sample on.
         begin = samples.offset[samples.segment[: samples.learning]]
         end = samples.composited.kept_end[samples.segment[1 : samples.learning + 1] - 1]
-        pose = name == "pose"
-        grid = self.shape.pose_grid if pose else self.shape.reconstruction_grid
-        table = self.pose_table if pose else self.reconstruction_table
-        row = 0 if pose else self.shape.pose_grid.width
-        step = self.steps[name]
-        adam = (
-            f4(BETA1),
-            f4(BETA2),
-            f4(EPSILON),
-            f4(1 / (1 - BETA1**step)),
-            f4(1 / (1 - BETA2**step) ** 0.5),
-        )
-        moment1, moment2 = (m.numpy().reshape(-1) for m in self.moments[name])
+        grid, step = self.grids[name], self.steps[name]
+        row = 0 if name == "pose" else self.grids["pose"].width
+        adam = tuple(map(f4, (BETA1, BETA2, EPSILON, 1 / (1 - BETA1**step), 1 / (1 - BETA2**step) ** 0.5)))
+        table, moment1, moment2 = (t.numpy().reshape(-1) for t in (self.tables[name], *self.moments[name]))
         encoding.update_table(
             samples.x, begin, end, g_features[row : row + grid.width],
             grid.scale, grid.stride, grid.hashed, grid.offset,
-            table.numpy().reshape(-1), moment1, moment2, rates, adam, self._scratch, tasks(), self.workers,
+            table, moment1, moment2, rates, adam, self._scratch, tasks(), self.workers,
         )  # fmt: skip
 
     def discard_gradients(self) -> None:
         self._pending = None
-        for weight in (*self.networks, self.reconstruction_columns):
-            weight.grad = None
+        super().discard_gradients()
 
 
 class _RenderRays(torch.autograd.Function):

@@ -1,7 +1,7 @@
 """Small dense products on blocks of samples whose activations stay in cache.
 
-Activations are [channels, BLOCK] with row stride STRIDE, flattened; the first `n` samples of a block are live. Products
-read and write whole vectors beyond `n`, so inputs must be finite there; gradients must be zero there.
+Activations are [channels, BLOCK] with row stride STRIDE, flattened; the first `n` samples of a block are in use.
+Products read and write whole vectors beyond `n`, so inputs must be finite there, and gradients zero.
 Weights are [rows, columns], flattened; both counts are multiples of `CHANNELS`.
 """
 
@@ -32,48 +32,44 @@ PADDED = VECTORS * LANES  # products work on this many samples at a time
 assert BLOCK % PADDED == 0
 
 
-@njit(**KERNEL)
-def product(weight, x, y, rows, columns, n):
-    """y[:rows, :n] = weight x[:columns, :n]."""
-    for t in range(0, n, PADDED):
-        for o in range(0, rows, ROWS):
-            product_tile(weight, o * columns, columns, 1, x, t, y, o * STRIDE + t, columns, x)
+def _make_product(tile, rows_of_tile: int, *, transposed: bool = False):
+    """A kernel that multiplies a block by a weight, or by its transpose, tile by tile of the result's channels."""
+
+    @njit(**KERNEL)
+    def multiply(weight, x, y, rows, columns, n, active=None):
+        outputs, inputs = (columns, rows) if transposed else (rows, columns)
+        output_stride, input_stride = (1, columns) if transposed else (columns, 1)
+        mask = x if active is None else active
+        for t in range(0, n, PADDED):
+            for o in range(0, outputs, rows_of_tile):
+                tile(
+                    weight,
+                    o * output_stride,
+                    output_stride,
+                    input_stride,
+                    x,
+                    t,
+                    y,
+                    o * STRIDE + t,
+                    inputs,
+                    mask,
+                )
+
+    return multiply
 
 
-@njit(**KERNEL)
-def product_of_4(weight, x, y, columns, n):
-    """The same for four rows."""
-    for t in range(0, n, PADDED):
-        product_tile_of_4(weight, 0, columns, 1, x, t, y, t, columns, x)
-
-
-@njit(**KERNEL)
-def rectified_product(weight, x, y, rows, columns, n):
-    """y[:rows, :n] = max(0, weight x[:columns, :n])."""
-    for t in range(0, n, PADDED):
-        for o in range(0, rows, ROWS):
-            rectified_tile(weight, o * columns, columns, 1, x, t, y, o * STRIDE + t, columns, x)
-
-
-@njit(**KERNEL)
-def transposed_product(weight, g, y, rows, columns, n):
-    """y[:columns, :n] = weight^T g[:rows, :n]."""
-    for t in range(0, n, PADDED):
-        for k in range(0, columns, ROWS):
-            product_tile(weight, k, 1, columns, g, t, y, k * STRIDE + t, rows, g)
-
-
-@njit(**KERNEL)
-def gradient_before(weight, g, active, y, rows, columns, n):
-    """y[:columns, :n] = weight^T g[:rows, :n] where the rectified activation `active` is positive, else 0."""
-    for t in range(0, n, PADDED):
-        for k in range(0, columns, ROWS):
-            masked_tile(weight, k, 1, columns, g, t, y, k * STRIDE + t, rows, active)
+# y[:rows, :n] = weight x[:columns, :n]; the second for four rows, the third with negative values set to zero.
+product = _make_product(product_tile, ROWS)
+product_of_4 = _make_product(product_tile_of_4, 4)
+rectified_product = _make_product(rectified_tile, ROWS)
+# y[:columns, :n] = weight^T x[:rows, :n]; the second is zero where the rectified `active` [columns, n] is.
+transposed_product = _make_product(product_tile, ROWS, transposed=True)
+masked_transposed_product = _make_product(masked_tile, ROWS, transposed=True)
 
 
 @njit(**KERNEL)
 def add_outer(g, x, dweight, rows, columns, n):
-    """Add g[:rows, :n] x[:columns, :n]^T to `dweight`, which is kept in tiles: see `from_tiles`."""
+    """Add g[:rows, :n] x[:columns, :n]^T to `dweight`, which is stored in tiles (`from_tiles`)."""
     vectors, d = (n + LANES - 1) // LANES, 0
     for o in range(0, rows, OUTER_ROWS):
         for k in range(0, columns, OUTER_COLUMNS):
@@ -82,7 +78,7 @@ def add_outer(g, x, dweight, rows, columns, n):
 
 
 def from_tiles(dweight: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """The matrix [rows, columns] that `add_outer` keeps tile by tile."""
+    """The matrix [rows, columns] that `add_outer` stores tile by tile."""
     tiles = dweight.reshape(rows // OUTER_ROWS, columns // OUTER_COLUMNS, OUTER_ROWS, OUTER_COLUMNS)
     return tiles.transpose(0, 2, 1, 3).reshape(rows, columns)
 

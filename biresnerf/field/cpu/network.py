@@ -18,7 +18,7 @@ from biresnerf.field.cpu.matrix_blocks import (
     add_outer,
     copy_in,
     exponential,
-    gradient_before,
+    masked_transposed_product,
     product,
     product_of_4,
     rectified_product,
@@ -26,10 +26,11 @@ from biresnerf.field.cpu.matrix_blocks import (
     zero_rest,
 )
 from biresnerf.field.cpu.vector_access import KERNEL, PARALLEL_KERNEL, load, next_task, reload, store
+from biresnerf.field.reference import operations
 
 f4, i8 = np.float32, np.int64
 HIDDEN, OUT, VIEW = 64, 16, 16
-DENSITY_SHIFT, DENSITY_CAP = f4(1.0), f4(11.0)  # density = exp(min(z0 - 1, 11)), BAA-NGP's trunc_exp(z0 - 1)
+DENSITY_SHIFT, DENSITY_CAP = f4(operations.DENSITY_SHIFT), f4(operations.DENSITY_CAP)
 COLOUR_INPUTS = VIEW + OUT
 
 
@@ -66,7 +67,7 @@ def hidden_colours(z, n, w3, w4, h3, h4):
 @njit(**KERNEL)
 def colours_of(h4, n, w5, out):
     """Three colours in 0..1 from the last hidden layer."""
-    product_of_4(w5, h4, out, HIDDEN, n)
+    product_of_4(w5, h4, out, 4, HIDDEN, n)
     for c in range(3):
         for t in range(n):
             i = c * STRIDE + t
@@ -74,28 +75,29 @@ def colours_of(h4, n, w5, out):
 
 
 @njit(**KERNEL)
+def _layer_backward(weight, g, x, rectified, rows, columns, n, trained, d_weight, g_x):
+    """Gradients of a layer [rows, columns]: to its input x, left in `g_x`, and if `trained` added to `d_weight`."""
+    if trained:
+        add_outer(g, x, d_weight, rows, columns, n)
+    if rectified:
+        masked_transposed_product(weight, g, g_x, rows, columns, n, x)
+    else:
+        transposed_product(weight, g, g_x, rows, columns, n)
+
+
+@njit(**KERNEL)
 def colour_backward(g_out, z, h3, h4, n, w3, w4, w5, trained, d3, d4, d5, ga, gb):
-    """Gradients from the colours' logits g_out [4] to the inputs z, left in `ga` [32]."""
-    if trained:
-        add_outer(g_out, h4, d5, 4, HIDDEN, n)
-    gradient_before(w5, g_out, h4, ga, 4, HIDDEN, n)
-    if trained:
-        add_outer(ga, h3, d4, HIDDEN, HIDDEN, n)
-    gradient_before(w4, ga, h3, gb, HIDDEN, HIDDEN, n)
-    if trained:
-        add_outer(gb, z, d3, HIDDEN, COLOUR_INPUTS, n)
-    transposed_product(w3, gb, ga, HIDDEN, COLOUR_INPUTS, n)
+    """Gradients from the colours' logits g_out [4] to the inputs z, left in `ga` [32]; `gb` is scratch."""
+    _layer_backward(w5, g_out, h4, True, 4, HIDDEN, n, trained, d5, ga)
+    _layer_backward(w4, ga, h3, True, HIDDEN, HIDDEN, n, trained, d4, gb)
+    _layer_backward(w3, gb, z, False, HIDDEN, COLOUR_INPUTS, n, trained, d3, ga)
 
 
 @njit(**KERNEL)
 def outputs_backward(g, x, h1, width, n, w1, w2, trained, d1, d2, ga, gb):
-    """Gradients from the outputs g [16] to the features x, left in `ga` [width]."""
-    if trained:
-        add_outer(g, h1, d2, OUT, HIDDEN, n)
-    gradient_before(w2, g, h1, gb, OUT, HIDDEN, n)
-    if trained:
-        add_outer(gb, x, d1, HIDDEN, width, n)
-    transposed_product(w1, gb, ga, HIDDEN, width, n)
+    """Gradients from the outputs g [16] to the features x, left in `ga` [width]; `gb` is scratch."""
+    _layer_backward(w2, g, h1, True, OUT, HIDDEN, n, trained, d2, gb)
+    _layer_backward(w1, gb, x, False, HIDDEN, width, n, trained, d1, ga)
 
 
 @njit(**PARALLEL_KERNEL)

@@ -10,25 +10,21 @@ import numpy as np
 from numba import njit, prange
 
 from biresnerf.field.cpu.vector_access import PARALLEL_KERNEL
+from biresnerf.field.reference import operations
 
 f4, i4 = np.float32, np.int32
 ONE, TWO = f4(1), f4(2)
-EDGE = f4(1e-6)  # keeps grid positions strictly inside [0, 1)
+EDGE = f4(operations.EDGE)  # keeps grid positions strictly inside [0, 1)
 
 
 @njit(inline="always", fastmath=True)
 def _grid_position(px, py, pz, unbounded):
     """Position in [0, 1]^3 and the largest coordinate m."""
     m = max(abs(px), max(abs(py), abs(pz)))
+    factor = f4(0.5)
     if unbounded:
-        factor = ONE if m <= ONE else (TWO - ONE / m) / m
-        return (
-            px * factor * f4(0.25) + f4(0.5),
-            py * factor * f4(0.25) + f4(0.5),
-            pz * factor * f4(0.25) + f4(0.5),
-            m,
-        )
-    return px * f4(0.5) + f4(0.5), py * f4(0.5) + f4(0.5), pz * f4(0.5) + f4(0.5), m
+        factor = f4(0.25) * (ONE if m <= ONE else (TWO - ONE / m) / m)
+    return px * factor + f4(0.5), py * factor + f4(0.5), pz * factor + f4(0.5), m
 
 
 @njit(inline="always", fastmath=True)
@@ -103,6 +99,7 @@ def pack(origin, direction, t_buffer, dt_buffer, count, offset, unbounded, x, t,
 @njit(**PARALLEL_KERNEL)
 def ray_gradients(origin, direction, offset, t, dx, unbounded, g_origin, g_direction):
     """Sum the samples' gradients dx [3, n] to grid positions into their rays."""
+    scale = f4(0.25) if unbounded else f4(0.5)
     for r in prange(g_origin.shape[0]):
         a0 = a1 = a2 = b0 = b1 = b2 = f4(0)
         for i in range(offset[r], offset[r + 1]):
@@ -125,14 +122,11 @@ def ray_gradients(origin, direction, offset, t, dx, unbounded, g_origin, g_direc
                         v += along if py > f4(0) else -along
                     else:
                         w += along if pz > f4(0) else -along
-                u, v, w = f4(0.25) * u, f4(0.25) * v, f4(0.25) * w
-            else:
-                u, v, w = f4(0.5) * u, f4(0.5) * v, f4(0.5) * w
             a0 += u
             a1 += v
             a2 += w
             b0 += t[i] * u
             b1 += t[i] * v
             b2 += t[i] * w
-        g_origin[r, 0], g_origin[r, 1], g_origin[r, 2] = a0, a1, a2
-        g_direction[r, 0], g_direction[r, 1], g_direction[r, 2] = b0, b1, b2
+        g_origin[r, 0], g_origin[r, 1], g_origin[r, 2] = scale * a0, scale * a1, scale * a2
+        g_direction[r, 0], g_direction[r, 1], g_direction[r, 2] = scale * b0, scale * b1, scale * b2

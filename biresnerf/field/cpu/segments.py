@@ -25,10 +25,11 @@ from biresnerf.field.cpu.network import (
     view_in,
 )
 from biresnerf.field.cpu.vector_access import KERNEL, PARALLEL_KERNEL, load, next_task, store
+from biresnerf.field.reference import operations
 
 f4, i4 = np.float32, np.int32
 ONE = f4(1)
-LEAST_TRANSMITTANCE = f4(1e-4)
+LEAST_TRANSMITTANCE = f4(operations.LEAST_TRANSMITTANCE)
 
 
 @njit(**KERNEL)

@@ -39,7 +39,7 @@ def _composite_backward(
         g0, g1, g2 = g_colour[r, 0], g_colour[r, 1], g_colour[r, 2]
         behind = g_opacity[r] * (ONE - out_opacity[r])
         transmittance = ONE
-        # What lies behind the sample at hand: sum of w_j c_j over later samples, and the background.
+        # The colour behind the current sample: sum of w_j c_j over later samples, and the background.
         s0, s1, s2 = out_colour[r, 0], out_colour[r, 1], out_colour[r, 2]
         for p in range(kept_begin[r], kept_end[r]):
             i = kept[p]

@@ -41,33 +41,24 @@ def _flat(array) -> bool:
 
 
 def _make_load(tag: str):
-    def load_kind(typing_context, array, index):
+    @intrinsic
+    def load_element(typing_context, array, index):
         if not _flat(array):
             return None
 
         def codegen(context, builder, signature, arguments):
-            pointer = _pointer(
-                context, builder, signature.args[0], arguments[0], signature.args[1], arguments[1]
-            )
-            value = builder.load(pointer)
+            (array_type, index_type), (data, i) = signature.args, arguments
+            value = builder.load(_pointer(context, builder, array_type, data, index_type, i))
             value.set_metadata(tag, _scope(builder))
             return value
 
         return array.dtype(array, index), codegen
 
-    return load_kind
+    return load_element
 
 
-@intrinsic
-def load(typing_context, array, index):
-    """Read an element of a flat array that the enclosing loop only reads."""
-    return _make_load("alias.scope")(typing_context, array, index)
-
-
-@intrinsic
-def reload(typing_context, array, index):
-    """Read an element of a flat array that the enclosing loop also writes."""
-    return _make_load("noalias")(typing_context, array, index)
+load = _make_load("alias.scope")  # an element of a flat array that the enclosing loop only reads
+reload = _make_load("noalias")  # an element of a flat array that the enclosing loop also writes
 
 
 @intrinsic

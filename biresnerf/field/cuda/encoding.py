@@ -11,15 +11,10 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-PRIME_Y = tl.constexpr(2654435761)
-PRIME_Z = tl.constexpr(805459861)
+from biresnerf.field.cuda.access import load_vector, sample_counts, samples_of_block, store_vector
+from biresnerf.field.grid_levels import HASH_PRIMES
 
-
-@triton.jit
-def samples_of_program(n, BLOCK: tl.constexpr):
-    """Indices of this program's samples, and which of them are below n."""
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    return i, i < n
+PRIME_Y, PRIME_Z = tl.constexpr(HASH_PRIMES[1]), tl.constexpr(HASH_PRIMES[2])
 
 
 @triton.jit
@@ -34,9 +29,8 @@ def _level_of_program(stride, hashed, offset):
 @triton.jit
 def _locate(x, i, here, capacity, scale):
     """Cell and fraction within it of samples' positions, per axis."""
-    px = tl.load(x + i, mask=here, other=0.5) * scale + 0.5
-    py = tl.load(x + capacity + i, mask=here, other=0.5) * scale + 0.5
-    pz = tl.load(x + 2 * capacity + i, mask=here, other=0.5) * scale + 0.5
+    px, py, pz = load_vector(x + i, capacity, here)
+    px, py, pz = px * scale + 0.5, py * scale + 0.5, pz * scale + 0.5
     ix, iy, iz = px.to(tl.int32), py.to(tl.int32), pz.to(tl.int32)
     fx, fy, fz = px - ix.to(tl.float32), py - iy.to(tl.float32), pz - iz.to(tl.float32)
     return ix.to(tl.uint32), iy.to(tl.uint32), iz.to(tl.uint32), fx, fy, fz
@@ -69,7 +63,7 @@ def encode(
     n = tl.load(taken)
     if tl.program_id(0) * BLOCK >= n:
         return
-    i, here = samples_of_program(n, BLOCK)
+    i, here = samples_of_block(tl.program_id(0), n, BLOCK)
     level, side, by_hash, base, size = _level_of_program(stride, hashed, offset)
     s = tl.load(scale + level)
     ix, iy, iz, fx, fy, fz = _locate(x, i, here, capacity, s)
@@ -101,12 +95,8 @@ def encode(
         sy = s * _straight_through(fy, smooth)
         sz = s * _straight_through(fz, smooth)
         j = jacobian + (6 * level).to(tl.int64) * capacity + i
-        tl.store(j, sx * x0, mask=here)
-        tl.store(j + capacity, sy * y0, mask=here)
-        tl.store(j + 2 * capacity, sz * z0, mask=here)
-        tl.store(j + 3 * capacity, sx * x1, mask=here)
-        tl.store(j + 4 * capacity, sy * y1, mask=here)
-        tl.store(j + 5 * capacity, sz * z1, mask=here)
+        store_vector(j, capacity, sx * x0, sy * y0, sz * z0, here)
+        store_vector(j + 3 * capacity, capacity, sx * x1, sy * y1, sz * z1, here)
 
 
 @triton.jit
@@ -118,7 +108,7 @@ def position_gradient(
     n = tl.load(taken)
     if tl.program_id(0) * BLOCK >= n:
         return
-    i, here = samples_of_program(n, BLOCK)
+    i, here = samples_of_block(tl.program_id(0), n, BLOCK)
     a = tl.zeros([BLOCK], tl.float32)
     b, c = a, a
     for level in range(levels):
@@ -126,22 +116,15 @@ def position_gradient(
         j = jacobian + tl.cast(6 * level, tl.int64) * capacity + i
         u = tl.load(g, mask=here, other=0.0)
         v = tl.load(g + capacity, mask=here, other=0.0)
-        a += u * tl.load(j, mask=here, other=0.0) + v * tl.load(j + 3 * capacity, mask=here, other=0.0)
-        b += u * tl.load(j + capacity, mask=here, other=0.0) + v * tl.load(
-            j + 4 * capacity, mask=here, other=0.0
-        )
-        c += u * tl.load(j + 2 * capacity, mask=here, other=0.0) + v * tl.load(
-            j + 5 * capacity, mask=here, other=0.0
-        )
+        x0, y0, z0 = load_vector(j, capacity, here)
+        x1, y1, z1 = load_vector(j + 3 * capacity, capacity, here)
+        a, b, c = a + (u * x0 + v * x1), b + (u * y0 + v * y1), c + (u * z0 + v * z1)
     factor = tl.load(share)
     a, b, c = factor * a, factor * b, factor * c
     if ACCUMULATE:
-        a += tl.load(g_x + i, mask=here, other=0.0)
-        b += tl.load(g_x + capacity + i, mask=here, other=0.0)
-        c += tl.load(g_x + 2 * capacity + i, mask=here, other=0.0)
-    tl.store(g_x + i, a, mask=here)
-    tl.store(g_x + capacity + i, b, mask=here)
-    tl.store(g_x + 2 * capacity + i, c, mask=here)
+        x0, y0, z0 = load_vector(g_x + i, capacity, here)
+        a, b, c = a + x0, b + y0, c + z0
+    store_vector(g_x + i, capacity, a, b, c, here)
 
 
 @triton.jit
@@ -150,10 +133,10 @@ def table_gradient(
     BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Add the trained samples' feature gradients to the table's gradient [entries, 2], by atomic additions."""
-    n = tl.minimum(tl.load(ray_offset + tl.load(trained_rays).to(tl.int32)), tl.load(taken))
+    _all, n = sample_counts(taken, ray_offset, trained_rays)
     if tl.program_id(0) * BLOCK >= n:
         return
-    i, here = samples_of_program(n, BLOCK)
+    i, here = samples_of_block(tl.program_id(0), n, BLOCK)
     level, side, by_hash, base, size = _level_of_program(stride, hashed, offset)
     ix, iy, iz, fx, fy, fz = _locate(x, i, here, capacity, tl.load(scale + level))
     g = g_features + (row + 2 * level).to(tl.int64) * capacity + i

@@ -1,7 +1,7 @@
 """The radiance field on the Triton kernels. Nothing in a training step waits for the device.
 
 How many samples a step takes is known on the device only: buffers have a fixed capacity, kernels read counts from
-device memory, and the host hears of them a step late. docs/cuda.md says more.
+device memory, and they reach the host a step late. See docs/cuda.md.
 """
 
 from __future__ import annotations
@@ -18,16 +18,8 @@ from biresnerf.field.cuda import plans
 from biresnerf.field.cuda.launches import interpreted
 from biresnerf.field.cuda.sample_count import SampleCount
 from biresnerf.field.cuda.workspace import Capacity, Workspace
-from biresnerf.field.grid_field import GridField
-from biresnerf.field.radiance_field import (
-    BETA1,
-    BETA2,
-    FieldShape,
-    Marching,
-    PositionGradient,
-    Rays,
-    Rendering,
-)
+from biresnerf.field.grid_field import BETA1, BETA2, GridField
+from biresnerf.field.radiance_field import FieldShape, Marching, PositionGradient, Rays, Rendering
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +27,7 @@ RAYS_LEAST, SAMPLES_LEAST = 256, 1 << 16
 MARGIN = 1.3  # counts change from step to step by less; a step with more leaves its last rays out
 GROWTH = 1.6  # of what is needed, where buffers have to grow
 BOX_DIAGONAL = 2 * math.sqrt(3)
+RESULTS = ("ray_colour", "opacity", "depth")
 
 
 class CudaField(GridField):
@@ -62,10 +55,13 @@ class CudaField(GridField):
 
     def start_reconstruction(self) -> None:
         super().start_reconstruction()
-        self._workspace, self._pending = None, False
+        self._drop_workspace()
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         super().load_state(state)
+        self._drop_workspace()
+
+    def _drop_workspace(self) -> None:
         self._workspace, self._pending = None, False
 
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
@@ -80,7 +76,7 @@ class CudaField(GridField):
         return self.density_of_first(torch.full((1,), len(position), device=self.device), position)
 
     def density_of_first(self, count: Tensor, position: Tensor) -> Tensor:
-        w = self._reserve(0, 1, 1, self._side())
+        w = self._reserve(0, 1, 1, 1 if self._workspace is None else self._workspace.capacity.side)
         self._forward_number += 1
         results = [position.new_zeros(0)]
         for begin in range(0, len(position), w.capacity.samples):
@@ -93,7 +89,7 @@ class CudaField(GridField):
         return torch.cat(results)
 
     def _view(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
-        """Rendering without gradient, in parts whose samples fit whatever they turn out to be."""
+        """Rendering without gradient, in parts that fit the buffers whatever their number of samples."""
         side = marching.occupied.shape[0]
         w = self._reserve(0, self._most_of_a_ray(marching), marching.most, side)
         parts, total = [], torch.zeros(1, dtype=torch.int32, device=self.device)
@@ -108,7 +104,7 @@ class CudaField(GridField):
             w.record()
             w.plan(plans.viewing).run()
             n = len(part.origin)
-            parts.append([w.buffers[name][:n].clone() for name in ("ray_colour", "opacity", "depth")])
+            parts.append([w.buffers[name][:n].clone() for name in RESULTS])
             total += w.buffers["ray_offset"][-1:]
         colour, opacity, depth = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
         return Rendering(colour, opacity, depth, int(total))
@@ -119,15 +115,15 @@ class CudaField(GridField):
         """Colour, opacity and depth for a backward pass to follow; samples; the number of this pass."""
         count, interval, side = len(rays.origin), marching.step, marching.occupied.shape[0]
         w = self._reserve(count, 1, marching.most, side)
-        heard = self._sample_count.latest()
-        if heard > w.capacity.samples:
+        needed = self._sample_count.latest()
+        if needed > w.capacity.samples:
             logger.warning(
-                "a step needed %d samples of %d: its last rays were left out", heard, w.capacity.samples
+                "a step needed %d samples of %d: its last rays were left out", needed, w.capacity.samples
             )
         samples = self._sample_count.expected(count, interval)
         certain = count * self._most_of_a_ray(marching) <= w.capacity.samples
         if samples is None or not (certain or samples * MARGIN <= w.capacity.samples):
-            # The first of its kind, or far more than before: here alone the host waits for the device.
+            # No count is known, or far more samples are expected: only here the host waits for the device.
             self._write(w, rays, marching, gradient)
             w.plan(plans.marching).run()
             samples = int(w.buffers["ray_offset"][-1])
@@ -138,8 +134,7 @@ class CudaField(GridField):
         w.record()
         w.plan(plans.forward).run()
         self._sample_count.note(w.buffers["ray_offset"][-1:], count, interval)
-        results = (w.buffers[name][:count].clone() for name in ("ray_colour", "opacity", "depth"))
-        colour, opacity, depth = results
+        colour, opacity, depth = (w.buffers[name][:count].clone() for name in RESULTS)
         return colour, opacity, depth, samples, self._forward_number
 
     def run_backward(
@@ -148,7 +143,7 @@ class CudaField(GridField):
         """Gradients to origin and direction; keeps those to the field for `step`."""
         w = self._workspace
         if w is None or number != self._forward_number:
-            raise RuntimeError("the field was asked for something else between render and backward")
+            raise RuntimeError("the field was used for something else between render and backward")
         w.buffers["g_ray_colour"][:count].copy_(g_colour)
         w.buffers["g_opacity"][:count].copy_(g_opacity)
         w.plan(plans.backward).run()
@@ -168,39 +163,34 @@ class CudaField(GridField):
         table["rates"].copy_(torch.from_numpy(rates), non_blocking=True)
         corrections = torch.tensor([1 / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step)])
         table["corrections"].copy_(corrections, non_blocking=True)
-        w.plan(plans.update_pose if name == "pose" else plans.update_reconstruction).run()
+        w.plan(plans.update, name).run()
 
     def discard_gradients(self) -> None:
         self._pending = False
-        for weight in (*self.networks, self.reconstruction_columns):
-            weight.grad = None
-
-    def _side(self) -> int:
-        return 1 if self._workspace is None else self._workspace.capacity.side
+        super().discard_gradients()
 
     def _most_of_a_ray(self, marching: Marching) -> int:
-        """No ray has more samples."""
+        """The most samples that a ray can have."""
         if self.unbounded:
             return marching.most
         return min(marching.most, math.ceil(BOX_DIAGONAL / marching.step) + 1)
 
     def _reserve(self, rays: int, samples: int, most: int, side: int) -> Workspace:
-        """A workspace for at least so many rays and samples: the one at hand, or a larger one in its stead."""
+        """A workspace for at least so many rays and samples: the current one, or a larger one that replaces it."""
         held = self._workspace
         if held is not None and held.capacity.holds(Capacity(rays, samples, most, side)):
             return held
         before = held.capacity if held is not None else Capacity(RAYS_LEAST, self._samples, 1, side)
         rays = max(before.rays, 1 << (rays - 1).bit_length() if rays else 0)
         self._samples = max(before.samples, samples)
-        # The old one's memory goes first.
-        held = self._workspace = None
-        self._pending = False
+        held = None
+        self._drop_workspace()  # frees its memory before the larger one takes its own
         self._forward_number += 1
         self._workspace = Workspace(self, Capacity(rays, self._samples, max(before.most, most), side))
         return self._workspace
 
     def _write(self, w: Workspace, rays: Rays, marching: Marching, gradient: PositionGradient) -> None:
-        """Put into the buffers what this pass is about."""
+        """Write the inputs of a pass into the buffers."""
         self._forward_number += 1
         count = len(rays.origin)
         for name in ("origin", "direction", "background", "jitter"):

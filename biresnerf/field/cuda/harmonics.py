@@ -5,15 +5,15 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from biresnerf.field.cuda.access import load_vector, store_vector
+
 
 @triton.jit
 def _directions(direction, ray_count, BLOCK: tl.constexpr):
     """This program's rays, which of them exist, and their directions."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = r < tl.load(ray_count).to(tl.int32)
-    x = tl.load(direction + 3 * r, mask=here, other=0.0)
-    y = tl.load(direction + 3 * r + 1, mask=here, other=0.0)
-    z = tl.load(direction + 3 * r + 2, mask=here, other=0.0)
+    x, y, z = load_vector(direction + 3 * r, 1, here)
     return r, here, x, y, z
 
 
@@ -47,9 +47,7 @@ def harmonics_gradient(direction, ray_count, g_harmonics, g_direction, BLOCK: tl
     r, here, x, y, z = _directions(direction, ray_count, BLOCK)
     xx, yy, zz = x * x, y * y, z * z
     g = g_harmonics + 16 * r
-    gx = tl.load(g_direction + 3 * r, mask=here, other=0.0)
-    gy = tl.load(g_direction + 3 * r + 1, mask=here, other=0.0)
-    gz = tl.load(g_direction + 3 * r + 2, mask=here, other=0.0)
+    gx, gy, gz = load_vector(g_direction + 3 * r, 1, here)
     gy -= 0.48860251190291987 * tl.load(g + 1, mask=here, other=0.0)
     gz += 0.48860251190291987 * tl.load(g + 2, mask=here, other=0.0)
     gx -= 0.48860251190291987 * tl.load(g + 3, mask=here, other=0.0)
@@ -75,6 +73,4 @@ def harmonics_gradient(direction, ray_count, g_harmonics, g_direction, BLOCK: tl
     gx, gy, gz = gx + 2.0 * a * x * z, gy - 2.0 * a * y * z, gz + a * (xx - yy)
     a = 0.5900435899266435 * tl.load(g + 15, mask=here, other=0.0)
     gx, gy = gx + 3.0 * a * (yy - xx), gy + 6.0 * a * x * y
-    tl.store(g_direction + 3 * r, gx, mask=here)
-    tl.store(g_direction + 3 * r + 1, gy, mask=here)
-    tl.store(g_direction + 3 * r + 2, gz, mask=here)
+    store_vector(g_direction + 3 * r, 1, gx, gy, gz, here)

@@ -1,7 +1,7 @@
 """Viewing directions of pixels in one Triton kernel: `biresnerf.geometry.camera.camera.directions_in_cam`.
 
-There, Newton's method asks after every step whether it is done, and the host would wait for the answer. Here all its
-steps are taken.
+There, Newton's method checks after every step whether it has converged, and the host would wait for that. Here it
+always takes all its steps.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from biresnerf.field.cuda.access import load_vector, store_vector
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.distortion import NEWTON_STEPS
 
@@ -36,15 +37,9 @@ def directions(
     y0 = y0 / tl.load(fy + m, mask=here, other=1.0)
     x, y = x0, y0
     if STEPS > 0:
-        a1 = tl.load(distortion + 9 * m, mask=here, other=0.0)
-        a2 = tl.load(distortion + 9 * m + 1, mask=here, other=0.0)
-        a3 = tl.load(distortion + 9 * m + 2, mask=here, other=0.0)
-        a4 = tl.load(distortion + 9 * m + 3, mask=here, other=0.0)
-        b1 = tl.load(distortion + 9 * m + 4, mask=here, other=0.0)
-        b2 = tl.load(distortion + 9 * m + 5, mask=here, other=0.0)
-        b3 = tl.load(distortion + 9 * m + 6, mask=here, other=0.0)
-        p1 = tl.load(distortion + 9 * m + 7, mask=here, other=0.0)
-        p2 = tl.load(distortion + 9 * m + 8, mask=here, other=0.0)
+        a1, a2, a3 = load_vector(distortion + 9 * m, 1, here)
+        a4, b1, b2 = load_vector(distortion + 9 * m + 3, 1, here)
+        b3, p1, p2 = load_vector(distortion + 9 * m + 6, 1, here)
         for _ in range(STEPS):
             s = x * x + y * y
             below = ((b3 * s + b2) * s + b1) * s + 1.0
@@ -68,9 +63,9 @@ def directions(
         angle = tl.sqrt(tl.where(off_axis, s, 1.0))
         scale = tl.where(curved, tl.where(off_axis, tl.sin(angle) / angle, 1.0 - s / 6.0), scale)
         z = tl.where(curved, tl.where(off_axis, tl.cos(angle), 1.0 - s / 2.0), z)
-    tl.store(out + 3 * i, (x * scale).to(tl.float32), mask=here)
-    tl.store(out + 3 * i + 1, (y * scale).to(tl.float32), mask=here)
-    tl.store(out + 3 * i + 2, z.to(tl.float32), mask=here)
+    store_vector(
+        out + 3 * i, 1, (x * scale).to(tl.float32), (y * scale).to(tl.float32), z.to(tl.float32), here
+    )
 
 
 def directions_in_cam(intrinsics: Intrinsics, image_index: Tensor, pixel_xy: Tensor) -> Tensor:

@@ -11,8 +11,10 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from biresnerf.field.cuda.encoding import samples_of_program
+from biresnerf.field.cuda.access import sample_counts, samples_of_block
+from biresnerf.field.reference import operations
 
+DENSITY_SHIFT, DENSITY_CAP = tl.constexpr(operations.DENSITY_SHIFT), tl.constexpr(operations.DENSITY_CAP)
 HIDDEN = tl.constexpr(64)
 OUT = tl.constexpr(16)  # outputs of the density network, view harmonics, and the padded width of the colour
 
@@ -48,15 +50,9 @@ def _product(a, b, PRECISION: tl.constexpr):
 
 
 @triton.jit
-def _density_logit(z):
-    """The first column of z [samples, 16]."""
-    return tl.sum(tl.where(tl.arange(0, OUT)[None, :] == 0, z, 0.0), 1)
-
-
-@triton.jit
-def _density(z):
-    """exp(min(z0 - 1, 11)): BAA-NGP's truncated exponential."""
-    return tl.exp(tl.minimum(_density_logit(z) - 1.0, 11.0))
+def _density_exponent(z):
+    """The shifted first column of z [samples, 16]: density = exp(min(it, DENSITY_CAP))."""
+    return tl.sum(tl.where(tl.arange(0, OUT)[None, :] == 0, z, 0.0), 1) - DENSITY_SHIFT
 
 
 @triton.jit
@@ -73,18 +69,6 @@ def _first_layer(
     if HIGH > 0:
         h += _product(high, tl.trans(_weights(columns, HIDDEN, HIDDEN, HIGH, HIGH_PAD, 0, HIGH)), PRECISION)
     return low, high, tl.maximum(h, 0.0)
-
-
-@triton.jit
-def _outputs(
-    features, i, here, capacity, w1, columns, w2, LOW: tl.constexpr, LOW_PAD: tl.constexpr, HIGH: tl.constexpr,
-    HIGH_PAD: tl.constexpr, PRECISION: tl.constexpr,
-):  # fmt: skip
-    """Outputs [samples, 16] of the density network."""
-    _low, _high, h1 = _first_layer(
-        features, i, here, capacity, w1, columns, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION
-    )
-    return _product(h1, tl.trans(_weights(w2, OUT, OUT, HIDDEN, HIDDEN, 0, HIDDEN)), PRECISION)
 
 
 @triton.jit
@@ -117,9 +101,12 @@ def network_forward(
     n = tl.load(taken)
     if tl.program_id(0) * BLOCK >= n:
         return
-    i, here = samples_of_program(n, BLOCK)
-    z = _outputs(features, i, here, capacity, w1, columns, w2, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION)
-    tl.store(density + i, _density(z), mask=here)
+    i, here = samples_of_block(tl.program_id(0), n, BLOCK)
+    _low, _high, h1 = _first_layer(
+        features, i, here, capacity, w1, columns, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION
+    )
+    z = _product(h1, tl.trans(_weights(w2, OUT, OUT, HIDDEN, HIDDEN, 0, HIDDEN)), PRECISION)
+    tl.store(density + i, tl.exp(tl.minimum(_density_exponent(z), DENSITY_CAP)), mask=here)
     if WITH_COLOUR:
         _h3, _h4, rgb = _colour_layers(z, _view(view, ray, i, here), w3, w4, w5, PRECISION)
         _store_tile(outputs, 0, i, here, capacity, OUT, OUT, z)
@@ -145,15 +132,13 @@ def colour_backward(
 
     The latter are this program's share, colour_sums [programs, their numbers], from trained samples alone.
     """
-    n = tl.load(taken)
-    trained = tl.minimum(tl.load(ray_offset + tl.load(trained_rays).to(tl.int32)), n)
+    n, trained = sample_counts(taken, ray_offset, trained_rays)
     d3v = tl.zeros([HIDDEN, OUT], tl.float32)
-    d3z = tl.zeros([HIDDEN, OUT], tl.float32)
+    d3z = d3v
     d4 = tl.zeros([HIDDEN, HIDDEN], tl.float32)
     d5 = tl.zeros([OUT, HIDDEN], tl.float32)
     for block in range(tl.program_id(0), tl.cdiv(n, BLOCK), programs):
-        i = block * BLOCK + tl.arange(0, BLOCK)
-        here = i < n
+        i, here = samples_of_block(block, n, BLOCK)
         counts = (i < trained)[:, None]
         z = _tile(outputs, 0, i, here, capacity, OUT, OUT)
         v = _view(view, ray, i, here)
@@ -170,8 +155,8 @@ def colour_backward(
         gv = _product(g, _weights(w3, HIDDEN, HIDDEN, OUT, OUT, 0, 2 * OUT), PRECISION)
         _store_tile(g_view, 0, i, here, capacity, OUT, OUT, gv)
         g = _product(g, _weights(w3, HIDDEN, HIDDEN, OUT, OUT, OUT, 2 * OUT), PRECISION)
-        a = _density_logit(z) - 1.0
-        slope = tl.where(a < 11.0, tl.exp(tl.minimum(a, 11.0)), 0.0)
+        a = _density_exponent(z)
+        slope = tl.where(a < DENSITY_CAP, tl.exp(tl.minimum(a, DENSITY_CAP)), 0.0)
         slope = slope * tl.load(g_density + i, mask=here, other=0.0)
         g += tl.where(tl.arange(0, OUT)[None, :] == 0, slope[:, None], 0.0)
         _store_tile(g_outputs, 0, i, here, capacity, OUT, OUT, g)
@@ -190,14 +175,12 @@ def density_backward(
     PRECISION: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Gradients to features [width, capacity] and, as in `colour_backward`, to w1, w2 and the columns."""
-    n = tl.load(taken)
-    trained = tl.minimum(tl.load(ray_offset + tl.load(trained_rays).to(tl.int32)), n)
+    n, trained = sample_counts(taken, ray_offset, trained_rays)
     d1 = tl.zeros([HIDDEN, LOW_PAD], tl.float32)
     d2 = tl.zeros([OUT, HIDDEN], tl.float32)
     d6 = tl.zeros([HIDDEN, HIGH_PAD], tl.float32)
     for block in range(tl.program_id(0), tl.cdiv(n, BLOCK), programs):
-        i = block * BLOCK + tl.arange(0, BLOCK)
-        here = i < n
+        i, here = samples_of_block(block, n, BLOCK)
         counts = (i < trained)[:, None]
         low, high, h1 = _first_layer(
             features, i, here, capacity, w1, columns, LOW, LOW_PAD, HIGH, HIGH_PAD, PRECISION

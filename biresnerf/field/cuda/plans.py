@@ -9,7 +9,7 @@ import torch
 from biresnerf.field.cuda import encoding, harmonics, network, rays
 from biresnerf.field.cuda.launches import Launch, bind, block
 from biresnerf.field.cuda.workspace import Workspace
-from biresnerf.field.radiance_field import BETA1, BETA2, EPSILON
+from biresnerf.field.grid_field import BETA1, BETA2, EPSILON
 
 SAMPLES = 128  # a program takes, in kernels of one thread a sample
 RAYS = 32  # a program takes, in kernels of one thread a ray
@@ -68,14 +68,17 @@ def density(w: Workspace) -> list[Any]:
     return [*_encoding(w, with_jacobian=False), _per_tile(network.network_forward, w, WITH_COLOUR=False)]
 
 
-def update_pose(w: Workspace) -> list[Any]:
-    """Adam on the pose-estimation module's table, from the last backward pass."""
-    return _update(w, "pose")
-
-
-def update_reconstruction(w: Workspace) -> list[Any]:
-    """Adam on the reconstruction module's table, from the last backward pass."""
-    return _update(w, "reconstruction")
+def update(w: Workspace, name: str) -> list[Any]:
+    """Adam on the table of a module, from the last backward pass."""
+    grid, size = w.grids[name], block(ENTRIES)
+    largest = 2 * max(int(entries) for entries in grid.offset[1:] - grid.offset[:-1])
+    return [
+        _per_sample(encoding.table_gradient, w, name, per_level=True),
+        bind(
+            encoding.adam_touched, (-(-largest // size), grid.levels), w.tables[name],
+            BETA1=BETA1, BETA2=BETA2, EPSILON=EPSILON, BLOCK=size,
+        ),
+    ]  # fmt: skip
 
 
 def _rendering(w: Workspace, with_jacobian: bool) -> list[Any]:
@@ -97,18 +100,6 @@ def _encoding(w: Workspace, with_jacobian: bool) -> list[Launch]:
             smoothing=w.buffers[f"{name}_smoothing"], WITH_JACOBIAN=with_jacobian,
         )
         for name in w.modules
-    ]  # fmt: skip
-
-
-def _update(w: Workspace, name: str) -> list[Any]:
-    grid, size = w.grids[name], block(ENTRIES)
-    largest = 2 * max(int(entries) for entries in grid.offset[1:] - grid.offset[:-1])
-    return [
-        _per_sample(encoding.table_gradient, w, name, per_level=True),
-        bind(
-            encoding.adam_touched, (-(-largest // size), grid.levels), w.tables[name],
-            BETA1=BETA1, BETA2=BETA2, EPSILON=EPSILON, BLOCK=size,
-        ),
     ]  # fmt: skip
 
 

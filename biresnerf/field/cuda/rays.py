@@ -1,4 +1,4 @@
-"""Ray marching through the occupancy grid, compositing, view harmonics and gradients to rays, in Triton.
+"""Ray marching through the occupancy grid, compositing and gradients to rays, in Triton.
 
 The definitions are in `field.reference.operations`. Rays live in the unit frame, positions in [0, 1]. Every sum over
 the samples of a ray is taken by one program in a fixed order.
@@ -9,9 +9,10 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from biresnerf.field.reference.operations import LEAST_TRANSMITTANCE
+from biresnerf.field.cuda.access import load_vector, store_vector
+from biresnerf.field.reference import operations
 
-LEAST = tl.constexpr(LEAST_TRANSMITTANCE)
+LEAST, EDGE = tl.constexpr(operations.LEAST_TRANSMITTANCE), tl.constexpr(operations.EDGE)
 OPAQUE = tl.constexpr(100.0)  # e^-100 is 0 in float32; larger numbers would cost the sums their last digits
 
 
@@ -29,17 +30,19 @@ def _contraction(px, py, pz, UNBOUNDED: tl.constexpr):
 @triton.jit
 def _length(px, py, pz, step, UNBOUNDED: tl.constexpr):
     """Length of the interval that starts at a point."""
-    m = tl.maximum(tl.abs(px), tl.maximum(tl.abs(py), tl.abs(pz)))
-    dt = m * 0.0 + step
-    if UNBOUNDED:
-        outside = tl.maximum(m, 1.0)
-        dt = step * outside * outside
-    return dt
+    outside = tl.maximum(tl.maximum(tl.abs(px), tl.maximum(tl.abs(py), tl.abs(pz))), 1.0)
+    return step * outside * outside if UNBOUNDED else outside * 0.0 + step
 
 
 @triton.jit
 def _cell(v, side):
     return tl.minimum(tl.maximum((v * side).to(tl.int32), 0), side - 1)
+
+
+@triton.jit
+def _inside(v):
+    """A coordinate of [-0.5, 0.5] as one strictly inside [0, 1]."""
+    return tl.minimum(tl.maximum(v + 0.5, EDGE), 1.0 - EDGE)
 
 
 @triton.jit
@@ -58,16 +61,8 @@ def march(
     """Start of every live interval, start [rays, most], and how many a ray has, count [rays]; a thread per ray."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = r < tl.load(ray_count).to(tl.int32)
-    ox, oy, oz = (
-        tl.load(origin + 3 * r, mask=here, other=0.0),
-        tl.load(origin + 3 * r + 1, mask=here, other=0.0),
-        tl.load(origin + 3 * r + 2, mask=here, other=0.0),
-    )
-    dx, dy, dz = (
-        tl.load(direction + 3 * r, mask=here, other=1.0),
-        tl.load(direction + 3 * r + 1, mask=here, other=1.0),
-        tl.load(direction + 3 * r + 2, mask=here, other=1.0),
-    )
+    ox, oy, oz = load_vector(origin + 3 * r, 1, here)
+    dx, dy, dz = load_vector(direction + 3 * r, 1, here)
     step = tl.load(interval)
     t = ox * 0.0 + tl.load(near)
     t_end = ox * 0.0 + tl.load(far)
@@ -120,8 +115,8 @@ def pack(
     if r >= rays:
         return
     begin, end = _span(ray_offset, r, capacity)
-    ox, oy, oz = tl.load(origin + 3 * r), tl.load(origin + 3 * r + 1), tl.load(origin + 3 * r + 2)
-    dx, dy, dz = tl.load(direction + 3 * r), tl.load(direction + 3 * r + 1), tl.load(direction + 3 * r + 2)
+    ox, oy, oz = load_vector(origin + 3 * r, 1, True)
+    dx, dy, dz = load_vector(direction + 3 * r, 1, True)
     step = tl.load(interval)
     row = r.to(tl.int64) * most
     for first in range(begin, end, CHUNK):
@@ -132,9 +127,7 @@ def pack(
         middle = s + 0.5 * length
         px, py, pz = ox + middle * dx, oy + middle * dy, oz + middle * dz
         factor, _m = _contraction(px, py, pz, UNBOUNDED)
-        tl.store(x + i, tl.minimum(tl.maximum(px * factor + 0.5, 1e-6), 1.0 - 1e-6), mask=here)
-        tl.store(x + capacity + i, tl.minimum(tl.maximum(py * factor + 0.5, 1e-6), 1.0 - 1e-6), mask=here)
-        tl.store(x + 2 * capacity + i, tl.minimum(tl.maximum(pz * factor + 0.5, 1e-6), 1.0 - 1e-6), mask=here)
+        store_vector(x + i, capacity, _inside(px * factor), _inside(py * factor), _inside(pz * factor), here)
         tl.store(t + i, middle, mask=here)
         tl.store(dt + i, length, mask=here)
         tl.store(ray + i, r, mask=here)
@@ -142,6 +135,26 @@ def pack(
     next_full = tl.load(ray_offset + r + 2, mask=r + 1 < rays, other=capacity + 1) > capacity
     if (full == 0) & next_full:
         tl.store(taken, end)
+
+
+@triton.jit
+def _weights(density, dt, i, here, before):
+    """Length and optical thickness of samples i, thickness up to their ends, whether light reaches them, and weights.
+
+    `before` is the thickness in front of the first one.
+    """
+    length = tl.load(dt + i, mask=here, other=0.0)
+    thickness = tl.minimum(tl.load(density + i, mask=here, other=0.0) * length, OPAQUE)
+    inclusive = before + tl.cumsum(thickness, 0)
+    transmittance = tl.exp(thickness - inclusive)
+    reached = transmittance >= LEAST
+    return (
+        length,
+        thickness,
+        inclusive,
+        reached,
+        tl.where(reached, transmittance * (1.0 - tl.exp(-thickness)), 0.0),
+    )
 
 
 @triton.jit
@@ -155,28 +168,22 @@ def composite(
         return
     begin, end = _span(ray_offset, r, capacity)
     c0 = tl.zeros([CHUNK], tl.float32)
-    c1 = tl.zeros([CHUNK], tl.float32)
-    c2 = tl.zeros([CHUNK], tl.float32)
-    distance = tl.zeros([CHUNK], tl.float32)
+    c1, c2, distance = c0, c0, c0
     before = tl.sum(c0, 0)  # thickness in front of the chunk
     taken_in = before  # and of the samples that light reaches
     for first in range(begin, end, CHUNK):
         i = first + tl.arange(0, CHUNK)
         here = i < end
-        thickness = tl.load(density + i, mask=here, other=0.0) * tl.load(dt + i, mask=here, other=0.0)
-        thickness = tl.minimum(thickness, OPAQUE)
-        reaching = tl.exp(thickness - tl.cumsum(thickness, 0) - before)
-        weight = tl.where(reaching >= LEAST, reaching * (1.0 - tl.exp(-thickness)), 0.0)
-        c0 += weight * tl.load(colour + i, mask=here, other=0.0)
-        c1 += weight * tl.load(colour + capacity + i, mask=here, other=0.0)
-        c2 += weight * tl.load(colour + 2 * capacity + i, mask=here, other=0.0)
+        _length, thickness, _inclusive, reached, weight = _weights(density, dt, i, here, before)
+        q0, q1, q2 = load_vector(colour + i, capacity, here)
+        c0, c1, c2 = c0 + weight * q0, c1 + weight * q1, c2 + weight * q2
         distance += weight * tl.load(t + i, mask=here, other=0.0)
         before += tl.sum(thickness, 0)
-        taken_in += tl.sum(tl.where(reaching >= LEAST, thickness, 0.0), 0)
+        taken_in += tl.sum(tl.where(reached, thickness, 0.0), 0)
     last = tl.exp(-taken_in)
-    tl.store(ray_colour + 3 * r, tl.sum(c0, 0) + last * tl.load(background + 3 * r))
-    tl.store(ray_colour + 3 * r + 1, tl.sum(c1, 0) + last * tl.load(background + 3 * r + 1))
-    tl.store(ray_colour + 3 * r + 2, tl.sum(c2, 0) + last * tl.load(background + 3 * r + 2))
+    b0, b1, b2 = load_vector(background + 3 * r, 1, True)
+    c0, c1, c2 = tl.sum(c0, 0) + last * b0, tl.sum(c1, 0) + last * b1, tl.sum(c2, 0) + last * b2
+    store_vector(ray_colour + 3 * r, 1, c0, c1, c2, True)
     tl.store(opacity + r, 1.0 - last)
     tl.store(depth + r, tl.sum(distance, 0) / tl.maximum(1.0 - last, 1e-6))
 
@@ -191,33 +198,22 @@ def composite_backward(
     if r >= tl.load(ray_count).to(tl.int32):
         return
     begin, end = _span(ray_offset, r, capacity)
-    g0, g1, g2 = (
-        tl.load(g_ray_colour + 3 * r),
-        tl.load(g_ray_colour + 3 * r + 1),
-        tl.load(g_ray_colour + 3 * r + 2),
-    )
-    # What lies behind the sample at hand, background included, weighed by the colour's gradient.
-    behind = g0 * tl.load(ray_colour + 3 * r) + g1 * tl.load(ray_colour + 3 * r + 1)
-    behind += g2 * tl.load(ray_colour + 3 * r + 2)
+    g0, g1, g2 = load_vector(g_ray_colour + 3 * r, 1, True)
+    c0, c1, c2 = load_vector(ray_colour + 3 * r, 1, True)
+    # The colour behind the current sample, background included, times the colour's gradient.
+    behind = g0 * c0 + g1 * c1 + g2 * c2
     through = tl.load(g_opacity + r) * (1.0 - tl.load(opacity + r))
     before = behind * 0.0
     for first in range(begin, end, CHUNK):
         i = first + tl.arange(0, CHUNK)
         here = i < end
-        length = tl.load(dt + i, mask=here, other=0.0)
-        thickness = tl.minimum(tl.load(density + i, mask=here, other=0.0) * length, OPAQUE)
-        inclusive = before + tl.cumsum(thickness, 0)
-        reached = tl.exp(thickness - inclusive) >= LEAST
-        weight = tl.where(reached, tl.exp(thickness - inclusive) * (1.0 - tl.exp(-thickness)), 0.0)
-        q = g0 * tl.load(colour + i, mask=here, other=0.0)
-        q += g1 * tl.load(colour + capacity + i, mask=here, other=0.0)
-        q += g2 * tl.load(colour + 2 * capacity + i, mask=here, other=0.0)
+        length, thickness, inclusive, reached, weight = _weights(density, dt, i, here, before)
+        q0, q1, q2 = load_vector(colour + i, capacity, here)
+        q = g0 * q0 + g1 * q1 + g2 * q2
         later = behind - tl.cumsum(weight * q, 0)
         g = tl.where(reached, length * (tl.exp(-inclusive) * q - later + through), 0.0)
         tl.store(g_density + i, g, mask=here)
-        tl.store(g_colour + i, weight * g0, mask=here)
-        tl.store(g_colour + capacity + i, weight * g1, mask=here)
-        tl.store(g_colour + 2 * capacity + i, weight * g2, mask=here)
+        store_vector(g_colour + i, capacity, weight * g0, weight * g1, weight * g2, here)
         behind -= tl.sum(weight * q, 0)
         before += tl.sum(thickness, 0)
 
@@ -232,8 +228,8 @@ def ray_gradients(
     if r >= tl.load(ray_count).to(tl.int32):
         return
     begin, end = _span(ray_offset, r, capacity)
-    ox, oy, oz = tl.load(origin + 3 * r), tl.load(origin + 3 * r + 1), tl.load(origin + 3 * r + 2)
-    dx, dy, dz = tl.load(direction + 3 * r), tl.load(direction + 3 * r + 1), tl.load(direction + 3 * r + 2)
+    ox, oy, oz = load_vector(origin + 3 * r, 1, True)
+    dx, dy, dz = load_vector(direction + 3 * r, 1, True)
     lane, k = tl.arange(0, CHUNK), tl.arange(0, 16)
     a0 = tl.zeros([CHUNK], tl.float32)
     a1, a2, b0, b1, b2 = a0, a0, a0, a0, a0
@@ -242,9 +238,7 @@ def ray_gradients(
         i = first + lane
         here = i < end
         at = tl.load(t + i, mask=here, other=0.0)
-        u = tl.load(g_x + i, mask=here, other=0.0)
-        v = tl.load(g_x + capacity + i, mask=here, other=0.0)
-        w = tl.load(g_x + 2 * capacity + i, mask=here, other=0.0)
+        u, v, w = load_vector(g_x + i, capacity, here)
         px, py, pz = ox + at * dx, oy + at * dy, oz + at * dz
         factor, m = _contraction(px, py, pz, UNBOUNDED)
         if UNBOUNDED:
@@ -263,10 +257,6 @@ def ray_gradients(
         b0, b1, b2 = b0 + at * u, b1 + at * v, b2 + at * w
         tile = tl.load(g_view + k[:, None] * capacity + i[None, :], mask=here[None, :], other=0.0)
         harmonics += tl.sum(tile, 1)
-    tl.store(g_origin + 3 * r, tl.sum(a0, 0))
-    tl.store(g_origin + 3 * r + 1, tl.sum(a1, 0))
-    tl.store(g_origin + 3 * r + 2, tl.sum(a2, 0))
-    tl.store(g_direction + 3 * r, tl.sum(b0, 0))
-    tl.store(g_direction + 3 * r + 1, tl.sum(b1, 0))
-    tl.store(g_direction + 3 * r + 2, tl.sum(b2, 0))
+    store_vector(g_origin + 3 * r, 1, tl.sum(a0, 0), tl.sum(a1, 0), tl.sum(a2, 0), True)
+    store_vector(g_direction + 3 * r, 1, tl.sum(b0, 0), tl.sum(b1, 0), tl.sum(b2, 0), True)
     tl.store(g_harmonics + 16 * r + k, harmonics)

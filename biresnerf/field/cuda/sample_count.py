@@ -1,4 +1,4 @@
-"""How many samples rays have: known on the device, heard of on the host without waiting."""
+"""How many samples rays have: known on the device, copied to the host without waiting."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ class SampleCount:
         self._density: float | None = None
 
     def note(self, total: Tensor, rays: int, interval: float) -> None:
-        """Ask for the count `total` [1] of so many rays marched at `interval`."""
+        """Request the count `total` [1] of this many rays marched at `interval`."""
         self._arriving.copy_(total, non_blocking=True)
         if self._arrived is not None:
             self._arrived.record()
         self._waiting = (rays, interval)
 
     def latest(self) -> int:
-        """The count last asked for, waiting for it; 0 where none has been. Call before the next `note`."""
+        """The count last requested, after waiting for it; 0 if there is none. Call before the next `note`."""
         if self._arrived is not None and self._waiting is not None:
             self._arrived.synchronize()
         count = int(self._arriving)
@@ -35,7 +35,7 @@ class SampleCount:
         return count
 
     def expected(self, rays: int, interval: float) -> int | None:
-        """What the last count lets expect of other rays; None where nothing is known."""
+        """The count to expect of other rays, from the last one; None if there is none."""
         return None if self._density is None else round(self._density * rays / interval)
 
     def forget(self) -> None:

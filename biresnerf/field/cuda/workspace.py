@@ -10,12 +10,10 @@ import torch
 from torch import Tensor
 
 from biresnerf.field.cuda.launches import Plan
-from biresnerf.field.grid_field import GridField
+from biresnerf.field.grid_field import OUTPUTS, GridField
 from biresnerf.field.grid_levels import GridLevels
-from biresnerf.field.radiance_field import OUTPUTS
 from biresnerf.field.spherical_harmonics import VIEW_FEATURES
 
-MODULES = ("pose", "reconstruction")
 CONTROLS = (
     "ray_count", "trained_rays", "interval", "near", "far",
     "pose_smoothing", "reconstruction_smoothing", "pose_share", "reconstruction_share",
@@ -42,10 +40,7 @@ class Workspace:
 
     def __init__(self, field: GridField, capacity: Capacity) -> None:
         self.capacity, self.shape, self.device = capacity, field.shape, field.device
-        self.modules = MODULES if field.reconstructing else MODULES[:1]
-        self.grids: dict[str, GridLevels] = dict(
-            zip(MODULES, (self.shape.pose_grid, self.shape.reconstruction_grid), strict=True)
-        )
+        self.modules, self.grids = field.modules, field.grids
         self.width = sum(self.grids[name].width for name in self.modules)
         self.programs = (
             torch.cuda.get_device_properties(self.device).multi_processor_count
@@ -65,17 +60,17 @@ class Workspace:
             "columns": field.reconstruction_columns,
         }
         self.tables = {
-            name: _level_buffers(self.grids[name], table, field.moments[name])
-            for name, table in zip(MODULES, (field.pose_table, field.reconstruction_table), strict=True)
-            if name in self.modules
+            name: _level_buffers(self.grids[name], field.tables[name], field.moments[name])
+            for name in self.modules
         }
-        self._plans: dict[Callable[[Workspace], list[Any]], Plan] = {}
+        self._plans: dict[tuple[Any, ...], Plan] = {}
 
-    def plan(self, launches: Callable[[Workspace], list[Any]]) -> Plan:
-        """The plan that `launches` makes of this workspace, made once."""
-        if launches not in self._plans:
-            self._plans[launches] = Plan(launches(self), self.device)
-        return self._plans[launches]
+    def plan(self, launches: Callable[..., list[Any]], *arguments: str) -> Plan:
+        """The plan that `launches` makes for this workspace and these arguments, made once."""
+        key = (launches, *arguments)
+        if key not in self._plans:
+            self._plans[key] = Plan(launches(self, *arguments), self.device)
+        return self._plans[key]
 
     def write_controls(self, values: dict[str, float]) -> None:
         """Set what changes from step to step."""

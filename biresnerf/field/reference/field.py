@@ -8,18 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from biresnerf.field.grid_field import GridField
+from biresnerf.field.grid_field import BETA1, BETA2, EPSILON, GridField
 from biresnerf.field.grid_levels import GridLevels
-from biresnerf.field.radiance_field import (
-    BETA1,
-    BETA2,
-    EPSILON,
-    FieldShape,
-    Marching,
-    PositionGradient,
-    Rays,
-    Rendering,
-)
+from biresnerf.field.radiance_field import FieldShape, Marching, PositionGradient, Rays, Rendering
 from biresnerf.field.reference import operations as reference
 from biresnerf.field.spherical_harmonics import spherical_harmonics
 
@@ -67,8 +58,12 @@ class ReferenceField(GridField):
     def _sample(
         self, x: Tensor, view: Tensor, gradient: PositionGradient, trained: bool
     ) -> tuple[Tensor, Tensor]:
-        parameters = [self.pose_table, self.reconstruction_table, self.reconstruction_columns]
-        parameters += [*self.networks, *self.reconstruction_head]
+        parameters = [
+            *self.tables.values(),
+            self.reconstruction_columns,
+            *self.networks,
+            *self.reconstruction_head,
+        ]
         for parameter in parameters:
             parameter.requires_grad_(trained)
         logits = [
@@ -91,17 +86,9 @@ class ReferenceField(GridField):
 
     @torch.no_grad()
     def _update_table(self, name: str, rates: np.ndarray) -> None:
-        pose = name == "pose"
-        table = self.pose_table if pose else self.reconstruction_table
-        grid = self.shape.pose_grid if pose else self.shape.reconstruction_grid
-        if table.grad is None:
-            return
-        adam_touched(table, table.grad, *self.moments[name], self.steps[name], rates, grid)
-
-    def discard_gradients(self) -> None:
-        self.pose_table.grad = self.reconstruction_table.grad = None
-        for weight in (*self.networks, self.reconstruction_columns, *self.reconstruction_head):
-            weight.grad = None
+        table = self.tables[name]
+        if table.grad is not None:
+            adam_touched(table, table.grad, *self.moments[name], self.steps[name], rates, self.grids[name])
 
 
 def adam_touched(

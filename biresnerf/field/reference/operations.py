@@ -1,4 +1,4 @@
-"""The operations of the radiance field in plain torch: the definition that every fast backend is held to.
+"""The operations of the radiance field in plain torch: the definition that every fast backend is tested against.
 
 Any device, any float type, differentiable by autograd. Written to be read, not to be fast.
 """
@@ -59,7 +59,7 @@ def network(features: Tensor, view: Tensor, weights: list[Tensor]) -> tuple[Tens
 
 
 def network_logits(features: Tensor, view: Tensor, weights: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """What density [n] and colour [n, 3] are made of, of features [n, width] and view harmonics [n, 16].
+    """Logits of density [n] and colour [n, 3], of features [n, width] and view harmonics [n, 16].
 
     `weights` = (64 x width, 16 x 64) of the density network and (64 x 32, 64 x 64, 3 x 64) of the colour network,
     no biases, rectified; density = exp(min(z0 - 1, 11)) of the first output (BAA-NGP's truncated exponential).
