@@ -18,11 +18,7 @@ EXIT_STOPPED = 143  # of the process of a cell that was stopped
 CELL, RESULT, LOG, RUN = "cell.json", "result.json", "log.txt", "run"  # in the folder of a cell
 
 
-class Record(FrozenModel):
-    """Data that does not change and has no unknown keys."""
-
-
-class Perturbation(Record):
+class Perturbation(FrozenModel):
     """How the start poses of a run are made from the true ones."""
 
     kind: Literal["noise", "identity"] = "noise"
@@ -42,7 +38,7 @@ class Perturbation(Record):
         return ", ".join(parts)
 
 
-class Scene(Record):
+class Scene(FrozenModel):
     """A set of true poses. ``digest`` is of its transforms files: other poses make another scene."""
 
     name: str
@@ -53,7 +49,7 @@ class Scene(Record):
     test_views: int = Field(0, ge=0, description="At most this many views of the test file are rendered.")
 
 
-class EqualTime(Record):
+class EqualTime(FrozenModel):
     """How the number of steps was chosen for a run that gets the time of the first variant."""
 
     seconds: float = Field(description="What the first variant took to optimise.")
@@ -61,7 +57,7 @@ class EqualTime(Record):
     calibration_ms_per_step: float
 
 
-class Cell(Record):
+class Cell(FrozenModel):
     """One run of a comparison."""
 
     scene: Scene
@@ -85,7 +81,7 @@ class Cell(Record):
         return f"{self.scene.name}-{self.key}"
 
 
-class CameraResult(Record):
+class CameraResult(FrozenModel):
     """Rotation error of one camera after an alignment that is robust to lost cameras."""
 
     name: str
@@ -94,7 +90,7 @@ class CameraResult(Record):
     after_deg: float
 
 
-class ViewQuality(Record):
+class ViewQuality(FrozenModel):
     """Means over views the field never saw, their poses fitted to it first (BARF's test-time refinement)."""
 
     kind: Literal["held out", "test"]
@@ -105,7 +101,7 @@ class ViewQuality(Record):
     lpips_absent: str | None = Field(None, description="Why there is no LPIPS.")
 
 
-class Outcome(Record):
+class Outcome(FrozenModel):
     """The result of a completed run."""
 
     version: str
@@ -132,7 +128,7 @@ class Outcome(Record):
         return sum(camera.after_deg > LOST_FROM_DEG for camera in self.cameras)
 
 
-class CellResult(Record):
+class CellResult(FrozenModel):
     """``result.json`` of a cell: its outcome, or the error."""
 
     cell: Cell

@@ -17,7 +17,7 @@ def as_markdown(tables: Tables) -> str:
     if tables.notes:
         parts.append("\n".join(f"- {note}" for note in tables.notes))
     parts.append(f"Measured on {tables.machine}.")
-    return "\n\n".join(part for part in parts if part)
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _rows(tables: Tables) -> str:

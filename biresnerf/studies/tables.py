@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from biresnerf.studies.cell import Outcome, Record
+from biresnerf.frozen_model import FrozenModel
+from biresnerf.studies.cell import Outcome
 from biresnerf.studies.plan import Entry
 
 
@@ -47,7 +48,7 @@ METRICS = (
 )
 
 
-class Row(Record):
+class Row(FrozenModel):
     """One variant on one scene from one kind of start, over the seeds: means; for max and memory the largest."""
 
     scene: str
@@ -58,7 +59,7 @@ class Row(Record):
     values: dict[str, float | None]
 
 
-class Summary(Record):
+class Summary(FrozenModel):
     """One variant from one kind of start over the scenes: mean and median of the rows."""
 
     start: str
@@ -68,7 +69,7 @@ class Summary(Record):
     median: dict[str, float | None]
 
 
-class PairedTest(Record):
+class PairedTest(FrozenModel):
     """A two-sided Wilcoxon signed-rank test of ``other - first``."""
 
     pairs: int = Field(description="n: scenes x starts x seeds that both variants finished.")
@@ -80,7 +81,7 @@ class PairedTest(Record):
     median_difference: float = Field(description="Median of other - first.")
 
 
-class Difference(Record):
+class Difference(FrozenModel):
     """The test of one metric between the first variant and another, over all scenes, starts and seeds."""
 
     metric: str
@@ -89,7 +90,7 @@ class Difference(Record):
     test: PairedTest
 
 
-class Failure(Record):
+class Failure(FrozenModel):
     """A run that ended with an error."""
 
     scene: str
@@ -99,7 +100,7 @@ class Failure(Record):
     error: str
 
 
-class Tables(Record):
+class Tables(FrozenModel):
     """``tables.json``."""
 
     variants: dict[str, dict[str, object]] = Field(description="Settings of each, over the shared ones.")

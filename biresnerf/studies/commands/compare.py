@@ -165,7 +165,7 @@ def run_and_write(plan: Plan, given: dict[str, Any]) -> list[Entry]:
     tables = make_tables(entries, variants, plan.settings, describe_machine())
     markdown = as_markdown(tables)
     write_text(output / TABLES_JSON, tables.model_dump_json(indent=1))
-    write_text(output / TABLES_MARKDOWN, markdown)
+    write_text(output / TABLES_MARKDOWN, markdown.rstrip())
     if given["as_json"]:
         print_json(tables)
     else:
