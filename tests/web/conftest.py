@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -177,6 +178,13 @@ def digests(api: httpx.Client, done: dict[str, Any]) -> dict[str, str]:
 def api(service: Running) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=f"{service.url}/v1", timeout=60.0) as client:
         yield client
+
+
+def curve_steps(page: Page) -> list[int]:
+    """The first and the last step that the curves show."""
+    chart = page.get_by_role("img", name="PSNR of the training views")
+    expect(chart).to_be_visible()
+    return [int(step) for step in re.findall(r"at step (\d+)", chart.get_attribute("aria-label") or "")]
 
 
 def drop(page: Page, *paths: Path) -> None:
