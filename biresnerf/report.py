@@ -138,6 +138,11 @@ class ImageReport(FrozenModel):
     )
     moved_far: bool = Field(False, description="Its pose moved by far more than the other images' did.")
     blurred: bool = Field(False, description="Far less sharp than photos taken from about the same place.")
+    contradicted: bool = Field(
+        False,
+        description="Its own feature matches fit its refined pose far worse than those of the other images fit theirs: "
+        "do not trust it.",
+    )
     exposure_off: bool = Field(False, description="Brighter or darker than the other photos make the scene.")
     unsure_deg: float | None = Field(
         None,

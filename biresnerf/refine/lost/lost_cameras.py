@@ -17,6 +17,8 @@ from torch import Tensor
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.refine.lost.matched_repair import MatchedRepair
+from biresnerf.refine.lost.own_matches import OwnMatches
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.optimise.pose_hypotheses import pose_hypotheses
 from biresnerf.refine.parameters.parametrisations import Se3World
@@ -64,8 +66,8 @@ class LostCameraRepair:
         repaired: images whose pose was replaced.
     """
 
-    def __init__(self, optimiser: JointOptimiser) -> None:
-        self.optimiser = optimiser
+    def __init__(self, optimiser: JointOptimiser, own: OwnMatches | None = None) -> None:
+        self.optimiser, self._matches = optimiser, MatchedRepair(optimiser, own)
         self.repaired: list[int] = []
         self._marching = optimiser.marching(optimiser.schedule.fine_interval)
         self._given = optimiser.poses.poses().numpy()
@@ -95,6 +97,7 @@ class LostCameraRepair:
         total *= GUESSED_TIMES if bool(optimiser.camera_errors.doubted.any()) else 1
         allowance = min(self._spent + EVENT_SHARE * total, RUN_SHARE * total)
         self._marching = self._coarse_marching()
+        self.repaired = sorted({*self.repaired, *self._matches.place()})
         alone = self._alone()
         # Matches are better evidence than the error of a young field: cameras they placed stay (on dtu these were 2 deg
         # off, and 7 to 9 deg after a repair).
@@ -175,7 +178,7 @@ class LostCameraRepair:
             scores = self._scores(tried, image[: len(tried)])
             best = int(scores.argmin())
             error = float(scores[best])
-            accepted = error < bound
+            accepted = error < bound and not self._matches.object_to(camera, tried[best])
             if accepted and (optimiser.switch is None or error < median):
                 break  # the run itself optimises the rest
         logger.info(

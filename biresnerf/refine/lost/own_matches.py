@@ -13,6 +13,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.epipolar import epipolar_angles
 from biresnerf.geometry.resection import resect
 from biresnerf.geometry.triangulation import parallax_deg, triangulate
+from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.scene.scene_depth import track_rays
 
 Array = NDArray[np.float64]
@@ -41,6 +42,13 @@ class OwnMatches:
         self.tracks, self.rays = tracks, track_rays(intrinsics, tracks)
         self.focal_px = ((intrinsics.fx + intrinsics.fy) / 2).numpy()
 
+    @classmethod
+    def of(cls, scene: Scene) -> OwnMatches | None:
+        """Those of a scene; None where there are none."""
+        if scene.tracks is None:
+            return None
+        return cls(scene.tracks, [scene.dataset.camera_of(i) for i in range(len(scene.dataset))])
+
     def errors_px(self, world_from_cam: Array) -> Array:
         """Each camera's median epipolar error [n] with the poses [n, 4, 4], px; NaN where it has too few pairs."""
         one, other = self.tracks.pairs()
@@ -54,21 +62,18 @@ class OwnMatches:
                 medians[image] = np.median(own)
         return medians
 
-    def contradicted(self, errors_px: Array) -> NDArray[np.bool_]:
-        """Cameras [n] whose own matches fit far worse than the set's, by their errors [n]."""
-        return np.nan_to_num(errors_px) > CONTRADICTED * self._usual(errors_px)
-
     def placed(self, camera: int, world_from_cam: Array, trusted: NDArray[np.bool_]) -> Array | None:
-        """The camera's pose [4, 4] by points that trusted cameras [n] see, at poses [n, 4, 4].
+        """The camera's pose [4, 4] by points that trusted cameras [n] see, at poses [n, 4, 4]; none of those left out.
 
         None where too few points agree, or where its own matches do not fit the pose found better than the present one.
         """
         before = self.errors_px(world_from_cam)
         others = trusted.copy()
         others[camera] = False
-        bound_px = AGREE * self._usual(before[others])
+        bound_px = AGREE * _usual(before[others])
         shared = np.zeros(self.tracks.points, dtype=np.bool_)
         shared[self.tracks.point[self.tracks.image == camera]] = True
+        shared &= ~self.tracks.left_out()
         used = others[self.tracks.image] & shared[self.tracks.point]
         seen = np.bincount(self.tracks.point[used], minlength=self.tracks.points)
         used &= (seen >= 2)[self.tracks.point]
@@ -86,16 +91,19 @@ class OwnMatches:
             return None
         poses = world_from_cam.copy()
         poses[camera] = found.world_from_cam
-        return found.world_from_cam if self.better(camera, before, self.errors_px(poses)) else None
+        return found.world_from_cam if better(camera, before, self.errors_px(poses)) else None
 
-    def better(self, camera: int, before_px: Array, after_px: Array) -> bool:
-        """Whether a camera's own matches fit better after than before; errors [n]."""
-        return bool(max(after_px[camera], LEAST_PX) < max(before_px[camera], LEAST_PX))
 
-    def worse(self, camera: int, before_px: Array, after_px: Array) -> bool:
-        """Whether they fit worse."""
-        return bool(max(after_px[camera], LEAST_PX) > max(before_px[camera], LEAST_PX))
+def contradicted(errors_px: Array) -> NDArray[np.bool_]:
+    """Cameras [n] whose own matches fit far worse than the set's, by their errors [n]."""
+    return np.asarray(np.nan_to_num(errors_px) > CONTRADICTED * _usual(errors_px))
 
-    def _usual(self, errors_px: Array) -> float:
-        known = errors_px[np.isfinite(errors_px)]
-        return max(float(np.median(known)), LEAST_PX) if len(known) else np.inf
+
+def better(camera: int, before_px: Array, after_px: Array) -> bool:
+    """Whether a camera's own matches fit better after than before, by its errors [n]."""
+    return bool(max(after_px[camera], LEAST_PX) < max(before_px[camera], LEAST_PX))
+
+
+def _usual(errors_px: Array) -> float:
+    known = errors_px[np.isfinite(errors_px)]
+    return max(float(np.median(known)), LEAST_PX) if len(known) else np.inf

@@ -16,6 +16,7 @@ from biresnerf.errors import Interrupted, RefinementError
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refine.lost.lost_cameras import LostCameraRepair
+from biresnerf.refine.lost.own_matches import OwnMatches
 from biresnerf.refine.optimise.async_metrics import StepResult
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
@@ -74,7 +75,8 @@ class TwoStages:
     ) -> None:
         self.optimiser, self.scene, self.folder, self.origin = optimiser, scene, folder, origin
         self.monitor, self.observer = monitor, observer
-        self.record, self.history, self.repair = RunRecord(), History(folder), LostCameraRepair(optimiser)
+        self.record, self.history = RunRecord(), History(folder)
+        self.repair = LostCameraRepair(optimiser, OwnMatches.of(scene))
         options = optimiser.options
         self.detector = StabilityDetector(
             options.coarse_steps_min,

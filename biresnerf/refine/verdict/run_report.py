@@ -63,7 +63,7 @@ def run_report(
         warnings=dataset.warnings
         + _unmatched_warnings(scene)
         + _lost_warnings(dataset, lost)
-        + (unsure_warnings(dataset, judgement.unsure_deg) if judgement is not None else ()),
+        + (_judged_warnings(dataset, judgement) if judgement is not None else ()),
     )
 
 
@@ -101,6 +101,19 @@ def _lost_warnings(dataset: Dataset, lost: list[int]) -> tuple[str, ...]:
         return ()
     names = ", ".join(dataset.names[i] for i in lost)
     return (f"{len(lost)} of {len(dataset)} images agree with no pose that was found: {names}.",)
+
+
+def _judged_warnings(dataset: Dataset, judgement: Judgement) -> tuple[str, ...]:
+    contradicted = np.flatnonzero(judgement.contradicted).tolist()
+    unsure = unsure_warnings(dataset, judgement.unsure_deg)
+    if not contradicted:
+        return unsure
+    named = [f"{dataset.names[i]} ({judgement.epipolar_px[1, i]:.1f} px)" for i in contradicted]
+    return (
+        f"The feature matches of {len(contradicted)} of {len(dataset)} images contradict their refined poses: "
+        f"{few_names(named, 20)}. Do not rely on these poses.",
+        *unsure,
+    )
 
 
 def unsure_warnings(dataset: Dataset, unsure_deg: np.ndarray) -> tuple[str, ...]:
@@ -154,5 +167,8 @@ def _judged(judgement: Judgement | None, image: int) -> dict[str, float | bool |
         "epipolar_px_before": judgement.epipolar_px[0, image],
         "epipolar_px_after": judgement.epipolar_px[1, image],
     }
-    flags = {name: bool(getattr(judgement, name)[image]) for name in ("moved_far", "blurred", "exposure_off")}
+    flags = {
+        name: bool(getattr(judgement, name)[image])
+        for name in ("contradicted", "moved_far", "blurred", "exposure_off")
+    }
     return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | flags

@@ -6,6 +6,7 @@ export const FLAGS = {
   fixed: "fixed",
   lost: "lost",
   repaired: "repaired",
+  contradicted: "matches disagree",
   moved_far: "moved far",
   blurred: "blurred",
   exposure_off: "exposure off",
@@ -14,7 +15,7 @@ export const FLAGS = {
 export type Flag = keyof typeof FLAGS;
 
 /** Flags that deserve attention. */
-export const ALARMING: ReadonlySet<Flag> = new Set(["lost", "moved_far", "blurred", "exposure_off", "unsure_deg"]);
+export const ALARMING: ReadonlySet<Flag> = new Set(["lost", "contradicted", "moved_far", "blurred", "exposure_off", "unsure_deg"]);
 
 export const VERDICTS = {
   improved: { word: "improved", tone: "good" },

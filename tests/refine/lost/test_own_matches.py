@@ -10,7 +10,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.refine.lost.own_matches import OwnMatches
+from biresnerf.refine.lost.own_matches import OwnMatches, contradicted
 from tests.data.formats.random_sets import random_poses
 
 CAMERA = Camera("SIMPLE_RADIAL", 640, 480, (600.0, 320.0, 240.0, 0.02))
@@ -42,9 +42,9 @@ def without(poses: np.ndarray, camera: int, seed: int) -> np.ndarray:
 def test_the_matches_of_a_lost_camera_name_it_alone_and_bring_it_back(seed):
     poses, own = rig(seed, wrong=0.15)
     lost = without(poses, 3, seed)
-    contradicted = own.contradicted(own.errors_px(lost))
-    assert np.flatnonzero(contradicted).tolist() == [3]
-    found = own.placed(3, lost, ~contradicted)
+    wrong = contradicted(own.errors_px(lost))
+    assert np.flatnonzero(wrong).tolist() == [3]
+    found = own.placed(3, lost, ~wrong)
     assert rotation_between_deg(found[:3, :3], poses[3, :3, :3]) < 0.5
     assert np.linalg.norm(found[:3, 3] - poses[3, :3, 3]) < 0.03
 
@@ -60,7 +60,7 @@ def test_it_is_brought_back_to_where_the_others_are_with_their_own_errors():
 def test_true_poses_are_contradicted_nowhere_and_nothing_better_is_found():
     poses, own = rig(6, wrong=0.2)
     errors = own.errors_px(poses)
-    assert not own.contradicted(errors).any()
+    assert not contradicted(errors).any()
     assert errors.max() < 2.0
     found = own.placed(2, poses, np.ones(12, bool))
     assert found is None or rotation_between_deg(found[:3, :3], poses[2, :3, :3]) < 0.3
@@ -75,4 +75,4 @@ def test_too_few_matches_or_wrong_ones_or_no_trusted_cameras_place_nothing():
     assert own.placed(0, poses, np.zeros(12, bool)) is None
     together = np.repeat(poses[:1], 12, axis=0)  # no parallax
     assert own.placed(0, together, np.ones(12, bool)) is None
-    assert not own.contradicted(own.errors_px(together)).any()
+    assert not contradicted(own.errors_px(together)).any()

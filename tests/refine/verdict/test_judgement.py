@@ -202,3 +202,12 @@ def test_matches_of_points_left_out_judge_and_photos_placed_by_a_guess_do_not(sc
     few = tracks.where(tracks.point < 12 * VIEWS)  # too few points to spare any
     assert not found(~guessed, few, started=True).independent
     assert found(~guessed, few, started=False).independent
+
+
+def test_a_camera_that_its_own_matches_contradict_is_named(scene, monkeypatch):
+    monkeypatch.setattr(f"{judge_poses.__module__}.compare_on_unseen_views", lambda *_: None)
+    truth, refined = scene[0].world_from_cam, scene[0].world_from_cam.copy()
+    refined[5] = refined[6]
+    found = judged(scene, truth, refined, true_matches(scene[0]))
+    assert np.flatnonzero(found.contradicted).tolist() == [5]
+    assert not judged(scene, refined, truth, true_matches(scene[0])).contradicted.any()
