@@ -131,6 +131,37 @@ def track_cost(rotation, centre, lens, xyz, start, image, xy, sigma, scale):
 
 
 @njit(**KERNEL)
+def eliminate_point(image, first, last, blocks, forces, mixed, inverse, gradient, system, right):
+    """Add a point's observations, from first to last, to the normal equations of the cameras alone.
+
+    `blocks` and `forces` are the cameras' own, counted from the first; `inverse` and `gradient` the point's.
+    """
+    through = np.empty((6, 3))
+    for e in range(first, last):
+        row = 6 * image[e]
+        for a in range(6):
+            for b in range(3):
+                through[a, b] = 0
+                for c in range(3):
+                    through[a, b] += mixed[e, a, c] * inverse[c, b]
+        for a in range(6):
+            right[row + a] += forces[e - first, a]
+            for b in range(3):
+                right[row + a] -= through[a, b] * gradient[b]
+            for b in range(6):
+                system[row + a, row + b] += blocks[e - first, a, b]
+        for g in range(first, last):
+            column = 6 * image[g]
+            for a in range(6):
+                for b in range(6):
+                    system[row + a, column + b] -= (
+                        through[a, 0] * mixed[g, b, 0]
+                        + through[a, 1] * mixed[g, b, 1]
+                        + through[a, 2] * mixed[g, b, 2]
+                    )
+
+
+@njit(**KERNEL)
 def track_system(rotation, centre, lens, xyz, start, image, xy, sigma, scale, damping, system, right):
     """Add the normal equations without the points to system [6n, 6n] and right [6n], which is half the gradient.
 
@@ -141,7 +172,7 @@ def track_system(rotation, centre, lens, xyz, start, image, xy, sigma, scale, da
     inverses, gradients = np.zeros((points, 3, 3)), np.zeros((points, 3))
     mixed = np.zeros((len(image), 6, 3))
     own, jac, camera = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 6))
-    r, v, q, through = np.empty(2), np.empty(3), np.empty(3), np.empty((6, 3))
+    r, v, q = np.empty(2), np.empty(3), np.empty(3)
     s2, iv = scale * scale, 1.0 / (sigma * sigma)
     most = 0
     for i in range(points):
@@ -182,26 +213,7 @@ def track_system(rotation, centre, lens, xyz, start, image, xy, sigma, scale, da
             inverses[i] = 0
             gradients[i] = 0
             continue
-        for e in range(first, start[i + 1]):
-            row = 6 * image[e]
-            for a in range(6):
-                for b in range(3):
-                    through[a, b] = 0
-                    for c in range(3):
-                        through[a, b] += mixed[e, a, c] * inverses[i, c, b]
-            for a in range(6):
-                right[row + a] += forces[e - first, a]
-                for b in range(3):
-                    right[row + a] -= through[a, b] * gradients[i, b]
-                for b in range(6):
-                    system[row + a, row + b] += blocks[e - first, a, b]
-            for g in range(first, start[i + 1]):
-                column = 6 * image[g]
-                for a in range(6):
-                    for b in range(6):
-                        system[row + a, column + b] -= (
-                            through[a, 0] * mixed[g, b, 0]
-                            + through[a, 1] * mixed[g, b, 1]
-                            + through[a, 2] * mixed[g, b, 2]
-                        )
+        eliminate_point(
+            image, first, start[i + 1], blocks, forces, mixed, inverses[i], gradients[i], system, right
+        )
     return inverses, gradients, mixed
