@@ -24,6 +24,13 @@ PoseArray = Annotated[
 ]
 
 
+MaybePoseArray = Annotated[
+    NDArray[np.float64] | None,
+    PlainValidator(lambda value: None if value is None else np.array(value, dtype=np.float64)),
+    PlainSerializer(lambda poses: None if poses is None else poses.tolist()),
+]
+
+
 @dataclass(frozen=True, eq=False)
 class InitialPoses:
     """Poses to start from.
@@ -33,12 +40,15 @@ class InitialPoses:
         source: of the set as a whole.
         sources: of each pose.
         trials: how every candidate did in the choice between several; empty if there was only one.
+        matched_poses: float64 [n, 4, 4], the best set that feature matches support, whichever set is started from; None
+            where there is none.
     """
 
     world_from_cam: PoseArray
     source: PoseSource
     sources: tuple[PoseSource, ...]
     trials: tuple[TrialReport, ...] = ()
+    matched_poses: MaybePoseArray = None
 
     @property
     def matched(self) -> NDArray[np.bool_]:

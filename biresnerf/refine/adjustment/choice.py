@@ -45,12 +45,11 @@ class Choice:
 def choose(candidates: Sequence[Candidate], misfits: Mapping[str, Array]) -> Choice:
     """The candidate that evidence left out speaks for.
 
-    A candidate is beaten by one that fits some kind of evidence better and none worse, beyond chance over cameras.
-    Of those that nothing beats and that beat the first, the input's poses, the one is taken that gains most over those;
-    if there is none, the input's poses.
+    A candidate is beaten by one that fits some kind of evidence better and none worse, beyond chance over cameras. The
+    first is kept unless something beats it: then the next one that beats it, and that nothing beats, is taken.
 
     Args:
-        candidates: the input's poses first.
+        candidates: in the order in which they are kept on a tie.
         misfits: of each kind of evidence (``tracks``, ``patches``), [candidates, n]: each camera's mean robust square
             in noise levels; NaN where it does not know the camera.
     """
@@ -64,9 +63,7 @@ def choose(candidates: Sequence[Candidate], misfits: Mapping[str, Array]) -> Cho
     )
     count = range(len(candidates))
     beats = np.array([[_beats(misfits, i, j) for j in count] for i in count])
-    gains = np.array([_gain(misfits, i, 0) for i in count])
-    fit = beats[:, 0] & ~beats.any(0)
-    best = int(np.flatnonzero(fit)[gains[fit].argmax()]) if fit.any() else 0
+    best = int((beats[:, 0] & ~beats.any(0)).argmax())
     logger.info(
         "poses: %s of %s", candidates[best].name,
         ", ".join(f"{r.name} ({r.track_misfit}, {r.patch_misfit})" for r in reports),
@@ -95,12 +92,6 @@ def _sign(gains: Array) -> int:
     half = student_quantile(len(gains) - 1) * float(gains.std(ddof=1)) / len(gains) ** 0.5
     mean = float(gains.mean())
     return int(mean > half) - int(mean < -half)
-
-
-def _gain(misfits: Mapping[str, Array], one: int, other: int) -> float:
-    """The mean gains of all kinds of evidence, in sum."""
-    found = [_gains(kind, one, other) for kind in misfits.values()]
-    return float(sum(gains.mean() for gains in found if len(gains) >= LEAST_JUDGED))
 
 
 def _median(misfit: Array | None, candidate: int) -> float | None:

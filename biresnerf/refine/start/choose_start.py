@@ -50,7 +50,7 @@ def find_start(
         found = find_forward_facing(images, options, device, threads, monitor.should_stop)
         return replace(first, world_from_cam=found)
     if len(candidates) == 1:
-        return first
+        return replace(first, matched_poses=first.world_from_cam if first.matched.any() else None)
     message = f"trying {len(candidates)} sets of poses"
     monitor.report(Progress(stage="seeding", fraction=TRYING_FROM, message=message))
     return choose_start(candidates, images, options, device, threads, monitor.should_stop)
@@ -78,14 +78,16 @@ def choose_start(
     scores = [float(trials_of.score(rig).psnr.mean()) for rig in rigs]
     best = int(np.argmax(scores))
     if scores[best] < scores[0] + MARGIN_DB:
-        matched = int(np.argmax(scores[1:])) + 1
-        disagree = float(np.median(rotation_between_deg(rigs[0], rigs[matched])))
+        other = int(np.argmax(scores[1:])) + 1
+        disagree = float(np.median(rotation_between_deg(rigs[0], rigs[other])))
         preferred = candidates[0].source == "given" and disagree > DISAGREE_DEG
-        best = matched if preferred and scores[matched] > scores[0] - MARGIN_DB else 0
+        best = other if preferred and scores[other] > scores[0] - MARGIN_DB else 0
     trials = tuple(
         TrialReport(source=c.source, placed=int(c.matched.sum()), psnr=s)
         for c, s in zip(candidates, scores, strict=True)
     )
     chosen = candidates[best]
+    matched = [i for i, candidate in enumerate(candidates) if candidate.matched.any()]
+    likeliest = rigs[max(matched, key=lambda i: scores[i])] if matched else None
     logger.info("start: %s of %s", chosen.source, ", ".join(f"{t.source} {t.psnr:.2f} dB" for t in trials))
-    return replace(chosen, trials=trials)
+    return replace(chosen, trials=trials, matched_poses=likeliest)

@@ -12,9 +12,10 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.options.refine_options import RefineOptions
+from biresnerf.progress import Monitor
 from biresnerf.refine.start import choose_start as start_module
 from biresnerf.refine.start import frozen_trials
-from biresnerf.refine.start.choose_start import choose_start
+from biresnerf.refine.start.choose_start import choose_start, find_start
 from biresnerf.refine.start.first_step import MATCHED_MOBILITY, pose_mobility, stage_lengths
 from tests.refine.tiny_scene import CPU, tiny_options, tiny_set
 
@@ -62,6 +63,18 @@ def test_good_given_poses_win_over_wrong_matches(scene):
     assert chosen.source == "given"
     np.testing.assert_array_equal(pose_mobility(chosen), 1.0)
     assert [trial.source for trial in chosen.trials] == ["given", "matches-incremental"]
+    np.testing.assert_array_equal(chosen.matched_poses, wrong)  # remembered, to be judged at the end
+    kept = TypeAdapter(InitialPoses).validate_json(TypeAdapter(InitialPoses).dump_json(chosen))
+    np.testing.assert_array_equal(kept.matched_poses, wrong)
+
+
+def test_without_matches_no_matched_poses_are_remembered(scene):
+    dataset, images = scene
+    given = InitialPoses(dataset.world_from_cam, "given", ("given",) * VIEWS)
+    found = find_start([given], images, tiny_options(), CPU, 2, Monitor())
+    assert found.matched_poses is None
+    kept = TypeAdapter(InitialPoses).validate_json(TypeAdapter(InitialPoses).dump_json(found))
+    assert kept.matched_poses is None
 
 
 def test_on_a_tie_the_given_poses_stay_if_matches_agree(scene):
