@@ -1,4 +1,4 @@
-"""The whole method on one screen: read, seed, stage 1, stage 2, evaluate, judge, write."""
+"""The whole method on one screen: read, seed, stage 1, stage 2, evaluate, adjust, judge, write."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from biresnerf.field.backends import resolve_here, use_threads
 from biresnerf.field.cpu.compile_kernels import compile_kernels
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import KERNELS_FROM, START_KNOWN, Monitor, OnProgress, Progress
+from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.checkpoint import SEEDING, TRACKS, Checkpoint, RunOrigin
@@ -83,8 +84,10 @@ def refine_poses(
         stages.run_stage_1()
         stages.run_stage_2()
         evaluation = evaluate(stages, ResultPictures(setup.folder, scene))
+        candidates = adjust_cameras(stages)
+        stages.observer.at_end(stages.optimiser)
         judgement = judge(stages)
-        report = run_report(stages, evaluation.scores, judgement, "complete")
+        report = run_report(stages, evaluation.scores, judgement, "complete", candidates)
         return write_result(setup.folder, stages, evaluation, report)
     except Interrupted:
         report = run_report(stages, evaluation.scores, judgement, "partial")

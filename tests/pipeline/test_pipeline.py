@@ -156,7 +156,7 @@ def test_the_report_is_valid_and_agrees_with_the_poses(run):
     assert report.backend == "cpu"
     assert report.working_size == (56, 56)
     assert report.options == OPTIONS.resolved("cpu")
-    assert set(report.seconds) == {"preparing", "coarse", "fine", "evaluating", "judging"}
+    assert set(report.seconds) == {"preparing", "coarse", "fine", "evaluating", "adjusting", "judging"}
     refined = run.refined()
     assert [image.name for image in report.images] == [f"./train/r_{i}" for i in range(VIEWS)]
     turned = rotation_between_deg(run.start, refined)

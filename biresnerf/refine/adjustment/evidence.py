@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.refine.adjustment.splines import blurred, spline_coefficients
 
 Array = NDArray[np.float64]
 
@@ -60,6 +61,30 @@ class PatchPhotos:
     offsets: NDArray[np.int64]
     widths: NDArray[np.int64]
     heights: NDArray[np.int64]
+    _smoothed: dict[float, tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=dict)
+
+    @classmethod
+    def stacked(cls, photos: list[NDArray[np.float32]]) -> PatchPhotos:
+        """From photos [h, w, channels], one by one."""
+        heights, widths = np.array([photo.shape[:2] for photo in photos], np.int64).T
+        offsets = np.concatenate(([0], np.cumsum(heights * widths))).astype(np.int64)
+        return cls(np.concatenate([p.reshape(-1, p.shape[2]) for p in photos]), offsets, widths, heights)
+
+    def smoothed(self, blur_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """All photos blurred, and the coefficients of the cubic B-splines through them; computed once."""
+        if blur_px not in self._smoothed:
+            smooth, coefficients = np.empty_like(self.values), np.empty_like(self.values)
+            for i in range(len(self.widths)):
+                rows, photo = slice(self.offsets[i], self.offsets[i + 1]), blurred(self.of(i), blur_px)
+                smooth[rows] = photo.reshape(-1, photo.shape[2])
+                coefficients[rows] = spline_coefficients(photo).reshape(-1, photo.shape[2])
+            self._smoothed[blur_px] = smooth, coefficients
+        return self._smoothed[blur_px]
+
+    def of(self, image: int) -> NDArray[np.float32]:
+        """One photo [h, w, channels], a view."""
+        rows = self.values[self.offsets[image] : self.offsets[image + 1]]
+        return rows.reshape(int(self.heights[image]), int(self.widths[image]), -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,12 +134,10 @@ class PosePrior:
 
 @dataclass(frozen=True)
 class NoiseLevels:
-    """How far residuals are from zero at poses without error: standard deviations.
+    """How far residuals are from zero at poses without error.
 
     Attributes:
-        track_px: of either coordinate of an observation.
-        patch: of a patch's comparison, in the noise expected of its pixels.
+        track_px: standard deviation of either coordinate of an observation.
     """
 
     track_px: float = 1.0
-    patch: float = 1.0

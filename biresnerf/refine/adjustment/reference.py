@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from biresnerf.geometry.lie import so3_exp
@@ -29,3 +30,42 @@ def track_residuals(
 def robust(square: Tensor, scale: float) -> Tensor:
     """Geman and McClure's cost of squared residuals in noise levels: S^2 e^2 / (S^2 + e^2)."""
     return scale**2 * square / (scale**2 + square)
+
+
+def bspline(coefficients: Tensor, xy: Tensor) -> Tensor:
+    """Values [m, channels] of a cubic B-spline [h, w, channels] at pixels [m, 2], two inside the border at least."""
+    position = xy - 0.5
+    corner = position.detach().floor()
+    near = torch.arange(-1, 3, dtype=xy.dtype)
+    weight = _cubic((position - corner)[:, :, None] - near)
+    column, row = (corner[:, axis, None].long() + near.long() for axis in (0, 1))
+    around = coefficients[row[:, :, None], column[:, None, :]]
+    return torch.einsum("ma,mb,mabc->mc", weight[:, 1], weight[:, 0], around)
+
+
+def _cubic(x: Tensor) -> Tensor:
+    """The cubic B-spline, centred, of distances within 2."""
+    a = x.abs()
+    return torch.where(a < 1, 2 / 3 - a**2 + a**3 / 2, (2 - a).clamp(min=0) ** 3 / 6)
+
+
+def patch_residuals(
+    rotation: Tensor,
+    centre: Tensor,
+    lens: Tensor,
+    coefficients: Tensor,
+    values: Tensor,
+    rays: Tensor,
+    inverse: Tensor,
+) -> Tensor:
+    """A patch of the first camera compared with the second's photo: differences of colour [k, channels].
+
+    Args:
+        rotation, centre: of host and target, [2, 3, 3] world from cam and [2, 3].
+        lens: [4], the target's.
+        coefficients: [h, w, channels], of the target's photo.
+        values: [k, channels], of the host's.
+        rays, inverse: [k, 3] with z = 1, and inverse depths [k] in the host.
+    """
+    away = rays @ rotation[0].T + inverse[:, None] * (centre[0] - centre[1])
+    return bspline(coefficients, in_pixels(lens, away @ rotation[1])) - values

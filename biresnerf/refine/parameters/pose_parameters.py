@@ -134,6 +134,15 @@ class PoseParameters:
             )
         self.start[camera] = unit_from_cam
 
+    @torch.no_grad()
+    def place(self, unit_from_cam: Tensor) -> None:
+        """Restart all cameras at other poses [n, 4, 4], without momentum."""
+        self.start.copy_(unit_from_cam[:, :3])
+        for parameter in (self.rotation, self.translation):
+            parameter.zero_()
+        self.parametrisation.begin(unit_from_cam, self.start.device)
+        self.restart_adam()
+
     def forget_gradients(self) -> None:
         self._adam.zero_grad(set_to_none=True)
 

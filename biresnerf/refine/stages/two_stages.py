@@ -47,7 +47,7 @@ class Observer:
 
     Attributes:
         at_check: what it returns at each check joins that check's line of the history.
-        at_end: called once, after the last step and the scoring of the run's own views.
+        at_end: called once, when the poses are final.
         write_preview: shows the state of the run in files, and returns these relative to the output folder.
     """
 

@@ -61,9 +61,7 @@ def evaluate(stages: TwoStages, pictures: Pictures) -> Evaluation:
         Interrupted: stopped; a continued run evaluates again.
     """
     with stages.record.timed("evaluating"):
-        evaluation = _evaluate(stages, pictures)
-    stages.observer.at_end(stages.optimiser)
-    return evaluation
+        return _evaluate(stages, pictures)
 
 
 def _evaluate(stages: TwoStages, pictures: Pictures) -> Evaluation:

@@ -14,7 +14,7 @@ from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.first_step import poses_in_input_frame
 from biresnerf.refine.verdict.judgement import Judgement, motion
 from biresnerf.refine.views.evaluation import ViewScore
-from biresnerf.report import CameraReport, HeldOut, ImageReport, Report
+from biresnerf.report import CameraReport, CandidateReport, HeldOut, ImageReport, Report
 
 
 def run_report(
@@ -22,12 +22,14 @@ def run_report(
     scores: list[ViewScore],
     judgement: Judgement | None,
     state: Literal["complete", "partial"],
+    candidates: tuple[CandidateReport, ...] = (),
 ) -> Report:
     """The report of a run as it is now.
 
     Args:
         scores: of held-out views, as far as they are scored.
         judgement: None where there is no verdict.
+        candidates: the poses that were compared at the end.
     """
     from biresnerf import __version__
 
@@ -50,6 +52,7 @@ def run_report(
         if scores
         else None,
         start_trials=scene.start.trials,
+        candidates=candidates,
         steps_done=optimiser.step_index,
         switch_step=optimiser.switch if optimiser.method.two_stages else None,
         switch_reason=record.switch_reason,

@@ -1,0 +1,171 @@
+"""The last step of a run: candidates from all evidence, judged by what none was fitted to, and the best one taken."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.data.points.tracks import Tracks
+from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.similarity import align_robust
+from biresnerf.progress import JUDGING_FROM, Monitor, Progress
+from biresnerf.refine.adjustment.adjustment import Adjustment, Halves, adjust_poses, misfit
+from biresnerf.refine.adjustment.choice import Candidate, Choice, choose
+from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
+from biresnerf.refine.finish.photo_evidence import photo_patches
+from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.scene.scene import Scene
+from biresnerf.refine.stages.two_stages import TwoStages
+from biresnerf.report import CandidateName, CandidateReport
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+ORDER: tuple[CandidateName, ...] = (
+    "refined", "input", "adjusted", "adjusted-patches", "adjusted-tracks", "matched",
+)  # fmt: skip
+# Standard deviations of the refined poses' errors, rad and distances of the cameras from the scene: far more than they
+# have, so that only what no evidence fixes is left to them.
+PRIOR = 0.02
+MOST_OBSERVATIONS = 40_000  # of tracks that are adjusted to
+LEFT_OUT_ONE_IN = 5  # patches
+MOST_CAMERAS = 500  # the system of all cameras is dense
+
+
+def adjust_cameras(stages: TwoStages) -> tuple[CandidateReport, ...]:
+    """Adjust all cameras at once and move them where left-out evidence says that is better; how the candidates did.
+
+    Cameras that are fixed or tied to each other, fisheyes, and methods of others are left alone.
+
+    Raises:
+        Interrupted: stopped; a continued run adjusts again.
+    """
+    optimiser = stages.optimiser
+    if (
+        not optimiser.method.robust_extensions
+        or optimiser.bodies.tied
+        or not 3 <= len(stages.scene.dataset) <= MOST_CAMERAS
+    ):
+        return ()
+    with stages.record.timed("adjusting"):
+        choice = _choice(stages.scene, optimiser, stages.monitor)
+    if choice is None:
+        return ()
+    if choice.chosen.name != "refined":
+        optimiser.poses.place(torch.from_numpy(choice.chosen.world_from_cam))
+    return choice.reports
+
+
+@dataclass(frozen=True, eq=False)
+class _Split:
+    """Evidence to adjust to, and evidence to judge by."""
+
+    fitted: Evidence
+    left_out: Evidence
+
+
+def _choice(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Choice | None:
+    """None where there is no evidence to judge by. Candidates are in the unit frame."""
+    _report(monitor)
+    split = _evidence(scene, optimiser)
+    if split is None:
+        return None
+    refined = optimiser.poses.poses().numpy()
+    if not np.isfinite(refined).all():
+        return None
+    prior = PosePrior.equal(refined, PRIOR, PRIOR * optimiser.frame.distance)
+    adjusted, noise = _adjusted(refined, split.fitted, prior, monitor)
+    found = [Candidate("refined", refined), *_earlier(scene, refined), *adjusted]
+    # On a tie with the refined poses these stay, for the verdict to judge; the input's are better than any that tie.
+    candidates = sorted(found, key=lambda candidate: ORDER.index(candidate.name))
+    misfits: dict[str, Array] = {}
+    for kind, left_out in (
+        ("tracks", replace(split.left_out, patches=None)),
+        ("patches", replace(split.left_out, tracks=None)),
+    ):
+        if left_out.tracks is not None or left_out.patches is not None:
+            _report(monitor)
+            rigs = [candidate.world_from_cam for candidate in candidates]
+            misfits[kind] = np.stack([misfit(rig, left_out, noise) for rig in rigs])
+    return choose(candidates, misfits) if misfits else None
+
+
+def _adjusted(
+    refined: Array, evidence: Evidence, prior: PosePrior, monitor: Monitor
+) -> tuple[list[Candidate], NoiseLevels]:
+    """Candidates adjusted to tracks, to patches and to both, and the noise level that tracks have."""
+    found: list[Candidate] = []
+
+    def add(name: CandidateName, evidence: Evidence, halves: Halves | None = None) -> Adjustment:
+        _report(monitor)
+        result = adjust_poses(refined, evidence, prior, halves)
+        logger.info("%s: %s", name, _described(result))
+        if _usable(result):
+            found.append(Candidate(name, result.world_from_cam))
+        return result
+
+    noise = (
+        add("adjusted-tracks", replace(evidence, patches=None)).noise if evidence.tracks else NoiseLevels()
+    )
+    if evidence.patches:
+        patched = add("adjusted-patches", replace(evidence, tracks=None))
+        if evidence.tracks and _usable(patched):
+            add("adjusted", evidence, patched.halves)
+    return found, noise
+
+
+def _usable(found: Adjustment) -> bool:
+    return found.used and (found.agreement is None or found.agreement.trusted)
+
+
+def _described(found: Adjustment) -> str:
+    sigma = float(np.degrees(np.sqrt(np.median(np.trace(found.covariance[:, :3, :3], axis1=1, axis2=2)))))
+    return (
+        f"standard deviation {sigma:.3f} degrees, tracks {found.track_noise_px:.2f} px, "
+        f"{found.track_inliers:.2f} of them within, patches {found.patch_inliers:.2f}, {found.agreement}"
+    )
+
+
+def _earlier(scene: Scene, refined: Array) -> list[Candidate]:
+    """The input's poses, and those of matches where there are any, carried to the refined ones' frame."""
+    given: list[tuple[CandidateName, Array | None]] = [
+        ("input", scene.dataset.world_from_cam),
+        ("matched", scene.start.matched_poses),
+    ]
+    return [
+        Candidate(name, align_robust(poses, refined, with_rotations=True).apply_to_poses(poses))
+        for name, poses in given
+        if poses is not None and np.isfinite(poses).all()
+    ]
+
+
+def _evidence(scene: Scene, optimiser: JointOptimiser) -> _Split | None:
+    """What there is of tracks and patches, for ideal cameras; None where cameras cannot be made ideal."""
+    dataset = optimiser.lenses.refined(scene.dataset)
+    intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
+    ideal = ideal_pinholes(intrinsics)
+    if ideal is None:
+        return None
+    fitted: Tracks | None = None
+    judging: Tracks | None = None
+    if scene.tracks is not None:
+        fitted, judging = straight_tracks(scene.tracks, intrinsics, ideal).split()
+        fitted = fitted and fitted.thinned(MOST_OBSERVATIONS, len(dataset))
+    patches = photo_patches(scene, optimiser, intrinsics, ideal)
+    if patches is None:
+        return _Split(Evidence(ideal, fitted), Evidence(ideal, judging))
+    spared = np.arange(len(patches)) % LEFT_OUT_ONE_IN == 0
+    return _Split(Evidence(ideal, fitted, patches.of(~spared)), Evidence(ideal, judging, patches.of(spared)))
+
+
+def _report(monitor: Monitor) -> None:
+    monitor.raise_if_stopped("stopped while the cameras were adjusted; run again to go on")
+    monitor.report(
+        Progress(stage="evaluating", fraction=JUDGING_FROM, message="adjusting all cameras at once")
+    )

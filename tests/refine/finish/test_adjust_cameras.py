@@ -1,0 +1,89 @@
+"""After the last step: cameras move where left-out evidence says so, and nowhere else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.refine.finish.adjust_cameras import adjust_cameras
+from biresnerf.refine.finish.photo_evidence import photo_patches
+from biresnerf.refine.stages.two_stages import TwoStages
+from tests.refine.adjustment.rig import disturbed, observed, rotation_errors_deg
+from tests.refine.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
+
+VIEWS = 9
+
+
+@pytest.fixture(name="rng")
+def generator():
+    return np.random.default_rng(2)
+
+
+def stages(folder, rng, *, given=None, refined=0.01, noise_px=0.02):
+    """A run whose poses ended off the truth by `refined` rad, with tracks of the full-size photos."""
+    dataset, images = tiny_set(folder, VIEWS, 24)
+    truth = dataset.world_from_cam
+    tracks = observed(truth, rng.uniform(-0.5, 0.5, (120, 3)), lenses(dataset), rng, noise_px)
+    if given is not None:
+        frames = [
+            replace(f, world_from_cam=pose) for f, pose in zip(dataset.frames, given(truth), strict=True)
+        ]
+        dataset = replace(dataset, frames=tuple(frames))
+    scene = replace(given_scene(dataset, images), tracks=tracks)
+    optimiser = tiny_optimiser(dataset, images, tiny_options())
+    poses = optimiser.frame.unit_from_world.apply_to_poses(truth)
+    optimiser.poses.place(torch.from_numpy(disturbed(poses, rng, refined, 2 * refined)))
+    return TwoStages(optimiser, scene, folder), truth
+
+
+def lenses(dataset):
+    return Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
+
+
+def errors_deg(run, truth):
+    return rotation_errors_deg(run.optimiser.poses.poses().numpy(), truth)
+
+
+def test_cameras_are_adjusted_where_tracks_left_out_prefer_it(tmp_path, rng):
+    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    before = errors_deg(run, truth)
+    reports = adjust_cameras(run)
+    assert [report.name for report in reports if report.chosen] == ["adjusted-tracks"]
+    assert errors_deg(run, truth).mean() < 0.2 * before.mean()
+
+
+def test_true_poses_of_the_input_are_returned(tmp_path, rng):
+    run, truth = stages(tmp_path, rng)
+    assert [report.name for report in adjust_cameras(run) if report.chosen] == ["input"]
+    assert errors_deg(run, truth).max() < 1e-4
+
+
+def test_refined_poses_stay_without_evidence(tmp_path, rng):
+    run, _ = stages(tmp_path, rng)
+    run.scene = replace(run.scene, tracks=None)
+    before = run.optimiser.poses.poses()
+    assert adjust_cameras(run) == ()
+    assert torch.equal(run.optimiser.poses.poses(), before)
+
+
+def test_refined_poses_stay_where_all_tracks_are_wrong(tmp_path, rng):
+    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    tracks = run.scene.tracks
+    run.scene = replace(run.scene, tracks=replace(tracks, xy=rng.uniform(0, 24, tracks.xy.shape)))
+    before = errors_deg(run, truth)
+    adjust_cameras(run)
+    assert errors_deg(run, truth).mean() < 1.5 * before.mean()
+
+
+def test_methods_of_others_are_left_alone(tmp_path, rng):
+    run, _ = stages(tmp_path, rng)
+    run.optimiser.method = replace(run.optimiser.method, robust_extensions=False)
+    assert adjust_cameras(run) == ()
+
+
+def test_a_field_without_surface_gives_no_patches(tmp_path, rng):
+    run, _ = stages(tmp_path, rng)
+    intrinsics = lenses(run.scene.dataset)
+    assert photo_patches(run.scene, run.optimiser, intrinsics, intrinsics) is None
