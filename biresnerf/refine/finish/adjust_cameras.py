@@ -41,6 +41,8 @@ MOST_CAMERAS = 500  # the system of all cameras is dense
 def adjust_cameras(stages: TwoStages) -> tuple[CandidateReport, ...]:
     """Adjust all cameras at once and move them where left-out evidence says that is better; how the candidates did.
 
+    Cameras that their own matches contradict are placed by those first.
+
     Cameras that are fixed or tied to each other, fisheyes, and methods of others are left alone.
 
     Raises:
@@ -54,6 +56,7 @@ def adjust_cameras(stages: TwoStages) -> tuple[CandidateReport, ...]:
     ):
         return ()
     with stages.record.timed("adjusting"):
+        stages.repair.place_by_matches()
         choice = _choice(stages.scene, optimiser, stages.monitor)
     if choice is None:
         return ()

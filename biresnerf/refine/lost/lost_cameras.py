@@ -97,7 +97,7 @@ class LostCameraRepair:
         total *= GUESSED_TIMES if bool(optimiser.camera_errors.doubted.any()) else 1
         allowance = min(self._spent + EVENT_SHARE * total, RUN_SHARE * total)
         self._marching = self._coarse_marching()
-        self.repaired = sorted({*self.repaired, *self._matches.place()})
+        self.place_by_matches()
         alone = self._alone()
         # Matches are better evidence than the error of a young field: cameras they placed stay (on dtu these were 2 deg
         # off, and 7 to 9 deg after a repair).
@@ -110,6 +110,10 @@ class LostCameraRepair:
                 logger.info("no budget left to repair camera %d", camera)
                 break
             self._repair(camera, median, ~suspects, alone=bool(alone[camera]))
+
+    def place_by_matches(self) -> None:
+        """Give cameras that their own matches contradict the poses that those support."""
+        self.repaired = sorted({*self.repaired, *self._matches.place()})
 
     @torch.no_grad()
     def _alone(self) -> Tensor:

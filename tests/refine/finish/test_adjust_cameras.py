@@ -9,6 +9,8 @@ import torch
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.finish.photo_evidence import photo_patches
+from biresnerf.refine.lost.lost_cameras import LostCameraRepair
+from biresnerf.refine.lost.own_matches import OwnMatches
 from biresnerf.refine.stages.two_stages import TwoStages
 from tests.refine.adjustment.rig import disturbed, observed, rotation_errors_deg
 from tests.refine.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
@@ -21,11 +23,11 @@ def generator():
     return np.random.default_rng(2)
 
 
-def stages(folder, rng, *, given=None, refined=0.01, noise_px=0.02):
+def stages(folder, rng, *, given=None, refined=0.01, noise_px=0.02, points=120):
     """A run whose poses ended off the truth by `refined` rad, with tracks of the full-size photos."""
     dataset, images = tiny_set(folder, VIEWS, 24)
     truth = dataset.world_from_cam
-    tracks = observed(truth, rng.uniform(-0.5, 0.5, (120, 3)), lenses(dataset), rng, noise_px)
+    tracks = observed(truth, rng.uniform(-0.5, 0.5, (points, 3)), lenses(dataset), rng, noise_px)
     if given is not None:
         frames = [
             replace(f, world_from_cam=pose) for f, pose in zip(dataset.frames, given(truth), strict=True)
@@ -87,3 +89,15 @@ def test_a_field_without_surface_gives_no_patches(tmp_path, rng):
     run, _ = stages(tmp_path, rng)
     intrinsics = lenses(run.scene.dataset)
     assert photo_patches(run.scene, run.optimiser, intrinsics, intrinsics) is None
+
+
+def test_a_lost_camera_is_placed_by_its_matches_and_adjusted_with_the_others(tmp_path, rng):
+    run, truth = stages(
+        tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3), refined=0.002, points=400
+    )
+    away = run.optimiser.poses.poses()[4] @ torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))
+    run.optimiser.poses.replace(4, away[:3].float())
+    run.repair = LostCameraRepair(run.optimiser, OwnMatches.of(run.scene))
+    adjust_cameras(run)
+    assert run.repair.repaired == [4]
+    assert errors_deg(run, truth).max() < 0.5
