@@ -38,8 +38,7 @@ LEAST_INTERVAL = 1.2e-2  # unit lengths: scoring needs no finer samples
 BETTER, NEAR_MEDIAN = (
     0.7,
     1.5,
-)  # a pose is accepted below this share of the old error and of the others' median;
-FAR_BETTER = 0.25  # or below this share of the old error alone: better than to stay where nothing is seen
+)  # a pose is accepted below these shares of the old error and of the others' median
 ALONE = 0.2  # sharing less of its view than this, a camera of an open scene must go elsewhere, however small its error
 ALONE_SIDE = 8  # as seen by 8 x 8 pixels
 ALONE_MOST = 0.2  # of all cameras: where more are alone, the photos were taken so
@@ -169,7 +168,7 @@ class LostCameraRepair:
         old = float(scores[0])
         # A guess need not be clearly beaten.
         better = 1.0 if bool(optimiser.camera_errors.doubted[camera]) else BETTER
-        bound = min(better * old, max(NEAR_MEDIAN * median, FAR_BETTER * old))
+        bound = min(better * old, NEAR_MEDIAN * median)
         if alone:  # its own error says nothing, nor does that of another pose that shares no view
             bound = NEAR_MEDIAN * median
             shared = self._shared(tried, image) >= ALONE
