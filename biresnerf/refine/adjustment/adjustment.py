@@ -50,6 +50,8 @@ class Halves:
     agreement: Agreement
 
 
+NOTHING_FITS = ROBUST_SCALE**2  # a misfit is below it
+
 # On the demo scene the halves end 0.07 degrees apart where they moved 0.3, and a third of the comparisons fits; on lego
 # at 100 px, where patches do harm, they end 0.34 apart of 0.5, and a fifteenth fits.
 MOST_APART, LEAST_INLIERS = 0.3, 0.2
@@ -159,7 +161,7 @@ def misfit(world_from_cam: Array, evidence: Evidence, noise: NoiseLevels) -> Arr
     """How badly poses fit evidence that they were not adjusted to: each camera's mean robust square [n].
 
     Points are estimated anew for these poses, as are the depths of patches: poses must be in their frame. A residual e,
-    in noise levels, counts S^2 e^2 / (S^2 + e^2), below S^2. NaN for a camera that no evidence is of.
+    in noise levels, counts S^2 e^2 / (S^2 + e^2), below `NOTHING_FITS`. NaN for a camera that no evidence is of.
 
     Args:
         noise: as measured by an adjustment; must be the same for all poses that are compared.
@@ -177,7 +179,7 @@ def misfit(world_from_cam: Array, evidence: Evidence, noise: NoiseLevels) -> Arr
     if patches is not None:
         patches.settle(cameras)
         square = patches.squares(cameras, patches.unknowns)
-        robust = _robust(square, patches.scale) / patches.scale**2
+        robust = _robust(square, patches.scale) * (ROBUST_SCALE / patches.scale) ** 2
         for image in (patches.patches.target, patches.patches.host[patches.patches.point]):
             total += np.bincount(image, robust, n)
             count += np.bincount(image, minlength=n)

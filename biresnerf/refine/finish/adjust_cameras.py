@@ -13,7 +13,7 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.progress import JUDGING_FROM, Monitor, Progress
-from biresnerf.refine.adjustment.adjustment import Adjustment, Halves, adjust_poses, misfit
+from biresnerf.refine.adjustment.adjustment import NOTHING_FITS, Adjustment, Halves, adjust_poses, misfit
 from biresnerf.refine.adjustment.choice import Candidate, Choice, choose
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
 from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
@@ -27,12 +27,17 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
+# On a tie the earlier is kept: the input's poses, unless the evidence cannot tell.
 ORDER: tuple[CandidateName, ...] = (
-    "refined", "input", "adjusted", "adjusted-patches", "adjusted-tracks", "matched",
+    "input", "refined", "adjusted", "adjusted-patches", "adjusted-tracks", "matched",
 )  # fmt: skip
 # Standard deviations of the refined poses' errors, rad and distances of the cameras from the scene: far more than they
 # have, so that only what no evidence fixes is left to them.
 PRIOR = 0.02
+MOST_NOISE_PX, MOST_NOISE = (
+    2.0,
+    0.002,
+)  # of tracks, in px or shares of the photos' size; sets have 0.1 to 0.5 px
 MOST_OBSERVATIONS = 40_000  # of tracks that are adjusted to
 LEFT_OUT_ONE_IN = 5  # patches
 MOST_CAMERAS = 500  # the system of all cameras is dense
@@ -74,7 +79,7 @@ class _Split:
 
 
 def _choice(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Choice | None:
-    """None where there is no evidence to judge by. Candidates are in the unit frame."""
+    """None where no evidence can tell. Candidates are in the unit frame."""
     _report(monitor)
     split = _evidence(scene, optimiser)
     if split is None:
@@ -84,8 +89,11 @@ def _choice(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Choice
         return None
     prior = PosePrior.equal(refined, PRIOR, PRIOR * optimiser.frame.distance)
     adjusted, noise = _adjusted(refined, split.fitted, prior, monitor)
+    if noise.track_px > _most_noise_px(split.fitted):
+        logger.info("tracks say nothing: their noise is %.1f px", noise.track_px)
+        split = _Split(replace(split.fitted, tracks=None), replace(split.left_out, tracks=None))
+        adjusted = [each for each in adjusted if each.name == "adjusted-patches"]
     found = [Candidate("refined", refined), *_earlier(scene, refined), *adjusted]
-    # On a tie with the refined poses these stay, for the verdict to judge; the input's are better than any that tie.
     candidates = sorted(found, key=lambda candidate: ORDER.index(candidate.name))
     misfits: dict[str, Array] = {}
     for kind, left_out in (
@@ -94,9 +102,16 @@ def _choice(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Choice
     ):
         if left_out.tracks is not None or left_out.patches is not None:
             _report(monitor)
-            rigs = [candidate.world_from_cam for candidate in candidates]
-            misfits[kind] = np.stack([misfit(rig, left_out, noise) for rig in rigs])
-    return choose(candidates, misfits) if misfits else None
+            misfits[kind] = np.stack([misfit(each.world_from_cam, left_out, noise) for each in candidates])
+    return choose(candidates, misfits) if any(map(_tells, misfits.values())) else None
+
+
+def _tells(misfits: Array) -> bool:
+    """Whether evidence [candidates, n] knows half of the cameras, and fits them with the best candidate."""
+    known = np.isfinite(misfits).all(0)
+    if known.mean() < 0.5:
+        return False
+    return bool(np.median(misfits[:, known], axis=1).min() < NOTHING_FITS / 2)
 
 
 def _adjusted(
@@ -121,6 +136,12 @@ def _adjusted(
         if evidence.tracks and _usable(patched):
             add("adjusted", evidence, patched.halves)
     return found, noise
+
+
+def _most_noise_px(evidence: Evidence) -> float:
+    """More is no feature's noise: the tracks are wrong."""
+    size = torch.maximum(evidence.intrinsics.width, evidence.intrinsics.height).double().median()
+    return max(MOST_NOISE_PX, MOST_NOISE * float(size))
 
 
 def _usable(found: Adjustment) -> bool:
