@@ -54,7 +54,10 @@ def test_what_is_told_on_the_way_is_what_colmap_answers(photos: Path):
     matches = np.zeros((VIEWS, VIEWS), dtype=int)
     for (a, b), count in told[-1].matches.items():
         matches[a, b] = matches[b, a] = count
-    np.testing.assert_array_equal(matches, mapping.matches)
+    # COLMAP maps with these. About a fifth of all points is left out, to judge poses by.
+    np.testing.assert_array_equal(matches > 0, mapping.matches > 0)
+    assert (matches <= mapping.matches).all()
+    assert matches.sum() == pytest.approx(0.8 * mapping.matches.sum(), rel=0.1)
 
 
 @needs_colmap
