@@ -10,7 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+
+from biresnerf.geometry.lie import hat, so3_exp
+from biresnerf.geometry.similarity import nearest_rotation
 
 Array = NDArray[np.float64]
 
@@ -139,10 +143,7 @@ def _carried(points: Array, in_cam: Array) -> tuple[Array, Array]:
     """The rotations [s, 3, 3] and centres [s, 3] that carry points of the camera [s, 3, 3] onto those of the world."""
     middle, middle_in_cam = points.mean(1), in_cam.mean(1)
     across = (points - middle[:, None]).transpose(0, 2, 1) @ (in_cam - middle_in_cam[:, None])
-    left, _, right = np.linalg.svd(across)
-    turn = np.ones((len(points), 1, 3))
-    turn[:, 0, 2] = np.linalg.det(left @ right)
-    rotation = (left * turn) @ right
+    rotation = nearest_rotation(across)
     return rotation, middle - (rotation @ middle_in_cam[:, :, None])[:, :, 0]
 
 
@@ -163,7 +164,7 @@ def _refined(points: Array, rays: Array, rotation: Array, centre: Array, bound: 
         residual = seen - rays
         weight = 1 / (1 + (residual**2).sum(1) / bound**2) ** 2
         flat = (np.eye(3) - seen[:, :, None] * seen[:, None, :]) / length[:, None, None]
-        jacobian = np.concatenate([flat @ _cross_matrices(towards), -flat], axis=2)
+        jacobian = np.concatenate([flat @ hat(torch.from_numpy(towards)).numpy(), -flat], axis=2)
         system = np.einsum("m,mij,mik->jk", weight, jacobian, jacobian)
         right = np.einsum("m,mij,mi->j", weight, jacobian, residual)
         try:
@@ -171,22 +172,7 @@ def _refined(points: Array, rays: Array, rotation: Array, centre: Array, bound: 
         except np.linalg.LinAlgError:
             break
         centre = centre + rotation @ step[3:]
-        rotation = rotation @ _rotation(step[:3])
+        rotation = rotation @ so3_exp(torch.from_numpy(step[:3])).numpy()
         if np.linalg.norm(step[:3]) < 1e-12:
             break
     return rotation, centre
-
-
-def _cross_matrices(vectors: Array) -> Array:
-    """The matrices [m, 3, 3] of the cross product with vectors [m, 3] from the left."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
-
-
-def _rotation(vector: Array) -> Array:
-    """Of a rotation vector [3]."""
-    angle = float(np.linalg.norm(vector))
-    axis = _cross_matrices(vector[None] / max(angle, 1e-300))[0]
-    turned: Array = np.eye(3) + np.sin(angle) * axis + (1 - np.cos(angle)) * axis @ axis
-    return turned

@@ -180,14 +180,12 @@ def _align_weighted(
     # sum of B_i A_i^T: its nearest rotation is the mean turn between the cameras of the two rigs.
     turn = np.einsum("n,nij,nkj->ik", weights_rotation / weights_rotation.sum(), b[:, :3, :3], a[:, :3, :3])
     if _is_point(spread_a, centres_a) or _is_point(spread_b, centres_b):
-        scale, rotation = 1.0, _nearest_rotation(turn)
+        scale, rotation = 1.0, nearest_rotation(turn)
     else:
         scale = spread_b / spread_a if with_scale else 1.0
         correlation = (from_middle_b.T * share) @ from_middle_a / (spread_a * spread_b)
         # Both matrices are without unit: a trace of 1 for centres that agree, of 3 for rotations that do.
-        rotation = (
-            _nearest_rotation(correlation + turn) if with_rotations else _rotation_of(correlation, turn)
-        )
+        rotation = nearest_rotation(correlation + turn) if with_rotations else _rotation_of(correlation, turn)
     return Similarity(scale, rotation, middle_b - scale * rotation @ middle_a)
 
 
@@ -207,15 +205,17 @@ def _rotation_of(correlation: Array, turn: Array) -> Array:
     return rotation
 
 
-def _nearest_rotation(matrix: Array) -> Array:
+def nearest_rotation(matrix: Array) -> Array:
+    """The rotations [..., 3, 3] nearest to matrices [..., 3, 3] (Frobenius norm); never a reflection."""
     left, _, right_t = np.linalg.svd(matrix)
     return _proper(left, right_t)
 
 
 def _proper(left: Array, right_t: Array) -> Array:
-    """The product of two orthogonal matrices, the last axis between them negated where it would be a reflection."""
-    sign = np.sign(np.linalg.det(left) * np.linalg.det(right_t))
-    rotation: Array = left @ np.diag([1.0, 1.0, sign]) @ right_t
+    """The products of orthogonal matrices, the last axis between them negated where one would be a reflection."""
+    between = np.ones((*left.shape[:-2], 1, 3))
+    between[..., 0, 2] = np.sign(np.linalg.det(left) * np.linalg.det(right_t))
+    rotation: Array = (left * between) @ right_t
     return rotation
 
 

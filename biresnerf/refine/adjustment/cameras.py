@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.lie import so3_exp, so3_log
+from biresnerf.geometry.similarity import nearest_rotation
 
 Array = NDArray[np.float64]
 
@@ -36,9 +37,8 @@ class Cameras:
 
     def world_from_cam(self) -> Array:
         """Poses [n, 4, 4], their rotations exact to rounding."""
-        left, _, right = np.linalg.svd(self.rotation)
         poses = np.zeros((len(self), 4, 4))
-        poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = left @ right, self.centre, 1.0
+        poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = nearest_rotation(self.rotation), self.centre, 1.0
         return poses
 
     def moved(self, motion: Array) -> Cameras:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.data.photos.bilinear import bilinear
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project
 
@@ -48,13 +49,5 @@ def straight_photo(
     source = project(intrinsics, index, directions_in_cam(ideal, index, xy)).numpy() - 0.5
     limit = np.array([width - 1, height - 1])
     seen = np.isfinite(source).all(1) & (source >= 0).all(1) & (source <= limit).all(1)
-    source = np.clip(np.nan_to_num(source), 0, limit)
-    corner = np.minimum(source.astype(np.int64), np.maximum(limit - 1, 0))
-    right, below = (source - corner).astype(np.float32).T[:, :, None]
-    flat = photo.reshape(height * width, -1)
-    at = corner[:, 1] * width + corner[:, 0]
-    across, down = (1 if width > 1 else 0), (width if height > 1 else 0)
-    upper = flat[at] * (1 - right) + flat[at + across] * right
-    lower = flat[at + down] * (1 - right) + flat[at + down + across] * right
-    straight = upper * (1 - below) + lower * below
-    return straight.reshape(photo.shape).astype(np.float32), seen.reshape(height, width)
+    straight = bilinear(photo, np.nan_to_num(source))
+    return straight.reshape(photo.shape), seen.reshape(height, width)

@@ -25,6 +25,7 @@ from biresnerf.data.model.atomic_file import whole_file, write_json
 from biresnerf.data.model.colmap_scene import ColmapImage
 from biresnerf.data.model.dataset import Frame
 from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
+from biresnerf.data.photos.bilinear import bilinear
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_files import quiet_pillow
 from biresnerf.data.show.renders import picture_stems
@@ -199,25 +200,12 @@ def undistorted(picture: NDArray[np.uint8], old: Camera, new: Camera) -> NDArray
         last = min(first + _ROWS_AT_ONCE, new.height)
         y, x = np.mgrid[first:last, 0 : new.width] + 0.5
         rays = np.stack([((x - cx) / focal).ravel(), ((y - cy) / focal).ravel(), np.ones(x.size)], axis=1)
-        rows = _bilinear(values, pixels_of_points(lens, rays) - 0.5)
+        rows = bilinear(values, pixels_of_points(lens, rays) - 0.5)
         if opacity:
             rows[:, :3] *= 255.0 / np.maximum(rows[:, 3:], 1e-3)
         shape = (last - first, new.width, values.shape[2])
         flat[first:last] = np.clip(np.rint(rows), 0, 255).astype(np.uint8).reshape(shape)
     return flat
-
-
-def _bilinear(values: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Samples [m, channels] at positions [m, 2] in pixel indices; the border pixel goes on outside."""
-    height, width = values.shape[:2]
-    x, y = np.clip(at[:, 0], 0, width - 1), np.clip(at[:, 1], 0, height - 1)
-    left, top = np.minimum(x.astype(np.int64), width - 2), np.minimum(y.astype(np.int64), height - 2)
-    left, top = np.maximum(left, 0), np.maximum(top, 0)
-    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    a, b = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
-    upper = values[top, left] * (1 - a) + values[top, right] * a
-    lower = values[below, left] * (1 - a) + values[below, right] * a
-    return upper * (1 - b) + lower * b
 
 
 CODECS = (
