@@ -95,16 +95,9 @@ def directions_for(device: torch.device) -> Directions:
 
 
 def make_field(shape: FieldShape, seed: int, device: torch.device, threads: int) -> RadianceField:
-    """The fastest backend for the device: Numba kernels on the CPU, Triton kernels on CUDA.
-
-    Two heads (the wiring `residual`) are in plain torch alone.
-    """
+    """The fastest backend for the device: Numba kernels on the CPU, Triton kernels on CUDA."""
     field: RadianceField
-    if shape.wiring == "residual":
-        from biresnerf.field.reference.field import ReferenceField
-
-        field = ReferenceField(shape, seed, device)
-    elif device.type == "cpu":
+    if device.type == "cpu":
         from biresnerf.field.cpu.field import CpuField
 
         field = CpuField(shape, seed, device, threads)

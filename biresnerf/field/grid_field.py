@@ -1,14 +1,8 @@
 """The field on grid encodings: its parameters, and the optimiser step all its backends share.
 
 Two encodings, named by their job as in the paper: the pose-estimation module (low resolution, dense) and the
-reconstruction module (high resolution, hashed). How the second joins in stage 2 is the shape's `wiring`:
-
-- `concat`: the features stand side by side; the reconstruction module's columns of the first layer start at zero, so
-  switching it on leaves the function exactly as it was.
-- `replace`: the networks start afresh on the reconstruction module alone. The pose-estimation module's columns are
-  zero from then on, and it learns no more.
-- `residual`: the reconstruction module has networks of its own; their outputs, zero at first, are added to the others'
-  before density and colour are computed.
+reconstruction module (high resolution, hashed). In stage 2 their features stand side by side; the reconstruction
+module's columns of the first layer start at zero, so switching it on leaves the function exactly as it was.
 
 A field of one encoding has it as the pose-estimation module; its other grid has no levels.
 """
@@ -50,12 +44,6 @@ class GridField(RadianceField):
         self.networks = self._draw_networks(shape.pose_grid.width)
         high = shape.reconstruction_grid.width
         self.reconstruction_columns = torch.zeros(HIDDEN, high, device=device).requires_grad_()
-        self.reconstruction_head: list[Tensor] = []  # of `residual`: what follows those columns
-        if shape.wiring == "residual":
-            self.reconstruction_columns, *self.reconstruction_head = self._draw_networks(high)
-            with torch.no_grad():
-                self.reconstruction_head[0][0] = 0.0  # the density's row
-                self.reconstruction_head[-1].zero_()  # the colour
         self.tables = dict(zip(MODULES, (self.pose_table, self.reconstruction_table), strict=True))
         self.moments = {
             name: (torch.zeros_like(table), torch.zeros_like(table)) for name, table in self.tables.items()
@@ -69,7 +57,7 @@ class GridField(RadianceField):
             self._first = self.networks[0].detach().clone().requires_grad_()
             self.reach(0.0)
         self._networks_adam = self._adam([self._first, *self.networks[1:]])
-        self._columns_adam = self._adam([self.reconstruction_columns, *self.reconstruction_head])
+        self._columns_adam = self._adam([self.reconstruction_columns])
 
     def _uniform(self, rows: int, columns: int, bound: float) -> Tensor:
         values = torch.rand(rows, columns, generator=self._generator) * (2 * bound) - bound
@@ -115,29 +103,11 @@ class GridField(RadianceField):
 
     def start_reconstruction(self) -> None:
         self.reconstructing = True
-        if self.shape.wiring == "replace":
-            columns, *others = self._draw_networks(self.shape.reconstruction_grid.width)
-            with torch.no_grad():
-                self.networks[0].zero_()
-                for old, new in zip(
-                    [self.reconstruction_columns, *self.networks[1:]], [columns, *others], strict=True
-                ):
-                    old.copy_(new)
-            self._forget_first_layer()
-
-    def _forget_first_layer(self) -> None:
-        """The pose-estimation module's columns stay at zero; the networks' moments start afresh."""
-        self._networks_adam = self._adam(self.networks[1:])
-
-    @property
-    def _replaced(self) -> bool:
-        return self.reconstructing and self.shape.wiring == "replace"
 
     def step(self, rates: FieldRates) -> None:
         """One Adam step from the gradients of the last backward."""
-        if not self._replaced:
-            self.steps["pose"] += 1
-            self._update_table("pose", np.full(self.shape.pose_grid.levels, rates.pose, np.float32))
+        self.steps["pose"] += 1
+        self._update_table("pose", np.full(self.shape.pose_grid.levels, rates.pose, np.float32))
         if self._mixing is not None and self.networks[0].grad is not None:
             self._first.grad = self.networks[0].grad @ self._mixing.T
         self._step_networks(self._networks_adam, rates.networks)
@@ -155,8 +125,7 @@ class GridField(RadianceField):
         optimiser.zero_grad(set_to_none=True)
 
     def discard_gradients(self) -> None:
-        weights = (*self.networks, self.reconstruction_columns, *self.reconstruction_head)
-        for parameter in (*self.tables.values(), *weights):
+        for parameter in (*self.tables.values(), *self.networks, self.reconstruction_columns):
             parameter.grad = None
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -167,9 +136,7 @@ class GridField(RadianceField):
         tensors |= {
             f"network{i}": weight.detach() for i, weight in enumerate([self._first, *self.networks[1:]])
         }
-        tensors["reconstruction_columns"] = self.reconstruction_columns.detach()
-        head = enumerate(self.reconstruction_head)
-        return tensors | {f"reconstruction_head{i}": weight.detach() for i, weight in head}
+        return tensors | {"reconstruction_columns": self.reconstruction_columns.detach()}
 
     def state(self) -> dict[str, Tensor]:
         state = self._tensors()
@@ -185,8 +152,6 @@ class GridField(RadianceField):
         *steps, reconstructing = state["counters"].tolist()
         self.steps = dict(zip(MODULES, steps, strict=True))
         self.reconstructing = bool(reconstructing)
-        if self._replaced:
-            self._forget_first_layer()
         load_adam_state("adam_networks", self._networks_adam, state)
         load_adam_state("adam_columns", self._columns_adam, state)
         self._mix()

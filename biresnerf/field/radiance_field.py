@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from biresnerf.field.grid_levels import GridLevels
-from biresnerf.options.refine_options import Wiring
 
 
 @dataclass(frozen=True)
 class FieldShape:
     """The parts of a field on grids. `unbounded` scenes are contracted outside the inner box [-1, 1]^3.
 
-    `wiring`: how the second grid joins the first in stage 2 (`GridField`).
     `broadcast`: levels of the first grid open from coarse to fine, closed ones repeating the finest open one
     (`coarse_to_fine.level_mixing`).
     """
@@ -24,7 +22,6 @@ class FieldShape:
     reconstruction_grid: GridLevels
     unbounded: bool
     broadcast: bool = False
-    wiring: Wiring = "concat"
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,6 @@ from biresnerf.stages import STAGES
 Device = Literal["auto", "cpu", "cuda"]
 Background = Literal["auto", "white", "black", "none"]
 ExposureChoice = Literal["auto", "none", "on"]
-Wiring = Literal["concat", "replace", "residual"]
-DetectorName = Literal["trend", "counter", "variance"]
-PoseParametrisation = Literal["se3_world", "so3xr3", "so3xr3_camp"]
 StartPoses = Literal["auto", "given", "colmap", "none"]
 RefineIntrinsics = Literal["auto", "none", "focal", "all"]
 SeedingEffort = Literal["full", "low"]
@@ -107,11 +104,6 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     check_every: Annotated[int | Open, Option("coarse")] = Field(
         OPEN, ge=5, description="Steps between two checks whether the error is stable."
     )
-    detector: Annotated[DetectorName, Option("coarse", level="research")] = Field(
-        "trend",
-        description="When the error counts as stable. trend: its fitted line is flat; counter: it rises as often as it "
-        "falls; variance: it varies little.",
-    )
     samples_per_step: Annotated[int | Open, Option("coarse", smaller=divided(4, 1024))] = Field(
         OPEN, ge=1024, le=2**22, description="Field samples per step at the end of the coarse-to-fine ramp."
     )
@@ -133,16 +125,6 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     double_pose_step: Annotated[bool | Open, Option("coarse", level="research")] = Field(
         OPEN,
         description="Also update the poses with a second Adam at the field's learning rate, as BAA-NGP's code does.",
-    )
-    pose_parametrisation: Annotated[PoseParametrisation, Option("coarse", level="research")] = Field(
-        "se3_world",
-        description="se3_world: cameras rotate about the scene; so3xr3: about their own centre; so3xr3_camp: that with "
-        "CamP's preconditioner.",
-    )
-    wiring: Annotated[Wiring, Option("fine", level="research")] = Field(
-        "concat",
-        description="How the reconstruction module is connected. concat: its features beside the pose-estimation "
-        "module's; replace: instead of them, with new networks; residual: own networks, outputs added.",
     )
     pose_levels: Annotated[int, Option("coarse", level="research")] = Field(
         3, ge=1, le=16, description="Levels of the pose-estimation module."

@@ -19,7 +19,6 @@ from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refine.parameters.parametrisations import Se3World
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from biresnerf.refine.views.evaluation import FIT_RATE, FIT_STEPS, fit_rays, render_view
 
@@ -68,8 +67,7 @@ def _fitted(
 ) -> Tensor:
     """unit_from_cam [3, 4] of one view after fitting its photo to the field."""
     device = optimiser.device
-    form = Se3World(optimiser.poses.parametrisation.length)
-    pose = PoseParameters(torch.from_numpy(unit_from_cam[None]), form, device)
+    pose = PoseParameters(torch.from_numpy(unit_from_cam[None]), optimiser.poses.length, device)
     pixels = torch.nonzero(torch.ones(photo.shape[:2]) if counts is None else counts)
     rays = fit_rays(optimiser)
     which = torch.full((rays,), index, device=device)

@@ -15,8 +15,8 @@ from biresnerf.options.refine_options import RefineOptions, parse_options
 VIEWS, SIZE = 8, 24
 # Choices are kept, sizes are not.
 KEPT = (
-    *("method", "seed", "background", "exposure", "start", "fixed", "refine_intrinsics", "detector"),
-    *("pose_parametrisation", "wiring", "double_pose_step", "exports"),
+    *("method", "seed", "background", "exposure", "start", "fixed", "refine_intrinsics"),
+    *("double_pose_step", "exports"),
 )
 SMALL = {
     "preset": "fast",

@@ -25,18 +25,16 @@ class ReferenceField(GridField):
         self.pose_table.requires_grad_()
         self.reconstruction_table.requires_grad_()
 
-    def _heads(self, x: Tensor, gradient: PositionGradient) -> list[tuple[Tensor, list[Tensor]]]:
-        """Features [n, width] and the networks they go to; the outputs of all heads are added."""
+    def _features(self, x: Tensor, gradient: PositionGradient) -> tuple[Tensor, list[Tensor]]:
+        """Features [n, width] and the networks they go to."""
         low = reference.encode(x, self.pose_table, self.shape.pose_grid, gradient.pose_smoothing)
         if not self.reconstructing:
-            return [(low, self.networks)]
+            return low, self.networks
         passed = x.detach() + gradient.reconstruction_share * (x - x.detach())
         grid, table = self.shape.reconstruction_grid, self.reconstruction_table
         high = reference.encode(passed, table, grid, gradient.reconstruction_smoothing)
-        if self.shape.wiring == "residual":
-            return [(low, self.networks), (high, [self.reconstruction_columns, *self.reconstruction_head])]
         first = torch.cat([self.networks[0], self.reconstruction_columns], 1)
-        return [(torch.cat([low, high], 1), [first, *self.networks[1:]])]
+        return torch.cat([low, high], 1), [first, *self.networks[1:]]
 
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
         with torch.no_grad():
@@ -58,31 +56,19 @@ class ReferenceField(GridField):
     def _sample(
         self, x: Tensor, view: Tensor, gradient: PositionGradient, trained: bool
     ) -> tuple[Tensor, Tensor]:
-        parameters = [
-            *self.tables.values(),
-            self.reconstruction_columns,
-            *self.networks,
-            *self.reconstruction_head,
-        ]
+        parameters = [*self.tables.values(), self.reconstruction_columns, *self.networks]
         for parameter in parameters:
             parameter.requires_grad_(trained)
-        logits = [
-            reference.network_logits(features, view, weights)
-            for features, weights in self._heads(x, gradient)
-        ]
+        features, weights = self._features(x, gradient)
+        result = reference.network(features, view, weights)
         for parameter in parameters:
             parameter.requires_grad_()
-        density = torch.stack([head[0] for head in logits]).sum(0)
-        colour = torch.stack([head[1] for head in logits]).sum(0)
-        return reference.density_of(density), torch.sigmoid(colour)
+        return result
 
     @torch.no_grad()
     def density(self, position: Tensor) -> Tensor:
-        logits = [
-            (torch.relu(features @ weights[0].T) @ weights[1].T)[:, 0]
-            for features, weights in self._heads(position, PositionGradient())
-        ]
-        return reference.density_of(torch.stack(logits).sum(0))
+        features, weights = self._features(position, PositionGradient())
+        return reference.density_of((torch.relu(features @ weights[0].T) @ weights[1].T)[:, 0])
 
     @torch.no_grad()
     def _update_table(self, name: str, rates: np.ndarray) -> None:

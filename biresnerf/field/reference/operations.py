@@ -53,13 +53,7 @@ def encode(x: Tensor, table: Tensor, grid: GridLevels, smoothing: float = 0.0) -
 
 
 def network(features: Tensor, view: Tensor, weights: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Density [n] and colour [n, 3] of features [n, width] and view harmonics [n, 16], as below."""
-    density, colour = network_logits(features, view, weights)
-    return density_of(density), torch.sigmoid(colour)
-
-
-def network_logits(features: Tensor, view: Tensor, weights: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Logits of density [n] and colour [n, 3], of features [n, width] and view harmonics [n, 16].
+    """Density [n] and colour [n, 3] of features [n, width] and view harmonics [n, 16].
 
     `weights` = (64 x width, 16 x 64) of the density network and (64 x 32, 64 x 64, 3 x 64) of the colour network,
     no biases, rectified; density = exp(min(z0 - 1, 11)) of the first output (BAA-NGP's truncated exponential).
@@ -67,7 +61,7 @@ def network_logits(features: Tensor, view: Tensor, weights: list[Tensor]) -> tup
     w1, w2, w3, w4, w5 = weights
     outputs = torch.relu(features @ w1.T) @ w2.T
     colour = torch.relu(torch.relu(torch.cat([view, outputs], 1) @ w3.T) @ w4.T) @ w5.T
-    return outputs[:, 0], colour
+    return density_of(outputs[:, 0]), torch.sigmoid(colour)
 
 
 def density_of(logit: Tensor) -> Tensor:

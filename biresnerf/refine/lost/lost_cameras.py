@@ -21,7 +21,6 @@ from biresnerf.refine.lost.matched_repair import MatchedRepair
 from biresnerf.refine.lost.own_matches import OwnMatches
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.optimise.pose_hypotheses import pose_hypotheses
-from biresnerf.refine.parameters.parametrisations import Se3World
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from biresnerf.refine.scene.shared_views import shared_shares
 
@@ -224,8 +223,7 @@ class LostCameraRepair:
         """Poses [k, 3, 4] after some steps of Adam on the photometric error alone, all in one batch."""
         optimiser = self.optimiser
         bottom = matrices.new_tensor([0.0, 0, 0, 1]).expand(len(matrices), 1, 4)
-        form = Se3World(optimiser.poses.parametrisation.length)
-        poses = PoseParameters(torch.cat([matrices, bottom], 1), form, optimiser.device)
+        poses = PoseParameters(torch.cat([matrices, bottom], 1), optimiser.poses.length, optimiser.device)
         count = len(matrices) * rays
         owner = torch.arange(len(matrices), device=optimiser.device).repeat_interleave(rays)
         image = torch.full((count,), camera, device=optimiser.device)

@@ -21,10 +21,8 @@ from biresnerf.refine.optimise.methods import find_method
 from biresnerf.refine.optimise.optimiser_state import Part, StepState, load_state_of, state_of
 from biresnerf.refine.optimise.photo_sampler import PhotoSampler, PixelBatch
 from biresnerf.refine.optimise.pose_hypotheses import photo_distances
-from biresnerf.refine.parameters.camp_preconditioner import camp_preconditioner
 from biresnerf.refine.parameters.exposure import Exposure
 from biresnerf.refine.parameters.intrinsics_parameters import IntrinsicsParameters
-from biresnerf.refine.parameters.parametrisations import PARAMETRISATIONS
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from biresnerf.refine.parameters.rigid_bodies import RigidBodies
 from biresnerf.refine.scene.scene_frame import SceneFrame
@@ -108,18 +106,12 @@ class JointOptimiser:
         return self.lenses.intrinsics
 
     def _pose_parameters(self, unit_from_cam: Tensor) -> PoseParameters:
-        options, distance = self.options, self.frame.distance
-        length = distance / RIG_DISTANCE
-
-        def precondition(poses: Tensor) -> Tensor:
-            return camp_preconditioner(poses, self.intrinsics, distance, length, options.seed)
-
         return PoseParameters(
             unit_from_cam,
-            PARAMETRISATIONS[options.pose_parametrisation].create(length, precondition),
+            self.frame.distance / RIG_DISTANCE,
             self.device,
             betas=self.method.pose_betas,
-            double_step=options.double_pose_step,
+            double_step=self.options.double_pose_step,
             body=torch.from_numpy(self.bodies.of),
         )
 

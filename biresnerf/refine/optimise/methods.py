@@ -74,12 +74,10 @@ def two_grids(
     options: ResolvedOptions, frame: SceneFrame, device: torch.device, threads: int
 ) -> RadianceField:
     """The pose-estimation module, stored densely, and the reconstruction module, hashed."""
-    if options.wiring == "residual":
-        torch.set_num_threads(threads)  # in plain torch, and the kernels are at rest
     dense = grid_levels(
         options.pose_levels, options.pose_resolution_min, options.pose_resolution_max, DENSE_TABLE_LOG2
     )
-    shape = FieldShape(dense, reconstruction_levels(options), frame.unbounded, wiring=options.wiring)
+    shape = FieldShape(dense, reconstruction_levels(options), frame.unbounded)
     return make_field(shape, options.seed, device, threads)
 
 

@@ -1,4 +1,7 @@
-"""Camera poses as parameters of the optimisation."""
+"""Camera poses as parameters of the optimisation.
+
+BARF's coordinates: unit_from_cam = exp(rotation, translation) start, so a rotation turns a camera about the scene.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import torch
 from torch import Tensor
 
 from biresnerf.field.adam_state import adam_state, load_adam_state
-from biresnerf.refine.parameters.parametrisations import Parametrisation
+from biresnerf.geometry.lie import se3_exp
 
 EPSILON = 1e-12
 SECOND_EPSILON, SECOND_DECAY = 1e-15, 1e-6  # BAA-NGP: its optimiser of the field moves the poses too
@@ -16,7 +19,8 @@ class PoseParameters:
     """Increments on given poses ``unit_from_cam`` [n, 4, 4], zero at the start, one row for each rigid body.
 
     Args:
-        parametrisation: what the increments mean; serves these poses alone.
+        length: unit lengths per unit of translation: a quarter of the rig's distance, so that one learning rate suits
+            every scene.
         double_step: a second Adam, at the field's rate, takes a step after each of the first's from the same gradient,
             as in BAA-NGP's code.
         body: [n], numbered without gaps: which cameras share their increments; each has its own where left out.
@@ -25,7 +29,7 @@ class PoseParameters:
     def __init__(
         self,
         unit_from_cam: Tensor,
-        parametrisation: Parametrisation,
+        length: float,
         device: torch.device,
         *,
         betas: tuple[float, float] = (0.9, 0.99),
@@ -35,10 +39,7 @@ class PoseParameters:
         count = len(unit_from_cam) if body is None else int(body.max()) + 1
         # None where every camera is its own body.
         self.body = body.to(device) if body is not None and count < len(body) else None
-        if self.body is not None and not parametrisation.moves_bodies:
-            raise ValueError(f"{type(parametrisation).__name__} cannot move bodies of several cameras")
-        self.parametrisation = parametrisation
-        parametrisation.begin(unit_from_cam, device)
+        self.length = length
         self.start = unit_from_cam[:, :3].to(torch.float32).to(device)
         self.rotation = torch.zeros(count, 3, device=device, requires_grad=True)
         self.translation = torch.zeros(count, 3, device=device, requires_grad=True)
@@ -53,7 +54,9 @@ class PoseParameters:
         rotation, translation = self.rotation, self.translation
         if self.body is not None:
             rotation, translation = rotation[self.body], translation[self.body]
-        return self.parametrisation.moved(self.start, rotation, translation, self.body)
+        turn, shift = se3_exp(rotation, translation * self.length)
+        centre = (turn @ self.start[:, :, 3:])[:, :, 0] + shift
+        return torch.cat([turn @ self.start[:, :, :3], centre[:, :, None]], 2)
 
     def members(self, camera: int) -> list[int]:
         """The cameras of one camera's body, itself included."""
@@ -98,7 +101,8 @@ class PoseParameters:
         """
         now = self.matrices()
         shift = dolly_directions(now) * log_focal.expm1().to(now)[:, None]
-        self.start[:, :, 3] += self.parametrisation.start_shift(self.start, now, shift)
+        turn = now[:, :, :3] @ self.start[:, :, :3].transpose(1, 2)
+        self.start[:, :, 3] += (turn.transpose(1, 2) @ shift[:, :, None])[:, :, 0]
 
     def restart_adam(self) -> None:
         """Reset the moments, before another optimisation."""
@@ -121,7 +125,6 @@ class PoseParameters:
                     for moment in adam.state.get(parameter, {}).values():
                         if moment.shape == parameter.shape:
                             moment[row] = 0
-        self.parametrisation.restart(camera, self.poses())
 
     def _carry_body(self, camera: int, unit_from_cam: Tensor) -> None:
         """Set the start poses of a camera's body so that the camera begins at `unit_from_cam` [3, 4]."""
@@ -140,15 +143,17 @@ class PoseParameters:
         self.start.copy_(unit_from_cam[:, :3])
         for parameter in (self.rotation, self.translation):
             parameter.zero_()
-        self.parametrisation.begin(unit_from_cam, self.start.device)
         self.restart_adam()
 
     def forget_gradients(self) -> None:
         self._adam.zero_grad(set_to_none=True)
 
     def _tensors(self) -> dict[str, Tensor]:
-        increments = {"rotation": self.rotation.detach(), "translation": self.translation.detach()}
-        return {"start": self.start, **increments, **self.parametrisation.state()}
+        return {
+            "start": self.start,
+            "rotation": self.rotation.detach(),
+            "translation": self.translation.detach(),
+        }
 
     def _adams(self) -> dict[str, torch.optim.Adam]:
         return {"adam": self._adam} if self._second is None else {"adam": self._adam, "second": self._second}

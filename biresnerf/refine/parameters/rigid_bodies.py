@@ -16,7 +16,6 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.errors import InputError
 from biresnerf.geometry.similarity import Similarity, align_robust
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.refine.parameters.parametrisations import PARAMETRISATIONS
 
 # Fixed centres nearer to each other than this share of the rig's spread leave its scale open.
 _APART = 1e-6
@@ -108,21 +107,11 @@ def rigid_bodies(dataset: Dataset, options: ResolvedOptions) -> RigidBodies:
     ``options.fixed`` names images as the input writes them or by their path relative to its folder.
 
     Raises:
-        InputError: ``fixed_not_found``, ``fixed_without_pose``, or ``invalid_options`` for a parametrisation that
-            cannot hold a rig.
+        InputError: ``fixed_not_found`` or ``fixed_without_pose``.
     """
     rows = _fixed_rows(dataset, options.fixed)
     of = np.arange(len(dataset))
-    moments = _moments(dataset)
-    form = options.pose_parametrisation
-    if moments and not PARAMETRISATIONS[form].moves_bodies:
-        raise InputError(
-            "invalid_options",
-            f"{form} moves every camera independently, and this set's cameras belong to a rig.",
-            where="pose_parametrisation",
-            hint="Use se3_world or so3xr3, or a model without rigs.bin and frames.bin.",
-        )
-    for group in moments:
+    for group in _moments(dataset):
         of[group] = group[0]
     _, of = np.unique(of, return_inverse=True)
     held = np.zeros(len(dataset), dtype=np.bool_)

@@ -1,14 +1,8 @@
 """Error-stability detection, Algorithm 1 of Guo et al. 2023: when the coarse stage has converged.
 
-The paper gives no formula; three readings of it can be chosen. All see the error averaged over the blocks between
-checks, and all call it stable only once the floor is reached.
-
-- `trend`: a line is fitted to the error (dB) over a window of blocks; stable when it neither rises nor falls by more
-  than its own fluctuation, twice in a row.
-- `counter`: rises and falls from block to block are counted over the window; stable when neither has a surplus and the
-  error's range is small against its mean.
-- `variance`: the error's standard deviation over a long window is small against its mean. The window alone makes 5 000
-  steps of 200 the least.
+The paper gives no formula. Here a line is fitted to the error (dB), averaged over the blocks between checks, over a
+window of blocks. The error is stable when the line neither rises nor falls by more than the error's own fluctuation,
+twice in a row, and the floor is reached.
 """
 
 from __future__ import annotations
@@ -20,18 +14,13 @@ from typing import Literal
 import numpy as np
 
 from biresnerf.frozen_model import FrozenModel
-from biresnerf.options.refine_options import DetectorName
 
 Verdict = Literal["running", "stable", "cap", "diverging"]
 
 WINDOW = 10  # blocks
 SLOPE_DB = 0.15  # net change over the window that still counts as flat
 FLUCTUATION_DB = 0.35  # standard deviation about the line that still counts as calm
-CONFIRMATIONS: dict[DetectorName, int] = {"trend": 2, "counter": 1, "variance": 1}
-# counter: most rises beyond falls, or the reverse; largest range of errors over their mean
-SURPLUS, RANGE = 3, 0.05
-# variance: blocks, and the largest standard deviation of errors over their mean
-LONG_WINDOW, VARIATION = 25, 0.03
+CONFIRMATIONS = 2  # checks in a row
 RISING_BLOCKS = 3  # blocks in a row with rising error that mean divergence
 # A rollback is costly, and a plateau's noise rises half of the time: the rise over the window must exceed the noise.
 RISE_DB, RISE_FLUCTUATIONS = 0.5, 4.0
@@ -62,7 +51,6 @@ class StabilityDetector:
 
     floor: int
     cap: int
-    reading: DetectorName = "trend"
     motion_deg: float = STILL_DEG
     guarded: bool = True
     decibels: list[float] = field(default_factory=list)
@@ -88,7 +76,7 @@ class StabilityDetector:
                 return "diverging"
         if step >= self.cap:
             return "cap"
-        if self.confirmed >= CONFIRMATIONS[self.reading] and step >= self.floor:
+        if self.confirmed >= CONFIRMATIONS and step >= self.floor:
             return "stable"
         return "running"
 
@@ -100,21 +88,11 @@ class StabilityDetector:
         return {"trend_db": change, "level_db": max(SLOPE_DB, fluctuation), "confirmed": self.confirmed}
 
     def _flat(self) -> bool:
-        """Whether the last window shows neither trend nor unrest, as the chosen reading has it."""
+        """Whether the last window shows neither trend nor unrest."""
         imbalance = abs(int(np.sign(np.diff(self.decibels[-WINDOW:])).sum()))
-        if self.reading == "trend":
-            change, fluctuation = self._trend()
-            tolerance = max(SLOPE_DB, fluctuation)
-            return abs(change) <= tolerance and fluctuation <= FLUCTUATION_DB and imbalance <= WINDOW // 2
-        if self.reading == "counter":
-            errors = self._errors(WINDOW)
-            return imbalance <= SURPLUS and bool(np.ptp(errors) < RANGE * errors.mean())
-        errors = self._errors(LONG_WINDOW)
-        return len(errors) == LONG_WINDOW and bool(errors.std() < VARIATION * errors.mean())
-
-    def _errors(self, blocks: int) -> np.ndarray:
-        """Root-mean-square errors of the last blocks."""
-        return 10 ** (-np.array(self.decibels[-blocks:]) / 20)
+        change, fluctuation = self._trend()
+        tolerance = max(SLOPE_DB, fluctuation)
+        return abs(change) <= tolerance and fluctuation <= FLUCTUATION_DB and imbalance <= WINDOW // 2
 
     def _trend(self) -> tuple[float, float]:
         """Net change (dB) over the window, and standard deviation about the line."""

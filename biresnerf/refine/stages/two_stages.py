@@ -81,7 +81,6 @@ class TwoStages:
         self.detector = StabilityDetector(
             options.coarse_steps_min,
             options.coarse_steps_max,
-            options.detector,
             guarded=optimiser.method.robust_extensions,
         )
         self.estimate, self._previews = Estimate(), PreviewTimer(options.checkpoint_every_s)

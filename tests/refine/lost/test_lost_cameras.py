@@ -17,7 +17,6 @@ from biresnerf.geometry.similarity import align_robust
 from biresnerf.progress import Monitor
 from biresnerf.refine.lost import lost_cameras
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refine.parameters.parametrisations import Se3World
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from biresnerf.refine.scene.scene_frame import scene_frame
 from biresnerf.refine.stages.checkpoint import load_checkpoint
@@ -194,7 +193,7 @@ def test_the_report_names_those_that_stay_lost(scene, tmp_path):
 
 def test_a_replaced_pose_has_no_momentum_and_others_keep_theirs():
     generator = torch.Generator().manual_seed(0)
-    poses = PoseParameters(torch.eye(4).repeat(3, 1, 1), Se3World(1.0), CPU)
+    poses = PoseParameters(torch.eye(4).repeat(3, 1, 1), 1.0, CPU)
     target = torch.randn(3, 3, 4, generator=generator)
     for _ in range(5):
         (poses.matrices() * target).sum().backward()
