@@ -8,6 +8,7 @@ import numpy as np
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.named_images import few_names
+from biresnerf.refine.lost.own_matches import LEAST_PAIRS
 from biresnerf.refine.parameters.intrinsics_parameters import IntrinsicsParameters
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
@@ -64,7 +65,7 @@ def run_report(
         working_size=(int(scene.images.widths.max()), int(scene.images.heights.max())),
         input_from_optimised=similarity.report(),
         warnings=dataset.warnings
-        + _unmatched_warnings(scene)
+        + unmatched_warnings(scene)
         + _lost_warnings(dataset, lost)
         + (_judged_warnings(dataset, judgement) if judgement is not None else ()),
     )
@@ -88,14 +89,17 @@ def camera_reports(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[Came
     )
 
 
-def _unmatched_warnings(scene: Scene) -> tuple[str, ...]:
-    unmatched = np.flatnonzero(scene.start.unmatched).tolist()
+def unmatched_warnings(scene: Scene) -> tuple[str, ...]:
+    """A warning that names the images that matches left out of a set they mostly placed, and that no tracks show."""
+    tracks, count = scene.tracks, len(scene.dataset)
+    observed = np.zeros(count) if tracks is None else np.bincount(tracks.image, minlength=count)
+    unmatched = np.flatnonzero(scene.start.unmatched & (observed < LEAST_PAIRS)).tolist()
     if not unmatched:
         return ()
     names = ", ".join(scene.dataset.names[i] for i in unmatched)
     return (
-        f"Feature matches placed all but {len(unmatched)} of {len(scene.dataset)} images: of {names} only the photo "
-        "tells where it was taken from. Look at these poses before you rely on them.",
+        f"Feature matches say nothing of {len(unmatched)} of {count} images: of {names} only the photo tells where it "
+        "was taken from. Look at these poses before you rely on them.",
     )
 
 
