@@ -97,15 +97,18 @@ def _make_corners(hashing: bool):
     return corners
 
 
-def _make_forward(hashing: bool):
-    """The kernel that encodes samples [begin, end) at one level."""
+def _make_forward(hashing: bool, differentiating: bool):
+    """The kernel that encodes samples [begin, end) at one level, with the Jacobian or without."""
     corners = _make_corners(hashing)
 
     @njit(**KERNEL)
     def forward(x, table, scale, stride, smoothing, features, jacobian, begin, end):
         mask = u4(table.shape[0] - 1)
         out0, out1 = features[0], features[1]
-        j0, j1, j2, j3, j4, j5 = jacobian[0], jacobian[1], jacobian[2], jacobian[3], jacobian[4], jacobian[5]
+        if differentiating:
+            j0, j1, j2, j3, j4, j5 = (
+                jacobian[0], jacobian[1], jacobian[2], jacobian[3], jacobian[4], jacobian[5],
+            )  # fmt: skip
         for i in range(begin, end):
             ix, iy, iz, fx, fy, fz = _locate(x, i, scale)
             k0, k1, k2, k3, k4, k5, k6, k7 = corners(ix, iy, iz, stride, mask)
@@ -115,17 +118,18 @@ def _make_forward(hashing: bool):
             high = (_high(w0), _high(w1), _high(w2), _high(w3), _high(w4), _high(w5), _high(w6), _high(w7))
             p, px, py, pz = _trilinear(low, fx, fy, fz)
             q, qx, qy, qz = _trilinear(high, fx, fy, fz)
-            sx = scale * _straight_through(fx, smoothing)
-            sy = scale * _straight_through(fy, smoothing)
-            sz = scale * _straight_through(fz, smoothing)
             store(out0, i, p)
-            store(j0, i, sx * px)
-            store(j1, i, sy * py)
-            store(j2, i, sz * pz)
             store(out1, i, q)
-            store(j3, i, sx * qx)
-            store(j4, i, sy * qy)
-            store(j5, i, sz * qz)
+            if differentiating:
+                sx = scale * _straight_through(fx, smoothing)
+                sy = scale * _straight_through(fy, smoothing)
+                sz = scale * _straight_through(fz, smoothing)
+                store(j0, i, sx * px)
+                store(j1, i, sy * py)
+                store(j2, i, sz * pz)
+                store(j3, i, sx * qx)
+                store(j4, i, sy * qy)
+                store(j5, i, sz * qz)
 
     return forward
 
@@ -176,13 +180,17 @@ def _make_scatter(hashing: bool):
     return scatter
 
 
-_forward_hashed, _forward_dense = _make_forward(True), _make_forward(False)
+_forward_hashed, _forward_dense = _make_forward(True, True), _make_forward(False, True)
+_features_hashed, _features_dense = _make_forward(True, False), _make_forward(False, False)
 _scatter_hashed, _scatter_dense = _make_scatter(True), _make_scatter(False)
 
 
 @njit(**PARALLEL_KERNEL)
 def encode(x, words, scale, stride, hashed, offset, smoothing, features, jacobian):
-    """Features [2 levels, n] and Jacobian [levels, 6, n] of points x [3 n] in [0, 1]; `words` is the table as u64."""
+    """Features [2 levels, n] and Jacobian [levels, 6, n] of points x [3 n] in [0, 1]; `words` is the table as u64.
+
+    No Jacobian is computed where it has no rows, [levels, 0, n].
+    """
     levels, n = scale.shape[0], x.shape[0] // 3
     chunks = (n + CHUNK - 1) // CHUNK
     for task in prange(levels * chunks):
@@ -191,7 +199,12 @@ def encode(x, words, scale, stride, hashed, offset, smoothing, features, jacobia
         end = min(n, begin + CHUNK)
         table = words[offset[level] : offset[level + 1]]
         out, j = features[2 * level : 2 * level + 2], jacobian[level]
-        if hashed[level]:
+        if j.shape[0] == 0:
+            if hashed[level]:
+                _features_hashed(x, table, scale[level], stride[level], smoothing, out, j, begin, end)
+            else:
+                _features_dense(x, table, scale[level], stride[level], smoothing, out, j, begin, end)
+        elif hashed[level]:
             _forward_hashed(x, table, scale[level], stride[level], smoothing, out, j, begin, end)
         else:
             _forward_dense(x, table, scale[level], stride[level], smoothing, out, j, begin, end)

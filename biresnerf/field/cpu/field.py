@@ -72,15 +72,17 @@ class CpuField(GridField):
         return [first, *(w.detach().numpy() for w in self.networks[1:4]), last]
 
     def _encode(
-        self, x: np.ndarray, gradient: PositionGradient, role: str
+        self, x: np.ndarray, gradient: PositionGradient | None, role: str
     ) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Features [width, n] and each module's Jacobian, [levels, 0, n] where no gradient is asked for."""
         n, width = len(x) // 3, self._width()
+        derivatives, gradient = (0, PositionGradient()) if gradient is None else (6, gradient)
         features = self._buffers.take(f"{role} features", width, n)
         jacobians, row = [], 0
         smoothings = (gradient.pose_smoothing, gradient.reconstruction_smoothing)
         for name, smoothing in zip(self.modules, smoothings, strict=False):
             grid, words = self.grids[name], self.tables[name].numpy().reshape(-1).view(np.uint64)
-            jacobian = self._buffers.take(f"{role} jacobian {name}", grid.levels, 6, n)
+            jacobian = self._buffers.take(f"{role} jacobian {name}", grid.levels, derivatives, n)
             encoding.encode(
                 x, words, grid.scale, grid.stride, grid.hashed, grid.offset, f4(smoothing),
                 features[row : row + grid.width], jacobian,
@@ -92,13 +94,13 @@ class CpuField(GridField):
 
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
         colour, opacity, depth, count = _RenderRays.apply(
-            rays.origin, rays.direction, self, rays, marching, gradient
+            rays.origin, rays.direction, self.networks[0], self, rays, marching, gradient
         )
         return Rendering(colour, opacity, depth, int(count))
 
     def density(self, position: Tensor) -> Tensor:
         x = position.contiguous().numpy().reshape(-1)
-        features, _ = self._encode(x, PositionGradient(), "density")
+        features, _ = self._encode(x, None, "density")
         result = np.empty(len(position), f4)
         w1, w2 = (w.reshape(-1) for w in self._weights()[:2])
         network.network_density(
@@ -127,9 +129,12 @@ class CpuField(GridField):
         return offset, x, t, dt, ray
 
     def render_forward(self, origin: np.ndarray, direction: np.ndarray, view: np.ndarray, rays: Rays,
-                       marching: Marching, gradient: PositionGradient,
+                       marching: Marching, gradient: PositionGradient | None,
                        ) -> tuple[Samples, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-        """March, evaluate the field at every live sample and composite: colour [rays, 3], opacity, depth [rays]."""
+        """March, evaluate the field at every live sample and composite: colour [rays, 3], opacity, depth [rays].
+
+        `gradient` is None where positions need none.
+        """
         take, count = self._buffers.take, len(origin)
         offset, x, t, dt, ray = self.march(origin, direction, rays.jitter.numpy(), marching)
         n = len(t)
@@ -152,7 +157,7 @@ class CpuField(GridField):
         return samples, colour, opacity, depth
 
     def render_backward(self, s: Samples, view: np.ndarray, colour: np.ndarray, opacity: np.ndarray,
-                        g_colour: np.ndarray, g_opacity: np.ndarray, gradient: PositionGradient,
+                        g_colour: np.ndarray, g_opacity: np.ndarray, gradient: PositionGradient | None,
                         ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
         """Gradients to grid positions [3, n] and view harmonics [rays, 16]; keeps those to the field for `step`."""
         take, n, width = self._buffers.take, len(s.t), len(s.features)
@@ -165,7 +170,7 @@ class CpuField(GridField):
         render_segments_backward(
             s.segment, s.learning, longest, s.offset, s.dt, s.ray, s.features.reshape(-1), width, view.reshape(-1),
             tuple(w.reshape(-1) for w in weights), s.composited, colour, opacity, g_colour, g_opacity,
-            s.jacobians[0], second, f4(gradient.reconstruction_share), s.x, take("g density", n),
+            s.jacobians[0], second, f4(gradient.reconstruction_share if gradient else 0), s.x, take("g density", n),
             take("g colour", 3 * n), g_features.reshape(-1), dx, g_view, tuple(sums), tasks(), self.workers,
         )  # fmt: skip
         if s.learning:
@@ -209,10 +214,15 @@ class CpuField(GridField):
 
 
 class _RenderRays(torch.autograd.Function):
-    """Ties the kernels to autograd at the rays, so that poses are optimised like any other torch parameter."""
+    """Ties the kernels to autograd at the rays, so that poses are optimised like any other torch parameter.
+
+    One of the field's weights is an input so that the backward pass is reached where poses stand still.
+    """
 
     @staticmethod
-    def forward(ctx, origin, direction, field: CpuField, rays: Rays, marching, gradient):
+    def forward(ctx, origin, direction, _weight, field: CpuField, rays: Rays, marching, gradient):
+        if not any(ctx.needs_input_grad[:2]):
+            gradient = None
         o, d = origin.detach().numpy(), direction.detach().numpy()
         view = np.empty((len(d), VIEW_FEATURES), f4)
         harmonics(d, view)
@@ -230,9 +240,11 @@ class _RenderRays(torch.autograd.Function):
             samples, view, colour, opacity, np.ascontiguousarray(g_colour.numpy()),
             np.ascontiguousarray(g_opacity.numpy()), gradient,
         )  # fmt: skip
+        if gradient is None:
+            return (None,) * 7
         g_origin, g_direction = np.empty_like(o), np.empty_like(d)
         ray_kernels.ray_gradients(
             o, d, samples.offset, samples.t, dx, field.shape.unbounded, g_origin, g_direction
         )
         add_harmonics_gradient(d, g_view, g_direction)
-        return torch.from_numpy(g_origin), torch.from_numpy(g_direction), None, None, None, None
+        return torch.from_numpy(g_origin), torch.from_numpy(g_direction), *(None,) * 5

@@ -93,8 +93,11 @@ def _spread(block, channels, kept, begin, n, start, target, stride):
 
 @njit(**KERNEL)
 def add_position_gradient(g, row, stride, jacobian, begin, count, factor, dx):
-    """dx [3, count] (row stride `stride`) += factor J^T g over all levels, for samples from `begin` on."""
-    if factor == f4(0):
+    """dx [3, count] (row stride `stride`) += factor J^T g over all levels, for samples from `begin` on.
+
+    Nothing is added where the Jacobian [levels, 6, n] was not computed, [levels, 0, n].
+    """
+    if factor == f4(0) or jacobian.shape[1] == 0:
         return
     for level in range(jacobian.shape[0]):
         j = jacobian[level]

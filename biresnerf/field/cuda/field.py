@@ -65,9 +65,10 @@ class CudaField(GridField):
         self._workspace, self._pending = None, False
 
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
-        if torch.is_grad_enabled() and (rays.origin.requires_grad or rays.direction.requires_grad):
+        moving = rays.origin.requires_grad or rays.direction.requires_grad
+        if torch.is_grad_enabled() and (moving or rays.trained):
             colour, opacity, depth, samples = _RenderRays.apply(
-                rays.origin, rays.direction, self, rays, marching, gradient
+                rays.origin, rays.direction, self.networks[0], self, rays, marching, gradient
             )
             return Rendering(colour, opacity, depth, int(samples))
         return self._view(rays, marching, gradient)
@@ -218,10 +219,13 @@ def _refuse_the_wrong_mode(device: torch.device) -> None:
 
 
 class _RenderRays(torch.autograd.Function):
-    """Ties the kernels to autograd at the rays, so that poses are optimised like any other torch parameter."""
+    """Ties the kernels to autograd at the rays, so that poses are optimised like any other torch parameter.
+
+    One of the field's weights is an input so that the backward pass is reached where poses stand still.
+    """
 
     @staticmethod
-    def forward(ctx, origin, direction, field: CudaField, rays: Rays, marching, gradient):
+    def forward(ctx, origin, direction, _weight, field: CudaField, rays: Rays, marching, gradient):
         colour, opacity, depth, samples, number = field.run_forward(rays, marching, gradient)
         ctx.kept = (field, number, len(origin), rays.trained)
         ctx.mark_non_differentiable(depth)
@@ -231,4 +235,4 @@ class _RenderRays(torch.autograd.Function):
     def backward(ctx, g_colour, g_opacity, _g_depth, _g_samples):
         field, number, count, trained = ctx.kept
         g_origin, g_direction = field.run_backward(number, count, trained, g_colour, g_opacity)
-        return g_origin, g_direction, None, None, None, None
+        return g_origin, g_direction, *(None,) * 5

@@ -174,8 +174,11 @@ class JointOptimiser:
         batch = self.sampler.draw(
             self.rays, schedule.blur(t, self.switch, self.sampler.long_side), self.draws
         )
+        rate = self.pose_rate()
         lens_rate = schedule.lens_rate(t, self.switch) * self.pose_scale if self.lenses.moving else 0.0
         matrices, lenses = self.poses.matrices(), self.intrinsics
+        if rate == 0:
+            matrices = matrices.detach()
         if lens_rate > 0:
             matrices, lenses = self.lenses.with_gradient(matrices)
         origin, direction = self.cast(matrices[batch.image], batch.image, batch.xy, lenses)
@@ -189,14 +192,11 @@ class JointOptimiser:
         rates = schedule.field_rates(t, self.switch)
         self.field.step(rates)
         self.exposure.step(rates.networks)
-        rate = self.pose_rate()
         if rate > 0:
             mobility = self.mobility[0 if self.switch is None else 1]
             self.poses.step(rate, mobility, field_rate=rates.networks)
             if lens_rate > 0:
                 self.poses.dolly(self.lenses.step(lens_rate, focal=schedule.focal_moves(self.switch)))
-        else:
-            self.poses.forget_gradients()
         self.step_index += 1
         self._adapt_rays(rendering.samples, schedule.samples(t, self.switch))
         shown = colour.detach().clamp(max=1)
