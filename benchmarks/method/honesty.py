@@ -1,0 +1,231 @@
+"""Whether results keep their word: ``python -m benchmarks.method.honesty SET...``.
+
+Each SET holds true poses. It is refined from ten kinds of input (`STARTS`). Two things must never happen: the verdict
+``improved`` where the true error of the placed cameras rose, and a camera beyond 5 degrees that the report does not
+name. Prints a JSON line for each run, and the counts at the end.
+
+Photos are at most 400 px for feature matching and 100 px for the field, every few views of large sets, so that a run
+takes about a minute of one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.method.seeding import shrunk, with_focal
+from biresnerf.data.formats.read_dataset import read_dataset, read_poses
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.points.tracks import Tracks
+from biresnerf.data.seeding.seed_poses import seed_poses
+from biresnerf.errors import FaultError, InputError
+from biresnerf.geometry.perturb import orbit_away, perturb_poses
+from biresnerf.geometry.pose_error import camera_errors
+from biresnerf.geometry.similarity import align_robust
+from biresnerf.options.refine_options import parse_options
+from biresnerf.pipeline import refine_poses
+from biresnerf.report import ImageReport, Report
+from biresnerf.studies.scenes import with_poses
+
+Array = NDArray[np.float64]
+
+STARTS = (
+    "true", "matches", "noise 0.005", "noise 0.05", "noise 0.15", "noise 0.35", "tenth lost", "foreign photos",
+    "wrong lens", "wrong matches",
+)  # fmt: skip
+VIEWS = 30  # of a set, at most
+MATCHED_PX, FIELD_PX = 400, 100
+FOREIGN = 3
+BEYOND_DEG = 5.0
+RISEN = 1.05  # the error after, over the error before
+RISEN_DEG = 0.02  # and by at least so much: what the truth of the sets is good for
+
+
+def named(image: ImageReport) -> bool:
+    """Whether the report tells the user not to rely on this pose."""
+    return image.lost or image.contradicted or image.unsure_deg is not None
+
+
+def given_set(truth: Dataset, start: str, seed: int, others: Dataset) -> Dataset:
+    """The input that is refined: the truth with something wrong."""
+    poses = truth.world_from_cam
+    if start == "true":
+        return truth
+    if start == "matches":
+        found = seed_poses(all_poses_taken_away(truth), seed=seed)
+        matched = [c for c in found.candidates if c.matched.any()]
+        if not matched:
+            raise InputError("no_matches", "feature matches place nothing.")
+        return with_poses(truth, matched[0].world_from_cam)
+    if start.startswith("noise"):
+        return with_poses(truth, perturb_poses(poses, float(start.split()[1]), seed=seed))
+    noisy = perturb_poses(poses, 0.05, seed=seed)
+    if start == "tenth lost":
+        lost = np.random.default_rng(seed).choice(len(truth), max(1, len(truth) // 10), replace=False)
+        return with_poses(truth, orbit_away(noisy, [int(i) for i in lost], seed))
+    if start == "wrong lens":
+        return replace(
+            with_poses(truth, noisy), cameras=tuple(with_focal(camera, 1.05) for camera in truth.cameras)
+        )
+    if start == "foreign photos":
+        return with_foreign_photos(with_poses(truth, noisy), others)
+    return with_poses(truth, noisy)
+
+
+def all_poses_taken_away(truth: Dataset) -> Dataset:
+    frames = (replace(frame, world_from_cam=None, pose_source=None) for frame in truth.frames)
+    return replace(truth, frames=tuple(frames))
+
+
+def with_foreign_photos(dataset: Dataset, others: Dataset) -> Dataset:
+    """The set with a few photos of another scene, whose poses are missing."""
+    first = len(dataset.cameras)
+    foreign = [
+        replace(
+            f, name=f"foreign/{f.path.name}", camera=first + f.camera, world_from_cam=None, pose_source=None
+        )
+        for f in others.frames[:: max(1, len(others) // FOREIGN)][:FOREIGN]
+    ]
+    sources = tuple(dataset.source_of_intrinsics(i) for i in range(first))
+    sources += tuple(others.source_of_intrinsics(i) for i in range(len(others.cameras)))
+    return replace(
+        dataset,
+        frames=(*dataset.frames, *foreign),
+        cameras=(*dataset.cameras, *others.cameras),
+        intrinsics_sources=sources,
+    )
+
+
+@contextmanager
+def wrong_tracks(share: float, seed: int) -> Iterator[None]:
+    """Within it, this share of the observations of tracks lies at random places of other observations."""
+    load = Tracks.load
+
+    def loaded(path: Path, names: tuple[str, ...]) -> Tracks | None:
+        tracks = load(path, names)
+        if tracks is None:
+            return None
+        rng = np.random.default_rng(seed)
+        wrong = np.flatnonzero(rng.random(len(tracks)) < share)
+        xy = tracks.xy.copy()
+        xy[wrong] = tracks.xy[rng.permutation(wrong)]
+        return replace(tracks, xy=xy)
+
+    Tracks.load = staticmethod(loaded)  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        Tracks.load = load  # type: ignore[method-assign]
+
+
+def errors_deg(poses: Array, truth: Array, placed: NDArray[np.bool_]) -> Array:
+    """Rotation errors [n] after an alignment of the placed cameras that is robust to lost ones."""
+    carried = align_robust(poses[placed], truth[placed], with_rotations=True).apply_to_poses(poses)
+    return camera_errors(carried, truth).rotation_deg
+
+
+def judged(given: Dataset, truth: Dataset, report: Report, result: Array) -> dict[str, object]:
+    """What was true and what was said of one run."""
+    poses, count = truth.world_from_cam, len(truth)
+    placed = given.posed[:count]
+    given_poses = np.stack([f.world_from_cam for f in given.frames[:count] if f.world_from_cam is not None])
+    before = errors_deg(given_poses, poses, placed)
+    after = errors_deg(result[:count], poses, placed)
+    old, new = float(before[placed].mean()), float(after[placed].mean())
+    verdict = report.verdict.verdict if report.verdict else "none"
+    silent = [
+        i.name for i, error in zip(report.images, after, strict=False) if error > BEYOND_DEG and not named(i)
+    ]
+    unnamed = [i.name for i in report.images[count:] if not named(i)]  # of another scene: no pose is right
+    return {
+        "verdict": verdict,
+        "chosen": next((c.name for c in report.candidates if c.chosen), None),
+        "before_deg": round(old, 3),
+        "after_deg": round(new, 3),
+        "worst_deg": round(float(after.max()), 2),
+        "wrongly_improved": verdict == "improved" and new > max(RISEN * old, old + RISEN_DEG),
+        "worsened": new > max(RISEN * old, old + RISEN_DEG),
+        "silent": silent,
+        "foreign_unnamed": len(unnamed),
+        "named": sum(named(image) for image in report.images),
+    }
+
+
+def run(
+    truth: Dataset, start: str, seed: int, others: Dataset, options: dict[str, object]
+) -> dict[str, object]:
+    given = given_set(truth, start, seed, others)
+    asked = parse_options(
+        {"preset": "fast", "seed": seed, "max_image_size": FIELD_PX, "orbit_frames": 0, **options}
+    )
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        wrong_tracks(0.3 if start == "wrong matches" else 0.0, seed),
+    ):
+        output = Path(folder) / "out"
+        report = refine_poses(given, output, asked)
+        found = {Path(name).stem: pose for name, pose in read_poses(output / "transforms.json").items()}
+    # Foreign photos may share a stem with others; they come last and have no truth.
+    result = np.stack([found[Path(image.name).stem] for image in report.images[: len(truth)]])
+    return judged(given, truth, report, result)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sets", type=Path, nargs="+")
+    parser.add_argument(
+        "--foreign", type=Path, help="Where foreign photos come from; the next of SETS if left out."
+    )
+    parser.add_argument("--starts", default=",".join(STARTS))
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    asked = parser.parse_args()
+    from biresnerf.commands.settings_option import parse_settings
+
+    options = parse_settings(tuple(asked.set))
+    lines: list[dict[str, object]] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        sets = {
+            path: small(path, Path(scratch)) for path in dict.fromkeys((*asked.sets, asked.foreign)) if path
+        }
+        for i, path in enumerate(asked.sets):
+            others = sets[asked.foreign or asked.sets[(i + 1) % len(asked.sets)]]
+            for start in asked.starts.split(","):
+                began, line = time.monotonic(), {"set": path.name, "start": start}
+                try:
+                    line |= run(sets[path], start, asked.seed, others, options)
+                except FaultError as error:
+                    line |= {"refused": error.fault.code}
+                lines.append(line | {"seconds": round(time.monotonic() - began)})
+                print(json.dumps(lines[-1]), flush=True)
+    ran = [line for line in lines if "refused" not in line]
+    print(
+        f"{len(ran)} runs: {sum(bool(line['wrongly_improved']) for line in ran)} said improved though the error rose, "
+        f"{sum(bool(line['worsened']) for line in ran)} returned poses with a larger error, "
+        f"{sum(bool(line['silent']) for line in ran)} left a camera beyond {BEYOND_DEG:g} degrees unnamed"
+    )
+
+
+def small(path: Path, scratch: Path) -> Dataset:
+    """A few views of a set, small, under names of their own."""
+    truth = read_dataset(path)
+    posed = tuple(frame for frame in truth.frames if frame.world_from_cam is not None)
+    every = -(-len(posed) // VIEWS)
+    folder = scratch / path.name
+    folder.mkdir()
+    made = shrunk(replace(truth, frames=posed[::every]), MATCHED_PX, folder)
+    frames = tuple(replace(frame, name=f"{path.name}-{frame.path.stem}.png") for frame in made.frames)
+    return replace(made, frames=frames)
+
+
+if __name__ == "__main__":
+    main()
