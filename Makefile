@@ -13,6 +13,8 @@ CONSTRAINTS ?= constraints.txt
 export PIP_CONSTRAINT := $(CONSTRAINTS)
 export PIP_BUILD_CONSTRAINT := $(CONSTRAINTS)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Each process of the tests would compile all modules, and pytest rewrite all assertions, again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs fuzz audit sbom compose-check
 .DELETE_ON_ERROR:
@@ -29,7 +31,7 @@ test: web  ## all tests; PYTEST="-k name" chooses
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile $(PYTEST)
 
 test-fast: setup  ## within a minute: the tests that need no server and no browser and do not train
-	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 -m "not server and not browser and not slow" $(PYTEST)
+	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal -m "not server and not browser and not slow" $(PYTEST)
 
 test-lowest: build/lowest.txt  ## all tests with the lowest versions that pyproject.toml allows, in an environment of its own
 	$(MAKE) test VENV=.venv-lowest CONSTRAINTS=build/lowest.txt

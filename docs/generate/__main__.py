@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from docs.generate.pages import generated
+from docs.generate.pages import GENERATED
 
 
 def main() -> None:
     """Writes what differs, and says what that was."""
-    for path, text in generated().items():
+    for path, write in GENERATED.items():
+        text = write()
         if not path.is_file() or path.read_text("utf-8") != text:
             path.write_text(text, "utf-8")
             print(f"written: {path}")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from docs.generate.commands_page import commands_page
@@ -23,16 +25,20 @@ def openapi_document() -> str:
     return json.dumps(app.openapi(), indent=1, ensure_ascii=False) + "\n"
 
 
-def generated() -> dict[Path, str]:
-    """The text of every page and notebook, as it should be now."""
-    pages = {
-        ROOT / "docs/options.md": options_page(),
-        ROOT / "docs/settings.md": settings_page(),
-        ROOT / "docs/commands.md": commands_page(),
-        ROOT / "docs/formats.md": format_page(ROOT / "docs/formats.md"),
-        ROOT / "service/web/formats.json": page_formats(),
-        ROOT / "docs/result.schema.json": result_schema(),
-        ROOT / "docs/openapi.json": openapi_document(),
-    }
+def _writers() -> dict[Path, Callable[[], str]]:
+    formats = ROOT / "docs/formats.md"
     walks = [path for path in sorted((ROOT / "examples").glob("*.py")) if "# %%" in path.read_text("utf-8")]
-    return pages | {walk.with_suffix(".ipynb"): notebook(walk) for walk in walks}
+    return {
+        ROOT / "docs/options.md": options_page,
+        ROOT / "docs/settings.md": settings_page,
+        ROOT / "docs/commands.md": commands_page,
+        formats: partial(format_page, formats),
+        ROOT / "service/web/formats.json": page_formats,
+        ROOT / "docs/result.schema.json": result_schema,
+        ROOT / "docs/openapi.json": openapi_document,
+        **{walk.with_suffix(".ipynb"): partial(notebook, walk) for walk in walks},
+    }
+
+
+# What writes the text of every page and notebook, as it should be now.
+GENERATED = _writers()

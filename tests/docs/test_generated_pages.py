@@ -9,15 +9,13 @@ import pytest
 
 from biresnerf.options.refine_options import RefineOptions
 from docs.generate.commands_page import all_commands
-from docs.generate.pages import ROOT, generated
+from docs.generate.pages import GENERATED, ROOT
 from workers.settings.settings import Settings
 
-PAGES = generated()
 
-
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize("path", GENERATED, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_what_is_generated_has_not_drifted(path):
-    assert path.read_text("utf-8") == PAGES[path], "run `make docs`"
+    assert path.read_text("utf-8") == GENERATED[path](), "run `make docs`"
 
 
 def test_every_option_setting_and_command_has_its_place_and_a_meaning():
@@ -34,9 +32,9 @@ def test_every_option_setting_and_command_has_its_place_and_a_meaning():
 
 
 def test_a_notebook_holds_the_code_of_its_script_and_no_output():
-    for path, text in PAGES.items():
+    for path, write in GENERATED.items():
         if path.suffix == ".ipynb":
-            cells = json.loads(text)["cells"]
+            cells = json.loads(write())["cells"]
             code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
             script = path.with_suffix(".py").read_text()
             assert code

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.service.fuzzing import fuzzed
 
 
+@pytest.mark.server
 def test_made_up_requests_get_no_server_error_and_no_undeclared_answer() -> None:
     few = ("--phases", "examples,fuzzing,stateful", "--max-examples", "1")
     done, log = fuzzed(*few, "--generation-deterministic", "--no-color")

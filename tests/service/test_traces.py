@@ -63,6 +63,7 @@ def collector(monkeypatch: pytest.MonkeyPatch) -> Iterator[Collector]:
     collecting.server.server_close()
 
 
+@pytest.mark.server
 def test_a_job_is_one_trace_from_the_callers_span_to_its_last_stage(
     collector: Collector, scene: Path
 ) -> None:

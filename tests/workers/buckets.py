@@ -16,7 +16,6 @@ from pathlib import Path
 import boto3
 import pytest
 from botocore.config import Config
-from moto.server import ThreadedMotoServer
 
 from workers.store.file_places import Bucket
 
@@ -28,6 +27,8 @@ START_S = 20.0
 @contextlib.contextmanager
 def moto_server() -> Iterator[str]:
     """Address of a moto server in this process; keys are not checked."""
+    from moto.server import ThreadedMotoServer  # loads most of AWS: only where one is started
+
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     try:
