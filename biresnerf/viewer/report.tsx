@@ -87,7 +87,7 @@ function Widgets({ data, points }: { data: Embedded; points: readonly PointLayer
   const choice = { selected, onSelect: setSelected };
   return (
     <div class="job-view">
-      <VerdictSentence verdict={report.verdict} state={report.state} asked={report.options.verdict !== false} />
+      <VerdictSentence verdict={report.verdict} state={report.state} requested={report.options.verdict !== false} />
       <div class="job-pictures">
         <div class="panel panel-scene">
           <h2>Cameras</h2>

@@ -15,7 +15,7 @@ from biresnerf.geometry.rigid import rigid_inverse
 
 SensorType = Literal["CAMERA", "IMU"]
 SENSOR_TYPES: tuple[SensorType, ...] = ("CAMERA", "IMU")  # by COLMAP's numbers
-ModelForm = Literal["binary", "text"]
+ModelFileFormat = Literal["binary", "text"]
 Sensor = tuple[SensorType, int]
 NO_POINT = -1  # of an observation that belongs to no 3D point
 
@@ -126,7 +126,7 @@ class ColmapModel:
 
     Attributes:
         folder: where it was read.
-        form: which of the two forms was read.
+        file_format: which of the two was read.
         cameras: by id, in the file's order.
         images: by id, in the file's order.
         points: the 3D points.
@@ -135,7 +135,7 @@ class ColmapModel:
     """
 
     folder: Path
-    form: ModelForm
+    file_format: ModelFileFormat
     cameras: dict[int, Camera]
     images: dict[int, ColmapImage]
     points: ColmapPoints

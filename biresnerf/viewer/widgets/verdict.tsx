@@ -6,11 +6,11 @@ import { count, fixed, short, signed } from "./numbers";
 interface VerdictSentenceProps {
   readonly verdict: Verdict | null;
   readonly state: "complete" | "partial";
-  /** Whether the options asked for a verdict. */
-  readonly asked?: boolean;
+  /** Whether the options request a verdict. */
+  readonly requested?: boolean;
 }
 
-export function VerdictSentence({ verdict, state, asked = true }: VerdictSentenceProps) {
+export function VerdictSentence({ verdict, state, requested = true }: VerdictSentenceProps) {
   if (!verdict) {
     return (
       <section class="verdict" aria-label="Verdict">
@@ -18,7 +18,7 @@ export function VerdictSentence({ verdict, state, asked = true }: VerdictSentenc
           <span class="chip chip-plain">{state === "partial" ? "partial" : "no verdict"}</span>
           {state === "partial"
             ? "The run was stopped early: these are the best poses so far. They were not compared with the input's."
-            : asked
+            : requested
               ? "No verdict was reached."
               : "No verdict was requested: the result holds the refined poses."}
         </p>

@@ -24,7 +24,7 @@ export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
   return (
     <>
       {widgets && report && over && (
-        <widgets.VerdictSentence verdict={report.verdict} state={report.state} asked={report.options.verdict !== false} />
+        <widgets.VerdictSentence verdict={report.verdict} state={report.state} requested={report.options.verdict !== false} />
       )}
       <div class="job-pictures">
         <Panel name="Cameras" kind="panel-scene">

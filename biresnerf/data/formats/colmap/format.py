@@ -1,4 +1,4 @@
-"""COLMAP models as formats: where a folder holds them, and which of the two table forms is written."""
+"""COLMAP models as formats: where a folder holds them, and which of the two file formats is written."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.read_colmap import bind_colmap, parse_colmap
-from biresnerf.data.formats.colmap.read_model import model_forms
+from biresnerf.data.formats.colmap.read_model import model_file_formats
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.colmap.write_text import write_colmap_text
 from biresnerf.data.photos.named_images import IMAGE_FOLDER, images_in
@@ -20,7 +20,7 @@ COLMAP = Format(
     found_as=("sparse/0", "colmap/sparse/0", "sparse", "colmap/sparse", ".", "sparse_txt/0", "sparse_txt"),
     gives="poses, cameras, features, points, rigs, frames, all ids; binary or text, COLMAP 3.10 to 4.2",
     checked_against=(
-        "pycolmap 4.2.1: random models of every camera model, with rigs of three cameras, both forms; three real "
+        "pycolmap 4.2.1: random models of every camera model, with rigs of three cameras, binary and text; three real "
         "models. Models written by 3.10.0, 3.11.1, 3.12.6, 3.13.0 and 4.0.4"
     ),
     in_set="sparse/0",
@@ -64,7 +64,7 @@ CODECS = (
         COLMAP,
         parse=parse_colmap,
         bind=bind_colmap,
-        recognises=lambda place: bool(model_forms(place)),
+        recognises=lambda place: bool(model_file_formats(place)),
         pose_place=_model_folder,
         image_root=_image_root,
         write=lambda refined, path, _: write_colmap_binary(refined.model, path),
@@ -72,6 +72,8 @@ CODECS = (
     Codec(
         COLMAP_TEXT,
         write=lambda refined, path, _: write_colmap_text(refined.model, path),
-        given_back=lambda dataset: dataset.source.colmap is not None and dataset.source.colmap.form == "text",
+        given_back=lambda dataset: (
+            dataset.source.colmap is not None and dataset.source.colmap.file_format == "text"
+        ),
     ),
 )

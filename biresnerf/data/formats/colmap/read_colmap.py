@@ -66,7 +66,7 @@ def bind_colmap(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
 
 
 def _images_table(model: ColmapModel) -> str:
-    return "images.bin" if model.form == "binary" else "images.txt"
+    return "images.bin" if model.file_format == "binary" else "images.txt"
 
 
 def _for_these_images(model: ColmapModel, dataset: Dataset, table: str) -> ColmapModel:

@@ -20,36 +20,36 @@ from biresnerf.data.model.text_file import read_bytes, read_text
 from biresnerf.geometry.camera.camera_models import Camera
 
 MAX_TABLE_BYTES = 2 * 2**30
-_SUFFIXES: dict[colmap.ModelForm, str] = {"binary": ".bin", "text": ".txt"}
+_SUFFIXES: dict[colmap.ModelFileFormat, str] = {"binary": ".bin", "text": ".txt"}
 # An image's pose by images.bin and by frames.bin are the same motion, up to this much: radians, and the share of
 # the distance.
 _SAME_POSE = 1e-3
 
 
-def model_forms(folder: Path) -> tuple[colmap.ModelForm, ...]:
-    """The forms in which ``folder`` holds a model, binary first, as COLMAP reads them."""
+def model_file_formats(folder: Path) -> tuple[colmap.ModelFileFormat, ...]:
+    """The file formats in which ``folder`` holds a model, binary first, as COLMAP reads them."""
     return tuple(
-        form
-        for form, suffix in _SUFFIXES.items()
+        file_format
+        for file_format, suffix in _SUFFIXES.items()
         if (folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file()
     )
 
 
 def read_colmap_model(folder: Path) -> colmap.ColmapModel:
-    """The model in ``folder``; binary where it holds both forms, and a note says so.
+    """The model in ``folder``; binary where it holds both file formats, and a note says so.
 
     Raises:
         InputError: with the file and the id, line or byte; codes as in docs/input.md.
     """
-    forms = model_forms(folder)
-    if not forms:
+    found = model_file_formats(folder)
+    if not found:
         raise broken(
             folder.name, "holds no COLMAP model", "input_missing", "Give cameras.bin and images.bin."
         )
-    form = forms[0]
-    tables = _Tables(folder, form)
+    file_format = found[0]
+    tables = _Tables(folder, file_format)
     notes = [f"the binary model in {folder.name} was read and the text model beside it was not"]
-    notes = notes if len(forms) > 1 else []
+    notes = notes if len(found) > 1 else []
     cameras: dict[int, Camera] = tables.read("cameras")
     images: dict[int, colmap.ColmapImage] = tables.read("images")
     points: colmap.ColmapPoints | None = tables.read("points3D")
@@ -72,17 +72,17 @@ def read_colmap_model(folder: Path) -> colmap.ColmapModel:
                 f"{tables.file('images')} and {tables.file('frames')} have different poses for {len(moved)} "
                 f"images ({moved[0]}, ...); the frames' were taken, as COLMAP does"
             )
-    return colmap.ColmapModel(folder, form, cameras, images, points, rigs, frames, tuple(notes))
+    return colmap.ColmapModel(folder, file_format, cameras, images, points, rigs, frames, tuple(notes))
 
 
 class _Tables:
-    """The files of a model in one form."""
+    """The files of a model in one file format."""
 
-    def __init__(self, folder: Path, form: colmap.ModelForm) -> None:
-        self.folder, self.form = folder, form
+    def __init__(self, folder: Path, file_format: colmap.ModelFileFormat) -> None:
+        self.folder, self.file_format = folder, file_format
 
     def file(self, table: str) -> str:
-        return table + _SUFFIXES[self.form]
+        return table + _SUFFIXES[self.file_format]
 
     def read(self, table: str) -> Any:
         """The parsed table, or None where there is no such file."""
@@ -90,7 +90,7 @@ class _Tables:
         if not path.is_file():
             return None
         parser = "parse_" + table.removesuffix("3D")
-        if self.form == "binary":
+        if self.file_format == "binary":
             return getattr(colmap_binary, parser)(read_bytes(path, MAX_TABLE_BYTES), path.name)
         return getattr(colmap_text, parser)(read_text(path, MAX_TABLE_BYTES), path.name)
 

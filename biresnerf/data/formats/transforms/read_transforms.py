@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, dataset_of
-from biresnerf.data.formats.colmap.read_model import model_forms, read_colmap_model
+from biresnerf.data.formats.colmap.read_model import model_file_formats, read_colmap_model
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.model.conventions import world_from_cam_of_file
 from biresnerf.data.model.dataset import Dataset, SourceFormat
@@ -176,7 +176,7 @@ def _older_transform(file: Path, entries: Sequence[PoseEntry]) -> NDArray[np.flo
     frames' after it, as folders of other programs hold both files, too. None where they do not.
     """
     folder = file.parent / _MODEL
-    if not model_forms(folder):
+    if not model_file_formats(folder):
         return None
     try:
         images = read_colmap_model(folder).images.values()

@@ -188,7 +188,7 @@ def test_a_colmap_set_written_back_has_the_models_names_and_a_transforms_file_th
     (tmp_path / "transforms.json").unlink()
     write_colmap_binary(refined_set(dataset, dataset.world_from_cam).model, tmp_path / "sparse/0")
     again = read_dataset(tmp_path)
-    assert again.source.colmap.form == "binary"
+    assert again.source.colmap.file_format == "binary"
     assert again.names == NAMES
     assert_at_truth(again)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from biresnerf.data.formats.colmap.read_model import model_forms, read_colmap_model
+from biresnerf.data.formats.colmap.read_model import model_file_formats, read_colmap_model
 from biresnerf.data.model.colmap_scene import ColmapModel, RigidPose
 from biresnerf.geometry.camera.camera_models import MODEL_IDS
 from tests.data.formats.colmap.colmap_files import (
@@ -98,9 +98,9 @@ def test_random_models_of_every_camera_model_and_with_rigs_read_as_pycolmap_read
     made += [synthetic(s, "PINHOLE", tmp_path / f"rig{s}", 1 + s % 2, cameras_per_rig=3) for s in (90, 91)]
     answers = by_pycolmap(made)
     for one, said in zip(made, answers, strict=True):
-        for form in ("binary", "text"):
-            model = read_colmap_model(tmp_path / one["folder"] / form)
-            assert model.form == form
+        for file_format in ("binary", "text"):
+            model = read_colmap_model(tmp_path / one["folder"] / file_format)
+            assert model.file_format == file_format
             assert model.notes == ()
             assert len(model.points) == 20
             assert_reads_as_pycolmap(model, said)
@@ -118,9 +118,9 @@ def test_models_of_real_sets_read_as_pycolmap_reads_them(path):
 def test_both_forms_of_a_model_read_the_same_and_binary_goes_first(tmp_path):
     text = read_colmap_model(write_tables(tmp_path, TINY_TEXT))
     write_tables(tmp_path, tiny_tables())
-    assert model_forms(tmp_path) == ("binary", "text")
+    assert model_file_formats(tmp_path) == ("binary", "text")
     binary = read_colmap_model(tmp_path)
-    assert (text.form, binary.form) == ("text", "binary")
+    assert (text.file_format, binary.file_format) == ("text", "binary")
     assert text.notes == ()
     assert "the text model beside it was not" in binary.notes[0]
     assert [image.name for image in text.images.values()] == ["a.png", "left/b b.png", "c.png"]
@@ -192,8 +192,8 @@ def test_what_other_versions_of_colmap_write_is_read(tmp_path, version, rigged):
         check=False,
     )
     assert rewritten.returncode == 0, rewritten.stderr
-    for form in ("binary", "text"):
-        model = read_colmap_model(tmp_path / "rewritten" / form)
+    for file_format in ("binary", "text"):
+        model = read_colmap_model(tmp_path / "rewritten" / file_format)
         assert model.notes == ()
         assert bool(model.rigs) == (version >= "3.12")
         assert_reads_as_pycolmap(model, said)
