@@ -15,11 +15,16 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset, Frame, IntrinsicsSource, SourceFormat
 from biresnerf.data.model.pose_validation import refuse_coinciding
-from biresnerf.data.model.safe_names import refuse_outside
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
 from biresnerf.data.photos.image_files import ImageHeader, read_header
-from biresnerf.data.photos.mask_files import mask_beside
-from biresnerf.data.photos.named_images import few_names, photos_beside, refuse_no_images, refuse_too_few
+from biresnerf.data.photos.masks import mask_beside
+from biresnerf.data.photos.named_images import (
+    few_names,
+    photos_beside,
+    refuse_no_images,
+    refuse_outside,
+    refuse_too_few,
+)
 from biresnerf.data.photos.orientation import (
     meant_orientations,
     orientation_notes,
@@ -173,7 +178,10 @@ def dataset_of(
     warnings = [*notes, *orientation_notes(stored, orientations, names), *page_notes(stored, names)]
     warnings += [note for lens in found for note in lens.notes]
     if source.files:  # a folder of images alone never has poses or intrinsics
-        warnings += _pose_notes(frames, table or "images")
+        without = [frame.name for frame in frames if frame.world_from_cam is None]
+        if without:
+            what = f"{len(without)} of {len(frames)} {table or 'images'}"
+            warnings.append(f"{what} have no pose yet: {few_names(without)}")
         warnings += [guess_note(lens.source) for lens in found if lens.source != "given"]
     masked = sum(frame.mask is not None for frame in frames)
     if masked:
@@ -288,10 +296,3 @@ def _unique(names: Sequence[str], key: Callable[[str], str]) -> dict[str, str]:
     """The names by their key, without those that share one."""
     counts = Counter(map(key, names))
     return {key(name): name for name in names if counts[key(name)] == 1}
-
-
-def _pose_notes(frames: Sequence[Frame], what: str) -> list[str]:
-    without = [frame.name for frame in frames if frame.world_from_cam is None]
-    return (
-        [f"{len(without)} of {len(frames)} {what} have no pose yet: {few_names(without)}"] if without else []
-    )

@@ -18,7 +18,7 @@ from biresnerf.data.formats.transforms.write_transforms import transforms_notes
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import refined_set
-from biresnerf.data.photos.mask_files import mask_beside
+from biresnerf.data.photos.masks import mask_beside
 from biresnerf.data.points.refined_points import with_given_points
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Loss, formats

@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from biresnerf.data.model.atomic_file import write_text
-from biresnerf.data.model.json_document import read_model
+from biresnerf.data.model.untrusted_file import read_model
 from biresnerf.frozen_model import FrozenModel
 
 VIEW, THUMBNAIL = "view.json", "thumbnail.jpg"

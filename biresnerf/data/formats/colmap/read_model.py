@@ -16,7 +16,7 @@ from biresnerf.data.formats.colmap import read_binary as colmap_binary
 from biresnerf.data.formats.colmap import read_text as colmap_text
 from biresnerf.data.formats.colmap.model_checks import broken, check_images, check_rigs, check_tracks
 from biresnerf.data.model import colmap_scene as colmap
-from biresnerf.data.model.text_file import read_bytes, read_text
+from biresnerf.data.model.untrusted_file import read_bytes, read_text
 from biresnerf.geometry.camera.camera_models import Camera
 
 MAX_TABLE_BYTES = 2 * 2**30

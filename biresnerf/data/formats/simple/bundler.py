@@ -20,7 +20,7 @@ from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.text_file import finite_numbers, invalid_file, read_text
+from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
 from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera

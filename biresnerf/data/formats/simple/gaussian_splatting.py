@@ -15,9 +15,8 @@ from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry
 from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
 from biresnerf.data.model.dataset import SourceFormat
-from biresnerf.data.model.json_document import first_problem
 from biresnerf.data.model.pose_validation import rigid_matrix
-from biresnerf.data.model.text_file import read_text
+from biresnerf.data.model.untrusted_file import first_problem, read_text
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 

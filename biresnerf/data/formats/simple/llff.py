@@ -16,7 +16,7 @@ from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.text_file import read_bytes
+from biresnerf.data.model.untrusted_file import read_bytes
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.formats import Format

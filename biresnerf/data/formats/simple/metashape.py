@@ -20,7 +20,7 @@ from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
-from biresnerf.data.model.text_file import finite_numbers, invalid_file, read_text
+from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
 from biresnerf.data.photos.named_images import few_names
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera

@@ -14,8 +14,8 @@ from pydantic import Field
 
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.model.atomic_file import write_json
-from biresnerf.data.model.json_document import read_model
 from biresnerf.data.model.refined_set import PointsSource, RefinedSet
+from biresnerf.data.model.untrusted_file import read_model
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.formats import Format

@@ -22,7 +22,7 @@ from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.text_file import finite_numbers, read_text
+from biresnerf.data.model.untrusted_file import finite_numbers, read_text
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 

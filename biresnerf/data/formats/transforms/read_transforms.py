@@ -17,10 +17,9 @@ from biresnerf.data.formats.colmap.read_model import model_file_formats, read_co
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.model.conventions import world_from_cam_of_file
 from biresnerf.data.model.dataset import Dataset, SourceFormat
-from biresnerf.data.model.json_document import read_json_object
 from biresnerf.data.model.pose_validation import ROTATION_WARNED, rigid_matrix
-from biresnerf.data.model.text_file import invalid_file
-from biresnerf.data.photos.mask_files import dynamic_mask, named_mask
+from biresnerf.data.model.untrusted_file import invalid_file, read_json_object
+from biresnerf.data.photos.masks import dynamic_mask, named_mask
 from biresnerf.data.photos.named_images import (
     find_images,
     refuse_names_outside,
