@@ -1,4 +1,4 @@
-# Everything a developer does, in one or two lines each. Needs make and Python 3.11 or later with its venv module.
+# Everything a developer does, in one or two lines each. Needs make and Python 3.11 with its venv module.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
@@ -34,7 +34,7 @@ test-fast: setup  ## within a minute: the tests that need no server and no brows
 	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal -m "not server and not browser and not slow" $(PYTEST)
 
 test-lowest: build/lowest.txt  ## all tests with the lowest versions that pyproject.toml allows, in an environment of its own
-	$(MAKE) test VENV=.venv-lowest CONSTRAINTS=build/lowest.txt
+	NUMBA_CACHE_DIR=$(CURDIR)/build/lowest-kernels $(MAKE) test VENV=.venv-lowest CONSTRAINTS=build/lowest.txt
 
 build/lowest.txt: pyproject.toml
 	@mkdir -p build
@@ -88,8 +88,8 @@ $(TOOLS): constraints.txt
 
 # Without ensurepip the venv module leaves half an environment behind, so it is looked for first.
 $(BIN)/python:
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	  { echo "Python 3.11 or later is needed; say which with: make PYTHON=/path/to/python" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
+	  { echo "Python 3.11 is needed; say which with: make PYTHON=/path/to/python" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' || \
 	  { echo "Python's venv module is not whole; on Debian: apt install python3.11-venv" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
