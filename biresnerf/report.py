@@ -193,6 +193,17 @@ class CameraReport(FrozenModel):
     images: int = Field(examples=[60], description="How many images it took.")
     params_before: tuple[float, ...] = Field(examples=[[1500.0, 1500.0, 960.0, 540.0, 0.01, -0.02, 0.0, 0.0]])
     params_after: tuple[float, ...] = Field(examples=[[1501.2, 1501.2, 960.0, 540.0, 0.01, -0.02, 0.0, 0.0]])
+    focal_deviation_percent: float | None = Field(
+        None,
+        examples=[0.08],
+        description="Standard deviation of the focal length as feature matches and photos tell it, with what was known "
+        "before. None where they were not asked, or say nothing.",
+    )
+    observable: bool | None = Field(
+        None,
+        description="Whether they tell the focal length of this camera: if not, it was kept. None where they were "
+        "not asked.",
+    )
 
 
 class HeldOut(FrozenModel):

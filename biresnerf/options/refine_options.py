@@ -89,8 +89,8 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     )
     refine_intrinsics: Annotated[RefineIntrinsics, Option("coarse", level="usual")] = Field(
         "auto",
-        description="Intrinsics to refine; auto: focal lengths that were guessed or read from EXIF; all: focal length, "
-        "principal point and distortion.",
+        description="Intrinsics to refine; auto: focal length and distortion of cameras not given; all: of every "
+        "camera, and without feature matches the principal point as well.",
     )
     steps: Annotated[int | Open, Option("coarse", level="usual")] = Field(
         OPEN, ge=20, le=1_000_000, description="Optimisation steps of both stages together."

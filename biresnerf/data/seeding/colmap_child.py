@@ -54,7 +54,6 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     database, images = work / DATABASE, Path(request["root"])
     count = sum(len(camera["names"]) for camera in request["cameras"])
     pycolmap.set_random_seed(request["seed"])
-    given = [camera["known"] for camera in request["cameras"]]
     numbers = extract_features(request, database, images)
     say(f"features of {count} images found")
     match_features(request, database, work)
@@ -68,7 +67,6 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
         keep_from_mapping(database, tracks)
 
     answer: list[dict[str, Any]] = []
-    largest: Any = None
     for mapper, run in (("incremental", map_incrementally), ("global", map_globally)):
         (work / mapper).mkdir()
         models = run(database, images, work / mapper, request, numbers)
@@ -77,8 +75,6 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
             continue
         best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
         answer.append({"mapper": mapper, **describe(best, numbers)})
-        if largest is None or best.num_reg_images() > largest.num_reg_images():
-            largest = best
         placed = best.num_reg_images()
         say(
             f"{mapper} mapping: {placed} of {count} images, {best.num_points3D()} points, "
@@ -88,8 +84,7 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
             break
         if mapper == "incremental" and placed >= INTRINSICS_FROM * count:
             keep_intrinsics(database, best, request, numbers)
-    focals = {} if largest is None else preferred_focals(largest, given, numbers)
-    return {"models": answer, "matches": matches, "focals": focals}
+    return {"models": answer, "matches": matches}
 
 
 def extract_features(request: dict[str, Any], database: Path, images: Path) -> list[int]:
@@ -159,28 +154,6 @@ def map_globally(
     adjustment.refine_focal_length = adjustment.refine_extra_params = not fixed
     adjustment.refine_principal_point = False
     return pycolmap.global_mapping(database, images, work, options)
-
-
-def preferred_focals(model: Any, known: list[bool], numbers: list[int]) -> dict[str, Any]:
-    """What known focal lengths the matches would rather have: by a bundle adjustment that lets them go, too.
-
-    By the camera's place in the request: the focal length preferred over the known one; and the mean reprojection
-    errors before and after. The model is not to be used afterwards.
-    """
-    import pycolmap
-
-    places = [i for i, number in enumerate(numbers) if known[i] and number in model.cameras]
-    before = {i: model.cameras[numbers[i]].mean_focal_length() for i in places}
-    errors = [float(model.compute_mean_reprojection_error())]
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length = True
-    options.refine_principal_point = options.refine_extra_params = False
-    pycolmap.bundle_adjustment(model, options)
-    model.update_point_3d_errors()
-    errors.append(float(model.compute_mean_reprojection_error()))
-    ratios = {str(i): model.cameras[numbers[i]].mean_focal_length() / before[i] for i in places}
-    return {"ratios": ratios, "errors_px": errors}
 
 
 def keep_intrinsics(database_path: Path, model: Any, request: dict[str, Any], numbers: list[int]) -> None:

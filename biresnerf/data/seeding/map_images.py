@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -47,12 +47,6 @@ WIDEST_LOW, MOST_FEATURES_LOW = 800, 1024
 THOROUGH_UP_TO, THOROUGH_ALONE_UP_TO = 10e6, 4e6
 
 
-# A given focal length is doubted if matches prefer one that differs by more, with less than this share of the error.
-# Few small photos tell it to 3 % only. At 200 px, preferred over given, and the share: fountain-P11 given right 0.970
-# and 0.993, 5 % too long 0.932 and 0.972; fox given right 1.000 and 1.000, 5 % too long 0.961 and 0.988.
-FOCAL_OFF, FOCAL_ERROR_LEFT = 0.03, 0.99
-
-
 @dataclass(frozen=True, eq=False)
 class MappedModel:
     """What one way of mapping made of the images, in a frame and scale of its own.
@@ -65,7 +59,6 @@ class MappedModel:
         points: how many points the matches made.
         observations: in how many images, in sum.
         reprojection_px: mean distance of the points from their features.
-        focal_ratios: by index of the camera, the focal length that matches clearly prefer, over the given one.
     """
 
     mapper: str
@@ -75,7 +68,6 @@ class MappedModel:
     points: int
     observations: int
     reprojection_px: float
-    focal_ratios: dict[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,21 +213,11 @@ def read_mapping(dataset: Dataset, answer: dict[str, Any]) -> Mapping:
     """
     index = {name: i for i, name in enumerate(_numbered(dataset))}
     models = [_model(model, index) for model in answer["models"]]
-    if models:  # the focal lengths are those of the first of the largest
-        asked = max(range(len(models)), key=lambda i: len(models[i].rows))
-        models[asked] = replace(models[asked], focal_ratios=_focal_ratios(answer["focals"]))
     matches = np.zeros((len(dataset), len(dataset)), dtype=np.int64)
     for a, b, count in answer["matches"]:
         matches[index[a], index[b]] = matches[index[b], index[a]] = count
     best_first = sorted(models, key=lambda m: (-len(m.rows), -m.observations / max(m.reprojection_px, 0.1)))
     return Mapping(tuple(best_first), matches)
-
-
-def _focal_ratios(found: dict[str, Any]) -> dict[int, float]:
-    before, after = found.get("errors_px", (0.0, 0.0))
-    if after > FOCAL_ERROR_LEFT * before:
-        return {}
-    return {int(i): ratio for i, ratio in found.get("ratios", {}).items() if abs(ratio - 1) > FOCAL_OFF}
 
 
 def _model(found: dict[str, Any], index: dict[str, int]) -> MappedModel:

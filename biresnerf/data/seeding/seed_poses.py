@@ -167,23 +167,6 @@ def _without_colmap(given: _Given, start: StartPoses) -> Seeding:
     return _seeding(noted, given.without_matches())
 
 
-def _with_focal_notes(dataset: Dataset, models: list[MappedModel]) -> Dataset:
-    """The set, with a warning for every camera whose given focal length a model contradicts.
-
-    Args:
-        models: good enough to start from. Of the others, the lens is as wrong as the poses: on a plain vase, five of
-            40 images in one, 15 points, preferred a focal length 67 % shorter than the true one.
-    """
-    notes = tuple(
-        f"Feature matches fit better with a focal length {abs(ratio - 1):.1%} {'longer' if ratio > 1 else 'shorter'} "
-        f"than given for {dataset.names[next(j for j, f in enumerate(dataset.frames) if f.camera == i)]} and the "
-        "images that share its camera: where it is not certain, leave it out of the input, and matches find it."
-        for model in models
-        for i, ratio in sorted(model.focal_ratios.items())
-    )
-    return replace(dataset, warnings=dataset.warnings + notes)
-
-
 def _beside_given(given: _Given, mapping: Mapping) -> Seeding:
     """The given poses, completed by the best model, and every model that places enough of the images."""
     carried: list[tuple[MatchedPoses, MappedModel]] = []
@@ -211,7 +194,7 @@ def _beside_given(given: _Given, mapping: Mapping) -> Seeding:
         if matched is best or adds_to(carried[0][1], model):
             name = MATCHED[matched.mapper]
             candidates.append(given.candidate(name, matched, name, mapping.matches))
-    return _seeding(_with_focal_notes(dataset, [model for _, model in enough]), *candidates)
+    return _seeding(dataset, *candidates)
 
 
 def _from_scratch(given: _Given, mapping: Mapping, start: StartPoses) -> Seeding:
@@ -237,8 +220,7 @@ def _from_scratch(given: _Given, mapping: Mapping, start: StartPoses) -> Seeding
         unplaced = replace(given, dataset=dataset, posed=given.posed & ~matched.placed)
         name: PoseSource = "colmap" if model is best else MATCHED[model.mapper]
         candidates.append(unplaced.candidate(name, matched, "colmap", mapping.matches))
-    enough = [model for model in models if len(model.rows) >= LEAST_PLACED * len(dataset)]
-    return _seeding(_with_focal_notes(dataset, enough), *candidates)
+    return _seeding(dataset, *candidates)
 
 
 def _tied(model: MappedModel, given: _Given) -> MatchedPoses:

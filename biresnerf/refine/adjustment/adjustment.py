@@ -1,18 +1,19 @@
-"""The joint adjustment: all cameras at once to tracks and patches, robust, every noise level measured on the set."""
+"""The joint adjustment: all cameras and lenses to tracks and patches, robust, every noise level measured on the set."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
-from biresnerf.refine.adjustment.cameras import Cameras
+from biresnerf.refine.adjustment.cameras import POSE, Cameras
 from biresnerf.refine.adjustment.covariance import covariance
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
 from biresnerf.refine.adjustment.kernels.patches import UNSEEN
+from biresnerf.refine.adjustment.lens.lenses import LENS, OBSERVABLE, Lenses, LensEstimate, posterior
 from biresnerf.refine.adjustment.patch_term import PatchTerm
 from biresnerf.refine.adjustment.solve import Prior, minimise, normal_equations
 from biresnerf.refine.adjustment.term import Term
@@ -71,6 +72,7 @@ class Adjustment:
         agreement: of the halves of the patches; None where there are none.
         used: whether there was any evidence to adjust to; otherwise the poses are those given.
         halves: what was found of the patches on the way, for another adjustment from the same poses.
+        lenses: what was found of them; None where the evidence has none.
     """
 
     world_from_cam: Array
@@ -82,6 +84,7 @@ class Adjustment:
     agreement: Agreement | None
     used: bool
     halves: Halves | None = None
+    lenses: LensEstimate | None = None
 
     @property
     def noise(self) -> NoiseLevels:
@@ -93,21 +96,41 @@ class Adjustment:
 def adjust_poses(
     world_from_cam: Array, evidence: Evidence, prior: PosePrior, halves: Halves | None = None
 ) -> Adjustment:
-    """Adjust poses [n, 4, 4] to evidence, from where they are.
+    """Adjust poses [n, 4, 4] to evidence, from where they are, and its lenses as far as it tells of them.
 
-    Never raises on poor evidence: where it fixes nothing, poses stay.
+    Never raises on poor evidence: where it fixes nothing, poses and lenses stay.
 
     Args:
-        halves: of the same patches from the same poses, where they are known.
+        halves: of the same patches from the same poses and lenses, where they are known.
     """
-    cameras, before = Cameras.of(world_from_cam), Prior.of(prior)
+    found, lenses = _adjusted(world_from_cam, evidence, prior, halves), evidence.lenses
+    if lenses is None or found.lenses is None:
+        return found
+    unknown = lenses.free & ~found.lenses.observable
+    if not unknown.any():
+        return found
+    # The parameters are given up one kind at a time: without the last, the evidence may tell of the others.
+    given_up = unknown & (np.arange(LENS) == np.flatnonzero(unknown.any(0)).max())
+    again = adjust_poses(world_from_cam, replace(evidence, lenses=lenses.held(given_up)), prior)
+    if again.lenses is None:
+        return again
+    deviation = np.where(given_up, found.lenses.deviation, again.lenses.deviation)
+    return replace(again, lenses=replace(again.lenses, deviation=deviation))
+
+
+def _adjusted(
+    world_from_cam: Array, evidence: Evidence, prior: PosePrior, halves: Halves | None
+) -> Adjustment:
+    """With the lenses' parameters free that may move, whether the evidence tells of them or not."""
+    lenses = evidence.lenses
+    cameras, before = Cameras.of(world_from_cam, lenses), Prior.of(prior, lenses)
     if halves is None and evidence.patches is not None and len(evidence.patches) > 1:
         halves = _halves(cameras, evidence, before)
     start, patch_noise = (cameras, 1.0) if halves is None else (halves.middle, halves.noise)
     tracks, patches = _track_term(start, evidence, None), _patch_term(start, evidence, patch_noise)
     terms: list[Term] = [term for term in (tracks, patches) if term is not None]
     found = minimise(start, terms, before) if terms else cameras
-    if not (np.isfinite(found.rotation).all() and np.isfinite(found.centre).all()):
+    if not all(np.isfinite(part).all() for part in (found.rotation, found.centre, found.lens)):
         found, terms = cameras, []
     return Adjustment(
         world_from_cam=found.world_from_cam() if terms else np.array(world_from_cam, dtype=np.float64),
@@ -119,6 +142,7 @@ def adjust_poses(
         agreement=halves.agreement if halves else None,
         used=bool(terms),
         halves=halves,
+        lenses=_lens_estimate(found, terms, lenses) if lenses is not None else None,
     )
 
 
@@ -152,9 +176,26 @@ def _rotations_deg(one: Cameras, other: Cameras) -> Array:
 
 
 def _covariance(cameras: Cameras, terms: list[Term], prior: Prior) -> Array:
+    """Of the poses, whatever the lenses are."""
     linear = [term.linearise(cameras, 0.0) for term in terms]
     information, _ = normal_equations(cameras, linear, prior)
-    return covariance(cameras, information, prior.free)
+    poses = POSE * len(cameras)
+    lenses = poses + np.flatnonzero(prior.free[poses:])
+    mixed = information[:poses, lenses]
+    among = (
+        information[:poses, :poses] - mixed @ np.linalg.pinv(information[np.ix_(lenses, lenses)]) @ mixed.T
+    )
+    return covariance(cameras, among, prior.free[:poses])
+
+
+def _lens_estimate(cameras: Cameras, terms: list[Term], lenses: Lenses) -> LensEstimate:
+    information = np.zeros((cameras.unknowns, cameras.unknowns))
+    for term in terms:
+        information += term.linearise(cameras, 0.0).system
+    deviation = posterior(information, POSE * len(cameras), lenses)
+    with np.errstate(invalid="ignore"):
+        observable = lenses.free & (deviation < OBSERVABLE * lenses.deviation)
+    return LensEstimate(cameras.lens, deviation, observable)
 
 
 def misfit(world_from_cam: Array, evidence: Evidence, noise: NoiseLevels) -> Array:
@@ -166,7 +207,7 @@ def misfit(world_from_cam: Array, evidence: Evidence, noise: NoiseLevels) -> Arr
     Args:
         noise: as measured by an adjustment; must be the same for all poses that are compared.
     """
-    cameras = Cameras.of(world_from_cam)
+    cameras = Cameras.of(world_from_cam, evidence.lenses)
     n = len(cameras)
     total, count = np.zeros(n), np.zeros(n)
     tracks = _track_term(cameras, evidence, noise.track_px)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.refine.adjustment.lens.lenses import Lenses
 from biresnerf.refine.adjustment.paired import student_quantile
 from biresnerf.report import CandidateName, CandidateReport
 
@@ -28,10 +29,12 @@ class Candidate:
 
     Attributes:
         world_from_cam: [n, 4, 4], in the frame and scale of the others.
+        lenses: None: as the evidence has them.
     """
 
     name: CandidateName
     world_from_cam: Array
+    lenses: Lenses | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +79,11 @@ def _beats(misfits: Mapping[str, Array], one: int, other: int) -> bool:
     """Whether a candidate fits some kind of evidence better than another one, and none worse."""
     signs = [_sign(gains) for gains in (_gains(kind, one, other) for kind in misfits.values())]
     return 1 in signs and -1 not in signs
+
+
+def fits_better(one: Array, other: Array) -> bool:
+    """Whether misfits [n] are less than others beyond chance."""
+    return _sign(_gains(np.stack([one, other]), 0, 1)) > 0
 
 
 def _gains(misfit: Array, one: int, other: int) -> Array:

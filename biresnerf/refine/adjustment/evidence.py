@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.refine.adjustment.lens.lenses import Lenses
 from biresnerf.refine.adjustment.splines import blurred, spline_coefficients
 
 Array = NDArray[np.float64]
@@ -95,11 +96,13 @@ class Evidence:
         intrinsics: of all images at full size, without distortion: `biresnerf.refine.adjustment.ideal` makes them.
         tracks: None where there are none.
         patches: None where there are none.
+        lenses: how the lenses differ from the intrinsics, and how well that is known; None: not at all.
     """
 
     intrinsics: Intrinsics
     tracks: Tracks | None = None
     patches: Patches | None = None
+    lenses: Lenses | None = None
 
     def __post_init__(self) -> None:
         if self.intrinsics.distorted or self.intrinsics.some_fisheye:

@@ -105,25 +105,26 @@ class PatchTerm:
         return float(count * robust.sum() / self.noise**2 + (away**2).sum())
 
     def linearise(self, cameras: Cameras, damping: float) -> Linearised:
-        size = 6 * len(cameras)
+        size = cameras.unknowns
+        rows = cameras.rows(self.patches.host), cameras.rows(self.patches.target)
         system, right = np.zeros((size, size)), np.zeros(size)
         back = patch_system(
-            *self._seen(cameras, self.unknowns), PIXEL_NOISE, PIXEL_SHIFT, self.scale, SCALE_DEVIATION, self.noise,
-            damping, system, right,
+            *self._seen(cameras, self.unknowns), *rows, PIXEL_NOISE, PIXEL_SHIFT, self.scale, SCALE_DEVIATION,
+            self.noise, damping, system, right,
         )  # fmt: skip
-        return Linearised(system, right, back)
+        return Linearised(system, right, (*back, *rows))
 
     def stepped(self, linearised: Linearised, motion: Array) -> Array:
-        inverses, gradients, of_host, of_target = linearised.back
-        patches = self.patches
-        force = gradients + (of_host * motion[patches.host]).sum(1)
-        targets = (of_target * motion[patches.target]).sum(1)
-        force += np.bincount(patches.point, targets, len(patches))
+        inverses, gradients, of_host, of_target, host_rows, target_rows = linearised.back
+        force = gradients + (of_host * motion[host_rows]).sum(1)
+        targets = (of_target * motion[target_rows]).sum(1)
+        force += np.bincount(self.patches.point, targets, len(self.patches))
         return np.asarray(self.unknowns + np.clip(-inverses * force, -LONGEST_SCALE_STEP, LONGEST_SCALE_STEP))
 
     def _seen(self, cameras: Cameras, scales: Array) -> tuple[object, ...]:
         patches = self.patches
         return (
-            cameras.rotation, cameras.centre, self.lens, (self.coefficients, self.frames), self.values, patches.host,
-            patches.rays, patches.inverse_depth, self.start, patches.target, scales,
+            cameras.rotation, cameras.centre, cameras.lens_rows(self.lens), (self.coefficients, self.frames),
+            self.values, patches.host, cameras.rays_of(patches.host, patches.rays), patches.inverse_depth, self.start,
+            patches.target, scales,
         )  # fmt: skip

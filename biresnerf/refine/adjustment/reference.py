@@ -14,8 +14,27 @@ def moved(rotation: Tensor, centre: Tensor, motion: Tensor) -> tuple[Tensor, Ten
 
 
 def in_pixels(lens: Tensor, in_cam: Tensor) -> Tensor:
-    """Pixel positions [..., 2] of points [..., 3] in camera axes; lens [..., 4] is fx, fy, cx, cy."""
-    return lens[..., :2] * in_cam[..., :2] / in_cam[..., 2:] + lens[..., 2:]
+    """Pixel positions [..., 2] of points [..., 3] in camera axes; lens [..., 6] is fx, fy, cx, cy, k1, k2."""
+    slopes = in_cam[..., :2] / in_cam[..., 2:]
+    square = (slopes**2).sum(-1, keepdim=True)
+    radial = 1 + square * (lens[..., 4:5] + square * lens[..., 5:6])
+    return lens[..., :2] * radial * slopes + lens[..., 2:4]
+
+
+def with_lens(rows: Tensor, correction: Tensor) -> Tensor:
+    """Lenses [..., 6] from pinholes [..., 4] and corrections [..., 3]: log focal length, k1, k2."""
+    focal = rows[..., :2] * correction[..., :1].exp()
+    return torch.cat([focal, rows[..., 2:4], correction[..., 1:]], -1)
+
+
+def seen_by(rays: Tensor, correction: Tensor) -> Tensor:
+    """Rays [..., 3] (z = 1) of pixels with a correction [3] of the lens, from those without; by fixed point."""
+    slopes = rays[..., :2]
+    found = slopes
+    for _ in range(100):
+        square = (found**2).sum(-1, keepdim=True)
+        found = slopes / (correction[0].exp() * (1 + square * (correction[1] + square * correction[2])))
+    return torch.cat([found, rays[..., 2:]], -1)
 
 
 def track_residuals(
@@ -62,7 +81,7 @@ def patch_residuals(
 
     Args:
         rotation, centre: of host and target, [2, 3, 3] world from cam and [2, 3].
-        lens: [4], the target's.
+        lens: [6], the target's.
         coefficients: [h, w, channels], of the target's photo.
         values: [k, channels], of the host's.
         rays, inverse: [k, 3] with z = 1, and inverse depths [k] in the host.

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt over all cameras: terms without their own unknowns, and what is known of the poses before."""
+"""Levenberg-Marquardt over cameras and lenses: terms without their own unknowns, and what is known before."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.refine.adjustment.cameras import Cameras
+from biresnerf.refine.adjustment.cameras import POSE, Cameras
 from biresnerf.refine.adjustment.evidence import PosePrior
+from biresnerf.refine.adjustment.lens.lenses import Lenses
 from biresnerf.refine.adjustment.term import Linearised, Term
 
 Array = NDArray[np.float64]
@@ -23,12 +24,12 @@ SETTLED = 1e-3  # a lower relative change of all noise levels ends the rounds
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """The prior as a quadratic cost of cameras.
+    """The prior as a quadratic cost of cameras and lenses.
 
     Attributes:
         mean: the cameras before.
-        weight: inverse variances [6n]; zero where nothing is known.
-        free: which of the 6n unknowns may move.
+        weight: inverse variances [u]; zero where nothing is known.
+        free: which of the u = 6n + 3g unknowns may move.
     """
 
     mean: Cameras
@@ -36,19 +37,22 @@ class Prior:
     free: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, prior: PosePrior) -> Prior:
-        deviation = np.repeat(np.stack([prior.rotation, prior.position], 1), 3, axis=1)
-        free = ~np.repeat(prior.fixed, 6)
+    def of(cls, prior: PosePrior, lenses: Lenses | None = None) -> Prior:
+        deviation = np.repeat(np.stack([prior.rotation, prior.position], 1), 3, axis=1).reshape(-1)
+        free = ~np.repeat(prior.fixed, POSE)
+        if lenses is not None:
+            deviation = np.concatenate([deviation, lenses.deviation.reshape(-1)])
+            free = np.concatenate([free, lenses.free.reshape(-1)])
         usable = np.isfinite(deviation) & (deviation > 0)
-        weight = np.where(usable, 1 / np.where(usable, deviation, 1.0) ** 2, 0.0).reshape(-1)
-        return cls(Cameras.of(prior.world_from_cam), weight, free)
+        weight = np.where(usable, 1 / np.where(usable, deviation, 1.0) ** 2, 0.0)
+        return cls(Cameras.of(prior.world_from_cam, lenses), weight, free)
 
     def cost(self, cameras: Cameras) -> float:
-        return float((self.weight * cameras.apart(self.mean).reshape(-1) ** 2).sum())
+        return float((self.weight * cameras.apart(self.mean) ** 2).sum())
 
     def right(self, cameras: Cameras) -> Array:
-        """Half the gradient [6n], to first order in the rotations' distance."""
-        return np.asarray(self.weight * cameras.apart(self.mean).reshape(-1))
+        """Half the gradient [u], to first order in the rotations' distance."""
+        return np.asarray(self.weight * cameras.apart(self.mean))
 
 
 def minimise(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> Cameras:
@@ -101,9 +105,8 @@ def _step(
         return None
     if not np.isfinite(motion).all():
         return None
-    steps = motion.reshape(-1, 6)
-    moved = cameras.moved(steps)
-    unknowns = [term.stepped(at, steps) for term, at in zip(terms, linear, strict=True)]
+    moved = cameras.moved(motion)
+    unknowns = [term.stepped(at, motion) for term, at in zip(terms, linear, strict=True)]
     after = prior.cost(moved) + sum(t.cost(moved, u) for t, u in zip(terms, unknowns, strict=True))
     if not after < cost:
         return None
@@ -118,7 +121,7 @@ def total_cost(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> float:
 
 
 def normal_equations(cameras: Cameras, linear: Sequence[Linearised], prior: Prior) -> tuple[Array, Array]:
-    """Of the cameras alone: matrix [6n, 6n] and half the gradient [6n]."""
+    """Of cameras and lenses alone: matrix [u, u] and half the gradient [u]."""
     system, right = np.diag(prior.weight), prior.right(cameras)
     for at in linear:
         system, right = system + at.system, right + at.right

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +18,14 @@ class Linearised:
     """A robust cost near some cameras, without the unknowns that the term keeps to itself.
 
     Attributes:
-        system: added to the cameras' normal equations [6n, 6n]: J^T W J.
-        right: half the gradient [6n]: J^T W r.
+        system: added to the normal equations [u, u] of cameras and lenses: J^T W J.
+        right: half the gradient [u]: J^T W r.
         back: what the term needs to move its own unknowns along.
     """
 
     system: Array
     right: Array
-    back: tuple[Array, ...]
+    back: tuple[Any, ...]
 
 
 class Term(Protocol):
@@ -47,4 +47,4 @@ class Term(Protocol):
         """Normal equations at the term's present unknowns; `damping` as for the cameras."""
 
     def stepped(self, linearised: Linearised, motion: Array) -> Array:
-        """The unknowns after a step [n, 6] of the cameras."""
+        """The unknowns after a step [u] of cameras and lenses."""

@@ -46,6 +46,8 @@ class TrackTerm:
         self._given_noise = noise_px
         self.noise_px = 1.0 if noise_px is None else noise_px
         rays = directions_in_cam(intrinsics, torch.from_numpy(self.image), torch.from_numpy(self.xy)).numpy()
+        rays = cameras.rays_of(self.image, rays / rays[:, 2:])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         world = np.einsum("mij,mj->mi", cameras.rotation[self.image], rays)
         focal = np.sqrt(self.lens[:, 0] * self.lens[:, 1])[self.image]
         self.unknowns = triangulate(cameras.centre[self.image], world, focal, self.point, count)
@@ -86,17 +88,18 @@ class TrackTerm:
         return float(track_cost(*self._seen(cameras, unknowns), self.noise_px, ROBUST_SCALE))
 
     def linearise(self, cameras: Cameras, damping: float) -> Linearised:
-        size = 6 * len(cameras)
+        size, rows = cameras.unknowns, cameras.rows(self.image)
         system, right = np.zeros((size, size)), np.zeros(size)
         seen = self._seen(cameras, self.unknowns)
-        back = track_system(*seen, self.noise_px, ROBUST_SCALE, damping, system, right)
-        return Linearised(system, right, back)
+        back = track_system(*seen, rows, self.noise_px, ROBUST_SCALE, damping, system, right)
+        return Linearised(system, right, (*back, rows))
 
     def stepped(self, linearised: Linearised, motion: Array) -> Array:
-        inverses, gradients, mixed = linearised.back
+        inverses, gradients, mixed, rows = linearised.back
         force = gradients.copy()
-        np.add.at(force, self.point, np.einsum("mab,ma->mb", mixed, motion[self.image]))
+        np.add.at(force, self.point, np.einsum("mab,ma->mb", mixed, motion[rows]))
         return self.unknowns - np.einsum("pab,pb->pa", inverses, force)
 
     def _seen(self, cameras: Cameras, points: Array) -> tuple[NDArray[np.generic], ...]:
-        return cameras.rotation, cameras.centre, self.lens, points, self.start, self.image, self.xy
+        lens = cameras.lens_rows(self.lens)
+        return cameras.rotation, cameras.centre, lens, points, self.start, self.image, self.xy

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,16 +12,25 @@ from numpy.typing import NDArray
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.progress import JUDGING_FROM, Monitor, Progress
 from biresnerf.refine.adjustment.adjustment import NOTHING_FITS, Adjustment, Halves, adjust_poses, misfit
 from biresnerf.refine.adjustment.choice import Candidate, Choice, choose
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
 from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
+from biresnerf.refine.finish.lens_evidence import (
+    contradicted_focals,
+    corrected_cameras,
+    focal_certainty,
+    given_focals,
+    lenses_before,
+)
 from biresnerf.refine.finish.photo_evidence import photo_patches
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
+from biresnerf.refine.start.first_step import adjusts_cameras
 from biresnerf.report import CandidateName, CandidateReport
 
 logger = logging.getLogger(__name__)
@@ -40,7 +50,6 @@ MOST_NOISE_PX, MOST_NOISE = (
 )  # of tracks, in px or shares of the photos' size; sets have 0.1 to 0.5 px
 MOST_OBSERVATIONS = 40_000  # of tracks that are adjusted to
 LEFT_OUT_ONE_IN = 5  # patches
-MOST_CAMERAS = 500  # the system of all cameras is dense
 
 
 def adjust_cameras(stages: TwoStages) -> tuple[CandidateReport, ...]:
@@ -54,11 +63,7 @@ def adjust_cameras(stages: TwoStages) -> tuple[CandidateReport, ...]:
         Interrupted: stopped; a continued run adjusts again.
     """
     optimiser = stages.optimiser
-    if (
-        not optimiser.method.robust_extensions
-        or optimiser.bodies.tied
-        or not 3 <= len(stages.scene.dataset) <= MOST_CAMERAS
-    ):
+    if not adjusts_cameras(stages.scene.dataset, optimiser.method, optimiser.bodies):
         return ()
     with stages.record.timed("adjusting"):
         stages.repair.place_by_matches()
@@ -67,6 +72,10 @@ def adjust_cameras(stages: TwoStages) -> tuple[CandidateReport, ...]:
         return ()
     if choice.chosen.name != "refined":
         optimiser.poses.place(torch.from_numpy(choice.chosen.world_from_cam))
+    if choice.chosen.lenses is not None:
+        present = optimiser.lenses.refined(stages.scene.dataset).cameras
+        found = corrected_cameras(present, choice.chosen.lenses.correction)
+        optimiser.lenses.place(stages.scene.dataset.cameras, found or present)
     return choice.reports
 
 
@@ -88,12 +97,15 @@ def _choice(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Choice
     if not np.isfinite(refined).all():
         return None
     prior = PosePrior.equal(refined, PRIOR, PRIOR * optimiser.frame.distance)
-    adjusted, noise = _adjusted(refined, split.fitted, prior, monitor)
+    results = _adjusted(refined, split.fitted, prior, monitor)
+    noise = results["adjusted-tracks"].noise if "adjusted-tracks" in results else NoiseLevels()
     if noise.track_px > _most_noise_px(split.fitted):
         logger.info("tracks say nothing: their noise is %.1f px", noise.track_px)
         split = _Split(replace(split.fitted, tracks=None), replace(split.left_out, tracks=None))
-        adjusted = [each for each in adjusted if each.name == "adjusted-patches"]
-    found = [Candidate("refined", refined), *_earlier(scene, refined), *adjusted]
+        results = {name: each for name, each in results.items() if name == "adjusted-patches"}
+    cameras = optimiser.lenses.refined(scene.dataset).cameras
+    adjusted = [_candidate(name, each, split.fitted, cameras) for name, each in results.items()]
+    found = [Candidate("refined", refined), *_earlier(scene, refined), *filter(None, adjusted)]
     candidates = sorted(found, key=lambda candidate: ORDER.index(candidate.name))
     misfits: dict[str, Array] = {}
     for kind, left_out in (
@@ -102,8 +114,22 @@ def _choice(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Choice
     ):
         if left_out.tracks is not None or left_out.patches is not None:
             _report(monitor)
-            misfits[kind] = np.stack([misfit(each.world_from_cam, left_out, noise) for each in candidates])
-    return choose(candidates, misfits) if any(map(_tells, misfits.values())) else None
+            misfits[kind] = np.stack([_misfit(each, left_out, noise) for each in candidates])
+    if not any(map(_tells, misfits.values())):
+        return None
+    choice = choose(candidates, misfits)
+    _report(monitor)
+    best = results.get(choice.chosen.name) or next(iter(results.values()), None)
+    kept = given_focals(scene.dataset, optimiser.options.refine_intrinsics)
+    optimiser.lenses.certainty = focal_certainty(
+        best, split.fitted, contradicted_focals(refined, split.fitted, split.left_out, prior, noise, kept)
+    )
+    return choice
+
+
+def _misfit(candidate: Candidate, evidence: Evidence, noise: NoiseLevels) -> Array:
+    """Of its own poses and lenses."""
+    return misfit(candidate.world_from_cam, replace(evidence, lenses=candidate.lenses), noise)
 
 
 def _tells(misfits: Array) -> bool:
@@ -116,26 +142,36 @@ def _tells(misfits: Array) -> bool:
 
 def _adjusted(
     refined: Array, evidence: Evidence, prior: PosePrior, monitor: Monitor
-) -> tuple[list[Candidate], NoiseLevels]:
-    """Candidates adjusted to tracks, to patches and to both, and the noise level that tracks have."""
-    found: list[Candidate] = []
+) -> dict[CandidateName, Adjustment]:
+    """Adjusted to tracks, to patches and to both."""
+    found: dict[CandidateName, Adjustment] = {}
 
     def add(name: CandidateName, evidence: Evidence, halves: Halves | None = None) -> Adjustment:
         _report(monitor)
-        result = adjust_poses(refined, evidence, prior, halves)
+        found[name] = result = adjust_poses(refined, evidence, prior, halves)
         logger.info("%s: %s", name, _described(result))
-        if _usable(result):
-            found.append(Candidate(name, result.world_from_cam))
         return result
 
-    noise = (
-        add("adjusted-tracks", replace(evidence, patches=None)).noise if evidence.tracks else NoiseLevels()
-    )
+    if evidence.tracks:
+        add("adjusted-tracks", replace(evidence, patches=None))
     if evidence.patches:
         patched = add("adjusted-patches", replace(evidence, tracks=None))
         if evidence.tracks and _usable(patched):
             add("adjusted", evidence, patched.halves)
-    return found, noise
+    return found
+
+
+def _candidate(
+    name: CandidateName, found: Adjustment, evidence: Evidence, cameras: Sequence[Camera]
+) -> Candidate | None:
+    """An adjustment as a candidate; None where it is not to be believed, or a corrected camera would be no lens."""
+    if not _usable(found):
+        return None
+    if found.lenses is None or evidence.lenses is None or not found.lenses.correction.any():
+        return Candidate(name, found.world_from_cam)
+    if corrected_cameras(cameras, found.lenses.correction) is None:
+        return None
+    return Candidate(name, found.world_from_cam, evidence.lenses.known(found.lenses.correction))
 
 
 def _most_noise_px(evidence: Evidence) -> float:
@@ -176,6 +212,8 @@ def _evidence(scene: Scene, optimiser: JointOptimiser) -> _Split | None:
     ideal = ideal_pinholes(intrinsics)
     if ideal is None:
         return None
+    before = lenses_before(scene.dataset, optimiser.options.refine_intrinsics)
+    lenses = before if before.free.any() else None
     fitted: Tracks | None = None
     judging: Tracks | None = None
     if scene.tracks is not None:
@@ -183,9 +221,11 @@ def _evidence(scene: Scene, optimiser: JointOptimiser) -> _Split | None:
         fitted = fitted and fitted.thinned(MOST_OBSERVATIONS, len(dataset))
     patches = photo_patches(scene, optimiser, intrinsics, ideal)
     if patches is None:
-        return _Split(Evidence(ideal, fitted), Evidence(ideal, judging))
+        return _Split(Evidence(ideal, fitted, None, lenses), Evidence(ideal, judging))
     spared = np.arange(len(patches)) % LEFT_OUT_ONE_IN == 0
-    return _Split(Evidence(ideal, fitted, patches.of(~spared)), Evidence(ideal, judging, patches.of(spared)))
+    return _Split(
+        Evidence(ideal, fitted, patches.of(~spared), lenses), Evidence(ideal, judging, patches.of(spared))
+    )
 
 
 def _report(monitor: Monitor) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,20 +12,22 @@ from biresnerf.data.model.dataset import Dataset, IntrinsicsSource
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.field.adam_state import adam_state, load_adam_state
 from biresnerf.geometry.camera.camera import Intrinsics
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera, FullParameters
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import RefineIntrinsics
+from biresnerf.refine.parameters.lens_increments import (
+    ASPECT,
+    COLUMNS,
+    DISTORTION,
+    FOCAL,
+    RefinedPart,
+    free_columns,
+    increments_between,
+    moved_camera,
+    units,
+)
 from biresnerf.refine.parameters.pose_parameters import dolly_directions
 
-RefinedPart = Literal["none", "focal", "all"]
-
 BETAS, EPSILON = (0.9, 0.99), 1e-12
-# Columns of the increments: logarithms of the focal length and of fy/fx, the principal point in focal lengths, and the
-# nine coefficients of `Intrinsics.distortion`, in the unit that moves the image's corner by its own distance.
-FOCAL, ASPECT, CENTRE, DISTORTION = 0, 1, slice(2, 4), slice(4, 13)
-COLUMNS = 13
-_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k4", "k5", "k6", "p1", "p2")  # of a fisheye, else of FULL_OPENCV
-# The corner's distance r by which a unit of each coefficient moves it is r to this power.
-_POWERS = (3, 5, 7, 9, 3, 5, 7, 2, 2)
 # Expected standard deviations of the increments, and the weight of this prior in the loss: parameters without
 # evidence in the photos stay.
 DEVIATIONS = (0.2, 0.02, 0.05, 0.05, *(0.1,) * 9)
@@ -61,6 +62,21 @@ def refined_part(option: RefineIntrinsics, source: IntrinsicsSource) -> RefinedP
     return option
 
 
+@dataclass(frozen=True)
+class FocalCertainty:
+    """What an adjustment to feature matches and patches says of a camera's focal length.
+
+    Attributes:
+        deviation: standard deviation, as a share of it; None where there was no evidence at all.
+        observable: whether that is well below what was known before.
+        contradicts: the focal length that the evidence clearly prefers over the one kept, as a share of that; or None.
+    """
+
+    deviation: float | None
+    observable: bool
+    contradicts: float | None = None
+
+
 class IntrinsicsParameters:
     """Increments on the intrinsics of the set's cameras, zero at the start, one row per camera.
 
@@ -93,17 +109,16 @@ class IntrinsicsParameters:
         self.of_image = torch.tensor(of_image, dtype=torch.int64, device=device)
         self.is_training = torch.ones(len(working), 1, dtype=torch.bool, device=device)
         self.is_training[list(held_out)] = False
-        self.free = torch.stack([_free(c, part) for c, part in zip(cameras, parts, strict=True)]).to(device)
-        self.unit = torch.stack([_units(camera) for camera in cameras]).to(device)
+        self.free = torch.stack([free_columns(c, part) for c, part in zip(cameras, parts, strict=True)]).to(
+            device
+        )
+        self.unit = torch.stack([units(camera) for camera in cameras]).to(device)
         self.precision = PRIOR_WEIGHT / torch.tensor(DEVIATIONS, dtype=torch.float64, device=device) ** 2
         self.increments = torch.zeros(len(cameras), COLUMNS, dtype=torch.float64, device=device)
         self.increments.requires_grad_()
         self._adam = torch.optim.Adam([self.increments], betas=BETAS, eps=EPSILON)
-        used = self.free[:, DISTORTION].any(0)
-        groups = zip(self.given.terms, (used[:4], used[4:7], used[7:]), strict=True)
-        above, below, tangential = (max(t, int(g.nonzero().max()) + 1 if g.any() else 0) for t, g in groups)
-        self.given = replace(self.given, terms=(above, below, tangential))
-        self._present = self.given
+        self.certainty: tuple[FocalCertainty | None, ...] = (None,) * len(cameras)
+        self._show()
 
     @classmethod
     def held(cls, working: Sequence[Camera], device: torch.device) -> IntrinsicsParameters:
@@ -122,7 +137,7 @@ class IntrinsicsParameters:
 
     def differentiable(self) -> Intrinsics:
         """The same as a function of the increments."""
-        q = (self.increments * self.free)[self.of_image]
+        q = torch.where(self.free, self.increments, self.increments.detach())[self.of_image]
         q = torch.where(self.is_training, q, q.detach())
         given = self.given
         return replace(
@@ -157,7 +172,7 @@ class IntrinsicsParameters:
         """
         before = self.increments.detach().clone()
         if self.increments.grad is not None:
-            self.increments.grad += 2 * self.precision * before
+            self.increments.grad += 2 * self.precision * before * self.free
         self._adam.param_groups[0]["lr"] = rate
         self._adam.step()
         self.forget_gradients()
@@ -173,16 +188,47 @@ class IntrinsicsParameters:
         moved = ((self.increments - before) * self.free)[:, FOCAL][self.of_image]
         return moved if self.dollies else torch.zeros_like(moved)
 
+    @torch.no_grad()
+    def place(self, before: Sequence[Camera], after: Sequence[Camera]) -> None:
+        """Take other intrinsics than those of the set, `before`; in the same models, and with no history."""
+        for row, (old, new) in enumerate(zip(before, after, strict=True)):
+            self.increments[row] = increments_between(old, new, self.unit[row].cpu())
+        self._adam.state.clear()
+        self._show()
+
+    @property
+    def _placed(self) -> list[bool]:
+        """Of each camera, whether it is not as the set has it."""
+        return [bool(moved) for moved in (self.increments != 0).any(1).tolist()]
+
+    @torch.no_grad()
+    def _show(self) -> None:
+        """The present intrinsics, computed with every coefficient that a camera has or may get."""
+        used = (self.free | (self.increments != 0))[:, DISTORTION].any(0)
+        groups = zip(self.given.terms, (used[:4], used[4:7], used[7:]), strict=True)
+        above, below, tangential = (max(t, int(g.nonzero().max()) + 1 if g.any() else 0) for t, g in groups)
+        self.given = replace(self.given, terms=(above, below, tangential))
+        self._present = self.differentiable()
+
     def forget_gradients(self) -> None:
         self._adam.zero_grad(set_to_none=True)
 
+    @property
+    def refined_parts(self) -> tuple[RefinedPart, ...]:
+        """What of each camera was refined, in one way or another."""
+        bent = (self.increments[:, DISTORTION] != 0).any(1).tolist()
+        return tuple(
+            part if part != "none" or not placed else "all" if other else "focal"
+            for part, placed, other in zip(self.parts, self._placed, bent, strict=True)
+        )
+
     def refined(self, dataset: Dataset) -> Dataset:
         """The set with its cameras as they are now, each in its own model; moved ones have the source ``refined``."""
-        if not self.moving:
+        refined = self.refined_parts
+        if not any(part != "none" for part in refined):
             return dataset
         sources: list[IntrinsicsSource] = [
-            dataset.source_of_intrinsics(i) if part == "none" else "refined"
-            for i, part in enumerate(self.parts)
+            dataset.source_of_intrinsics(i) if part == "none" else "refined" for i, part in enumerate(refined)
         ]
         return replace(
             dataset,
@@ -195,66 +241,21 @@ class IntrinsicsParameters:
         return self._moved_cameras(working, self.of_image.tolist())
 
     def _moved_cameras(self, cameras: Sequence[Camera], rows: Iterable[int]) -> tuple[Camera, ...]:
-        increments = (self.increments.detach() * self.free).cpu()
-        units = self.unit.cpu()
+        increments, units, refined = self.increments.detach().cpu(), self.unit.cpu(), self.refined_parts
         return tuple(
-            camera if self.parts[row] == "none" else _moved_camera(camera, increments[row], units[row])
+            camera if refined[row] == "none" else moved_camera(camera, increments[row], units[row])
             for camera, row in zip(cameras, rows, strict=True)
         )
 
     def state(self) -> dict[str, Tensor]:
-        if not self.moving:
+        if not (self.moving or any(self._placed)):
             return {}
         return {"increments": self.increments.detach(), **adam_state("adam", self._adam)}
 
     @torch.no_grad()
     def load_state(self, state: dict[str, Tensor]) -> None:
-        if not self.moving:
+        if "increments" not in state:
             return
         self.increments.copy_(state["increments"])
         load_adam_state("adam", self._adam, state)
-        self._moved(self.increments)
-
-
-def _free(camera: Camera, part: RefinedPart) -> Tensor:
-    """Which columns may move, bool [COLUMNS]: those asked for that the camera's model has."""
-    free = torch.zeros(COLUMNS, dtype=torch.bool)
-    if part == "none":
-        return free
-    free[FOCAL] = True
-    if part == "all":
-        names, fisheye = MODEL_PARAMETERS[camera.model], camera.full().fisheye
-        free[ASPECT] = "fx" in names
-        free[CENTRE] = True
-        # A fisheye's k4 is the fourth of the numerator, a perspective lens's the first of the denominator.
-        places = range(4) if fisheye else (0, 1, 2, 4, 5, 6, 7, 8)
-        for place in places:
-            free[DISTORTION.start + place] = _COEFFICIENTS[place] in names
-    return free
-
-
-def _units(camera: Camera) -> Tensor:
-    """By how much a unit of each distortion increment changes its coefficient [9]."""
-    full = camera.full()
-    x, y = max(full.cx, camera.width - full.cx) / full.fx, max(full.cy, camera.height - full.cy) / full.fy
-    corner = (x * x + y * y) ** 0.5
-    return torch.tensor([corner ** (1 - power) for power in _POWERS], dtype=torch.float64)
-
-
-def _moved_camera(camera: Camera, increments: Tensor, unit: Tensor) -> Camera:
-    """A camera with increments [COLUMNS], in the same model."""
-    p, q = camera.full(), increments
-    above_below_tangential = (q[DISTORTION] * unit).tolist()
-    places = range(4) if p.fisheye else (0, 1, 2, 4, 5, 6, 7, 8)
-    coefficients = {
-        _COEFFICIENTS[i]: getattr(p, _COEFFICIENTS[i]) + above_below_tangential[i] for i in places
-    }
-    moved: FullParameters = p._replace(
-        fx=p.fx * float(q[FOCAL].exp()),
-        fy=p.fy * float((q[FOCAL] + q[ASPECT]).exp()),
-        cx=p.cx + float(q[2]) * p.fx,
-        cy=p.cy + float(q[3]) * p.fy,
-        **coefficients,
-    )
-    values = moved._asdict() | {"f": moved.fx}
-    return replace(camera, params=tuple(values[name] for name in MODEL_PARAMETERS[camera.model]))
+        self._show()

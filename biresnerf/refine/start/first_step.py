@@ -11,9 +11,9 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refine.optimise.methods import find_method
+from biresnerf.refine.optimise.methods import Method, find_method
 from biresnerf.refine.parameters.intrinsics_parameters import lenses_of
-from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
+from biresnerf.refine.parameters.rigid_bodies import RigidBodies, rigid_bodies
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.scene.scene_depth import matched_depth
 from biresnerf.refine.scene.scene_frame import scene_frame
@@ -22,6 +22,7 @@ from biresnerf.refine.scene.scene_frame import scene_frame
 # the full rate the steps alone carry them further before the field can tell: fox, from 0.29 deg, ended 1,500 steps
 # later at 1.03 with the full rate, 0.64 with a fifth of it, 0.28 with these.
 MATCHED_MOBILITY = (0.0, 0.3)
+LEAST_ADJUSTED, MOST_ADJUSTED = 3, 500  # cameras; the system of all of them is dense
 # Where matches placed most cameras, stage 1 has only to form the field: its lengths shrink to this share.
 MATCHED_COARSE_SHARE = 2 / 3
 
@@ -34,12 +35,24 @@ def first_step(scene: Scene, options: ResolvedOptions, device: torch.device, thr
     frame = scene_frame(world_from_cam, images, matched_depth(dataset, world_from_cam, scene.tracks))
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
     excluded = scene.excluded_from_training
-    lenses = lenses_of(dataset, images, options.refine_intrinsics, excluded, device, dollies=not bodies.tied)
+    adjusted = scene.tracks is not None and adjusts_cameras(dataset, find_method(options.method), bodies)
+    by_photos = "none" if adjusted else options.refine_intrinsics
+    lenses = lenses_of(dataset, images, by_photos, excluded, device, dollies=not bodies.tied)
     optimiser = JointOptimiser(
         images, frame, poses, options, excluded, device, threads, pose_mobility(start), bodies, lenses
     )
     optimiser.camera_errors.doubt(start.guessed)
     return optimiser
+
+
+def adjusts_cameras(dataset: Dataset, method: Method, bodies: RigidBodies) -> bool:
+    """Whether all cameras are adjusted at the end, and lenses with them where there are tracks.
+
+    Not cameras that are fixed or tied to each other, fisheyes, and methods of others.
+    """
+    fisheye = any(camera.full().fisheye for camera in dataset.cameras)
+    enough = LEAST_ADJUSTED <= len(dataset) <= MOST_ADJUSTED
+    return method.robust_extensions and enough and not bodies.tied and not fisheye
 
 
 def pose_mobility(start: InitialPoses) -> NDArray[np.float64]:

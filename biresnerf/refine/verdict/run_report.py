@@ -9,13 +9,13 @@ import numpy as np
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.named_images import few_names
 from biresnerf.refine.lost.own_matches import LEAST_PAIRS
-from biresnerf.refine.parameters.intrinsics_parameters import IntrinsicsParameters
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.first_step import poses_in_input_frame
+from biresnerf.refine.verdict.camera_reports import camera_reports, focal_warnings
 from biresnerf.refine.verdict.judgement import Judgement, motion
 from biresnerf.refine.views.evaluation import ViewScore
-from biresnerf.report import CameraReport, CandidateReport, HeldOut, ImageReport, Report
+from biresnerf.report import CandidateReport, HeldOut, ImageReport, Report
 
 
 def run_report(
@@ -65,27 +65,10 @@ def run_report(
         working_size=(int(scene.images.widths.max()), int(scene.images.heights.max())),
         input_from_optimised=similarity.report(),
         warnings=dataset.warnings
+        + focal_warnings(dataset, optimiser.lenses)
         + unmatched_warnings(scene)
         + _lost_warnings(dataset, lost)
         + (_judged_warnings(dataset, judgement) if judgement is not None else ()),
-    )
-
-
-def camera_reports(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[CameraReport, ...]:
-    """The set's cameras before and after refinement."""
-    used = [frame.camera for frame in dataset.frames]
-    return tuple(
-        CameraReport(
-            model=old.model,
-            width=old.width,
-            height=old.height,
-            source=dataset.source_of_intrinsics(i),
-            refined=lenses.parts[i] if lenses.moving else "none",
-            images=used.count(i),
-            params_before=old.params,
-            params_after=new.params,
-        )
-        for i, (old, new) in enumerate(zip(dataset.cameras, lenses.refined(dataset).cameras, strict=True))
     )
 
 

@@ -192,7 +192,7 @@ def test_the_request_is_plain_json(monkeypatch, noisy, tmp_path):
 
     def keep(request, *_):
         asked.update(json.loads(json.dumps(request)))
-        return {"models": [], "matches": [], "focals": {}}
+        return {"models": [], "matches": []}
 
     monkeypatch.setattr(map_images, "run_colmap", keep)
     first, second = (
@@ -237,42 +237,3 @@ def test_a_failure_of_colmap_leaves_the_given_poses_and_is_told(noisy, monkeypat
     found = seed_poses(noisy)
     assert set(found.candidates[0].sources) == {"given"}
     assert any("out of luck" in text for text in found.dataset.warnings)
-
-
-def with_focal(dataset: Dataset, times: float) -> Dataset:
-    camera = dataset.cameras[0]
-    return replace(dataset, cameras=(replace(camera, params=(times * camera.params[0], *camera.params[1:])),))
-
-
-def focal_warnings(found: Seeding) -> list[str]:
-    return [text for text in found.dataset.warnings if "focal length" in text]
-
-
-def test_only_a_clearly_better_focal_length_is_preferred(noisy):
-    placed = [{"name": f"{i:06}.png", "cam_from_world": np.eye(4)[:3].tolist()} for i in range(VIEWS)]
-    model = {"mapper": "incremental", "images": placed, "cameras": {}}
-    answer = {
-        "models": [{**model, "points": 100, "observations": 400, "reprojection_px": 0.3}],
-        "matches": [],
-        "focals": {"ratios": {"0": 0.93}, "errors_px": [0.32, 0.31]},
-    }
-    assert map_images.read_mapping(noisy, answer).models[0].focal_ratios == {0: 0.93}
-    answer["focals"]["errors_px"] = [0.32, 0.319]  # hardly any better
-    assert map_images.read_mapping(noisy, answer).models[0].focal_ratios == {}
-
-
-def test_a_given_focal_length_that_matches_contradict_is_told(noisy, tmp_path):
-    # The arc is short and its texture smooth: it tells gross errors only.
-    kept = tmp_path / "seeding.json"
-    (warning,) = focal_warnings(seed_poses(with_focal(noisy, 1.5), remember=kept))
-    assert "shorter than given" in warning
-    assert "00.png" in warning
-    assert focal_warnings(seed_poses(noisy)) == []
-    # The same focal lengths, preferred by a model of half the images.
-    remembered = json.loads(kept.read_text())
-    for model in remembered["answer"]["models"]:
-        model["images"] = model["images"][: VIEWS // 2]
-    kept.write_text(json.dumps(remembered))
-    few = seed_poses(with_focal(noisy, 1.5), remember=kept)
-    assert [candidate.source for candidate in few.candidates] == ["given"]
-    assert focal_warnings(few) == []

@@ -10,6 +10,7 @@ from biresnerf.refine.adjustment import reference
 from biresnerf.refine.adjustment.adjustment import adjust_poses, misfit
 from biresnerf.refine.adjustment.cameras import Cameras
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PatchPhotos, PosePrior
+from biresnerf.refine.adjustment.lens.lenses import Lenses
 from biresnerf.refine.adjustment.patch_points import Surfaces, find_patches
 from biresnerf.refine.adjustment.patch_term import PIXEL_NOISE, PIXEL_SHIFT, SCALE_DEVIATION, PatchTerm
 from biresnerf.refine.adjustment.splines import blurred, spline_coefficients
@@ -74,11 +75,16 @@ def test_a_blur_keeps_the_mean_and_lowers_the_contrast(rng):
     assert smooth.std() < 0.5 * photo.std()
 
 
-def test_normal_equations_are_those_of_autograd(rng):
+@pytest.mark.parametrize(
+    "correction", [None, [[0.02, 0.05, -0.03], [-0.01, 0.0, 0.04]]], ids=["held", "free"]
+)
+def test_normal_equations_are_those_of_autograd(rng, correction):
     plane = Plane(rng, cameras=3)
     poses = disturbed(plane.truth, rng, 0.003, 0.005)
     evidence = plane.evidence(poses, per_photo=2)
-    cameras = Cameras.of(poses)
+    lens_of = [0, 0, 1]
+    lenses = correction and Lenses(np.array(lens_of), np.array(correction), np.ones((2, 3)))
+    cameras = Cameras.of(poses, lenses)
     term = PatchTerm(evidence.patches, evidence.intrinsics, cameras)
     term.scale = 1.5
     at = term.linearise(cameras, 0.0)
@@ -87,29 +93,36 @@ def test_normal_equations_are_those_of_autograd(rng):
     rotation, centre = torch.from_numpy(cameras.rotation), torch.from_numpy(cameras.centre)
     coefficients = torch.from_numpy(term.coefficients.reshape(3, SIZE, SIZE, 3)).double()
 
-    def residuals(motion, scale):
-        turned, moved = reference.moved(rotation, centre, motion)
+    before = torch.from_numpy(cameras.lens)
+
+    def residuals(unknown, scale):
+        change = unknown[18:].reshape(-1, 3)
+        lens = (before + change)[lens_of] if correction else torch.zeros(3, 3, dtype=torch.float64)
+        turned, moved = reference.moved(rotation, centre, unknown[:18].reshape(3, 6))
         parts = []
         for i, j in zip(patches.point.tolist(), patches.target.tolist(), strict=True):
             pair = [int(patches.host[i]), j]
             parts.append(
                 reference.patch_residuals(
-                    turned[pair], moved[pair], torch.from_numpy(term.lens[j, :4]), coefficients[j],
-                    torch.from_numpy(term.values[i]), torch.from_numpy(patches.rays[i]),
+                    turned[pair], moved[pair],
+                    reference.with_lens(torch.from_numpy(term.lens[j, :4]), lens[j]), coefficients[j],
+                    torch.from_numpy(term.values[i]),
+                    reference.seen_by(torch.from_numpy(patches.rays[i]), lens[pair[0]]),
                     scale[i] * torch.from_numpy(patches.inverse_depth[i]),
                 )
             )  # fmt: skip
         return torch.stack(parts).reshape(len(parts), -1)
 
-    motion, scale = torch.zeros(3, 6, dtype=torch.float64), torch.ones(count, dtype=torch.float64)
-    r = residuals(motion, scale)
-    to_motion, to_scale = torch.autograd.functional.jacobian(residuals, (motion, scale))
+    unknown = torch.zeros(cameras.unknowns, dtype=torch.float64)
+    scale = torch.ones(count, dtype=torch.float64)
+    r = residuals(unknown, scale)
+    to_cameras, to_scale = torch.autograd.functional.jacobian(residuals, (unknown, scale))
     square = torch.from_numpy(term.squares(cameras, np.ones(count)))
     variance = (r**2).mean(1) / square
     assert (variance >= PIXEL_NOISE**2).all()
     assert (variance <= PIXEL_NOISE**2 + PIXEL_SHIFT**2).all()
     weight = ((1.5**2 / (1.5**2 + square)) ** 2 / variance)[:, None].expand_as(r).reshape(-1)
-    j_cameras, j_scales = to_motion.reshape(-1, 18), to_scale.reshape(-1, count)
+    j_cameras, j_scales = to_cameras.reshape(-1, cameras.unknowns), to_scale.reshape(-1, count)
     flat = r.reshape(-1)
     u, w = j_cameras.T @ (weight[:, None] * j_cameras), j_cameras.T @ (weight[:, None] * j_scales)
     v = j_scales.T @ (weight[:, None] * j_scales) + torch.eye(count) / SCALE_DEVIATION**2

@@ -11,6 +11,7 @@ from biresnerf.refine.adjustment import reference
 from biresnerf.refine.adjustment.adjustment import adjust_poses, misfit
 from biresnerf.refine.adjustment.cameras import Cameras
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refine.adjustment.lens.lenses import Lenses
 from biresnerf.refine.adjustment.track_term import ROBUST_SCALE, TrackTerm
 from tests.refine.adjustment.rig import disturbed, observed, pinholes, ring, rotation_errors_deg
 
@@ -30,27 +31,37 @@ def loose(poses):
     return PosePrior.equal(poses, 0.1, 0.4)
 
 
-def test_normal_equations_are_those_of_autograd(rng):
+@pytest.mark.parametrize(
+    "correction", [None, [[0.04, 0.05, -0.02], [-0.02, 0.0, 0.03]]], ids=["held", "free"]
+)
+def test_normal_equations_are_those_of_autograd(rng, correction):
     truth, evidence = scene(rng, cameras=4, points=9, noise_px=2.0)
-    cameras = Cameras.of(disturbed(truth, rng, 0.01, 0.05))
+    cameras = Cameras.of(disturbed(truth, rng, 0.01, 0.05), correction and two_lenses(correction))
     term = TrackTerm(evidence.tracks, evidence.intrinsics, cameras, noise_px=1.5)
     at = term.linearise(cameras, 0.0)
 
     rotation, centre = torch.from_numpy(cameras.rotation), torch.from_numpy(cameras.centre)
-    lens, index = torch.from_numpy(term.lens[:, :4]), [torch.from_numpy(x) for x in (term.point, term.image)]
+    pinhole, index = (
+        torch.from_numpy(term.lens[:, :4]),
+        [torch.from_numpy(x) for x in (term.point, term.image)],
+    )
     given, xy = torch.from_numpy(term.unknowns), torch.from_numpy(term.xy)
+    before = torch.from_numpy(cameras.lens)
 
-    def residuals(motion, xyz):
+    def residuals(unknown, xyz):
+        motion, change = unknown[:24].reshape(4, 6), unknown[24:].reshape(-1, 3)
+        now = (before + change)[[0, 0, 1, 1]] if correction else torch.zeros(4, 3, dtype=torch.float64)
+        lens = reference.with_lens(pinhole, now)
         return reference.track_residuals(
             *reference.moved(rotation, centre, motion), lens, xyz, *index, xy
         ).reshape(-1)
 
-    motion = torch.zeros(4, 6, dtype=torch.float64)
-    to_motion, to_points = torch.autograd.functional.jacobian(residuals, (motion, given))
-    r = residuals(motion, given)
+    unknown = torch.zeros(cameras.unknowns, dtype=torch.float64)
+    to_cameras, to_points = torch.autograd.functional.jacobian(residuals, (unknown, given))
+    r = residuals(unknown, given)
     square = (r.reshape(-1, 2) ** 2).sum(1) / 1.5**2
     weight = ((ROBUST_SCALE**2 / (ROBUST_SCALE**2 + square)) ** 2 / 1.5**2).repeat_interleave(2)
-    j_cameras, j_points = to_motion.reshape(len(r), 24), to_points.reshape(len(r), 27)
+    j_cameras, j_points = to_cameras, to_points.reshape(len(r), 27)
     u = j_cameras.T @ (weight[:, None] * j_cameras)
     w = j_cameras.T @ (weight[:, None] * j_points)
     v = j_points.T @ (weight[:, None] * j_points)
@@ -60,6 +71,11 @@ def test_normal_equations_are_those_of_autograd(rng):
     np.testing.assert_allclose(at.right, right.numpy(), rtol=1e-7, atol=1e-7 * float(right.abs().max()))
     cost = float(reference.robust(square, ROBUST_SCALE).sum())
     assert term.cost(cameras, term.unknowns) == pytest.approx(cost, rel=1e-9)
+
+
+def two_lenses(correction):
+    """Of four cameras, two each."""
+    return Lenses(np.array([0, 0, 1, 1]), np.array(correction), np.ones((2, 3)))
 
 
 def test_cameras_return_to_the_truth_from_a_degree_away(rng):
@@ -103,7 +119,7 @@ def test_the_result_is_that_of_scipy(rng):
     before = Cameras.of(start)
 
     def residuals(x):
-        cameras = before.moved(x[:30].reshape(5, 6))
+        cameras = before.moved(x[:30])
         away = x[30:].reshape(-1, 3)[term.point] - cameras.centre[term.image]
         q = np.einsum("mji,mj->mi", cameras.rotation[term.image], away)
         r = term.lens[term.image, :2] * q[:, :2] / q[:, 2:] + term.lens[term.image, 2:4] - term.xy
@@ -118,7 +134,7 @@ def test_the_result_is_that_of_scipy(rng):
     best = least_squares(residuals, np.concatenate([first, term.unknowns.reshape(-1)]), max_nfev=15)
     cost = float((residuals(np.concatenate([first, term.unknowns.reshape(-1)])) ** 2).sum())
     assert cost <= 2 * best.cost * (1 + 1e-4)
-    exact = before.moved(best.x[:30].reshape(5, 6)).world_from_cam()
+    exact = before.moved(best.x[:30]).world_from_cam()
     assert rotation_errors_deg(found.world_from_cam, exact).max() < 0.01
 
 

@@ -7,11 +7,14 @@ import pytest
 import torch
 
 from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.refine.adjustment.lens.corrected_camera import corrected_camera
 from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.finish.photo_evidence import photo_patches
 from biresnerf.refine.lost.lost_cameras import LostCameraRepair
 from biresnerf.refine.lost.own_matches import OwnMatches
+from biresnerf.refine.parameters.intrinsics_parameters import lenses_of
 from biresnerf.refine.stages.two_stages import TwoStages
+from biresnerf.refine.verdict.camera_reports import camera_reports, focal_warnings
 from tests.refine.adjustment.rig import disturbed, observed, rotation_errors_deg
 from tests.refine.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
 
@@ -23,8 +26,11 @@ def generator():
     return np.random.default_rng(2)
 
 
-def stages(folder, rng, *, given=None, refined=0.01, noise_px=0.02, points=120):
-    """A run whose poses ended off the truth by `refined` rad, with tracks of the full-size photos."""
+def stages(folder, rng, *, given=None, refined=0.01, noise_px=0.02, points=120, focal=1.0, source="given"):
+    """A run whose poses ended off the truth by `refined` rad, with tracks of the full-size photos.
+
+    The set has a focal length that is `focal` times too long.
+    """
     dataset, images = tiny_set(folder, VIEWS, 24)
     truth = dataset.world_from_cam
     tracks = observed(truth, rng.uniform(-0.5, 0.5, (points, 3)), lenses(dataset), rng, noise_px)
@@ -33,8 +39,11 @@ def stages(folder, rng, *, given=None, refined=0.01, noise_px=0.02, points=120):
             replace(f, world_from_cam=pose) for f, pose in zip(dataset.frames, given(truth), strict=True)
         ]
         dataset = replace(dataset, frames=tuple(frames))
+    wrong = tuple(corrected_camera(c, np.array([np.log(focal), 0, 0])) for c in dataset.cameras)
+    dataset = replace(dataset, cameras=wrong, intrinsics_sources=(source,) * len(wrong))
     scene = replace(given_scene(dataset, images), tracks=tracks)
     optimiser = tiny_optimiser(dataset, images, tiny_options())
+    optimiser.lenses = lenses_of(dataset, images, "none", [], torch.device("cpu"))
     poses = optimiser.frame.unit_from_world.apply_to_poses(truth)
     optimiser.poses.place(torch.from_numpy(disturbed(poses, rng, refined, 2 * refined)))
     return TwoStages(optimiser, scene, folder), truth
@@ -101,3 +110,45 @@ def test_a_lost_camera_is_placed_by_its_matches_and_adjusted_with_the_others(tmp
     adjust_cameras(run)
     assert run.repair.repaired == [4]
     assert errors_deg(run, truth).max() < 0.5
+
+
+def focal_ratio(run):
+    """Of the result over the set's."""
+    before, after = run.scene.dataset.cameras[0], run.optimiser.lenses.refined(run.scene.dataset).cameras[0]
+    return after.full().fx / before.full().fx
+
+
+def test_a_guessed_focal_length_is_found_with_the_poses(tmp_path, rng):
+    run, truth = stages(
+        tmp_path, rng, refined=0.01, points=400, focal=1.05, source="guessed", given=wild(rng)
+    )
+    before = errors_deg(run, truth)
+    adjust_cameras(run)
+    assert focal_ratio(run) == pytest.approx(1 / 1.05, rel=0.005)
+    assert errors_deg(run, truth).mean() < 0.2 * before.mean()
+    known = run.optimiser.lenses.certainty[0]
+    assert known.observable
+    assert known.deviation < 0.005
+    report = camera_reports(run.scene.dataset, run.optimiser.lenses)[0]
+    assert (report.source, report.refined, report.observable) == ("guessed", "focal", True)
+
+
+def test_a_given_focal_length_is_kept_and_warned_of_where_matches_contradict_it(tmp_path, rng):
+    run, _ = stages(tmp_path, rng, points=400, focal=1.06, given=wild(rng))
+    adjust_cameras(run)
+    assert focal_ratio(run) == 1.0
+    assert run.optimiser.lenses.certainty[0].contradicts == pytest.approx(1 / 1.06, rel=0.005)
+    (warning,) = focal_warnings(run.scene.dataset, run.optimiser.lenses)
+    assert "shorter than given" in warning
+
+
+def test_a_right_focal_length_that_was_given_is_not_warned_of(tmp_path, rng):
+    run, _ = stages(tmp_path, rng, points=400, given=wild(rng))
+    adjust_cameras(run)
+    assert run.optimiser.lenses.certainty[0].observable
+    assert run.optimiser.lenses.certainty[0].contradicts is None
+
+
+def wild(rng):
+    """Given poses that no evidence prefers."""
+    return lambda poses: disturbed(poses, rng, 0.1, 0.3)

@@ -74,7 +74,7 @@ def test_an_answer_found_with_more_effort_is_not_asked_for_again_and_one_with_le
 
     def keep_as(effort: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         with monkeypatch.context() as patched:
-            answer = {"models": [], "matches": [], "focals": {}}
+            answer = {"models": [], "matches": []}
             patched.setattr(map_images, "run_colmap", lambda *_: answer)
             patched.setattr(map_images, "keep_tracks", lambda *_: None)
             kept.unlink(missing_ok=True)

@@ -3,7 +3,8 @@
 The definitions are in `biresnerf.refine.adjustment.reference`. Cameras and their increments are those of `tracks`.
 Photos are cubic B-splines: coefficients [total_px, channels], photo after photo, row by row, with `frames` [n, 3]:
 first row of the coefficients, width and height. A patch i has rays [k, 3] (z = 1) in its host's axes, and inverse
-depths [k] times its one unknown, the scale s[i]; its comparisons lie one after the other.
+depths [k] times its one unknown, the scale s[i]; its comparisons lie one after the other. Rays are those of the lens as
+it is, so that they turn with an increment of the host's.
 """
 
 from __future__ import annotations
@@ -58,14 +59,16 @@ def compare(rotation, centre, lens, photos, values, host, target, rays, rho, s, 
     """Mean square of one comparison in the noise expected of its pixels, and that noise's variance.
 
     Args:
-        jac: [k, channels, 13], filled with derivatives by the host's increment, the target's and the scale; or empty.
+        jac: [k, channels, 13 or 19], filled with derivatives by the host's increment, the target's and the scale; or
+            empty. Of 19, each increment ends with that of the lens.
         r: [k, channels], filled with the residuals.
         values: [k, channels], of the host photo.
         floor, slope: standard deviation of a pixel, and what its gradient adds to it.
     """
     coefficients, frames = photos
     out, wx, dx, wy, dy, a, v, q, g = work
-    channels = coefficients.shape[1]
+    channels, width = coefficients.shape[1], jac.shape[2] // 2
+    k1, k2 = lens[target, 5], lens[target, 6]
     squares, steep = 0.0, 0.0
     for k in range(len(rho)):
         depth = s * rho[k]
@@ -83,7 +86,13 @@ def compare(rotation, centre, lens, photos, values, host, target, rays, rho, s, 
         if not q[2] > 1e-3:
             return UNSEEN, 1.0
         z = 1.0 / q[2]
-        x, y = lens[target, 0] * q[0] * z + lens[target, 2], lens[target, 1] * q[1] * z + lens[target, 3]
+        ux, uy = q[0] * z, q[1] * z
+        off = ux * ux + uy * uy
+        radial = 1 + off * (k1 + off * k2)
+        x, y = (
+            lens[target, 0] * radial * ux + lens[target, 2],
+            lens[target, 1] * radial * uy + lens[target, 3],
+        )
         if not sample(coefficients, frames, target, x, y, out, wx, dx, wy, dy):
             return UNSEEN, 1.0
         for c in range(channels):
@@ -92,28 +101,50 @@ def compare(rotation, centre, lens, photos, values, host, target, rays, rho, s, 
             steep += out[c, 1] * out[c, 1] + out[c, 2] * out[c, 2]
             if len(jac) == 0:
                 continue
-            gx, gy = out[c, 1] * lens[target, 0] * z, out[c, 2] * lens[target, 1] * z
-            gz = -(gx * q[0] + gy * q[1]) * z
+            gx, gy = out[c, 1] * lens[target, 0], out[c, 2] * lens[target, 1]
+            along = gx * ux + gy * uy
+            bent = (2 * k1 + 4 * off * k2) * along
+            gx, gy = (radial * gx + bent * ux) * z, (radial * gy + bent * uy) * z
+            gz = -(gx * ux + gy * uy)
             row = jac[k, c]
-            row[12] = 0
+            row[2 * width] = 0
             for x in range(3):
                 g[x] = rotation[target, x, 0] * gx + rotation[target, x, 1] * gy + rotation[target, x, 2] * gz
                 row[3 + x] = depth * g[x]
-                row[9 + x] = -depth * g[x]
-                row[12] += rho[k] * (centre[host, x] - centre[target, x]) * g[x]
+                row[width + 3 + x] = -depth * g[x]
+                row[2 * width] += rho[k] * (centre[host, x] - centre[target, x]) * g[x]
             row[0], row[1], row[2] = (
                 a[1] * g[2] - a[2] * g[1],
                 a[2] * g[0] - a[0] * g[2],
                 a[0] * g[1] - a[1] * g[0],
             )
-            row[6], row[7], row[8] = (
+            row[width], row[width + 1], row[width + 2] = (
                 v[2] * g[1] - v[1] * g[2],
                 v[0] * g[2] - v[2] * g[0],
                 v[1] * g[0] - v[0] * g[1],
             )
+            if width > 6:
+                row[width + 6], row[width + 7], row[width + 8] = (
+                    radial * along,
+                    off * along,
+                    off * off * along,
+                )
+                host_lens(rotation, lens, host, rays[k], a, g, row)
     count = len(rho) * channels
     variance = floor * floor + slope * slope * steep / count
     return squares / count / variance, variance
+
+
+@njit(inline="always", **KERNEL)
+def host_lens(rotation, lens, host, ray, a, g, row):
+    """Columns 6 to 8 of row: derivative by the host's lens, which changes the direction of its pixels."""
+    k1, k2 = lens[host, 5], lens[host, 6]
+    off = ray[0] * ray[0] + ray[1] * ray[1]
+    across = 0.0
+    for x in range(3):
+        across += g[x] * (a[x] - rotation[host, x, 2])
+    across /= 1 + off * (3 * k1 + 5 * off * k2)
+    row[6], row[7], row[8] = -across * (1 + off * (k1 + off * k2)), -across * off, -across * off * off
 
 
 @njit(**KERNEL)
@@ -187,24 +218,34 @@ def settle_scales(
 
 @njit(**KERNEL)
 def patch_system(
-    rotation, centre, lens, photos, values, host, rays, rho, start, target, s, floor, slope, scale, deviation, noise,
-    damping, system, right,
+    rotation, centre, lens, photos, values, host, rays, rho, start, target, s, host_rows, target_rows, floor, slope,
+    scale, deviation, noise, damping, system, right,
 ):  # fmt: skip
-    """Add the normal equations without the scales to system [6n, 6n] and right [6n], which is half the gradient.
+    """Add the normal equations without the scales to system [u, u] and right [u], which is half the gradient.
+
+    Args:
+        host_rows, target_rows: [patches, w], [m, w], where the w = 6 or 9 unknowns of each one's camera, and those of
+            its lens, are among all u.
 
     Returns of each patch the inverse of its own entry and its gradient, and the mixed row of its host, and that of each
-    target [m, 6].
+    target [m, w].
     """
     patches, pixels, channels = len(host), values.shape[1], values.shape[2]
-    work, r, jac = work_space(channels), np.empty((pixels, channels)), np.empty((pixels, channels, 13))
+    width = host_rows.shape[1]
+    last = 2 * width
+    work, r, jac = (
+        work_space(channels),
+        np.empty((pixels, channels)),
+        np.empty((pixels, channels, last + 1)),
+    )
     inverses, gradients = np.zeros(patches), np.zeros(patches)
-    of_host, of_target = np.zeros((patches, 6)), np.zeros((len(target), 6))
-    block, force = np.empty((13, 13)), np.empty(13)
+    of_host, of_target = np.zeros((patches, width)), np.zeros((len(target), width))
+    block, force = np.empty((last + 1, last + 1)), np.empty(last + 1)
     s2 = scale * scale
     for i in range(patches):
         own = 1.0 / (deviation * deviation)
         gradients[i] = (s[i] - 1) * own
-        h = 6 * host[i]
+        h = host_rows[i]
         for e in range(start[i], start[i + 1]):
             e2, variance = compare(
                 rotation, centre, lens, photos, values[i], host[i], target[e], rays[i], rho[i], s[i], floor, slope,
@@ -213,59 +254,57 @@ def patch_system(
             if e2 >= UNSEEN:
                 continue
             f = s2 / (s2 + e2)
-            w = f * f / variance / (noise * noise)
-            block[:] = 0
-            force[:] = 0
-            for k in range(pixels):
-                for c in range(channels):
-                    row = jac[k, c]
-                    for a in range(13):
-                        force[a] += w * row[a] * r[k, c]
-                        for b in range(a, 13):
-                            block[a, b] += w * row[a] * row[b]
-            for a in range(13):
-                for b in range(a):
-                    block[a, b] = block[b, a]
-            j = 6 * target[e]
-            for a in range(6):
-                right[h + a] += force[a]
-                right[j + a] += force[6 + a]
-                of_host[i, a] += block[a, 12]
-                of_target[e, a] = block[6 + a, 12]
-                for b in range(6):
-                    system[h + a, h + b] += block[a, b]
-                    system[j + a, j + b] += block[6 + a, 6 + b]
-                    system[h + a, j + b] += block[a, 6 + b]
-                    system[j + a, h + b] += block[6 + a, b]
-            own += block[12, 12]
-            gradients[i] += force[12]
+            weighted_squares(jac, r, f * f / variance / (noise * noise), block, force)
+            j = target_rows[e]
+            for a in range(width):
+                right[h[a]] += force[a]
+                right[j[a]] += force[width + a]
+                of_host[i, a] += block[a, last]
+                of_target[e, a] = block[width + a, last]
+                for b in range(width):
+                    system[h[a], h[b]] += block[a, b]
+                    system[j[a], j[b]] += block[width + a, width + b]
+                    system[h[a], j[b]] += block[a, width + b]
+                    system[j[a], h[b]] += block[width + a, b]
+            own += block[last, last]
+            gradients[i] += force[last]
         inverses[i] = 1.0 / (own * (1 + damping))
         _eliminate(
-            host[i],
-            of_host[i],
-            gradients[i],
-            inverses[i],
-            start[i],
-            start[i + 1],
-            target,
-            of_target,
-            system,
-            right,
-        )
+            h, of_host[i], gradients[i], inverses[i], start[i], start[i + 1], target_rows, of_target, system, right
+        )  # fmt: skip
     return inverses, gradients, of_host, of_target
 
 
 @njit(inline="always", **KERNEL)
-def _eliminate(host, of_host, gradient, inverse, first, last, target, of_target, system, right):
-    """Take one patch's scale out of the cameras' equations."""
+def weighted_squares(jac, r, w, block, force):
+    """block = w J^T J and force = w J^T r of jac [k, channels, d] and r [k, channels]."""
+    size = len(force)
+    block[:] = 0
+    force[:] = 0
+    for k in range(jac.shape[0]):
+        for c in range(jac.shape[1]):
+            row = jac[k, c]
+            for a in range(size):
+                force[a] += w * row[a] * r[k, c]
+                for b in range(a, size):
+                    block[a, b] += w * row[a] * row[b]
+    for a in range(size):
+        for b in range(a):
+            block[a, b] = block[b, a]
+
+
+@njit(inline="always", **KERNEL)
+def _eliminate(host_rows, of_host, gradient, inverse, first, last, target_rows, of_target, system, right):
+    """Take one patch's scale out of the equations of cameras and lenses."""
+    width = len(of_host)
     for e in range(first - 1, last):
-        one = 6 * host if e < first else 6 * target[e]
-        for a in range(6):
+        for a in range(width):
             x = inverse * (of_host[a] if e < first else of_target[e, a])
             if x == 0:
                 continue
-            right[one + a] -= x * gradient
+            one = host_rows[a] if e < first else target_rows[e, a]
+            right[one] -= x * gradient
             for g in range(first - 1, last):
-                other = 6 * host if g < first else 6 * target[g]
-                for b in range(6):
-                    system[one + a, other + b] -= x * (of_host[b] if g < first else of_target[g, b])
+                for b in range(width):
+                    other = host_rows[b] if g < first else target_rows[g, b]
+                    system[one, other] -= x * (of_host[b] if g < first else of_target[g, b])

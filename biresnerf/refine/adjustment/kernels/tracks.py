@@ -1,9 +1,9 @@
 """Points seen in several photos: reprojection residuals, and the cameras' normal equations without the points.
 
 The definitions are in `biresnerf.refine.adjustment.reference`. A point's observations lie one after the other. Cameras
-are R = rotation [n, 3, 3] (world from cam), c = centre [n, 3]; lens [n, 5] is fx, fy, cx, cy and
-the least depth that is in front. An increment of a camera
-is a rotation vector w and a shift s, both in the world's axes: exp(w) R and c + s.
+are R = rotation [n, 3, 3] (world from cam), c = centre [n, 3]; lens [n, 7] is fx, fy, cx, cy, the least depth that is
+in front, and k1, k2 of a radial factor. An increment of a camera is a rotation vector w and a shift s, both in the
+world's axes: exp(w) R and c + s. One of a lens is of log f, k1 and k2.
 """
 
 from __future__ import annotations
@@ -23,8 +23,11 @@ def project_point(rotation, centre, lens, cam, x, xy, r, v, q):
         q[a] = rotation[cam, 0, a] * v[0] + rotation[cam, 1, a] * v[1] + rotation[cam, 2, a] * v[2]
     if not q[2] > lens[cam, 4]:
         return False
-    r[0] = lens[cam, 0] * q[0] / q[2] + lens[cam, 2] - xy[0]
-    r[1] = lens[cam, 1] * q[1] / q[2] + lens[cam, 3] - xy[1]
+    x, y = q[0] / q[2], q[1] / q[2]
+    s = x * x + y * y
+    radial = 1 + s * (lens[cam, 5] + s * lens[cam, 6])
+    r[0] = lens[cam, 0] * radial * x + lens[cam, 2] - xy[0]
+    r[1] = lens[cam, 1] * radial * y + lens[cam, 3] - xy[1]
     return True
 
 
@@ -32,11 +35,32 @@ def project_point(rotation, centre, lens, cam, x, xy, r, v, q):
 def point_jacobian(rotation, lens, cam, q, jac):
     """jac [2, 3]: derivative of the residual in the point."""
     z = 1.0 / q[2]
+    x, y = q[0] * z, q[1] * z
+    s = x * x + y * y
+    radial = 1 + s * (lens[cam, 5] + s * lens[cam, 6])
+    slope = 2 * lens[cam, 5] + 4 * s * lens[cam, 6]  # of it, by half of s
     for row in range(2):
-        gx = lens[cam, row] * z
-        gz = -lens[cam, row] * q[row] * z * z
+        f = lens[cam, row] * z
+        own = x if row == 0 else y
+        gx, gy = f * slope * own * x, f * slope * own * y
+        if row == 0:
+            gx += f * radial
+        else:
+            gy += f * radial
+        gz = -(gx * x + gy * y)
         for a in range(3):
-            jac[row, a] = rotation[cam, a, row] * gx + rotation[cam, a, 2] * gz
+            jac[row, a] = rotation[cam, a, 0] * gx + rotation[cam, a, 1] * gy + rotation[cam, a, 2] * gz
+
+
+@njit(inline="always", **KERNEL)
+def lens_jacobian(lens, cam, q, camera):
+    """Columns 6 to 8 of camera [2, 9]: derivative of the residual in the lens."""
+    x, y = q[0] / q[2], q[1] / q[2]
+    s = x * x + y * y
+    radial = 1 + s * (lens[cam, 5] + s * lens[cam, 6])
+    for row in range(2):
+        f = lens[cam, row] * (x if row == 0 else y)
+        camera[row, 6], camera[row, 7], camera[row, 8] = f * radial, f * s, f * s * s
 
 
 @njit(inline="always", **KERNEL)
@@ -131,30 +155,31 @@ def track_cost(rotation, centre, lens, xyz, start, image, xy, sigma, scale):
 
 
 @njit(**KERNEL)
-def eliminate_point(image, first, last, blocks, forces, mixed, inverse, gradient, system, right):
-    """Add a point's observations, from first to last, to the normal equations of the cameras alone.
+def eliminate_point(rows, first, last, blocks, forces, mixed, inverse, gradient, system, right):
+    """Add a point's observations, from first to last, to the normal equations of cameras and lenses alone.
 
     `blocks` and `forces` are the cameras' own, counted from the first; `inverse` and `gradient` the point's.
     """
-    through = np.empty((6, 3))
+    width = rows.shape[1]
+    through = np.empty((width, 3))
     for e in range(first, last):
-        row = 6 * image[e]
-        for a in range(6):
+        for a in range(width):
             for b in range(3):
                 through[a, b] = 0
                 for c in range(3):
                     through[a, b] += mixed[e, a, c] * inverse[c, b]
-        for a in range(6):
-            right[row + a] += forces[e - first, a]
+        for a in range(width):
+            row = rows[e, a]
+            right[row] += forces[e - first, a]
             for b in range(3):
-                right[row + a] -= through[a, b] * gradient[b]
-            for b in range(6):
-                system[row + a, row + b] += blocks[e - first, a, b]
+                right[row] -= through[a, b] * gradient[b]
+            for b in range(width):
+                system[row, rows[e, b]] += blocks[e - first, a, b]
         for g in range(first, last):
-            column = 6 * image[g]
-            for a in range(6):
-                for b in range(6):
-                    system[row + a, column + b] -= (
+            for a in range(width):
+                row = rows[e, a]
+                for b in range(width):
+                    system[row, rows[g, b]] -= (
                         through[a, 0] * mixed[g, b, 0]
                         + through[a, 1] * mixed[g, b, 1]
                         + through[a, 2] * mixed[g, b, 2]
@@ -162,22 +187,25 @@ def eliminate_point(image, first, last, blocks, forces, mixed, inverse, gradient
 
 
 @njit(**KERNEL)
-def track_system(rotation, centre, lens, xyz, start, image, xy, sigma, scale, damping, system, right):
-    """Add the normal equations without the points to system [6n, 6n] and right [6n], which is half the gradient.
+def track_system(rotation, centre, lens, xyz, start, image, xy, rows, sigma, scale, damping, system, right):
+    """Add the normal equations without the points to system [u, u] and right [u], which is half the gradient.
+
+    Args:
+        rows: [m, 6 or 9], where the unknowns of each observation's camera, and those of its lens, are among all u.
 
     Returns for each point the inverse of its own block and its gradient, and the mixed block of each observation.
     A point that its observations do not fix in this precision has a zero inverse, and no say.
     """
-    points = len(xyz)
+    points, width = len(xyz), rows.shape[1]
     inverses, gradients = np.zeros((points, 3, 3)), np.zeros((points, 3))
-    mixed = np.zeros((len(image), 6, 3))
-    own, jac, camera = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 6))
+    mixed = np.zeros((len(image), width, 3))
+    own, jac, camera = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 9))
     r, v, q = np.empty(2), np.empty(3), np.empty(3)
     s2, iv = scale * scale, 1.0 / (sigma * sigma)
     most = 0
     for i in range(points):
         most = max(most, start[i + 1] - start[i])
-    blocks, forces = np.empty((most, 6, 6)), np.empty((most, 6))
+    blocks, forces = np.empty((most, width, width)), np.empty((most, width))
     for i in range(points):
         own[:] = 0
         first = start[i]
@@ -196,16 +224,18 @@ def track_system(rotation, centre, lens, xyz, start, image, xy, sigma, scale, da
                 camera[k, 2] = -(v[0] * jac[k, 1] - v[1] * jac[k, 0])
                 for a in range(3):
                     camera[k, 3 + a] = -jac[k, a]
+            if width > 6:
+                lens_jacobian(lens, cam, q, camera)
             for k in range(2):
                 for a in range(3):
                     gradients[i, a] += w * jac[k, a] * r[k]
                     for b in range(3):
                         own[a, b] += w * jac[k, a] * jac[k, b]
-                for a in range(6):
+                for a in range(width):
                     forces[e - first, a] += w * camera[k, a] * r[k]
                     for b in range(3):
                         mixed[e, a, b] += w * camera[k, a] * jac[k, b]
-                    for b in range(6):
+                    for b in range(width):
                         blocks[e - first, a, b] += w * camera[k, a] * camera[k, b]
         for a in range(3):
             own[a, a] *= 1 + damping
@@ -214,6 +244,6 @@ def track_system(rotation, centre, lens, xyz, start, image, xy, sigma, scale, da
             gradients[i] = 0
             continue
         eliminate_point(
-            image, first, start[i + 1], blocks, forces, mixed, inverses[i], gradients[i], system, right
+            rows, first, start[i + 1], blocks, forces, mixed, inverses[i], gradients[i], system, right
         )
     return inverses, gradients, mixed
