@@ -141,7 +141,7 @@ async def _finish_checks(service: Service) -> None:
 
 async def _finish_uploads(service: Service) -> None:
     """Finishes uploads that another process received but did not store; deletes those that expired."""
-    for upload_id in await service.stores.uploads.untaken():
+    for upload_id in await service.stores.uploads.not_imported():
         await import_upload(service, upload_id)
     await service.stores.uploads.expire()
 

@@ -60,7 +60,7 @@ class Clients:
 
         async def one(seen: Seen) -> None:
             async with turn:
-                await self.whole_life(seen)
+                await self.submit_and_follow(seen)
 
         await asyncio.gather(*(one(seen) for seen in self.seen))
         await self._http.aclose()
@@ -78,7 +78,7 @@ class Clients:
         }
         return Seen(kind, plan)
 
-    async def whole_life(self, seen: Seen) -> None:
+    async def submit_and_follow(self, seen: Seen) -> None:
         """From its dataset to its result."""
         await self._submit(seen)
         live = asyncio.create_task(self._follow(seen.job["id"]))

@@ -159,7 +159,7 @@ async def listeners(
     cpu = process.cpu_s()
     await asyncio.sleep(QUIET_S)
     idle_cores = (process.cpu_s() - cpu) / QUIET_S
-    cpu, looking = process.cpu_s(), asyncio.create_task(_look_meanwhile(calls, jobs))
+    cpu, looking = process.cpu_s(), asyncio.create_task(_poll_jobs(calls, jobs))
     sent = await _change(database, jobs, seconds)
     due = sum(1 for n in range(count) for job, _ in sent if job == jobs[n % len(jobs)])
     began = time.perf_counter()
@@ -200,7 +200,7 @@ async def _change(database: Database, jobs: list[str], seconds: float) -> dict[t
     return sent
 
 
-async def _look_meanwhile(calls: Calls, jobs: list[str]) -> None:
+async def _poll_jobs(calls: Calls, jobs: list[str]) -> None:
     for n in range(10**6):
         await calls("getJob, beside the listeners", "GET", f"/v1/jobs/{jobs[n % len(jobs)]}")
         await asyncio.sleep(0.1)

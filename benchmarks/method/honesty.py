@@ -61,7 +61,7 @@ def given_set(truth: Dataset, start: str, seed: int, others: Dataset) -> Dataset
     if start == "true":
         return truth
     if start == "matches":
-        found = seed_poses(all_poses_taken_away(truth), seed=seed)
+        found = seed_poses(without_poses(truth), seed=seed)
         matched = [c for c in found.candidates if c.matched.any()]
         if not matched:
             raise InputError("no_matches", "feature matches place nothing.")
@@ -81,7 +81,7 @@ def given_set(truth: Dataset, start: str, seed: int, others: Dataset) -> Dataset
     return with_poses(truth, noisy)
 
 
-def all_poses_taken_away(truth: Dataset) -> Dataset:
+def without_poses(truth: Dataset) -> Dataset:
     frames = (replace(frame, world_from_cam=None, pose_source=None) for frame in truth.frames)
     return replace(truth, frames=tuple(frames))
 

@@ -33,7 +33,7 @@ from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 
 
-def all_taken_away(truth: Dataset) -> Dataset:
+def without_cameras(truth: Dataset) -> Dataset:
     """The photos as nobody has said anything about them."""
     cameras, frames = {}, []
     for frame in truth.frames:
@@ -46,7 +46,7 @@ def all_taken_away(truth: Dataset) -> Dataset:
     return replace(truth, cameras=tuple(cameras), frames=tuple(frames), intrinsics_sources=sources)
 
 
-def some_taken_away(truth: Dataset, missing: float, noise: float) -> Dataset:
+def with_missing_poses(truth: Dataset, missing: float, noise: float) -> Dataset:
     """A share of the poses gone, the others noisy."""
     count = len(truth)
     gone = set(np.random.default_rng(0).choice(count, round(missing * count), replace=False).tolist())
@@ -109,9 +109,9 @@ def main() -> None:
         if asked.size:
             truth = shrunk(truth, asked.size, Path(folder))
         given = (
-            all_taken_away(truth)
+            without_cameras(truth)
             if asked.missing is None
-            else some_taken_away(truth, asked.missing, asked.noise)
+            else with_missing_poses(truth, asked.missing, asked.noise)
         )
         given = replace(given, cameras=tuple(with_focal(camera, asked.focal) for camera in given.cameras))
         began = time.monotonic()

@@ -37,7 +37,7 @@ async def outage(folder: Path, seconds: float) -> list[Claim]:
         clients = Clients(installation.ports, folder, random.Random(1))
         seen = Seen("good", plan)
         clients.seen = [seen]
-        living = asyncio.create_task(clients.whole_life(seen))
+        living = asyncio.create_task(clients.submit_and_follow(seen))
         while not journal.exists():
             await asyncio.sleep(0.1)
         await asyncio.sleep(BEFORE_S)

@@ -41,7 +41,7 @@ def _flops(width: int) -> float:
     return 2.0 * (forward + again + 2 * forward)
 
 
-def _rivals(ours: JointOptimiser, stage: str, definition: bool) -> dict[str, JointOptimiser]:
+def _alternatives(ours: JointOptimiser, stage: str, definition: bool) -> dict[str, JointOptimiser]:
     """The same optimisation on other fields; photos and poses are shared."""
     kinds: dict[str, Any] = {"unrolled": UnrolledField, "vectorised": VectorisedField}
     if definition:
@@ -70,7 +70,7 @@ def run(
             scene.step(rival, rays)
             torch.set_num_threads(1)
 
-        rivals = _rivals(ours, stage, definition)
+        rivals = _alternatives(ours, stage, definition)
         competitors = {"kernels": lambda ours=ours: scene.step(ours, rays)}
         competitors |= {name: lambda r=rival: torch_step(r) for name, rival in rivals.items()}
         seconds = interleave(competitors, rounds, clock)

@@ -71,7 +71,7 @@ class ServiceError(FaultError):
         try:
             problem = Problem.model_validate_json(content, extra="ignore")
         except ValidationError:
-            return cls.of_stranger(status, request_id=headers.get("x-request-id"), retry_after_s=wait_s)
+            return cls.of_foreign_answer(status, request_id=headers.get("x-request-id"), retry_after_s=wait_s)
         return cls.of(
             problem,
             status=status,
@@ -81,7 +81,7 @@ class ServiceError(FaultError):
         )
 
     @classmethod
-    def of_stranger(
+    def of_foreign_answer(
         cls, status: int, *, request_id: str | None = None, retry_after_s: float | None = None
     ) -> ServiceError:
         """An answer that did not come from a BiResNeRF service, but from a proxy or another program."""

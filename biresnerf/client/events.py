@@ -92,7 +92,7 @@ class Events(JobCalls):
             try:
                 async with self._open(call) as response:
                     if not response.headers.get("content-type", "").startswith("text/event-stream"):
-                        raise ServiceError.of_stranger(response.status_code)
+                        raise ServiceError.of_foreign_answer(response.status_code)
                     async for message in EventSource(response).aiter_sse():
                         retries.progressed()
                         if message.retry is not None:

@@ -179,7 +179,7 @@ def parse(response: httpx.Response, kind: type[Model]) -> Model:
     try:
         return kind.model_validate_json(response.content, extra="ignore")
     except ValidationError:
-        raise ServiceError.of_stranger(response.status_code) from None
+        raise ServiceError.of_foreign_answer(response.status_code) from None
 
 
 async def tell(callback: Callable[..., object], *facts: object) -> None:

@@ -123,7 +123,7 @@ def _stopping(request: Request) -> bool:
 
 def _unexpected(error: Exception, request: Request) -> ProblemError:
     if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
-        logger.error("no room left: %s", error)
+        logger.error("disk full: %s", error)
         return ProblemError("storage_full", "The disk of the service is full.")
     logger.exception(
         "request %s %s %s failed", request_id(request), request.method, quote(request.scope["path"])

@@ -119,14 +119,14 @@ def sweep_staging(root: Path) -> int:
             continue
         except OSError:
             # Without a lock file the folder is either brand new or half removed; its age shows which.
-            if _younger_than(folder, 3600):
+            if _modified_within(folder, 3600):
                 continue
         shutil.rmtree(folder, ignore_errors=True)
         removed += 1
     return removed
 
 
-def _younger_than(path: Path, seconds: float) -> bool:
+def _modified_within(path: Path, seconds: float) -> bool:
     try:
         return time.time() - path.stat().st_mtime < seconds
     except OSError:

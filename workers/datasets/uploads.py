@@ -207,7 +207,7 @@ class UploadStore(OwnedStore):
             *(upload_id, late_s),
         )
 
-    async def untaken(self) -> tuple[str, ...]:
+    async def not_imported(self) -> tuple[str, ...]:
         """Ids of received uploads that no process is adding to their dataset."""
         rows = await self._database.fetch(
             "SELECT id FROM uploads WHERE state = 'received'"

@@ -60,13 +60,13 @@ class DerivedJobs(JobStore):
             asked = asked_columns(options)
             fingerprint = fingerprint_of(f"fork {job_id} {stage}", options.model_dump(mode="json"), labels)
             # Before anything is copied, which no quota counts until the fork is there.
-            known = await self._known_or_room(connection, parent, idempotency_key, fingerprint)
+            known = await self._existing_after_quota(connection, parent, idempotency_key, fingerprint)
             if known is not None:
                 return known, False
         fork_id = new_id("job")
         copied = await self._copied(parent["reusable"], stage, fork_id)
         async with self._database.transaction() as connection:
-            known = await self._known_or_room(connection, parent, idempotency_key, fingerprint)
+            known = await self._existing_after_quota(connection, parent, idempotency_key, fingerprint)
             if known is not None:
                 return known, False
             values = {
@@ -81,7 +81,7 @@ class DerivedJobs(JobStore):
             await rescue(connection, f"jobs/{fork_id}")
             return await self._insert_below(connection, parent, fork_id, values), True
 
-    async def _known_or_room(
+    async def _existing_after_quota(
         self,
         connection: Connection,
         parent: Mapping[str, Any],

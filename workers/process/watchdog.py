@@ -73,6 +73,6 @@ class _Watchdog(threading.Thread):
             in_vain = in_vain + 1 if self._ticks == seen else 0
             seen = self._ticks
             if in_vain >= LOOKS:
-                log.critical("the event loop stands still; leaving")
+                log.critical("the event loop is blocked; exiting")
                 faulthandler.dump_traceback(all_threads=True)
                 os._exit(EXIT_STUCK)

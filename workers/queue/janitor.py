@@ -19,7 +19,7 @@ from workers.jobs.job_states import offer_held_jobs, requeue_lost, take_back
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
-from workers.store.trash import take_trash_out
+from workers.store.trash import empty_trash
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ class Janitor:
     async def run(self) -> None:
         """Rounds until cancelled."""
         # The trash apart: it can take long, and a round is told by its pause whether the machine slept.
-        trash = partial(take_trash_out, self._database, self._files)
+        trash = partial(empty_trash, self._database, self._files)
         await asyncio.gather(self._repeat(self._round), self._repeat(trash))
 
     async def _repeat(self, duty: Callable[[], Awaitable[None]]) -> None:
@@ -63,11 +63,11 @@ class Janitor:
                 " extract(epoch FROM clock_timestamp())::float8 AS now_s",
                 JANITOR_LOCK,
             )
-            self._distrust_after_a_pause(row["now_s"])
+            self._note_pause(row["now_s"])
             if self._healthy_since is None:
                 self._healthy_since = time.monotonic()
             if row["mine"]:
-                if self._silence_means_death(row["database_age_s"]):
+                if self._silent_workers_are_dead(row["database_age_s"]):
                     await self._release_stalled(connection)
                 await requeue_lost(connection, self._settings.stall_s)
                 await offer_held_jobs(connection)
@@ -76,7 +76,7 @@ class Janitor:
             self._upkeep_at = time.monotonic() + UPKEEP_S
             await self._database.run(job_queue.delete_old_entries)
 
-    def _distrust_after_a_pause(self, now_s: float) -> None:
+    def _note_pause(self, now_s: float) -> None:
         """After a machine slept or a database froze all workers were silent, though all live.
 
         Measured by the database's clock: our monotonic clock stands still while a machine sleeps.
@@ -84,10 +84,10 @@ class Janitor:
         paused_s = now_s - self._round_at if self._round_at is not None else 0.0
         self._round_at = now_s
         if paused_s > self._settings.janitor_s + self._settings.stall_s / 2:
-            log.warning("janitor: nothing happened for %.0f s; workers get time for a heartbeat", paused_s)
+            log.warning("janitor: paused for %.0f s; workers get time for a heartbeat", paused_s)
             self._healthy_since, self._saw_outage = None, True
 
-    def _silence_means_death(self, database_age_s: float) -> bool:
+    def _silent_workers_are_dead(self, database_age_s: float) -> bool:
         """After an outage of the database living workers first need time for a heartbeat."""
         patience_s = 1.5 * self._settings.stall_s
         seen_s = time.monotonic() - (self._healthy_since or time.monotonic())

@@ -133,7 +133,7 @@ class Slot:
                 try:
                     entry = await database.run(job_queue.take, worker_id)
                 except Unavailable as error:
-                    log.warning("no job can be taken: %s", error)
+                    log.warning("the queue cannot be read: %s", error)
                     entry = None
                 if entry is None:
                     await first_done(added.wait(), self._stop.wait(), asyncio.sleep(self._settings.poll_s))
@@ -145,14 +145,14 @@ class Slot:
             try:
                 again_in_s = await self._run_job(database, listener, entry)
             except Fenced as fenced:
-                log.warning("%s; leaving", fenced)
+                log.warning("%s; exiting", fenced)
                 os._exit(EXIT_FENCED)  # its queue entry belongs to the new owner
             except Exception:  # our own failure must not end the slot
                 log.exception("the job goes back to the queue")
                 again_in_s = self._settings.stall_s / 4
             acknowledge = partial(job_queue.acknowledge, again_in_s=again_in_s)
             if not await retry_while_unavailable(lambda: database.run(acknowledge, entry.id, worker_id)):
-                log.warning("queue entry %d is not ours any more", entry.id)
+                log.warning("queue entry %d now belongs to another worker", entry.id)
 
     async def _run_job(self, database: Database, listener: Listener, entry: Entry) -> float | None:
         """In how many seconds the queue offers the job again; none where it is over."""
@@ -192,7 +192,7 @@ class Slot:
         try:
             job_disk_budget(self._settings).require(size)
         except LimitReached as full:
-            log.warning("the job waits: %s", full.detail)
+            log.warning("the job waits for disk space: %s", full.detail)
             return False
         return True
 

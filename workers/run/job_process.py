@@ -67,7 +67,7 @@ def main(folder: Path) -> int:
         return EXIT_INPUT if isinstance(error, InputError) else EXIT_REFINEMENT
     except Exception as error:  # noqa: BLE001 - the last line of defence: a bug ends in the log and in the status
         traceback.print_exc()
-        return EXIT_MEMORY if is_want_of_memory(error) else EXIT_BUG
+        return EXIT_MEMORY if is_out_of_memory(error) else EXIT_BUG
     return 0
 
 
@@ -86,7 +86,7 @@ class _Stop:
         self.asked.set()
 
 
-def is_want_of_memory(error: Exception) -> bool:
+def is_out_of_memory(error: Exception) -> bool:
     """Whether less of everything might have gone well."""
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True

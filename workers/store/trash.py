@@ -52,7 +52,7 @@ async def delete_unless_rescued(database: Database, files: FileStore, folder: st
         log.warning("%s is deleted later: %s", folder, error)
 
 
-async def take_trash_out(database: Database, files: FileStore) -> None:
+async def empty_trash(database: Database, files: FileStore) -> None:
     """Delete the folders that are due, at most 20. Raises `Unavailable`.
 
     Outside of a transaction: a thousand files in a bucket take their time. Safe to run concurrently.

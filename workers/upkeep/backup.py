@@ -100,7 +100,7 @@ async def _stored(store: FileStore) -> list[StoredFile]:
     try:
         found.append(await store.head(MARK_KEY))
     except NotFound:
-        log.warning("the file store has no mark; is this the one the service uses?")
+        log.warning("the file store has no identity file; is this the one the service uses?")
     return found
 
 

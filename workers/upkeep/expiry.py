@@ -45,7 +45,7 @@ class Expiry:
             try:
                 await self.round()
             except (Unavailable, psycopg.Error) as error:
-                log.warning("expiry waits: %s", error)
+                log.warning("nothing can be expired now: %s", error)
             await first_done(stop.wait(), asyncio.sleep(self._settings.expiry_s))
 
     async def round(self) -> None:

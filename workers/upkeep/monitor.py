@@ -30,21 +30,21 @@ class Monitor:
     async def lacking(self) -> dict[Need, str]:
         """What is not as it has to be, and why; empty where jobs can be taken. Answers within seconds."""
         needs: dict[Need, Awaitable[str]] = {
-            "database": self._database_lacks(),
-            "storage": self._storage_lacks(),
-            "queue": self._queue_lacks(),
+            "database": self._database_problem(),
+            "storage": self._storage_problem(),
+            "queue": self._queue_problem(),
         }
         found = await asyncio.gather(*(_in_time(need) for need in needs.values()))
         return {need: why for need, why in zip(needs, found, strict=True) if why}
 
-    async def _database_lacks(self) -> str:
+    async def _database_problem(self) -> str:
         await self._database.fetch("SELECT 1")
         return ""
 
-    async def _storage_lacks(self) -> str:
+    async def _storage_problem(self) -> str:
         return "" if await self._files.healthy() else "Files cannot be written."
 
-    async def _queue_lacks(self) -> str:
+    async def _queue_problem(self) -> str:
         await self._database.fetch("SELECT 1 FROM queue_entries LIMIT 1")
         done = {row["name"] for row in await self._database.fetch("SELECT name FROM schema_steps")}
         missing = [name for name in step_names() if name not in done]

@@ -97,7 +97,7 @@ class WebhookSender:
                 try:
                     claimed = await self._claim(room) if room else []
                 except (Unavailable, psycopg.Error) as error:
-                    log.warning("webhooks wait: %s", error)
+                    log.warning("no webhook can be sent now: %s", error)
                     claimed = []
                 for row in claimed:
                     task = asyncio.create_task(self._send(row))

@@ -129,12 +129,12 @@ def watch(client: Client, job: JobView, view: JobProgressView, timeout_s: float 
     for event in client.events(job.id, timeout_s=timeout_s):
         if (now := event.job) is not None:
             view.job(now)
-        elif (text := _worth_a_line(event)) is not None:
+        elif (text := _line_of_event(event)) is not None:
             view.note(text)
     return client.job(job.id)
 
 
-def _worth_a_line(event: StreamEvent) -> str | None:
+def _line_of_event(event: StreamEvent) -> str | None:
     if event.kind == "attempt_crashed":
         return f"Attempt {event.data.get('attempt')} crashed; the job continues from its last checkpoint."
     if event.kind == "retried_smaller":

@@ -101,7 +101,7 @@ def make_scene(
     dataset = read_transforms(path)
     if kind == "half":
         return MadeScene(output, len(dataset), _keep_half(dataset, path), truth)
-    _make_wrong(dataset, path, kind, noise, seed)
+    _perturb_file(dataset, path, kind, noise, seed)
     return MadeScene(output, len(dataset), len(dataset), truth)
 
 
@@ -140,7 +140,7 @@ def _copied(own: Path, output: Path) -> Path:
     return path
 
 
-def _make_wrong(dataset: Dataset, path: Path, kind: str, noise: float, seed: int) -> None:
+def _perturb_file(dataset: Dataset, path: Path, kind: str, noise: float, seed: int) -> None:
     """Writes wrong poses into the transforms file."""
     import json
 

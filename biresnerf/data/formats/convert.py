@@ -76,7 +76,7 @@ def convert(
         if any("lens file" in formats()[name].needs for name in names) and len(chosen.cameras) == 1:
             write_json(staging / CAMERA, lens_values(chosen.cameras[0]))
         if photos != "none":
-            _bring_photos(chosen, staging, photos)
+            _transfer_photos(chosen, staging, photos)
     places = {name: folder / formats()[name].in_set for name in names}
     return Written(places, left_out, _notes(chosen, names))
 
@@ -122,7 +122,7 @@ def _mask_notes(dataset: Dataset, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _bring_photos(dataset: Dataset, folder: Path, how: Literal["link", "copy"]) -> None:
+def _transfer_photos(dataset: Dataset, folder: Path, how: Literal["link", "copy"]) -> None:
     files = {frame.path for frame in dataset.frames}
     files |= {frame.mask for frame in dataset.frames if frame.mask is not None}
     for file in sorted(files):

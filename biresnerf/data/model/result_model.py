@@ -23,7 +23,7 @@ def model_of_poses(
     """A model without points or rigs; ids are positions counted from 1."""
     cam_from_world = rigid_inverse(world_from_cam)
     images = {
-        number: _unseeing(number, name, camera + 1, colmap.rigid_pose_of(pose))
+        number: _without_observations(number, name, camera + 1, colmap.rigid_pose_of(pose))
         for number, (name, camera, pose) in enumerate(
             zip(names, camera_indices, cam_from_world, strict=True), start=1
         )
@@ -69,7 +69,7 @@ def model_at_poses(
                 lens_ids[index] = max(lenses) + 1
                 lenses[lens_ids[index]] = cameras[index]
             number = max(images) + 1
-            images[number] = _unseeing(number, name, lens_ids[index], pose)
+            images[number] = _without_observations(number, name, lens_ids[index], pose)
         elif changed[row]:
             images[image.id] = replace(image, cam_from_world=pose)
     moved = {
@@ -79,7 +79,9 @@ def model_at_poses(
     return replace(given, cameras=lenses, images=images, rigs=rigs, frames=frames)
 
 
-def _unseeing(number: int, name: str, camera_id: int, pose: colmap.RigidPose) -> colmap.ColmapImage:
+def _without_observations(
+    number: int, name: str, camera_id: int, pose: colmap.RigidPose
+) -> colmap.ColmapImage:
     return colmap.ColmapImage(number, name, camera_id, pose, np.zeros((0, 2)), np.zeros(0, np.int64))
 
 

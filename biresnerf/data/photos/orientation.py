@@ -56,7 +56,7 @@ def meant_orientations(
     of the stored one. Where the set has such photos, and none that is meant as stored against its tag, whoever
     wrote it turned all of them, also those whose shape does not show it (half turns, square pictures).
     """
-    verdicts = [_shape_says(header, *size) for header, size in zip(headers, declared, strict=True)]
+    verdicts = [_orientation_by_shape(header, *size) for header, size in zip(headers, declared, strict=True)]
     all_turned = "turned" in verdicts and "stored" not in verdicts
     return [
         header.orientation if verdict == "turned" or (verdict is None and all_turned) else 1
@@ -72,7 +72,7 @@ def same_shape(width: float, height: float, other_width: float, other_height: fl
     return off <= 1.0
 
 
-def _shape_says(header: ImageHeader, width: float | None, height: float | None) -> str | None:
+def _orientation_by_shape(header: ImageHeader, width: float | None, height: float | None) -> str | None:
     """Which picture the declared size fits, for one that its tag turns on its side; None where it fits both."""
     if header.orientation < 5 or width is None or height is None or min(width, height) <= 0:
         return None

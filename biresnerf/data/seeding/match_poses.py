@@ -70,7 +70,7 @@ def carry_model(
         )
         if trusted[common].mean() < 1 - STRAY_MOST:
             logger.info(
-                "%s mapping is not believed: %d of %d images leave their given pose by far more than the others",
+                "%s mapping rejected: %d of %d images leave their given pose by far more than the others",
                 model.mapper, (~trusted).sum(), common.sum(),
             )  # fmt: skip
             return None

@@ -85,7 +85,7 @@ async def test_an_archive_that_waits_for_its_turn_stays_its_takers(database_url:
             more = {**tus, "Content-Type": "application/offset+octet-stream"}
             assert (await http.patch(address, headers=more, content=archive)).status_code == 204
             upload = begun.json()["id"]
-            while await service.stores.uploads.untaken():
+            while await service.stores.uploads.not_imported():
                 await asyncio.sleep(0.02)
             taken = renewed = await lease(service, upload)
             async with asyncio.timeout(20):

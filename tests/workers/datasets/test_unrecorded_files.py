@@ -16,7 +16,7 @@ from workers.database.database import Connection, Database
 from workers.engine import Stores, open_stores
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
-from workers.store.trash import take_trash_out
+from workers.store.trash import empty_trash
 
 pytestmark = pytest.mark.anyio
 EXPIRY_S = 3.0
@@ -68,7 +68,7 @@ async def test_a_file_that_a_killed_process_did_not_record_is_deleted(
     assert len(await stores.files.list(f"datasets/{dataset.id}")) == 1
     assert (await stores.datasets.get(dataset.id)).files == 0
     await asyncio.sleep(EXPIRY_S)
-    await take_trash_out(database, stores.files)
+    await empty_trash(database, stores.files)
     assert await stores.files.list(f"datasets/{dataset.id}") == []
 
 
@@ -76,7 +76,7 @@ async def test_a_recorded_file_outlives_the_time_to_record_it(stores: Stores, da
     dataset = await stores.datasets.create("fox")
     file, _ = await stores.datasets.add_file(dataset.id, "a", chunks(b"abc"))
     await asyncio.sleep(EXPIRY_S)
-    await take_trash_out(database, stores.files)
+    await empty_trash(database, stores.files)
     assert [found.key for found in await stores.files.list("datasets")] == [file.key]
     assert await database.fetch("SELECT 1 FROM trash") == []
 

@@ -84,10 +84,10 @@ async def test_one_taker_at_a_time_and_a_dead_one_is_replaced(stores: Stores, se
     first, second = uuid.uuid4(), uuid.uuid4()
     assert not await stores.uploads.take(upload.id, first)  # nothing has arrived
     await stores.uploads.append(upload.id, 0, stream(b"abc"))
-    assert await stores.uploads.untaken() == (upload.id,)
+    assert await stores.uploads.not_imported() == (upload.id,)
     assert await stores.uploads.take(upload.id, first)
     assert not await stores.uploads.take(upload.id, second)
-    assert await stores.uploads.untaken() == ()
+    assert await stores.uploads.not_imported() == ()
     await asyncio.sleep(2 * settings.beat_s + 0.1)
     assert await stores.uploads.take(upload.id, second)
     await stores.uploads.conclude(upload.id, first, JobError(code="late", detail="from the grave"))

@@ -39,7 +39,7 @@ async def test_a_job_waits_for_a_host_with_room(
     await counting.submit(steps=2, step_s=0.01)
     log = tmp_path / "slot-full.log"
     end = time.monotonic() + PATIENCE_S
-    while "the job waits" not in log.read_text():
+    while "the job waits for disk space" not in log.read_text():
         assert time.monotonic() < end, log.read_text()
         await asyncio.sleep(0.05)
     job = await counting.stores.jobs.get(counting.id)

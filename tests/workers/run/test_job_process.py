@@ -19,7 +19,7 @@ from biresnerf.options.refine_options import RefineOptions
 from biresnerf.progress import Progress
 from tests.workers.conftest import ROOT, Counting, Slots, quick_settings, ready_dataset
 from workers.engine import open_stores
-from workers.run.job_process import is_want_of_memory
+from workers.run.job_process import is_out_of_memory
 
 pytestmark = pytest.mark.server
 
@@ -120,7 +120,7 @@ def test_a_users_mistake_ends_with_2_and_says_what_to_fix(tmp_path: Path, scene:
 def test_want_of_memory_is_told_from_other_errors(work: Callable[[], object], wants: bool):
     with pytest.raises((MemoryError, RuntimeError, OSError)) as caught:
         work()
-    assert is_want_of_memory(caught.value) == wants
+    assert is_out_of_memory(caught.value) == wants
 
 
 def test_the_check_names_the_broken_image(tmp_path: Path, scene: Path):

@@ -17,7 +17,7 @@ from workers.database.database import open_database
 from workers.engine import Stores
 from workers.settings.errors import Conflict, Expired, NotFound
 from workers.settings.settings import Settings
-from workers.store.trash import take_trash_out
+from workers.store.trash import empty_trash
 from workers.upkeep.dispatcher import dispatch
 from workers.upkeep.expiry import Expiry
 
@@ -38,7 +38,7 @@ async def rounds(settings: Settings, stores: Stores, count: int = 1) -> None:
     async with open_database(settings.require_database_url(), connections=2) as database:
         for _ in range(count):
             await Expiry(database, settings).round()
-            await take_trash_out(database, stores.files)
+            await empty_trash(database, stores.files)
 
 
 async def finished_job(settings: Settings, stores: Stores, dataset_id: str | None = None, **more: str) -> str:

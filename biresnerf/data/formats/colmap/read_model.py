@@ -58,7 +58,10 @@ def read_colmap_model(folder: Path) -> colmap.ColmapModel:
     check_images(images, cameras, tables.file("images"))
     if points is None:
         notes.append(f"{tables.file('points3D')} is missing: the model is taken without points")
-        points, images = colmap.no_points(), {number: _unseeing(image) for number, image in images.items()}
+        points, images = (
+            colmap.no_points(),
+            {number: _without_observations(image) for number, image in images.items()},
+        )
     check_tracks(images, points, tables.file("points3D"))
     if (rigs is None) != (frames is None):
         there, lacking = ("frames", "rigs") if rigs is None else ("rigs", "frames")
@@ -95,7 +98,7 @@ class _Tables:
         return getattr(colmap_text, parser)(read_text(path, MAX_TABLE_BYTES), path.name)
 
 
-def _unseeing(image: colmap.ColmapImage) -> colmap.ColmapImage:
+def _without_observations(image: colmap.ColmapImage) -> colmap.ColmapImage:
     return replace(image, point3d_ids=np.full(len(image.point3d_ids), colmap.NO_POINT))
 
 

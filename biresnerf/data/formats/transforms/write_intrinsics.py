@@ -31,7 +31,7 @@ def ngp_coefficients(lens: FullParameters) -> tuple[str, ...]:
     return ("k1", "k2", "k3", "k4") if lens.fisheye else ("k1", "k2", "p1", "p2")
 
 
-def says_lens(place: dict[str, Any]) -> bool:
+def has_own_intrinsics(place: dict[str, Any]) -> bool:
     """Whether a frame brings intrinsics of its own."""
     return any(place.get(key) is not None for key in (*FOCAL_KEYS, "cx", "cy", *COEFFICIENTS))
 

@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.codec import Codec, WriteContext
 from biresnerf.data.formats.transforms.read_transforms import bind_transforms, parse_transforms
-from biresnerf.data.formats.transforms.write_intrinsics import family, lens_values, put_lens, says_lens
+from biresnerf.data.formats.transforms.write_intrinsics import (
+    family,
+    has_own_intrinsics,
+    lens_values,
+    put_lens,
+)
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.model.dataset import Dataset
@@ -62,7 +67,7 @@ def write_transforms(dataset: Dataset, world_from_cam: NDArray[np.float64], path
     if not source.document:
         document = _with_intrinsics(document, dataset)
     else:
-        _put_found(document, dataset)
+        _write_found_intrinsics(document, dataset)
     write_json(path, document)
 
 
@@ -118,17 +123,17 @@ def _with_intrinsics(document: dict[str, Any], dataset: Dataset) -> dict[str, An
     return {**document, "frames": described}
 
 
-def _put_found(document: dict[str, Any], dataset: Dataset) -> None:
+def _write_found_intrinsics(document: dict[str, Any], dataset: Dataset) -> None:
     """Intrinsics that the input does not give, or others: in the frame that says its own, else at the top."""
     shared = {
         frame.camera
         for frame, row in zip(dataset.frames, document["frames"], strict=True)
-        if not says_lens(row)
+        if not has_own_intrinsics(row)
     }
     for frame, row in zip(dataset.frames, document["frames"], strict=True):
         if dataset.source_of_intrinsics(frame.camera) == "given":
             continue
-        own = says_lens(row) or len(shared) > 1
+        own = has_own_intrinsics(row) or len(shared) > 1
         put_lens(row if own else document, dataset.cameras[frame.camera])
 
 
