@@ -187,29 +187,6 @@ def test_focal_lengths_stay_where_stage_1_left_them_and_other_parts_go_on(scene)
     assert bool((after[0, 2:4] != before[0, 2:4]).all())
 
 
-def test_a_placed_lens_is_shown_written_and_kept_and_photos_do_not_move_it(tmp_path):
-    dataset, images = tiny_set(tmp_path)
-    given = replace(dataset, cameras=(Camera("RADIAL", 24, 24, (33.0, 12.0, 12.0, 0.0, 0.0)),))
-    images = replace(images, cameras=given.cameras * len(images))
-    found = replace(given.cameras[0], params=(34.0, 12.0, 12.0, 0.05, -0.02))
-    lenses = lenses_of(given, images, "none", [], CPU)
-    lenses.place(given.cameras, [found])
-    after = lenses.refined(given)
-    np.testing.assert_allclose(after.cameras[0].params, found.params, rtol=1e-12)
-    assert (after.intrinsics_sources, lenses.refined_parts) == (("refined",), ("all",))
-    shown = lenses.intrinsics
-    index, xy = torch.zeros(3, dtype=torch.int64), torch.tensor([[1.0, 2.0], [12.0, 12.0], [20.0, 5.0]])
-    expected = Intrinsics.from_cameras([found])
-    torch.testing.assert_close(
-        directions_in_cam(shown, index, xy), directions_in_cam(expected, index, xy), rtol=1e-6, atol=1e-6
-    )
-    lenses.step(0.01)
-    assert lenses.refined(given).cameras == after.cameras
-    other = lenses_of(given, images, "none", [], CPU)
-    other.load_state({name: value.clone() for name, value in lenses.state().items()})
-    assert other.refined(given).cameras == after.cameras
-
-
 def test_the_rule_of_auto():
     assert [refined_part("auto", s) for s in ("given", "colmap", "exif", "guessed")] == [
         "none", "none", "focal", "focal",

@@ -13,45 +13,10 @@ import numpy as np
 from numba import njit
 
 from biresnerf.refine.adjustment.kernels.compiled import KERNEL
+from biresnerf.refine.adjustment.kernels.photo_samples import sample
 
 SCAN, HALVINGS = 6, 5  # steps to either side of a scan, and how often the last one's length is halved
 UNSEEN = 1e9  # squared error of a comparison that leaves the photo
-
-
-@njit(inline="always", **KERNEL)
-def spline_weights(t, w, d):
-    """Weights [4] of a cubic B-spline's coefficients at t in 0..1 between the middle two, and their derivative."""
-    o = 1 - t
-    w[0], w[3] = o * o * o / 6, t * t * t / 6
-    w[1] = (3 * t * t * t - 6 * t * t + 4) / 6
-    w[2] = 1 - w[0] - w[1] - w[3]
-    d[0], d[3] = -o * o / 2, t * t / 2
-    d[1] = (9 * t * t - 12 * t) / 6
-    d[2] = -d[0] - d[1] - d[3]
-
-
-@njit(inline="always", **KERNEL)
-def sample(coefficients, frames, photo, x, y, out, wx, dx, wy, dy):
-    """Value and gradient [channels, 3] of a photo at pixel position (x, y); False near its border and outside."""
-    u, v = x - 0.5, y - 0.5
-    width, height = frames[photo, 1], frames[photo, 2]
-    if not (u >= 1 and v >= 1 and u < width - 2 and v < height - 2):
-        return False
-    ix, iy = int(u), int(v)
-    spline_weights(u - ix, wx, dx)
-    spline_weights(v - iy, wy, dy)
-    out[:] = 0
-    for a in range(4):
-        row = frames[photo, 0] + (iy - 1 + a) * width + ix - 1
-        for c in range(coefficients.shape[1]):
-            value, slope = 0.0, 0.0
-            for b in range(4):
-                value += wx[b] * coefficients[row + b, c]
-                slope += dx[b] * coefficients[row + b, c]
-            out[c, 0] += wy[a] * value
-            out[c, 1] += wy[a] * slope
-            out[c, 2] += dy[a] * value
-    return True
 
 
 @njit(**KERNEL)
@@ -67,7 +32,7 @@ def compare(rotation, centre, lens, photos, values, host, target, rays, rho, s, 
     """
     coefficients, frames = photos
     out, wx, dx, wy, dy, a, v, q, g = work
-    channels, width = coefficients.shape[1], jac.shape[2] // 2
+    channels = coefficients.shape[1]
     k1, k2 = lens[target, 5], lens[target, 6]
     squares, steep = 0.0, 0.0
     for k in range(len(rho)):
@@ -101,38 +66,44 @@ def compare(rotation, centre, lens, photos, values, host, target, rays, rho, s, 
             steep += out[c, 1] * out[c, 1] + out[c, 2] * out[c, 2]
             if len(jac) == 0:
                 continue
-            gx, gy = out[c, 1] * lens[target, 0], out[c, 2] * lens[target, 1]
-            along = gx * ux + gy * uy
-            bent = (2 * k1 + 4 * off * k2) * along
-            gx, gy = (radial * gx + bent * ux) * z, (radial * gy + bent * uy) * z
-            gz = -(gx * ux + gy * uy)
-            row = jac[k, c]
-            row[2 * width] = 0
-            for x in range(3):
-                g[x] = rotation[target, x, 0] * gx + rotation[target, x, 1] * gy + rotation[target, x, 2] * gz
-                row[3 + x] = depth * g[x]
-                row[width + 3 + x] = -depth * g[x]
-                row[2 * width] += rho[k] * (centre[host, x] - centre[target, x]) * g[x]
-            row[0], row[1], row[2] = (
-                a[1] * g[2] - a[2] * g[1],
-                a[2] * g[0] - a[0] * g[2],
-                a[0] * g[1] - a[1] * g[0],
-            )
-            row[width], row[width + 1], row[width + 2] = (
-                v[2] * g[1] - v[1] * g[2],
-                v[0] * g[2] - v[2] * g[0],
-                v[1] * g[0] - v[0] * g[1],
-            )
-            if width > 6:
-                row[width + 6], row[width + 7], row[width + 8] = (
-                    radial * along,
-                    off * along,
-                    off * off * along,
-                )
-                host_lens(rotation, lens, host, rays[k], a, g, row)
+            differentiate(
+                rotation, centre, lens, host, target, rays[k], rho[k], depth, a, v, z, ux, uy, radial,
+                out[c, 1] * lens[target, 0], out[c, 2] * lens[target, 1], g, jac[k, c],
+            )  # fmt: skip
     count = len(rho) * channels
     variance = floor * floor + slope * slope * steep / count
     return squares / count / variance, variance
+
+
+@njit(inline="always", **KERNEL)
+def differentiate(
+    rotation, centre, lens, host, target, ray, rho, depth, a, v, z, ux, uy, radial, gx, gy, g, row
+):  # fmt: skip
+    """Fill row [13 or 19], see `compare`: derivatives of one channel of one pixel.
+
+    Args:
+        a, v: the pixel's direction from the host and from the target, in the world; g: room for three numbers.
+        z, ux, uy, radial: one over its depth in the target, its slopes there, and the lens's factor of them.
+        gx, gy: gradient of the target's colour in focal lengths.
+    """
+    width = len(row) // 2
+    off, along = ux * ux + uy * uy, gx * ux + gy * uy
+    bent = (2 * lens[target, 5] + 4 * off * lens[target, 6]) * along
+    gx, gy = (radial * gx + bent * ux) * z, (radial * gy + bent * uy) * z
+    gz = -(gx * ux + gy * uy)
+    row[2 * width] = 0
+    for x in range(3):
+        g[x] = rotation[target, x, 0] * gx + rotation[target, x, 1] * gy + rotation[target, x, 2] * gz
+        row[3 + x] = depth * g[x]
+        row[width + 3 + x] = -depth * g[x]
+        row[2 * width] += rho * (centre[host, x] - centre[target, x]) * g[x]
+    row[0], row[1], row[2] = a[1] * g[2] - a[2] * g[1], a[2] * g[0] - a[0] * g[2], a[0] * g[1] - a[1] * g[0]
+    row[width] = v[2] * g[1] - v[1] * g[2]
+    row[width + 1] = v[0] * g[2] - v[2] * g[0]
+    row[width + 2] = v[1] * g[0] - v[0] * g[1]
+    if width > 6:
+        row[width + 6], row[width + 7], row[width + 8] = radial * along, off * along, off * off * along
+        host_lens(rotation, lens, host, ray, a, g, row)
 
 
 @njit(inline="always", **KERNEL)
