@@ -30,6 +30,7 @@ from biresnerf.refine.start.choose_start import find_start
 from biresnerf.refine.start.first_step import first_step, stage_lengths
 from biresnerf.refine.verdict.evaluate import Evaluation, evaluate
 from biresnerf.refine.verdict.judgement import judge
+from biresnerf.refine.verdict.pose_uncertainty import pose_uncertainty
 from biresnerf.refine.verdict.run_report import run_report
 from biresnerf.refine.views.held_out_views import held_out_views
 from biresnerf.report import Report
@@ -84,10 +85,11 @@ def refine_poses(
         stages.run_stage_1()
         stages.run_stage_2()
         evaluation = evaluate(stages, ResultPictures(setup.folder, scene))
-        candidates = adjust_cameras(stages)
+        finish = adjust_cameras(stages)
         stages.observer.at_end(stages.optimiser)
         judgement = judge(stages)
-        report = run_report(stages, evaluation.scores, judgement, "complete", candidates)
+        known = pose_uncertainty(stages, finish, judgement)
+        report = run_report(stages, evaluation.scores, judgement, "complete", finish.candidates, known)
         return write_result(setup.folder, stages, evaluation, report)
     except Interrupted:
         report = run_report(stages, evaluation.scores, judgement, "partial")

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.refine_options import ResolvedOptions
+from biresnerf.uncertainty import PoseUncertainty
 
 SwitchReason = Literal["stable", "cap"]
 IntrinsicsSource = Literal["given", "exif", "colmap", "guessed", "refined"]
@@ -129,26 +130,14 @@ class ImageReport(FrozenModel):
     moved_units: float = Field(
         examples=[0.042], description="Distance between the given camera centre and the refined one."
     )
-    lost: bool = Field(
-        False,
-        description="Its pose never agreed with the others' field, and no better one was found: do not trust it.",
+    uncertainty: PoseUncertainty | None = Field(
+        None, description="Of the returned pose; None of a partial result, and of methods of others."
     )
-    repaired: bool = Field(
-        False, description="It was lost and took up its way again from a pose found by trying many."
-    )
+    repaired: bool = Field(False, description="It was lost, and brought back by trying many poses.")
     moved_far: bool = Field(False, description="Its pose moved by far more than the other images' did.")
     blurred: bool = Field(False, description="Far less sharp than photos taken from about the same place.")
-    contradicted: bool = Field(
-        False,
-        description="Its own feature matches fit its refined pose far worse than those of the other images fit theirs: "
-        "do not trust it.",
-    )
+    contradicted: bool = Field(False, description="Its own matches fit far worse than others' fit theirs.")
     exposure_off: bool = Field(False, description="Brighter or darker than the other photos make the scene.")
-    unsure_deg: float | None = Field(
-        None,
-        description="Its photo fits as well with its camera carried about the scene by so many degrees (8, 16 or 32): "
-        "nothing that is measured tells them apart. None where it resists.",
-    )
     sharpness: float | None = Field(
         None, description="Variance of the Laplacian over that of its neighbours' photos; at working size."
     )

@@ -52,7 +52,8 @@ RISEN_DEG = 0.02  # and by at least so much: what the truth of the sets is good 
 
 def named(image: ImageReport) -> bool:
     """Whether the report tells the user not to rely on this pose."""
-    return image.lost or image.contradicted or image.unsure_deg is not None
+    known = image.uncertainty
+    return known is not None and (known.rotation_deg is None or known.rotation_deg > BEYOND_DEG)
 
 
 def given_set(truth: Dataset, start: str, seed: int, others: Dataset) -> Dataset:

@@ -62,7 +62,10 @@ def write_result(folder: OutputFolder, stages: TwoStages, evaluation: Evaluation
     if report.verdict is not None and report.verdict.returned == "input":
         returned, returned_dataset = scene.dataset.world_from_cam, scene.dataset
         if np.isfinite(refined).all():
-            _, moved = _write_poses(path / REFINED, scene, refined_dataset, refined, report)
+            # What is said of the returned poses is not said of these.
+            images = tuple(image.model_copy(update={"uncertainty": None}) for image in report.images)
+            of_refined = report.model_copy(update={"images": images})
+            _, moved = _write_poses(path / REFINED, scene, refined_dataset, refined, of_refined)
             poses = f"{REFINED}/{POSES}"
     # A run that is stopped must end soon: it leaves large exports out.
     exports, monitor = (optimiser.options.exports, stages.monitor) if complete else ((), Monitor())
@@ -120,6 +123,7 @@ def described(dataset: Dataset, world_from_cam: NDArray[np.float64], report: Rep
         similarity=Similarity.of(report.input_from_optimised),
         pose_sources=[image.pose_source for image in report.images],
         flags=[image.flags for image in report.images],
+        uncertainty=[image.uncertainty for image in report.images],
     )
 
 

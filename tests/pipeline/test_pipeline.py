@@ -201,7 +201,7 @@ def test_options_as_used_lie_beside_the_result(run):
 
 def test_a_finished_folder_holds_results_only(run):
     names = {path.name for path in run.output.iterdir()}
-    packs = {"transforms.json", "colmap", "poses.json", "tum.txt", "scene.glb"}
+    packs = {"transforms.json", "colmap", "poses.json", "poses.csv", "tum.txt", "scene.glb"}
     shown = {"view.json", "view", "thumbnail.jpg", "renders"} | (
         {"report.html"} if (BUNDLE / "report.js").is_file() else set()
     )

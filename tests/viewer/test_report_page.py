@@ -6,8 +6,10 @@ import shutil
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from biresnerf.geometry.rigid import interpolate_pose
+from biresnerf.uncertainty import PoseUncertainty
 from biresnerf.viewer.report_html import write_report_html
 from tests.viewer.conftest import ARGUMENTS, CHROMIUM, HOSTILE, HOSTILE_IMAGE, SCREENSHOTS, VIEWS, open_report
 
@@ -171,17 +173,63 @@ def test_no_serious_fault_of_accessibility_and_nothing_wider_than_the_screen(
     page.context.close()
 
 
-def test_a_photo_that_does_not_say_where_its_camera_stood_is_marked_and_found(browser, result, tmp_path):
+ROOT = np.array([[0.004, 0, 0], [0.001, 0.003, 0], [0.002, -0.001, 0.005]])
+UNKNOWN_IMAGE = 4
+
+
+@pytest.fixture(name="stated", scope="module")
+def stated_page(browser, result, tmp_path_factory):
+    """The report of a result with the same covariance of all poses but one, of which nothing is known."""
+    covariance = np.zeros((6, 6))
+    covariance[3:, 3:] = ROOT @ ROOT.T
+    known = PoseUncertainty(
+        known_from="matches",
+        rotation_deg=0.031,
+        position=0.0123,
+        position_percent=0.3,
+        covariance=covariance.tolist(),
+    )
+    unknown = PoseUncertainty(known_from="nothing", why_unknown="nothing speaks for it")
     images = tuple(
-        image.model_copy(update={"unsure_deg": 16.0 if number == 4 else None})
+        image.model_copy(update={"uncertainty": unknown if number == UNKNOWN_IMAGE else known})
         for number, image in enumerate(result.report.images)
     )
-    folder = shutil.copytree(result.folder, tmp_path / "out")
+    folder = tmp_path_factory.mktemp("stated") / "out"
+    shutil.copytree(result.folder, folder)
     write_report_html(folder, result.report.model_copy(update={"images": images}))
-    page = open_report(browser, folder / "report.html").page
-    page.locator(".images").get_by_label("Show").select_option(label="pose uncertain")
-    assert table(page) == [4]
-    page.context.close()
+    opened = open_report(browser, folder / "report.html")
+    yield opened.page
+    opened.page.context.close()
+
+
+def test_the_table_says_how_exact_each_pose_is_and_finds_those_not_known(stated):
+    heading = stated.get_by_role("button", name="exact to °")
+    column = [cell.text_content() for cell in stated.locator(".images thead th").all()].index("exact to °")
+    said = [
+        row.locator("th, td").nth(column).text_content() for row in stated.locator(".images tbody tr").all()
+    ]
+    assert said == ["not known" if image == UNKNOWN_IMAGE else "± 0.0310" for image in range(VIEWS)]
+    heading.click()
+    assert table(stated)[-1] == UNKNOWN_IMAGE
+    stated.locator(".images").get_by_label("Show").select_option(label="pose not known")
+    assert table(stated) == [UNKNOWN_IMAGE]
+    stated.locator(".images").get_by_label("Show").select_option(label="all")
+
+
+def test_drawn_ellipsoids_hold_nine_in_ten_errors_so_many_times_too_large(stated, result):
+    switch = stated.get_by_label("Uncertainty ×10")
+    assert switch.count() == 1
+    choose(stated, 1)
+    drawn = np.array(stage(stated)["uncertainty"].replace(",", " ").split(), float).reshape(3, 3)
+    key = "world_from_cam_before" if result.report.verdict.returned == "input" else "world_from_cam"
+    apart = (drawn - result.pose(1, key)[:3, 3]) / 10
+    held = np.einsum("ka,ab,kb->k", apart, np.linalg.inv(ROOT @ ROOT.T), apart)
+    np.testing.assert_allclose(held, chi2.ppf(0.9, 3), rtol=1e-3)
+    choose(stated, UNKNOWN_IMAGE)
+    assert stage(stated)["uncertainty"] == ""
+    choose(stated, 1)
+    switch.uncheck()
+    stated.wait_for_function(f"() => {STAGE}.uncertainty === ''")
 
 
 def test_without_webgl_the_cameras_are_listed_in_a_table(result, browser):

@@ -121,6 +121,7 @@ def _image(image: PoseImage, photos: Path | None) -> RefinedImage:
         image.flags,
         path,
         image.orientation,
+        image.uncertainty,
     )
 
 

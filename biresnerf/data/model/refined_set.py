@@ -16,6 +16,7 @@ from biresnerf.data.model.result_model import model_at_poses, model_of_poses, wi
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity
+from biresnerf.uncertainty import PoseUncertainty
 
 # ``given``: the input's, as nothing moved; ``tracks``: its tracks triangulated again; ``features``: matches of features
 # triangulated; ``moved``: the input's points carried along with the cameras nearest to them.
@@ -33,9 +34,10 @@ class RefinedImage:
         world_from_cam: float64 [4, 4], refined, in the caller's world; OpenCV axes.
         given: its pose before, float64 [4, 4]; None where there was none.
         pose_source: who found the pose that the optimisation started from.
-        flags: notable facts about it: ``fixed``, ``held_out``, ``lost``, ``repaired``, ...
+        flags: notable facts about it: ``fixed``, ``held_out``, ``repaired``, ...
         path: the file; None where it is not known.
         orientation: as `biresnerf.data.model.dataset.Frame` has it.
+        uncertainty: of the pose; None where nothing was said of it.
     """
 
     name: str
@@ -47,6 +49,7 @@ class RefinedImage:
     flags: tuple[str, ...] = ()
     path: Path | None = None
     orientation: int = 1
+    uncertainty: PoseUncertainty | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +107,7 @@ def refined_set(
     similarity: Similarity | None = None,
     pose_sources: Sequence[str] | None = None,
     flags: Sequence[tuple[str, ...]] | None = None,
+    uncertainty: Sequence[PoseUncertainty | None] | None = None,
 ) -> RefinedSet:
     """The set of ``dataset`` at refined poses [n, 4, 4], without points; what is left out is unknown or none.
 
@@ -121,6 +125,7 @@ def refined_set(
     before = [frame.world_from_cam for frame in dataset.frames] if given is None else list(given)
     sources = pose_sources or [frame.pose_source or "none" for frame in dataset.frames]
     marks = flags or [()] * count
+    known = uncertainty or [None] * count
     images = tuple(
         RefinedImage(
             frame.name,
@@ -132,6 +137,7 @@ def refined_set(
             marks[i],
             frame.path,
             frame.orientation,
+            known[i],
         )
         for i, (frame, file_name, pose) in enumerate(
             zip(dataset.frames, dataset.file_names, np.asarray(world_from_cam, np.float64), strict=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.adjustment.cameras import POSE, Cameras
-from biresnerf.refine.adjustment.covariance import covariance
+from biresnerf.refine.adjustment.covariance import covariance, of_each, without_lenses
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
 from biresnerf.refine.adjustment.kernels.patches import UNSEEN
 from biresnerf.refine.adjustment.lens.lenses import LENS, OBSERVABLE, Lenses, LensEstimate, posterior
@@ -65,8 +65,6 @@ class Adjustment:
 
     Attributes:
         world_from_cam: [n, 4, 4].
-        covariance: [n, 6, 6] of rotation vector (rad) and position (the poses' unit) in the world's axes, as the
-            measured noise explains it, the motion of the whole rig left out.
         track_noise_px, patch_noise: measured; NaN where there is no such evidence.
         track_inliers, patch_inliers: share of residuals within the robust scale; NaN likewise.
         agreement: of the halves of the patches; None where there are none.
@@ -76,7 +74,6 @@ class Adjustment:
     """
 
     world_from_cam: Array
-    covariance: Array
     track_noise_px: float
     patch_noise: float
     track_inliers: float
@@ -127,14 +124,13 @@ def _adjusted(
     if halves is None and evidence.patches is not None and len(evidence.patches) > 1:
         halves = _halves(cameras, evidence, before)
     start, patch_noise = (cameras, 1.0) if halves is None else (halves.middle, halves.noise)
-    tracks, patches = _track_term(start, evidence, None), _patch_term(start, evidence, patch_noise)
+    tracks, patches = track_term(start, evidence, None), patch_term(start, evidence, patch_noise)
     terms: list[Term] = [term for term in (tracks, patches) if term is not None]
     found = minimise(start, terms, before) if terms else cameras
     if not all(np.isfinite(part).all() for part in (found.rotation, found.centre, found.lens)):
         found, terms = cameras, []
     return Adjustment(
         world_from_cam=found.world_from_cam() if terms else np.array(world_from_cam, dtype=np.float64),
-        covariance=_covariance(found, terms, before),
         track_noise_px=tracks.noise_px if tracks else np.nan,
         patch_noise=patch_noise if patches else np.nan,
         track_inliers=float(tracks.inliers(found).mean()) if tracks else np.nan,
@@ -159,7 +155,9 @@ def _halves(cameras: Cameras, evidence: Evidence, prior: Prior) -> Halves:
         end = minimise(cameras, [term], prior)
         ends.append(end)
         inliers.append(float(term.inliers(end).mean()))
-        turned = _covariance(end, [term], prior)[:, :3, :3]
+        information, _ = normal_equations(end, [term.linearise(end, 0.0)], prior)
+        among = without_lenses(information, end, prior.free[POSE * len(end) :])
+        turned = of_each(covariance(end, among))[:, :3, :3]
         expected += float(np.trace(turned, axis1=1, axis2=2).mean())
     middle = ends[1].moved(ends[0].apart(ends[1]) / 2)
     apart = _rotations_deg(ends[0], ends[1])
@@ -173,19 +171,6 @@ def _halves(cameras: Cameras, evidence: Evidence, prior: Prior) -> Halves:
 def _rotations_deg(one: Cameras, other: Cameras) -> Array:
     a, b = one.world_from_cam(), other.world_from_cam()
     return camera_errors(align_by_spread(a, b).apply_to_poses(a), b).rotation_deg
-
-
-def _covariance(cameras: Cameras, terms: list[Term], prior: Prior) -> Array:
-    """Of the poses, whatever the lenses are."""
-    linear = [term.linearise(cameras, 0.0) for term in terms]
-    information, _ = normal_equations(cameras, linear, prior)
-    poses = POSE * len(cameras)
-    lenses = poses + np.flatnonzero(prior.free[poses:])
-    mixed = information[:poses, lenses]
-    among = (
-        information[:poses, :poses] - mixed @ np.linalg.pinv(information[np.ix_(lenses, lenses)]) @ mixed.T
-    )
-    return covariance(cameras, among, prior.free[:poses])
 
 
 def _lens_estimate(cameras: Cameras, terms: list[Term], lenses: Lenses) -> LensEstimate:
@@ -210,13 +195,13 @@ def misfit(world_from_cam: Array, evidence: Evidence, noise: NoiseLevels) -> Arr
     cameras = Cameras.of(world_from_cam, evidence.lenses)
     n = len(cameras)
     total, count = np.zeros(n), np.zeros(n)
-    tracks = _track_term(cameras, evidence, noise.track_px)
+    tracks = track_term(cameras, evidence, noise.track_px)
     if tracks is not None:
         tracks.settle(cameras)
         robust = _robust((tracks.errors_px(cameras) / noise.track_px) ** 2, ROBUST_SCALE)
         total += np.bincount(tracks.image, robust, n)
         count += np.bincount(tracks.image, minlength=n)
-    patches = _patch_term(cameras, evidence, 1.0)
+    patches = patch_term(cameras, evidence, 1.0)
     if patches is not None:
         patches.settle(cameras)
         square = patches.squares(cameras, patches.unknowns)
@@ -233,7 +218,7 @@ def _robust(square: Array, scale: float) -> Array:
     return np.asarray(1 / (1 / scale**2 + 1 / np.clip(square, 1e-300, UNSEEN)))
 
 
-def _track_term(cameras: Cameras, evidence: Evidence, noise_px: float | None) -> TrackTerm | None:
+def track_term(cameras: Cameras, evidence: Evidence, noise_px: float | None) -> TrackTerm | None:
     """The term of the tracks; None where there are none, or fewer residuals than unknowns."""
     tracks = evidence.tracks
     if tracks is None or len(tracks.point) == 0:
@@ -244,7 +229,7 @@ def _track_term(cameras: Cameras, evidence: Evidence, noise_px: float | None) ->
     return TrackTerm(tracks, evidence.intrinsics, cameras, noise_px)
 
 
-def _patch_term(cameras: Cameras, evidence: Evidence, noise: float) -> PatchTerm | None:
+def patch_term(cameras: Cameras, evidence: Evidence, noise: float) -> PatchTerm | None:
     """The finest term of the patches; None where there are none."""
     if evidence.patches is None or len(evidence.patches.target) == 0:
         return None

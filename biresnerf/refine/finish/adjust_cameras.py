@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,8 +52,30 @@ MOST_OBSERVATIONS = 40_000  # of tracks that are adjusted to
 LEFT_OUT_ONE_IN = 5  # patches
 
 
-def adjust_cameras(stages: TwoStages) -> tuple[CandidateReport, ...]:
-    """Adjust all cameras at once and move them where left-out evidence says that is better; how the candidates did.
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Poses [n, 4, 4] in the unit frame that were adjusted to evidence, and the level of its patches' noise."""
+
+    world_from_cam: Array
+    evidence: Evidence
+    patch_noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class Finish:
+    """What came of the last step.
+
+    Attributes:
+        candidates: the poses that were compared, and how they did.
+        fit: of the poses to all evidence that is to be trusted; None where there is none.
+    """
+
+    candidates: tuple[CandidateReport, ...] = ()
+    fit: Fit | None = None
+
+
+def adjust_cameras(stages: TwoStages) -> Finish:
+    """Adjust all cameras at once and move them where left-out evidence says that is better.
 
     Cameras that their own matches contradict are placed by those first.
 
@@ -64,19 +86,20 @@ def adjust_cameras(stages: TwoStages) -> tuple[CandidateReport, ...]:
     """
     optimiser = stages.optimiser
     if not adjusts_cameras(stages.scene.dataset, optimiser.method, optimiser.bodies):
-        return ()
+        return Finish()
     with stages.record.timed("adjusting"):
         stages.repair.place_by_matches()
-        choice = _choice(stages.scene, optimiser, stages.monitor)
-    if choice is None:
-        return ()
+        found = _choice(stages.scene, optimiser, stages.monitor)
+    if found is None:
+        return Finish()
+    choice, finish = found
     if choice.chosen.name != "refined":
         optimiser.poses.place(torch.from_numpy(choice.chosen.world_from_cam))
     if choice.chosen.lenses is not None:
         present = optimiser.lenses.refined(stages.scene.dataset).cameras
-        found = corrected_cameras(present, choice.chosen.lenses.correction)
-        optimiser.lenses.place(stages.scene.dataset.cameras, found or present)
-    return choice.reports
+        corrected = corrected_cameras(present, choice.chosen.lenses.correction)
+        optimiser.lenses.place(stages.scene.dataset.cameras, corrected or present)
+    return finish
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +110,7 @@ class _Split:
     left_out: Evidence
 
 
-def _choice(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Choice | None:
+def _choice(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> tuple[Choice, Finish] | None:
     """None where no evidence can tell. Candidates are in the unit frame."""
     _report(monitor)
     split = _evidence(scene, optimiser)
@@ -124,7 +147,26 @@ def _choice(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Choice
     optimiser.lenses.certainty = focal_certainty(
         best, split.fitted, contradicted_focals(refined, split.fitted, split.left_out, prior, noise, kept)
     )
-    return choice
+    return choice, Finish(choice.reports, _fit(candidates, results, split.fitted))
+
+
+def _fit(
+    candidates: Sequence[Candidate], results: Mapping[CandidateName, Adjustment], evidence: Evidence
+) -> Fit | None:
+    """The adjusted poses that heed most; None where none was to be believed."""
+    name = next((each.name for each in candidates if each.name in results), None)
+    if name is None:
+        return None
+    found, lenses = results[name], evidence.lenses
+    if lenses is not None and found.lenses is not None:
+        lenses = replace(lenses, correction=found.lenses.correction)
+    heeded = Evidence(
+        evidence.intrinsics,
+        evidence.tracks if name != "adjusted-patches" else None,
+        evidence.patches if name != "adjusted-tracks" else None,
+        lenses,
+    )
+    return Fit(found.world_from_cam, heeded, found.patch_noise if heeded.patches else 1.0)
 
 
 def _misfit(candidate: Candidate, evidence: Evidence, noise: NoiseLevels) -> Array:
@@ -185,10 +227,9 @@ def _usable(found: Adjustment) -> bool:
 
 
 def _described(found: Adjustment) -> str:
-    sigma = float(np.degrees(np.sqrt(np.median(np.trace(found.covariance[:, :3, :3], axis1=1, axis2=2)))))
     return (
-        f"standard deviation {sigma:.3f} degrees, tracks {found.track_noise_px:.2f} px, "
-        f"{found.track_inliers:.2f} of them within, patches {found.patch_inliers:.2f}, {found.agreement}"
+        f"tracks {found.track_noise_px:.2f} px, {found.track_inliers:.2f} of them within, "
+        f"patches {found.patch_inliers:.2f}, {found.agreement}"
     )
 
 

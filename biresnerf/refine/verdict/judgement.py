@@ -15,7 +15,6 @@ from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.progress import EXPORTING_FROM, JUDGING_FROM, Monitor, Progress
 from biresnerf.refine.lost.own_matches import contradicted
-from biresnerf.refine.lost.pose_certainty import unsure_deg
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
@@ -47,7 +46,6 @@ class Judgement:
         trial_psnr: of the unseen views, before and after [2, n]; NaN for the others.
         epipolar_px: before and after [2, n]; NaN where there are too few matches.
         sharpness, gain: see `image_flags`.
-        unsure_deg: how far each camera can be carried about the scene without fitting its photo less; 0 if not far.
         contradicted, moved_far, blurred, exposure_off: bool.
     """
 
@@ -56,7 +54,6 @@ class Judgement:
     epipolar_px: Array
     sharpness: Array
     gain: Array
-    unsure_deg: Array
     contradicted: NDArray[np.bool_]
     moved_far: NDArray[np.bool_]
     blurred: NDArray[np.bool_]
@@ -161,7 +158,6 @@ def _with_images(
         epipolar_px=epipolar_px,
         sharpness=sharpness,
         gain=gain,
-        unsure_deg=unsure_deg(optimiser),
         contradicted=contradicted(epipolar_px[1]),
         moved_far=image_flags.moved_far(turned, shifted, distance),
         blurred=image_flags.blurred(sharpness),

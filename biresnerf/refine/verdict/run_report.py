@@ -14,8 +14,10 @@ from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.first_step import poses_in_input_frame
 from biresnerf.refine.verdict.camera_reports import camera_reports, focal_warnings
 from biresnerf.refine.verdict.judgement import Judgement, motion
+from biresnerf.refine.verdict.pose_uncertainty import FIXED
 from biresnerf.refine.views.evaluation import ViewScore
 from biresnerf.report import CandidateReport, HeldOut, ImageReport, Report
+from biresnerf.uncertainty import PoseUncertainty
 
 
 def run_report(
@@ -24,6 +26,7 @@ def run_report(
     judgement: Judgement | None,
     state: Literal["complete", "partial"],
     candidates: tuple[CandidateReport, ...] = (),
+    uncertainty: tuple[PoseUncertainty, ...] = (),
 ) -> Report:
     """The report of a run as it is now.
 
@@ -31,19 +34,19 @@ def run_report(
         scores: of held-out views, as far as they are scored.
         judgement: None where there is no verdict.
         candidates: the poses that were compared at the end.
+        uncertainty: of each image's returned pose, or nothing.
     """
     from biresnerf import __version__
 
     scene, optimiser, record = stages.scene, stages.optimiser, stages.record
     dataset = scene.dataset
     refined, similarity = poses_in_input_frame(dataset, optimiser)
-    lost = [i for i, flag in enumerate(optimiser.camera_errors.lost.tolist()) if flag]
     return Report(
         version=__version__,
         state=state,
         options=optimiser.options,
         verdict=judgement.verdict if judgement is not None else None,
-        images=_image_reports(stages, scores, judgement, refined),
+        images=_image_reports(stages, scores, judgement, refined, uncertainty),
         cameras=camera_reports(dataset, optimiser.lenses),
         heldout=HeldOut(
             count=len(scores),
@@ -67,8 +70,7 @@ def run_report(
         warnings=dataset.warnings
         + focal_warnings(dataset, optimiser.lenses)
         + unmatched_warnings(scene)
-        + _lost_warnings(dataset, lost)
-        + (_judged_warnings(dataset, judgement) if judgement is not None else ()),
+        + _unknown_warnings(dataset, uncertainty),
     )
 
 
@@ -86,43 +88,28 @@ def unmatched_warnings(scene: Scene) -> tuple[str, ...]:
     )
 
 
-def _lost_warnings(dataset: Dataset, lost: list[int]) -> tuple[str, ...]:
-    if not lost:
-        return ()
-    names = ", ".join(dataset.names[i] for i in lost)
-    return (f"{len(lost)} of {len(dataset)} images agree with no pose that was found: {names}.",)
-
-
-def _judged_warnings(dataset: Dataset, judgement: Judgement) -> tuple[str, ...]:
-    contradicted = np.flatnonzero(judgement.contradicted).tolist()
-    unsure = unsure_warnings(dataset, judgement.unsure_deg)
-    if not contradicted:
-        return unsure
-    named = [f"{dataset.names[i]} ({judgement.epipolar_px[1, i]:.1f} px)" for i in contradicted]
-    return (
-        f"The feature matches of {len(contradicted)} of {len(dataset)} images contradict their refined poses: "
-        f"{few_names(named, 20)}. Do not rely on these poses.",
-        *unsure,
-    )
-
-
-def unsure_warnings(dataset: Dataset, unsure_deg: np.ndarray) -> tuple[str, ...]:
-    """A warning that names the images whose `Judgement.unsure_deg` [n] is not zero; empty where there is none."""
-    unsure = np.flatnonzero(unsure_deg).tolist()
-    if not unsure:
-        return ()
-    named = [f"{dataset.names[i]} ({unsure_deg[i]:.0f} degrees)" for i in unsure]
-    return (
-        f"{len(unsure)} of {len(dataset)} photos fit as well with their camera carried far round the scene, which "
-        f"looks alike from there: {few_names(named, 20)}. Look at these poses before you rely on them.",
+def _unknown_warnings(dataset: Dataset, uncertainty: tuple[PoseUncertainty, ...]) -> tuple[str, ...]:
+    """A warning for each reason why poses are not known, with the images' names."""
+    named: dict[str, list[str]] = {}
+    for name, pose in zip(dataset.names, uncertainty, strict=bool(uncertainty)):
+        if pose.why_unknown is not None and pose.why_unknown != FIXED:
+            named.setdefault(pose.why_unknown, []).append(name)
+    return tuple(
+        f"How exact the pose is cannot be said of {len(names)} of {len(dataset)} images, as {why}: "
+        f"{few_names(names, 20)}. Look at these poses before you rely on them."
+        for why, names in named.items()
     )
 
 
 def _image_reports(
-    stages: TwoStages, scores: list[ViewScore], judgement: Judgement | None, refined: np.ndarray
+    stages: TwoStages,
+    scores: list[ViewScore],
+    judgement: Judgement | None,
+    refined: np.ndarray,
+    uncertainty: tuple[PoseUncertainty, ...],
 ) -> tuple[ImageReport, ...]:
     scene, optimiser, repaired = stages.scene, stages.optimiser, stages.repair.repaired
-    lost, exposures = optimiser.camera_errors.lost, optimiser.exposure.gains()
+    exposures = optimiser.exposure.gains()
     turn, shift = motion(scene.dataset.world_from_cam, refined)
     scored = {score.image: score for score in scores}
     return tuple(
@@ -133,7 +120,7 @@ def _image_reports(
             fixed=bool(optimiser.bodies.fixed[i]),
             moved_deg=float(turn[i]),
             moved_units=float(shift[i]),
-            lost=bool(lost[i]),
+            uncertainty=uncertainty[i] if uncertainty else None,
             repaired=i in repaired,
             exposure=None if exposures is None else tuple(exposures[i].tolist()),
             psnr=scored[i].psnr if i in scored else None,
@@ -151,7 +138,6 @@ def _judged(judgement: Judgement | None, image: int) -> dict[str, float | bool |
     figures = {
         "sharpness": judgement.sharpness[image],
         "gain": judgement.gain[image],
-        "unsure_deg": judgement.unsure_deg[image] or np.nan,
         "trial_psnr_before": judgement.trial_psnr[0, image],
         "trial_psnr_after": judgement.trial_psnr[1, image],
         "epipolar_px_before": judgement.epipolar_px[0, image],

@@ -1,6 +1,6 @@
 // Prepares the files of a result for the widgets, which fetch nothing themselves.
 import { useMemo } from "preact/hooks";
-import type { HistoryLine, PosesDocument, Report, ShownPoints, ViewFile } from "schemas";
+import type { HistoryLine, ImageReport, PosesDocument, Report, ShownPoints, ViewFile } from "schemas";
 import { type Flag, FLAGS } from "../widgets/words";
 import { bordersOf, centreOf, length, type Matrix, minus, type Triple, turnDeg } from "./poses";
 
@@ -26,6 +26,10 @@ export interface SceneCamera {
   /** PSNR on refined poses minus on the input's, dB, in the verdict's trainings; null if not measured. */
   readonly delta_psnr: number | null;
   readonly flags: readonly string[];
+  /** What is said of the returned pose; null if nothing was. */
+  readonly uncertainty: ImageReport["uncertainty"];
+  /** The pose that the result holds: the input's, if the verdict kept it. */
+  readonly returned: Matrix;
 }
 
 export interface PointLayer {
@@ -49,6 +53,10 @@ export interface ImageRow {
   readonly epipolar_px_after: number | null;
   /** Held-out views: render against photo at the end. */
   readonly psnr: number | null;
+  /** 90 % bounds of the returned pose's errors; null if not known. */
+  readonly rotation_90: number | null;
+  readonly position_90: number | null;
+  readonly why_unknown: string | null;
   readonly flags: readonly Flag[];
 }
 
@@ -82,6 +90,8 @@ function camerasOf(poses: PosesDocument, report: Report | null): SceneCamera[] {
       moved_units: before ? length(minus(centreOf(after), centreOf(before))) : (measures?.moved_units ?? 0),
       delta_psnr: measured ? (measures.trial_psnr_after ?? 0) - (measures.trial_psnr_before ?? 0) : null,
       flags: image.flags,
+      uncertainty: measures?.uncertainty ?? null,
+      returned: report?.verdict?.returned === "input" && before ? before : after,
     };
   });
 }
@@ -99,7 +109,10 @@ function rowsOf(report: Report): ImageRow[] {
     epipolar_px_before: image.epipolar_px_before,
     epipolar_px_after: image.epipolar_px_after,
     psnr: image.psnr,
-    flags: flags.filter((flag) => image[flag]),
+    rotation_90: image.uncertainty?.rotation_deg ?? null,
+    position_90: image.uncertainty?.position ?? null,
+    why_unknown: image.uncertainty?.why_unknown ?? null,
+    flags: flags.filter((flag) => (flag === "uncertainty" ? image.uncertainty?.why_unknown : image[flag])),
   }));
 }
 

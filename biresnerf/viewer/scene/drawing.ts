@@ -1,21 +1,12 @@
 // The three-dimensional view: its objects, its viewpoint, and which camera is under the pointer.
 import {
-  BufferGeometry,
-  Group,
-  LineBasicMaterial,
-  LineSegments,
-  Mesh,
-  type MeshBasicMaterial,
-  PerspectiveCamera,
-  type Points,
-  type PointsMaterial,
-  Scene,
-  Vector3,
-  WebGLRenderer,
+  BufferGeometry, Group, LineBasicMaterial, LineSegments, Mesh, type MeshBasicMaterial, PerspectiveCamera, type Points,
+  type PointsMaterial, Scene, Vector3, WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { axisOf, between, centreOf, type Matrix, medianOf, minus, plus, spreadOf, type Triple } from "../result/poses";
 import type { PointLayer, SceneCamera } from "../result/widget_data";
+import { Ellipsoids } from "./ellipsoids";
 import { Frusta, VERTICES } from "./frusta";
 import { cloudOf, type Look, overviewOf, pathsOf, upwardsOf, type Viewpoint } from "./geometry";
 
@@ -34,6 +25,7 @@ export class SceneDrawing {
   private readonly chosen: Frusta;
   private readonly chosenSides: Mesh;
   private readonly paths: LineSegments;
+  private readonly ellipsoids: Ellipsoids;
   private points: Points | null = null;
   private layer: PointLayer | null = null;
   private look: Look | null = null;
@@ -65,6 +57,7 @@ export class SceneDrawing {
     this.chosenSides = this.chosen.filled(0.3);
     this.paths = new LineSegments(new BufferGeometry(), new LineBasicMaterial({ vertexColors: true }));
     this.paths.frustumCulled = false;
+    this.ellipsoids = new Ellipsoids(cameras, this.origin);
     for (const [index, camera] of cameras.entries()) {
       this.after.place(index, camera.after);
       if (camera.before) this.before.place(index, camera.before);
@@ -72,7 +65,7 @@ export class SceneDrawing {
     }
     // Scaled to a size of about one, whatever the input's unit: depth buffers have few digits.
     this.world.scale.setScalar(1 / this.spread);
-    this.world.add(this.before.lines, this.after.lines, this.paths, this.chosen.lines, this.chosenSides);
+    this.world.add(this.before.lines, this.after.lines, this.paths, this.ellipsoids.lines, this.chosen.lines, this.chosenSides);
     this.chosen.lines.renderOrder = 2;
     this.scene.add(this.world);
 
@@ -185,7 +178,11 @@ export class SceneDrawing {
     }
     this.before.lines.visible = look.before;
     this.choose(look);
-    if (last?.lines !== look.lines || last.colours !== look.colours) this.drawPaths(look);
+    if (last?.lines !== look.lines || last.colours !== look.colours) {
+      this.paths.geometry.dispose();
+      this.paths.geometry = pathsOf(this.cameras, look, this.origin);
+    }
+    if (last?.exaggerated !== look.exaggerated || last.colours !== look.colours) this.ellipsoids.show(look);
     if (this.layer !== look.layer) this.drawPoints(look.layer);
     if (this.through !== null && last?.share !== look.share) this.lookThrough(this.through, false);
     this.draw();
@@ -201,17 +198,10 @@ export class SceneDrawing {
     this.chosen.paint(0, look.selectedColour);
   }
 
-  private drawPaths(look: Look): void {
-    this.paths.visible = look.lines > 0;
-    this.paths.geometry.dispose();
-    this.paths.geometry = pathsOf(this.cameras, look, this.origin);
-  }
-
   private drawPoints(layer: PointLayer | null): void {
     this.layer = layer;
     if (this.points) {
-      this.world.remove(this.points);
-      this.points.geometry.dispose();
+      this.points.removeFromParent().geometry.dispose();
       (this.points.material as PointsMaterial).dispose();
       this.points = null;
     }
@@ -260,6 +250,11 @@ export class SceneDrawing {
     return plus(this.after.drawn(index, 0), this.origin);
   }
 
+  /** Points on a camera's ellipsoid as drawn, in the world. */
+  drawnUncertainty(index: number): Triple[] {
+    return this.ellipsoids.drawn(index).map((at) => plus(at, this.origin));
+  }
+
   /** The viewpoint in the world, to restore it in another drawing. */
   viewpoint(): Viewpoint {
     const inWorld = (p: Vector3) => plus(p.clone().multiplyScalar(this.spread).toArray(), this.origin);
@@ -285,7 +280,7 @@ export class SceneDrawing {
     cancelAnimationFrame(this.flight);
     this.controls.dispose();
     this.drawPoints(null);
-    for (const drawn of [this.before, this.after, this.chosen]) drawn.dispose();
+    for (const drawn of [this.before, this.after, this.chosen, this.ellipsoids]) drawn.dispose();
     this.chosenSides.geometry.dispose();
     (this.chosenSides.material as MeshBasicMaterial).dispose();
     this.paths.geometry.dispose();

@@ -15,6 +15,8 @@ export interface Look {
   readonly selectedColour: Colour;
   readonly selected: number | null;
   readonly layer: PointLayer | null;
+  /** How many times too large the uncertainty of the positions is drawn; 0 if it is not. */
+  readonly exaggerated: number;
 }
 
 export interface Viewpoint {
@@ -66,7 +68,7 @@ export function overviewOf(
 }
 
 /** The quantile of some values. */
-function quantile(values: readonly number[], part: number): number {
+export function quantile(values: readonly number[], part: number): number {
   const sorted = [...values].sort((a, b) => a - b);
   return sorted[Math.floor(part * (sorted.length - 1))] ?? 0;
 }
@@ -84,6 +86,14 @@ export function cloudOf(layer: PointLayer): Points {
   return points;
 }
 
+/** Segments between pairs of positions. */
+export function linesOf(positions: readonly number[], colours: readonly number[]): BufferGeometry {
+  const geometry = new BufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(new Float32Array(positions), 3));
+  geometry.setAttribute("color", new BufferAttribute(new Float32Array(colours), 3));
+  return geometry;
+}
+
 /** Lines from the centres before towards those after, scaled by `look.lines`; in the world minus `origin`. */
 export function pathsOf(cameras: readonly SceneCamera[], look: Look, origin: Triple): BufferGeometry {
   const positions: number[] = [];
@@ -97,8 +107,5 @@ export function pathsOf(cameras: readonly SceneCamera[], look: Look, origin: Tri
     positions.push(...start, ...start.map((value, axis) => value + look.lines * (moved[axis] ?? 0)));
     colours.push(...srgb(...colour), ...srgb(...colour));
   });
-  const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new BufferAttribute(new Float32Array(positions), 3));
-  geometry.setAttribute("color", new BufferAttribute(new Float32Array(colours), 3));
-  return geometry;
+  return linesOf(positions, colours);
 }

@@ -8,6 +8,7 @@ import { type ColourBy, css, kindColour, rampColour, scaleOf, signedColour, UNKN
 interface SceneChoice {
   readonly lines: 0 | 1 | 10;
   readonly before: boolean;
+  readonly uncertainty: boolean;
   readonly by: ColourBy;
   /** The upper end of each colour scale. */
   readonly caps: Readonly<Partial<Record<ColourBy, number>>>;
@@ -15,7 +16,7 @@ interface SceneChoice {
   readonly layer: string | null;
 }
 
-export const FIRST_CHOICE: SceneChoice = { lines: 1, before: true, by: "moved_deg", caps: {}, layer: null };
+export const FIRST_CHOICE: SceneChoice = { lines: 1, before: true, uncertainty: true, by: "moved_deg", caps: {}, layer: null };
 
 const COLOURS = (["moved_deg", "moved_units", "delta_psnr", "source"] as const).map((value) => {
   const { label, unit } = scaleOf(value, 1);
@@ -44,8 +45,10 @@ export function SceneControls(props: {
   onChange: (changed: Partial<SceneChoice>) => void;
   points: readonly PointLayer[];
   spread: number;
+  /** How many times too large ellipsoids are; null if there are none. */
+  exaggerated: number | null;
 }) {
-  const { choice, onChange, points, spread } = props;
+  const { choice, onChange, points, spread, exaggerated } = props;
   const scale = scaleOf(choice.by, spread);
   const caps = [...scale.caps].sort((a, b) => a - b);
   return (
@@ -81,6 +84,13 @@ export function SceneControls(props: {
         />
       )}
       <Switch label="Input" on={choice.before} onChange={(before) => onChange({ before })} />
+      {exaggerated !== null && (
+        <Switch
+          label={exaggerated === 1 ? "Uncertainty" : `Uncertainty ×${exaggerated}`}
+          on={choice.uncertainty}
+          onChange={(uncertainty) => onChange({ uncertainty })}
+        />
+      )}
     </div>
   );
 }

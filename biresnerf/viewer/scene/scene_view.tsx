@@ -8,6 +8,7 @@ import { themeColour, useDark, useReducedMotion } from "../widgets/theme";
 import { sourceWords } from "../widgets/words";
 import { CameraTable } from "./camera_table";
 import { colourOf, hexColour } from "./colours";
+import { exaggerationOf } from "./ellipsoids";
 import type { Look } from "./geometry";
 import { capOf, FIRST_CHOICE, layerOf, Legend, SceneControls } from "./scene_controls";
 import { useScene } from "./use_scene";
@@ -45,9 +46,14 @@ export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: S
   );
   const layer = layerOf(points, choice.layer);
   const { lines, before } = choice;
+  const times = useMemo(() => {
+    const some = cameras.some((camera) => camera.uncertainty?.position != null);
+    return some ? exaggerationOf(cameras, spread / Math.sqrt(Math.max(4, cameras.length))) : null;
+  }, [cameras, spread]);
+  const exaggerated = choice.uncertainty ? (times ?? 0) : 0;
   const look = useMemo<Look>(
-    () => ({ ...painted, lines, before, layer, share, selected }),
-    [painted, lines, before, layer, share, selected],
+    () => ({ ...painted, lines, before, layer, share, selected, exaggerated }),
+    [painted, lines, before, layer, share, selected, exaggerated],
   );
   const { drawing, failed } = useScene(host, cameras, look, () => setThrough(false));
   useEffect(() => {
@@ -64,6 +70,7 @@ export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: S
     <section class="scene" aria-label="Cameras in three dimensions">
       <SceneControls
         {...{ choice, points, spread }}
+        exaggerated={times}
         onChange={(changed) => setChoice({ ...choice, ...changed })}
       />
       <div
@@ -138,6 +145,15 @@ function Readout({ camera, share }: { camera: SceneCamera; share: number }) {
         <dt>moved</dt>
         <dd>{short(camera.moved_units * share)} units</dd>
       </div>
+      {camera.uncertainty && (
+        <div>
+          <dt>exact to (90 %)</dt>
+          <dd>
+            {camera.uncertainty.why_unknown ??
+              `± ${short(camera.uncertainty.rotation_deg)}°, ± ${short(camera.uncertainty.position)} units, from ${camera.uncertainty.known_from}`}
+          </dd>
+        </div>
+      )}
       <div>
         <dt>pose from</dt>
         <dd>{sourceWords(camera.source)}</dd>

@@ -56,5 +56,6 @@ function exposeState(stage: HTMLElement | null, now: SceneDrawing, selected: num
   stage.dataset.share = String(share);
   stage.dataset.selected = selected === null ? "" : String(selected);
   stage.dataset.centre = selected === null ? "" : now.drawnCentre(selected).join(" ");
+  stage.dataset.uncertainty = selected === null ? "" : now.drawnUncertainty(selected).join(" ");
   stage.dataset.onScreen = selected === null ? "" : (now.onScreen(selected, 0) ?? []).join(" ");
 }

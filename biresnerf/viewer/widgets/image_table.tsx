@@ -30,9 +30,14 @@ interface Column {
 const gain = (row: ImageRow): number | null =>
   row.psnr_before === null || row.psnr_after === null ? null : row.psnr_after - row.psnr_before;
 
+const bound = (value: number | null, row: ImageRow): string =>
+  value === null ? (row.why_unknown === null ? "–" : "not known") : `± ${short(value)}`;
+
 const COLUMNS: readonly Column[] = [
   { key: "moved_deg", title: "turned °", hint: "Rotation from the input's pose to the refined one", value: (r) => r.moved_deg, text: (r) => fixed(r.moved_deg, 2) },
   { key: "moved_units", title: "moved", hint: "Distance between the centres, in the input's units", value: (r) => r.moved_units, text: (r) => short(r.moved_units) },
+  { key: "rotation_90", title: "exact to °", hint: "Nine in ten rotation errors of returned poses are within this bound", value: (r) => r.rotation_90, text: (r) => bound(r.rotation_90, r) },
+  { key: "position_90", title: "exact to units", hint: "Nine in ten errors of returned centres are within this bound, in the input's units", value: (r) => r.position_90, text: (r) => bound(r.position_90, r) },
   { key: "psnr_before", title: "PSNR before", hint: "dB, in the verdict's training on the input's poses", value: (r) => r.psnr_before, text: (r) => fixed(r.psnr_before, 2) },
   { key: "psnr_after", title: "PSNR after", hint: "dB, in the verdict's training on the refined poses", value: (r) => r.psnr_after, text: (r) => fixed(r.psnr_after, 2) },
   { key: "gain", title: "gain dB", hint: "PSNR after minus before", value: gain, text: (r) => signed(gain(r), 2) },
@@ -152,7 +157,7 @@ export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }:
                   </span>
                 </th>
                 {columns.map((column) => (
-                  <td key={column.key} class="number">
+                  <td key={column.key} class="number" title={column.key.endsWith("_90") ? row.why_unknown ?? undefined : undefined}>
                     {column.key === "moved_deg" && (
                       <span class="bar" style={{ width: `${(100 * row.moved_deg) / most}%` }} aria-hidden="true" />
                     )}

@@ -4,18 +4,17 @@ import type { ImageReport, Verdict } from "schemas";
 export const FLAGS = {
   held_out: "held out",
   fixed: "fixed",
-  lost: "lost",
   repaired: "repaired",
   contradicted: "matches disagree",
   moved_far: "moved far",
   blurred: "blurred",
   exposure_off: "exposure off",
-  unsure_deg: "pose uncertain",
+  uncertainty: "pose not known",
 } as const satisfies Partial<Record<keyof ImageReport, string>>;
 export type Flag = keyof typeof FLAGS;
 
 /** Flags that deserve attention. */
-export const ALARMING: ReadonlySet<Flag> = new Set(["lost", "contradicted", "moved_far", "blurred", "exposure_off", "unsure_deg"]);
+export const ALARMING: ReadonlySet<Flag> = new Set(["contradicted", "moved_far", "blurred", "exposure_off", "uncertainty"]);
 
 export const VERDICTS = {
   improved: { word: "improved", tone: "good" },

@@ -122,7 +122,7 @@ def test_the_folder_that_was_written_is_read_with_its_poses(tmp_path: Path, form
 
 def test_the_command_offers_every_form_there_is() -> None:
     [option] = [one for one in convert_command.params if one.name == "names"]
-    assert set(option.type.choices) == {*PLACES, "pinhole", "poses", "scene"} == set(FORMS)
+    assert set(option.type.choices) == {*PLACES, "pinhole", "poses", "csv", "scene"} == set(FORMS)
 
 
 def test_a_form_that_cannot_hold_the_set_leaves_nothing_behind(tmp_path: Path) -> None:

@@ -277,11 +277,11 @@ def test_all_exports_are_written_and_those_that_cannot_be_say_why(tmp_path):
     found = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
     assert found == {
         *(f"colmap/sparse/0/{table}.bin" for table in ("cameras", "images", "points3D")),
-        *("tum.txt", "scene.glb", "poses.json", "kitti.txt", "transforms_ngp.json"),
+        *("tum.txt", "scene.glb", "poses.json", "poses.csv", "kitti.txt", "transforms_ngp.json"),
         *("bundler/bundle.out", "bundler/list.txt"),
     }
     always = {name for name, one in formats().items() if one.always}
-    assert always == {"transforms", "colmap", "tum", "scene", "poses"}
+    assert always == {"transforms", "colmap", "tum", "scene", "poses", "csv"}
 
 
 def test_every_export_that_may_be_asked_for_has_a_writer():

@@ -138,18 +138,6 @@ def test_the_result_is_that_of_scipy(rng):
     assert rotation_errors_deg(found.world_from_cam, exact).max() < 0.01
 
 
-def test_covariance_is_the_scatter_over_repeated_noise(rng):
-    truth = ring(8, rng)
-    points, intrinsics = rng.uniform(-0.8, 0.8, (120, 3)), pinholes(8)
-    errors, expected = [], []
-    for seed in range(20):
-        tracks = observed(truth, points, intrinsics, np.random.default_rng(seed), 0.5)
-        found = adjust_poses(truth, Evidence(intrinsics, tracks), PosePrior.equal(truth, np.inf, np.inf))
-        errors.append(rotation_errors_deg(found.world_from_cam, truth) ** 2)
-        expected.append(np.degrees(1) ** 2 * np.trace(found.covariance[:, :3, :3], axis1=1, axis2=2))
-    assert np.mean(errors) == pytest.approx(np.mean(expected), rel=0.3)
-
-
 def test_left_out_tracks_tell_better_poses_from_worse(rng):
     truth, evidence = scene(rng, noise_px=0.3)
     worse = disturbed(truth, rng, 0.002, 0.005)
@@ -170,7 +158,6 @@ def test_priors_of_no_or_of_any_error_end_in_finite_poses(rng, deviation):
     start = disturbed(truth, rng, 0.01, 0.03)
     found = adjust_poses(start, evidence, PosePrior.equal(start, deviation, deviation))
     assert np.isfinite(found.world_from_cam).all()
-    assert np.isfinite(found.covariance).all()
     if deviation == 0.0:
         np.testing.assert_allclose(found.world_from_cam, start, atol=1e-9)
     else:
@@ -205,7 +192,6 @@ def test_degenerate_tracks_leave_finite_poses(rng, kind):
     evidence = Evidence(pinholes(3), Tracks(tracks.point, tracks.image, np.nan_to_num(tracks.xy)))
     found = adjust_poses(truth, evidence, PosePrior.equal(truth, 0.01, 0.04))
     assert np.isfinite(found.world_from_cam).all()
-    assert np.isfinite(found.covariance).all()
     if kind == "too few":
         np.testing.assert_array_equal(found.world_from_cam, truth)
         assert not found.used

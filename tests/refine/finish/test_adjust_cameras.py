@@ -60,14 +60,14 @@ def errors_deg(run, truth):
 def test_cameras_are_adjusted_where_tracks_left_out_prefer_it(tmp_path, rng):
     run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
     before = errors_deg(run, truth)
-    reports = adjust_cameras(run)
+    reports = adjust_cameras(run).candidates
     assert [report.name for report in reports if report.chosen] == ["adjusted-tracks"]
     assert errors_deg(run, truth).mean() < 0.2 * before.mean()
 
 
 def test_true_poses_of_the_input_are_returned(tmp_path, rng):
     run, truth = stages(tmp_path, rng)
-    assert [report.name for report in adjust_cameras(run) if report.chosen] == ["input"]
+    assert [report.name for report in adjust_cameras(run).candidates if report.chosen] == ["input"]
     assert errors_deg(run, truth).max() < 1e-4
 
 
@@ -75,7 +75,7 @@ def test_refined_poses_stay_without_evidence(tmp_path, rng):
     run, _ = stages(tmp_path, rng)
     run.scene = replace(run.scene, tracks=None)
     before = run.optimiser.poses.poses()
-    assert adjust_cameras(run) == ()
+    assert adjust_cameras(run).candidates == ()
     assert torch.equal(run.optimiser.poses.poses(), before)
 
 
@@ -91,7 +91,7 @@ def test_refined_poses_stay_where_all_tracks_are_wrong(tmp_path, rng):
 def test_methods_of_others_are_left_alone(tmp_path, rng):
     run, _ = stages(tmp_path, rng)
     run.optimiser.method = replace(run.optimiser.method, robust_extensions=False)
-    assert adjust_cameras(run) == ()
+    assert adjust_cameras(run).candidates == ()
 
 
 def test_a_field_without_surface_gives_no_patches(tmp_path, rng):

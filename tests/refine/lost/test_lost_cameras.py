@@ -15,6 +15,7 @@ from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.progress import Monitor
+from biresnerf.refine.finish.adjust_cameras import Finish
 from biresnerf.refine.lost import lost_cameras
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
@@ -22,6 +23,7 @@ from biresnerf.refine.scene.scene_frame import scene_frame
 from biresnerf.refine.stages.checkpoint import load_checkpoint
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.verdict.evaluate import Evaluation
+from biresnerf.refine.verdict.pose_uncertainty import LOST, pose_uncertainty
 from biresnerf.refine.verdict.run_report import run_report
 from biresnerf.write.output_folder import OutputFolder
 from biresnerf.write.result import write_result
@@ -178,17 +180,19 @@ def test_in_an_open_scene_a_camera_that_looks_where_nobody_does_is_brought_home(
     )  # the field has hardly formed: the view is found, not yet the pose
 
 
-def test_the_report_names_those_that_stay_lost(scene, tmp_path):
+def test_the_report_names_those_that_stay_lost_and_those_repaired(scene, tmp_path):
     stages = start(scene, tmp_path, true_poses(scene), stop_at=1)
     finished(stages)
     stages.optimiser.camera_errors._stood_out[TURNED] = 2
     stages.repair.repaired = [ORBITED]
     dataset = scene[0]
-    partial = run_report(stages, [], None, "partial")
+    known = pose_uncertainty(stages, Finish(), None)
+    partial = run_report(stages, [], None, "partial", (), known)
     report = write_result(OutputFolder(tmp_path), stages, Evaluation(), partial)
-    assert [image.name for image in report.images if image.lost] == [dataset.names[TURNED]]
+    lost = [image.name for image in report.images if image.uncertainty.why_unknown == LOST]
+    assert lost == [dataset.names[TURNED]]
     assert [image.name for image in report.images if image.repaired] == [dataset.names[ORBITED]]
-    assert [dataset.names[TURNED] in warning for warning in report.warnings] == [True]
+    assert [dataset.names[TURNED] in warning for warning in report.warnings if LOST in warning] == [True]
 
 
 def test_a_replaced_pose_has_no_momentum_and_others_keep_theirs():

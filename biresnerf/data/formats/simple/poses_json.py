@@ -1,4 +1,4 @@
-"""``poses.json``: every image's pose before and after, its lens and flags, in one self-describing file of ours.
+"""``poses.json``: every image's pose before and after, how exact it is, its lens and flags, in one file of ours.
 
 With the COLMAP model it loses nothing, so the other formats of a result can be made from the two later.
 """
@@ -20,6 +20,7 @@ from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.formats import Format
 from biresnerf.report import SimilarityReport
+from biresnerf.uncertainty import PoseUncertainty
 
 POSES_JSON = Format(
     name="poses",
@@ -57,6 +58,9 @@ class PoseImage(FrozenModel, allow_inf_nan=False):
     world_from_cam_before: Matrix | None = Field(description="As given; null where no pose was.")
     pose_source: str
     flags: tuple[str, ...]
+    uncertainty: PoseUncertainty | None = Field(
+        None, description="Of world_from_cam; null where nothing was said of it."
+    )
 
 
 class PosesDocument(FrozenModel, allow_inf_nan=False):
@@ -85,6 +89,7 @@ def write_poses_json(refined: RefinedSet, path: Path) -> None:
             world_from_cam_before=None if image.given is None else _rows(image.given),
             pose_source=image.pose_source,
             flags=image.flags,
+            uncertainty=image.uncertainty,
         )
         for image, cam_from_world in zip(refined.images, refined.cam_from_world, strict=True)
     )

@@ -1,0 +1,33 @@
+"""What a result says of how exact a pose is. No torch: the service reads it too."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from biresnerf.frozen_model import FrozenModel
+
+KnownFrom = Literal["matches", "photos", "matches and photos", "nothing"]
+_Row = tuple[float, float, float, float, float, float]
+Covariance = tuple[_Row, _Row, _Row, _Row, _Row, _Row]
+
+
+class PoseUncertainty(FrozenModel, allow_inf_nan=False):
+    """How far a returned pose may be from the true one, once the rigs are aligned.
+
+    90 of 100 errors are within the bounds. All figures are None where they are not known.
+    """
+
+    known_from: KnownFrom = Field(description="What speaks for the pose beside the field.")
+    rotation_deg: float | None = Field(None, examples=[0.08], description="90 % bound of its error.")
+    position: float | None = Field(None, examples=[0.004], description="The centre's; the input's unit.")
+    position_percent: float | None = Field(None, description="In percent of the cameras' distance.")
+    covariance: Covariance | None = Field(
+        None,
+        description="Mean square errors, 6 x 6: of the rotation vector w (rad) with exp(w) R the true rotation, R the "
+        "returned world_from_cam; then of the centre (the input's unit). Both along the axes of the input's world.",
+    )
+    why_unknown: str | None = Field(
+        None, examples=["nothing but the field speaks for it"], description="None where the bounds are known."
+    )
