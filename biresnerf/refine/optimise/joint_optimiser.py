@@ -85,7 +85,7 @@ class JointOptimiser:
         self.step_index = 0
         # The step at which stage 2 began. A method of one stage is in its last from the first step.
         self.switch: int | None = None if self.method.two_stages else 0
-        self.pose_scale = 1.0
+        self.poses_held = False  # whether poses and lenses stay as they are
         self.mobility = (
             torch.ones(2, len(self.poses), device=device)
             if mobility is None or not self.method.robust_extensions
@@ -175,7 +175,8 @@ class JointOptimiser:
             self.rays, schedule.blur(t, self.switch, self.sampler.long_side), self.draws
         )
         rate = self.pose_rate()
-        lens_rate = schedule.lens_rate(t, self.switch) * self.pose_scale if self.lenses.moving else 0.0
+        held = self.poses_held or not self.lenses.moving
+        lens_rate = 0.0 if held else schedule.lens_rate(t, self.switch)
         matrices, lenses = self.poses.matrices(), self.intrinsics
         if rate == 0:
             matrices = matrices.detach()
@@ -213,7 +214,7 @@ class JointOptimiser:
 
     def pose_rate(self) -> float:
         """Learning rate of the poses at this step."""
-        return self.schedule.pose_rate(self.step_index, self.switch) * self.pose_scale
+        return 0.0 if self.poses_held else self.schedule.pose_rate(self.step_index, self.switch)
 
     def start_reconstruction(self) -> None:
         """Switch to stage 2 at this step."""
@@ -236,14 +237,8 @@ class JointOptimiser:
         self.rays = int(min(max(wanted, self.method.rays_least), RAYS_MOST))
 
     def coarse_state(self) -> dict[str, Tensor]:
-        """Tensors that a rollback in stage 1 restores: all but the reconstruction module, which has not moved."""
+        """The tensors of stage 1: all but the reconstruction module, which has not moved."""
         return {name: tensor for name, tensor in self.state().items() if "reconstruction" not in name}
-
-    def load_coarse_state(self, state: dict[str, Tensor]) -> None:
-        """Undo the steps since `coarse_state`, but not the random draws: other pixels may work better."""
-        drawn = self.generator.get_state()
-        self._load_tensors({**self.state(), **state})
-        self.generator.set_state(drawn)
 
     def state(self) -> dict[str, Tensor]:
         """All tensors of the run (shared, not copied)."""
@@ -261,19 +256,13 @@ class JointOptimiser:
 
     def step_state(self) -> StepState:
         """The state that is not in tensors."""
-        return StepState(
-            step_index=self.step_index, switch=self.switch, rays=self.rays, pose_scale=self.pose_scale
-        )
+        return StepState(step_index=self.step_index, switch=self.switch, rays=self.rays)
 
     def load_state(self, tensors: dict[str, Tensor], numbers: StepState) -> None:
         """Restore what `state` and `step_state` returned; the next step is then the one that would have come."""
-        self._load_tensors(tensors)
-        self.step_index, self.switch = numbers.step_index, numbers.switch
-        self.rays, self.pose_scale = numbers.rays, numbers.pose_scale
+        self.generator.set_state(tensors["generator"])
+        load_state_of(self._parts(), tensors)
+        self.step_index, self.switch, self.rays = numbers.step_index, numbers.switch, numbers.rays
         if self.draws is not self.generator:
             self.draws.manual_seed(self.options.seed + self.step_index)  # its state is not kept
         self.field.reach(self.step_index / self.schedule.steps)
-
-    def _load_tensors(self, tensors: dict[str, Tensor]) -> None:
-        self.generator.set_state(tensors["generator"])
-        load_state_of(self._parts(), tensors)

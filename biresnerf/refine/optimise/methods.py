@@ -38,8 +38,8 @@ class Method:
         occupancy_side: cells a side of the occupancy grid, given the options.
         two_stages: whether there is a switch; a run without one is in its last stage from the first step.
         pose_betas: of the poses' Adam.
-        robust_extensions: ours around the switch: cameras must be still, rising errors are rolled back, cameras placed
-            by matches move less, and stage 1 is shorter for them; lost cameras weigh less and are repaired.
+        robust_extensions: ours around the switch: cameras must be still, cameras placed by matches move less, and
+            stage 1 is shorter for them; lost cameras weigh less and are repaired.
         robust_frame: results return to the input's frame by a similarity robust to lost cameras, or by the least
             squares of camera centres alone.
         large_network: the field is one large network, whose samples cost tens of times those of a grid.

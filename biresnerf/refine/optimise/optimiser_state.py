@@ -1,4 +1,4 @@
-"""The state of a joint optimisation, as rollbacks and checkpoints keep it: tensors of its parts, and a few numbers."""
+"""The state of a joint optimisation, as checkpoints keep it: tensors of its parts, and a few numbers."""
 
 from __future__ import annotations
 
@@ -15,13 +15,11 @@ class StepState(FrozenModel):
     Attributes:
         switch: the step that stage 2 began at, None before.
         rays: of the next step.
-        pose_scale: factor of the pose rate, halved by each rollback.
     """
 
     step_index: int
     switch: int | None
     rays: int
-    pose_scale: float
 
 
 class Part(Protocol):

@@ -54,13 +54,12 @@ class RunRecord(FrozenModel, arbitrary_types_allowed=True):
     """What has happened in a run so far.
 
     Attributes:
-        resumed, rollbacks: how often.
+        resumed: how often.
         switch_reason: why stage 2 began.
         seconds: spent in each part of the run.
     """
 
     resumed: int = 0
-    rollbacks: int = 0
     switch_reason: SwitchReason | None = None
     seconds: dict[str, float] = Field(default_factory=lambda: {"coarse": 0.0, "fine": 0.0})
 
@@ -78,8 +77,7 @@ class Checkpoint(FrozenModel, arbitrary_types_allowed=True):
     Attributes:
         ends_stage_1: whether this is the state at the end of stage 1, kept for other runs.
         block_errors: mean squared errors of the steps since the detector's last check.
-        snapshot_error: of the state that a rollback would restore, if there is one.
-        tensors: of the optimisation, the snapshot and the tracks, on the CPU.
+        tensors: of the optimisation and the tracks, on the CPU.
     """
 
     ends_stage_1: bool = False
@@ -90,7 +88,6 @@ class Checkpoint(FrozenModel, arbitrary_types_allowed=True):
     detector: DetectorState
     repair: RepairState
     block_errors: tuple[float, ...] = ()
-    snapshot_error: float | None = None
     tensors: dict[str, Tensor] = Field(exclude=True, repr=False)
 
     @property

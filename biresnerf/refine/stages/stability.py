@@ -15,15 +15,12 @@ import numpy as np
 
 from biresnerf.frozen_model import FrozenModel
 
-Verdict = Literal["running", "stable", "cap", "diverging"]
+Verdict = Literal["running", "stable", "cap"]
 
 WINDOW = 10  # blocks
 SLOPE_DB = 0.15  # net change over the window that still counts as flat
 FLUCTUATION_DB = 0.35  # standard deviation about the line that still counts as calm
 CONFIRMATIONS = 2  # checks in a row
-RISING_BLOCKS = 3  # blocks in a row with rising error that mean divergence
-# A rollback is costly, and a plateau's noise rises half of the time: the rise over the window must exceed the noise.
-RISE_DB, RISE_FLUCTUATIONS = 0.5, 4.0
 STILL_DEG = 0.05  # 90 % quantile of rotation change per block below which cameras have settled
 # Adam's steps have the size of the learning rate whatever the gradient: settled cameras still stagger by about
 # rate * sqrt(steps) in a block. Measured on settled rigs: 1.2 to 1.5 times that; while they move, 3 and more.
@@ -35,7 +32,6 @@ class DetectorState(FrozenModel):
 
     decibels: tuple[float, ...] = ()
     confirmed: int = 0
-    rising: int = 0
 
 
 @dataclass
@@ -45,8 +41,7 @@ class StabilityDetector:
     Attributes:
         floor, cap: no switch before step `floor`; always at step `cap`.
         motion_deg: how calm cameras must be for STABLE: the 90 % quantile of their rotation within the block.
-        guarded: whether moving cameras put the switch off, and a rising error is called divergence; neither is in
-            the paper.
+        guarded: whether moving cameras put the switch off, which is not in the paper.
     """
 
     floor: int
@@ -55,7 +50,6 @@ class StabilityDetector:
     guarded: bool = True
     decibels: list[float] = field(default_factory=list)
     confirmed: int = 0
-    rising: int = 0
 
     def still_deg(self, pose_rate: float, steps: int) -> float:
         """Rotation within a block of `steps` steps that settled cameras may show at this learning rate (rad)."""
@@ -67,13 +61,8 @@ class StabilityDetector:
         """One block's result at `step`. `moved_deg`: 90 % quantile of the cameras' rotation during the block."""
         self.decibels.append(-10 * math.log10(max(mean_squared_error, 1e-12)))
         if len(self.decibels) >= WINDOW:
-            change, fluctuation = self._trend()
-            risen = change < -max(RISE_DB, RISE_FLUCTUATIONS * fluctuation)
-            self.rising = self.rising + 1 if risen else 0
             still = moved_deg < (still_deg or self.motion_deg) or not self.guarded
             self.confirmed = self.confirmed + 1 if self._flat() and still else 0
-            if self.rising >= RISING_BLOCKS and self.guarded:
-                return "diverging"
         if step >= self.cap:
             return "cap"
         if self.confirmed >= CONFIRMATIONS and step >= self.floor:
@@ -103,12 +92,7 @@ class StabilityDetector:
         return float(slope * (WINDOW - 1)), fluctuation
 
     def state(self) -> DetectorState:
-        return DetectorState(decibels=tuple(self.decibels), confirmed=self.confirmed, rising=self.rising)
+        return DetectorState(decibels=tuple(self.decibels), confirmed=self.confirmed)
 
     def load_state(self, state: DetectorState) -> None:
-        self.decibels, self.confirmed, self.rising = list(state.decibels), state.confirmed, state.rising
-
-    def clear(self) -> None:
-        """Forget the window, after a rollback."""
-        self.decibels.clear()
-        self.confirmed = self.rising = 0
+        self.decibels, self.confirmed = list(state.decibels), state.confirmed

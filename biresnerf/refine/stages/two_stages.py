@@ -1,4 +1,4 @@
-"""The two stages: step, watch the error, switch when it is stable, roll back when it diverges, keep checkpoints."""
+"""The two stages: step, watch the error, switch when it is stable, keep checkpoints."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from torch import Tensor
 
 from biresnerf.errors import Interrupted, RefinementError
 from biresnerf.geometry.pose_error import rotation_between_deg
@@ -36,8 +35,6 @@ from biresnerf.stages import ReusableStage
 
 logger = logging.getLogger(__name__)
 
-ROLLBACKS = 3
-SNAPSHOT = "snapshot."  # before the names of its tensors in a checkpoint
 REPORT_PERIOD_S = 0.5
 
 
@@ -90,7 +87,6 @@ class TwoStages:
         self._moved_deg = 0.0
         self._signal: dict[str, float] = {}
         self._poses_at_check = optimiser.poses.poses()
-        self._snapshot: tuple[float, dict[str, Tensor]] | None = None
         self._reusable: dict[ReusableStage, tuple[str, ...]] = {}
 
     @property
@@ -102,7 +98,7 @@ class TwoStages:
 
         Raises:
             Interrupted: stopped; a checkpoint is written.
-            RefinementError: ``diverged``: the error is not a number, or keeps rising after all rollbacks.
+            RefinementError: ``diverged``: the error is not a number.
         """
         self._reported = self._saved = time.monotonic()
         self._previews.begin()
@@ -170,17 +166,11 @@ class TwoStages:
         verdict = self.detector.check(optimiser.step_index, error, self._moved_deg, still_deg)
         self._signal = {"still_deg": still_deg, **self.detector.signal()}
         self._write_history(error, last)
-        if verdict == "diverging":
-            self._roll_back()
-            return
-        if self._snapshot is None or error < self._snapshot[0]:
-            self._snapshot = (error, {k: v.clone() for k, v in optimiser.coarse_state().items()})
-        if verdict in ("stable", "cap"):
+        if verdict != "running":
             self._repair(switching=True)
-            reason = "stable" if verdict == "stable" else "cap"
-            self.record = self.record.model_copy(update={"switch_reason": reason})
+            self.record = self.record.model_copy(update={"switch_reason": verdict})
             logger.info("stage 2 begins at step %d (%s)", optimiser.step_index, verdict)
-            self._snapshot, self._signal = None, {}
+            self._signal = {}
             self._save(ends_stage_1=True)
             self._reusable = {"coarse": (COARSE.as_posix(),)}
             optimiser.start_reconstruction()
@@ -218,17 +208,6 @@ class TwoStages:
             ).model_dump(exclude_none=True)
         )
 
-    def _roll_back(self) -> None:
-        """Back to the best state so far with half the pose rate (method 4.3, DIVERGE)."""
-        self.record = self.record.model_copy(update={"rollbacks": self.record.rollbacks + 1})
-        if self.record.rollbacks > ROLLBACKS or self._snapshot is None:
-            raise RefinementError("diverged", f"The error keeps rising at step {self.optimiser.step_index}.")
-        logger.warning("error rises at step %d: rolling back", self.optimiser.step_index)
-        self.optimiser.load_coarse_state(self._snapshot[1])
-        self.optimiser.pose_scale *= 0.5
-        self.detector.clear()
-        self._poses_at_check = self.optimiser.poses.poses()
-
     def _progress(self, checkpoint: str | None, preview: tuple[str, ...] = ()) -> Progress:
         optimiser = self.optimiser
         step, steps = optimiser.step_index, optimiser.schedule.steps
@@ -256,8 +235,6 @@ class TwoStages:
     def _save(self, *, ends_stage_1: bool = False) -> None:
         state = self.optimiser.coarse_state() if ends_stage_1 else self.optimiser.state()
         tensors = {**track_tensors(self.scene.tracks), **state, "poses_at_check": self._poses_at_check}
-        if self._snapshot is not None:
-            tensors.update({SNAPSHOT + name: tensor for name, tensor in self._snapshot[1].items()})
         checkpoint = Checkpoint(
             ends_stage_1=ends_stage_1,
             origin=self.origin,
@@ -267,15 +244,13 @@ class TwoStages:
             detector=self.detector.state(),
             repair=self.repair.state(),
             block_errors=tuple(self._errors),
-            snapshot_error=None if self._snapshot is None else self._snapshot[0],
             tensors=tensors,
         )
         save_checkpoint(self.folder, checkpoint)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue where a checkpoint was written; from the end of stage 1 of another run, begin stage 2."""
-        saved, optimiser = checkpoint.tensors, self.optimiser
-        tensors = {name: tensor for name, tensor in saved.items() if not name.startswith(SNAPSHOT)}
+        tensors, optimiser = checkpoint.tensors, self.optimiser
         if checkpoint.ends_stage_1:  # it holds nothing of the reconstruction module
             tensors = {**optimiser.state(), **tensors}
         optimiser.load_state(tensors, checkpoint.optimiser)
@@ -285,8 +260,5 @@ class TwoStages:
         if checkpoint.ends_stage_1:
             optimiser.start_reconstruction()
             return
-        if checkpoint.snapshot_error is not None:
-            snapshot = {k.removeprefix(SNAPSHOT): v for k, v in saved.items() if k.startswith(SNAPSHOT)}
-            self._snapshot = (checkpoint.snapshot_error, snapshot)
         self.detector.load_state(checkpoint.detector)
         self.record = self.record.model_copy(update={"resumed": self.record.resumed + 1})

@@ -112,7 +112,7 @@ class FrozenTrials:
             images, self.frame, poses, self._options, self.unseen, self._device, self._threads,
             sampler=self._sampler,
         )  # fmt: skip
-        optimiser.pose_scale = 0.0
+        optimiser.poses_held = True
         for _ in range(self.steps):
             if self._should_stop():
                 raise Interrupted("stopped while sets of poses were compared")

@@ -90,21 +90,6 @@ def test_poses_stand_still_in_the_last_steps(scene):
     assert torch.equal(optimiser.poses.matrices(), before)
 
 
-def test_a_rollback_undoes_the_steps_of_stage_1_but_not_the_random_draws(scene):
-    optimiser = tiny_optimiser(*scene, tiny_options())
-    for _ in range(5):
-        optimiser.step()
-    saved = {k: v.clone() for k, v in optimiser.coarse_state().items()}
-    for _ in range(5):
-        optimiser.step()
-    drawn = optimiser.generator.get_state()
-    optimiser.load_coarse_state(saved)
-    for name, tensor in optimiser.coarse_state().items():
-        expected = drawn if name == "generator" else saved[name]
-        assert torch.equal(tensor, expected), name
-    assert optimiser.step_index == 10
-
-
 def test_another_seed_is_another_run_and_the_same_seed_the_same(scene):
     def run(seed: int) -> torch.Tensor:
         optimiser = tiny_optimiser(*scene, tiny_options(seed=seed))

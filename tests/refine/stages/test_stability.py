@@ -58,22 +58,6 @@ def test_an_error_that_keeps_falling_by_a_fifth_of_a_decibel_a_block_never_count
         assert run(StabilityDetector(400, 10**9), 15 + 0.2 * np.arange(100) + noise)[0] == "running"
 
 
-def test_a_rising_error_is_diverging():
-    fall = approach(600, 30, seed=0)
-    rise = fall[-1] - 0.3 * np.arange(1, 30)
-    detector = StabilityDetector(10**8, 10**9)  # floor never reached: only divergence can speak
-    verdict, step = run(detector, np.concatenate([fall, rise]))
-    assert verdict == "diverging"
-    assert 30 * PERIOD < step <= (30 + WINDOW + 3) * PERIOD
-
-
-def test_a_rollback_forgets_the_rise():
-    detector = StabilityDetector(10**8, 10**9)
-    assert run(detector, 20 - 0.5 * np.arange(30))[0] == "diverging"
-    detector.clear()
-    assert run(detector, 20 - 0.5 * np.arange(WINDOW - 1))[0] == "running"
-
-
 def test_the_cap_ends_stage_1_however_the_error_moves():
     for curve in (15 + 0.2 * np.arange(100), np.full(100, 20.0)):
         detector = StabilityDetector(400, 3000)
@@ -97,13 +81,6 @@ def test_moving_cameras_are_not_stable_though_the_error_is_flat():
 def test_a_wildly_fluctuating_error_is_not_stable():
     noise = np.random.default_rng(0).normal(0, 2.0, 100)
     assert run(StabilityDetector(400, 10**9), 20 + noise)[0] != "stable"
-
-
-@pytest.mark.parametrize("noise_db", [0.06, 0.12, 0.2])
-def test_the_noise_of_a_plateau_is_not_taken_for_divergence(noise_db):
-    for seed in range(40):
-        noise = np.random.default_rng(seed).normal(0, noise_db, 40)
-        assert run(StabilityDetector(400, 10**9), 20 + noise, moved_deg=1.0)[0] == "running"
 
 
 def test_one_flat_window_is_not_enough():
@@ -131,7 +108,5 @@ def test_time_constants_of_the_approach_give_the_calibrated_switches():
         assert abs(np.median(found) - expected) <= 800
 
 
-def test_an_unguarded_detector_neither_sees_divergence_nor_waits_for_still_cameras():
-    curve = np.concatenate([approach(600, 30, seed=0), 27.5 - 0.3 * np.arange(1, 30)])
-    assert run(StabilityDetector(10**8, 10**9, guarded=False), curve)[0] == "running"
+def test_an_unguarded_detector_does_not_wait_for_still_cameras():
     assert run(StabilityDetector(400, 10**9, guarded=False), np.full(60, 20.0), moved_deg=1.0)[0] == "stable"

@@ -1,4 +1,4 @@
-"""Both stages as one run: switching, stopping, resuming bit for bit, rolling back."""
+"""Both stages as one run: switching, stopping, resuming bit for bit."""
 
 from __future__ import annotations
 
@@ -132,40 +132,6 @@ def test_the_fraction_waits_where_an_early_switch_makes_the_rest_dearer_than_tho
     later = stages._progress(None)
     assert later.eta_s > early.eta_s
     assert later.fraction == early.fraction
-
-
-def test_rising_errors_roll_back_to_the_best_state_with_half_the_pose_rate(scene, tmp_path):
-    stages = start(scene, tmp_path, tiny_options(coarse_steps_max=40, coarse_steps_min=40))
-    verdicts = iter(["running"] * 4 + ["diverging"] * 1)
-    stages.detector.check = lambda *_: next(verdicts)
-    stages.monitor = Monitor(should_stop=lambda: stages.optimiser.step_index == 20)
-    finished(stages)
-    best = {k: v.clone() for k, v in stages._snapshot[1].items()}
-    stages.monitor = Monitor(should_stop=lambda: stages.optimiser.step_index == 25)
-    finished(stages)
-    assert stages.record.rollbacks == 1
-    assert stages.optimiser.pose_scale == 0.5
-    assert torch.equal(stages.optimiser.state()["poses.rotation"], best["poses.rotation"])
-    assert torch.equal(stages.optimiser.state()["field.pose_table"], best["field.pose_table"])
-
-
-def test_a_resumed_run_can_still_roll_back(scene, tmp_path):
-    first = start(scene, tmp_path, tiny_options(), stop_at=7)
-    finished(first)
-    second = start(scene, tmp_path, tiny_options(), stop_at=11)
-    second.restore(load_checkpoint(tmp_path))
-    second.detector.check = lambda *_: "diverging"
-    assert not finished(second)
-    assert second.record.rollbacks == 1
-
-
-def test_an_error_that_keeps_rising_ends_the_run_with_a_reason(scene, tmp_path):
-    stages = start(scene, tmp_path, tiny_options(coarse_steps_max=40, coarse_steps_min=40))
-    verdicts = iter(["running", *["diverging"] * 4])
-    stages.detector.check = lambda *_: next(verdicts)
-    with pytest.raises(RefinementError) as caught:
-        finished(stages)
-    assert caught.value.code == "diverged"
 
 
 def test_a_loss_that_is_no_number_ends_the_run_with_a_reason(scene, tmp_path):
