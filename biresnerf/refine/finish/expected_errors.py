@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 MOST_ROTATION = 0.1
 # Errors of lenses, of photos and of the field's surface are alike in many residuals and do not average out: by how much
 # they make errors larger than the noise does.
-TRACK_MODEL_ERROR, PATCH_MODEL_ERROR = 2.5, 1.25
+TRACK_MODEL_ERROR, PATCH_MODEL_ERROR = 3.0, 1.25
 NORMAL_90 = 1.2816  # of a normal deviate: one in ten is above it
 
 
