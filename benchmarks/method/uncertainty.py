@@ -94,6 +94,9 @@ def main() -> None:
     work += [(str(run), of_run, (run, truth)) for run, truth in asked.run]
     for name, measure, arguments in work:
         ratios, figures = measure(*arguments)
+        if len(ratios) == 0:
+            print(json.dumps({"set": name, "cameras": 0}), flush=True)
+            continue
         all_ratios.append(ratios)
         medians = dict(
             zip(
