@@ -1,4 +1,4 @@
-"""The whole method on one screen: read, seed, stage 1, stage 2, evaluate, adjust, judge, write."""
+"""The whole method on one screen: read, seed, stage 1, stage 2, evaluate, judge, write."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from biresnerf.field.backends import resolve_here, use_threads
 from biresnerf.field.cpu.compile_kernels import compile_kernels
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import KERNELS_FROM, START_KNOWN, Monitor, OnProgress, Progress
-from biresnerf.refine.finish.adjust_cameras import adjust_cameras
+from biresnerf.refine.finish.rounds import run_stage_2
 from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.checkpoint import SEEDING, TRACKS, Checkpoint, RunOrigin
@@ -83,10 +83,9 @@ def refine_poses(
     evaluation, judgement = Evaluation(), None
     try:
         stages.run_stage_1()
-        stages.run_stage_2()
-        evaluation = evaluate(stages, ResultPictures(setup.folder, scene))
-        finish = adjust_cameras(stages)
+        finish = run_stage_2(stages)
         stages.observer.at_end(stages.optimiser)
+        evaluation = evaluate(stages, ResultPictures(setup.folder, scene))
         judgement = judge(stages)
         known = pose_uncertainty(stages, finish, judgement)
         report = run_report(stages, evaluation.scores, judgement, "complete", finish.candidates, known)

@@ -224,8 +224,8 @@ class CandidateReport(FrozenModel):
     """
 
     name: CandidateName = Field(
-        description="input: as given or seeded; matched: COLMAP's own model; refined: by the field; adjusted: all "
-        "cameras at once, to tracks of feature matches, to patches of photos, or to both."
+        description="input: as given or seeded; matched: COLMAP's own model; refined: as the steps left them; "
+        "adjusted: all cameras at once, to tracks of feature matches, to patches of photos, or to both."
     )
     track_misfit: float | None = Field(None, examples=[1.1], description="None without feature matches.")
     patch_misfit: float | None = Field(None, examples=[1.3])

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import TypeVar
+
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +23,8 @@ from biresnerf.refine.adjustment.kernels.patches import (
 from biresnerf.refine.adjustment.term import Linearised
 
 Array = NDArray[np.float64]
+Seen = tuple[object, ...]  # what all kernels read
+Result = TypeVar("Result")
 
 # Expected of a pixel, 0 to 1: its own noise, and by how much of a pixel resampling and surface are off.
 PIXEL_NOISE, PIXEL_SHIFT = 0.01, 0.1
@@ -85,13 +93,15 @@ class PatchTerm:
     def squares(self, cameras: Cameras, scales: Array) -> Array:
         """Mean square [m] of each comparison."""
         squared = np.empty(len(self.patches.target))
-        patch_errors(*self._seen(cameras, scales), PIXEL_NOISE, PIXEL_SHIFT, squared)
+        self._in_parts(
+            lambda part: patch_errors(*part[1], PIXEL_NOISE, PIXEL_SHIFT, squared), cameras, scales
+        )
         return squared
 
     def settle(self, cameras: Cameras) -> None:
         """The depths' scales that fit best, for cameras that stay."""
-        seen = self._seen(cameras, self.unknowns)
-        settle_scales(*seen, PIXEL_NOISE, PIXEL_SHIFT, self.scale, SCALE_DEVIATION, 2 * SCALE_DEVIATION)
+        fixed = PIXEL_NOISE, PIXEL_SHIFT, self.scale, SCALE_DEVIATION, 2 * SCALE_DEVIATION
+        self._in_parts(lambda part: settle_scales(*part[1], *fixed), cameras, self.unknowns)
 
     def inliers(self, cameras: Cameras) -> NDArray[np.bool_]:
         """Which comparisons [m] are within the robust scale."""
@@ -107,12 +117,19 @@ class PatchTerm:
     def linearise(self, cameras: Cameras, damping: float) -> Linearised:
         size = cameras.unknowns
         rows = cameras.rows(self.patches.host), cameras.rows(self.patches.target)
-        system, right = np.zeros((size, size)), np.zeros(size)
-        back = patch_system(
-            *self._seen(cameras, self.unknowns), *rows, PIXEL_NOISE, PIXEL_SHIFT, self.scale, SCALE_DEVIATION,
-            self.noise, damping, system, right,
-        )  # fmt: skip
-        return Linearised(system, right, (*back, *rows))
+        fixed = PIXEL_NOISE, PIXEL_SHIFT, self.scale, SCALE_DEVIATION, self.noise, damping
+        of_target = np.zeros(rows[1].shape)
+
+        def linearised(part: tuple[slice, Seen]) -> tuple[Array, Array, tuple[Array, ...]]:
+            taken, seen = part
+            system, right = np.zeros((size, size)), np.zeros(size)
+            back = patch_system(*seen, rows[0][taken], rows[1], *fixed, system, right, of_target)
+            return system, right, back
+
+        parts = self._in_parts(linearised, cameras, self.unknowns)
+        back = [np.concatenate(each) for each in zip(*(part[2] for part in parts), strict=True)]
+        system, right = (np.sum([part[k] for part in parts], axis=0) for k in (0, 1))
+        return Linearised(system, right, (*back, of_target, *rows))
 
     def stepped(self, linearised: Linearised, motion: Array) -> Array:
         inverses, gradients, of_host, of_target, host_rows, target_rows = linearised.back
@@ -121,10 +138,21 @@ class PatchTerm:
         force += np.bincount(self.patches.point, targets, len(self.patches))
         return np.asarray(self.unknowns + np.clip(-inverses * force, -LONGEST_SCALE_STEP, LONGEST_SCALE_STEP))
 
-    def _seen(self, cameras: Cameras, scales: Array) -> tuple[object, ...]:
+    def _in_parts(
+        self, kernel: Callable[[tuple[slice, Seen]], Result], cameras: Cameras, scales: Array
+    ) -> list[Result]:
+        """What a kernel makes of the patches, a part of them on each of the threads."""
+        workers = numba.get_num_threads()
+        bounds = np.linspace(0, len(self.patches), workers + 1).astype(int)
+        parts = [slice(*ends) for ends in pairwise(bounds)]
+        seen = [self._seen(cameras, scales, part) for part in parts]
+        with ThreadPoolExecutor(workers) as threads:
+            return list(threads.map(kernel, zip(parts, seen, strict=True)))
+
+    def _seen(self, cameras: Cameras, scales: Array, taken: slice) -> Seen:
         patches = self.patches
         return (
             cameras.rotation, cameras.centre, cameras.lens_rows(self.lens), (self.coefficients, self.frames),
-            self.values, patches.host, cameras.rays_of(patches.host, patches.rays), patches.inverse_depth, self.start,
-            patches.target, scales,
+            self.values[taken], patches.host[taken], cameras.rays_of(patches.host[taken], patches.rays[taken]),
+            patches.inverse_depth[taken], self.start[taken.start : taken.stop + 1], patches.target, scales[taken],
         )  # fmt: skip

@@ -1,10 +1,11 @@
-"""The last step of a run: candidates from all evidence, judged by what none was fitted to, and the best one taken."""
+"""All cameras adjusted at once: candidates from all evidence, judged by what none was fitted to, the best one taken."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,7 +15,6 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.similarity import align_robust
-from biresnerf.progress import JUDGING_FROM, Monitor, Progress
 from biresnerf.refine.adjustment.adjustment import NOTHING_FITS, Adjustment, Halves, adjust_poses, misfit
 from biresnerf.refine.adjustment.choice import Candidate, Choice, choose
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
@@ -89,12 +89,12 @@ def adjust_cameras(stages: TwoStages) -> Finish:
         return Finish()
     with stages.record.timed("adjusting"):
         stages.repair.place_by_matches()
-        found = _choice(stages.scene, optimiser, stages.monitor)
+        found = _choice(stages.scene, optimiser, partial(_announce, stages))
     if found is None:
         return Finish()
     choice, finish = found
     if choice.chosen.name != "refined":
-        optimiser.poses.place(torch.from_numpy(choice.chosen.world_from_cam))
+        stages.place(choice.chosen.world_from_cam)
     if choice.chosen.lenses is not None:
         present = optimiser.lenses.refined(stages.scene.dataset).cameras
         corrected = corrected_cameras(present, choice.chosen.lenses.correction)
@@ -110,9 +110,10 @@ class _Split:
     left_out: Evidence
 
 
-def _choice(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> tuple[Choice, Finish] | None:
+def _choice(
+    scene: Scene, optimiser: JointOptimiser, announce: Callable[[], None]
+) -> tuple[Choice, Finish] | None:
     """None where no evidence can tell. Candidates are in the unit frame."""
-    _report(monitor)
     split = _evidence(scene, optimiser)
     if split is None:
         return None
@@ -120,7 +121,7 @@ def _choice(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> tuple[
     if not np.isfinite(refined).all():
         return None
     prior = PosePrior.equal(refined, PRIOR, PRIOR * optimiser.frame.distance)
-    results = _adjusted(refined, split.fitted, prior, monitor)
+    results = _adjusted(refined, split.fitted, prior, announce)
     noise = results["adjusted-tracks"].noise if "adjusted-tracks" in results else NoiseLevels()
     if noise.track_px > _most_noise_px(split.fitted):
         logger.info("tracks say nothing: their noise is %.1f px", noise.track_px)
@@ -136,12 +137,12 @@ def _choice(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> tuple[
         ("patches", replace(split.left_out, tracks=None)),
     ):
         if left_out.tracks is not None or left_out.patches is not None:
-            _report(monitor)
+            announce()
             misfits[kind] = np.stack([_misfit(each, left_out, noise) for each in candidates])
     if not any(map(_tells, misfits.values())):
         return None
     choice = choose(candidates, misfits)
-    _report(monitor)
+    announce()
     best = results.get(choice.chosen.name) or next(iter(results.values()), None)
     kept = given_focals(scene.dataset, optimiser.options.refine_intrinsics)
     optimiser.lenses.certainty = focal_certainty(
@@ -183,13 +184,13 @@ def _tells(misfits: Array) -> bool:
 
 
 def _adjusted(
-    refined: Array, evidence: Evidence, prior: PosePrior, monitor: Monitor
+    refined: Array, evidence: Evidence, prior: PosePrior, announce: Callable[[], None]
 ) -> dict[CandidateName, Adjustment]:
     """Adjusted to tracks, to patches and to both."""
     found: dict[CandidateName, Adjustment] = {}
 
     def add(name: CandidateName, evidence: Evidence, halves: Halves | None = None) -> Adjustment:
-        _report(monitor)
+        announce()
         found[name] = result = adjust_poses(refined, evidence, prior, halves)
         logger.info("%s: %s", name, _described(result))
         return result
@@ -269,8 +270,6 @@ def _evidence(scene: Scene, optimiser: JointOptimiser) -> _Split | None:
     )
 
 
-def _report(monitor: Monitor) -> None:
-    monitor.raise_if_stopped("stopped while the cameras were adjusted; run again to go on")
-    monitor.report(
-        Progress(stage="evaluating", fraction=JUDGING_FROM, message="adjusting all cameras at once")
-    )
+def _announce(stages: TwoStages) -> None:
+    stages.monitor.raise_if_stopped("stopped while the cameras were adjusted; run again to go on")
+    stages.announce("adjusting all cameras at once")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -216,6 +217,15 @@ class JointOptimiser:
         """Learning rate of the poses at this step."""
         return 0.0 if self.poses_held else self.schedule.pose_rate(self.step_index, self.switch)
 
+    def hold_poses(self, learning_share: float) -> None:
+        """Poses stand still from now on, and the run ends after so large a share of its steps."""
+        self.poses_held = True
+        self._end_at(min(self.step_index + round(learning_share * self.options.steps), self.schedule.steps))
+
+    def _end_at(self, steps: int) -> None:
+        options = self.schedule.options.model_copy(update={"steps": steps})
+        self.schedule = replace(self.schedule, options=options)
+
     def start_reconstruction(self) -> None:
         """Switch to stage 2 at this step."""
         self.switch = self.step_index
@@ -256,13 +266,21 @@ class JointOptimiser:
 
     def step_state(self) -> StepState:
         """The state that is not in tensors."""
-        return StepState(step_index=self.step_index, switch=self.switch, rays=self.rays)
+        return StepState(
+            step_index=self.step_index,
+            switch=self.switch,
+            rays=self.rays,
+            poses_held=self.poses_held,
+            steps=self.schedule.steps,
+        )
 
     def load_state(self, tensors: dict[str, Tensor], numbers: StepState) -> None:
         """Restore what `state` and `step_state` returned; the next step is then the one that would have come."""
         self.generator.set_state(tensors["generator"])
         load_state_of(self._parts(), tensors)
         self.step_index, self.switch, self.rays = numbers.step_index, numbers.switch, numbers.rays
+        self.poses_held = numbers.poses_held
+        self._end_at(numbers.steps)
         if self.draws is not self.generator:
             self.draws.manual_seed(self.options.seed + self.step_index)  # its state is not kept
         self.field.reach(self.step_index / self.schedule.steps)

@@ -15,11 +15,15 @@ class StepState(FrozenModel):
     Attributes:
         switch: the step that stage 2 began at, None before.
         rays: of the next step.
+        poses_held: whether poses stand still.
+        steps: where the run ends.
     """
 
     step_index: int
     switch: int | None
     rays: int
+    poses_held: bool
+    steps: int
 
 
 class Part(Protocol):

@@ -31,7 +31,7 @@ CHECKPOINT = Path("checkpoint") / "latest.safetensors"
 SEEDING = CHECKPOINT.with_name("seeding.json")  # COLMAP's result; every checkpoint carries a copy
 TRACKS = CHECKPOINT.with_name(KEPT)  # through feature matches; every checkpoint carries them, too
 COARSE = CHECKPOINT.with_name("coarse.safetensors")  # the state at the end of stage 1, for runs that share it
-FORMAT = "5"
+FORMAT = "6"
 TRACKED = "tracks."  # before the names of tensors
 OTHER_FOLDER = "Choose another output folder, or remove this one."
 
@@ -56,11 +56,13 @@ class RunRecord(FrozenModel, arbitrary_types_allowed=True):
     Attributes:
         resumed: how often.
         switch_reason: why stage 2 began.
+        adjusted: whether all cameras were adjusted on the way through stage 2.
         seconds: spent in each part of the run.
     """
 
     resumed: int = 0
     switch_reason: SwitchReason | None = None
+    adjusted: bool = False
     seconds: dict[str, float] = Field(default_factory=lambda: {"coarse": 0.0, "fine": 0.0})
 
     @contextmanager
@@ -68,7 +70,7 @@ class RunRecord(FrozenModel, arbitrary_types_allowed=True):
         """Record the seconds of a block, if it ends without an error."""
         started = time.monotonic()
         yield
-        self.seconds[part] = time.monotonic() - started
+        self.seconds[part] = self.seconds.get(part, 0.0) + time.monotonic() - started
 
 
 class Checkpoint(FrozenModel, arbitrary_types_allowed=True):

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from biresnerf.errors import Interrupted, RefinementError
 from biresnerf.geometry.pose_error import rotation_between_deg
@@ -106,13 +108,23 @@ class TwoStages:
         while self.optimiser.switch is None and self.optimiser.step_index < self.optimiser.schedule.steps:
             self._step()
 
-    def run_stage_2(self) -> None:
-        """Step to the end and write a checkpoint. Raises as `run_stage_1`."""
-        while self.optimiser.step_index < self.optimiser.schedule.steps:
+    def run_stage_2(self, share: float = 1.0) -> None:
+        """Step until this share of all steps is taken, and write a checkpoint. Raises as `run_stage_1`."""
+        until = round(share * self.optimiser.schedule.steps)
+        while self.optimiser.step_index < until:
             self._step()
         self._save()
-        # Evaluation may take long: meanwhile a preview shows the final poses, and a stop loses nothing.
+        # What follows may take long: meanwhile a preview shows the poses, and a stop loses nothing.
         self.monitor.report(self._progress(CHECKPOINT.as_posix(), self._preview()))
+
+    def place(self, unit_from_cam: NDArray[np.float64]) -> None:
+        """Move all cameras to other poses [n, 4, 4]; that does not count as motion within the block."""
+        self.optimiser.poses.place(torch.from_numpy(unit_from_cam))
+        self._poses_at_check = self.optimiser.poses.poses()
+
+    def announce(self, message: str) -> None:
+        """Report what is done between steps."""
+        self.monitor.report(self._progress(None).model_copy(update={"message": message}))
 
     def _step(self) -> None:
         """One step, and what is due after it: a check, a checkpoint, a preview, a report."""

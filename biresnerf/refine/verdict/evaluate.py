@@ -55,13 +55,17 @@ class Evaluation:
 
 
 def evaluate(stages: TwoStages, pictures: Pictures) -> Evaluation:
-    """Fit the poses of held-out views, score and render views, film the orbit.
+    """Score held-out views with poses fitted to the field, render views, film the orbit. Poses end as they were.
 
     Raises:
         Interrupted: stopped; a continued run evaluates again.
     """
-    with stages.record.timed("evaluating"):
-        return _evaluate(stages, pictures)
+    poses = stages.optimiser.poses.poses()
+    try:
+        with stages.record.timed("evaluating"):
+            return _evaluate(stages, pictures)
+    finally:
+        stages.optimiser.poses.place(poses)
 
 
 def _evaluate(stages: TwoStages, pictures: Pictures) -> Evaluation:

@@ -10,9 +10,11 @@ from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refine.adjustment.lens.corrected_camera import corrected_camera
 from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.finish.photo_evidence import photo_patches
+from biresnerf.refine.finish.rounds import FIRST_ROUND, LEARNING, run_stage_2
 from biresnerf.refine.lost.lost_cameras import LostCameraRepair
 from biresnerf.refine.lost.own_matches import OwnMatches
 from biresnerf.refine.parameters.intrinsics_parameters import lenses_of
+from biresnerf.refine.stages.checkpoint import load_checkpoint
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.verdict.camera_reports import camera_reports, focal_warnings
 from tests.refine.adjustment.rig import disturbed, observed, rotation_errors_deg
@@ -152,3 +154,44 @@ def test_a_right_focal_length_that_was_given_is_not_warned_of(tmp_path, rng):
 def wild(rng):
     """Given poses that no evidence prefers."""
     return lambda poses: disturbed(poses, rng, 0.1, 0.3)
+
+
+def test_the_field_learns_at_adjusted_poses_that_stand_still(tmp_path, rng):
+    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    run.run_stage_1()
+    before = errors_deg(run, truth)
+    ends = []
+    step = run.optimiser.step
+
+    def watched():
+        ends.append(run.optimiser.poses.poses())
+        return step()
+
+    run.optimiser.step = watched
+    run_stage_2(run)
+    steps = run.optimiser.options.steps
+    assert run.optimiser.step_index == (FIRST_ROUND + LEARNING) * steps
+    assert all(torch.equal(ends[-1], poses) for poses in ends[-round(LEARNING * steps) :])
+    assert errors_deg(run, truth).mean() < 0.2 * before.mean()
+
+
+def test_poses_go_on_with_the_field_to_the_last_step_where_no_evidence_tells(tmp_path, rng):
+    run, _ = stages(tmp_path, rng)
+    run.scene = replace(run.scene, tracks=None)
+    run.run_stage_1()
+    assert run_stage_2(run).candidates == ()
+    assert run.optimiser.step_index == run.optimiser.options.steps
+    assert not run.optimiser.poses_held
+
+
+def test_a_run_resumed_after_the_first_adjustment_ends_at_the_same_poses(tmp_path, rng):
+    run, _ = stages(tmp_path / "once", rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    run.run_stage_1()
+    run_stage_2(run)
+    again = TwoStages(
+        tiny_optimiser(run.scene.dataset, run.scene.images, tiny_options()), run.scene, run.folder
+    )
+    again.restore(load_checkpoint(run.folder))
+    assert again.optimiser.schedule.steps == run.optimiser.step_index
+    run_stage_2(again)
+    torch.testing.assert_close(again.optimiser.poses.poses(), run.optimiser.poses.poses())

@@ -190,7 +190,7 @@ def settle_scales(
 @njit(**KERNEL)
 def patch_system(
     rotation, centre, lens, photos, values, host, rays, rho, start, target, s, host_rows, target_rows, floor, slope,
-    scale, deviation, noise, damping, system, right,
+    scale, deviation, noise, damping, system, right, of_target,
 ):  # fmt: skip
     """Add the normal equations without the scales to system [u, u] and right [u], which is half the gradient.
 
@@ -198,8 +198,8 @@ def patch_system(
         host_rows, target_rows: [patches, w], [m, w], where the w = 6 or 9 unknowns of each one's camera, and those of
             its lens, are among all u.
 
-    Returns of each patch the inverse of its own entry and its gradient, and the mixed row of its host, and that of each
-    target [m, w].
+    Returns of each patch the inverse of its own entry and its gradient, and the mixed row of its host. Fills that of
+    each target [m, w].
     """
     patches, pixels, channels = len(host), values.shape[1], values.shape[2]
     width = host_rows.shape[1]
@@ -209,8 +209,7 @@ def patch_system(
         np.empty((pixels, channels)),
         np.empty((pixels, channels, last + 1)),
     )
-    inverses, gradients = np.zeros(patches), np.zeros(patches)
-    of_host, of_target = np.zeros((patches, width)), np.zeros((len(target), width))
+    inverses, gradients, of_host = np.zeros(patches), np.zeros(patches), np.zeros((patches, width))
     block, force = np.empty((last + 1, last + 1)), np.empty(last + 1)
     s2 = scale * scale
     for i in range(patches):
@@ -243,7 +242,7 @@ def patch_system(
         _eliminate(
             h, of_host[i], gradients[i], inverses[i], start[i], start[i + 1], target_rows, of_target, system, right
         )  # fmt: skip
-    return inverses, gradients, of_host, of_target
+    return inverses, gradients, of_host
 
 
 @njit(inline="always", **KERNEL)

@@ -1,0 +1,29 @@
+"""Stage 2 in two rounds of steps, each followed by the adjustment of all cameras."""
+
+from __future__ import annotations
+
+from biresnerf.refine.finish.adjust_cameras import Finish, adjust_cameras
+from biresnerf.refine.stages.two_stages import TwoStages
+
+# Shares of all steps: where cameras are adjusted first, and how long the field then learns at their poses. The first is
+# soon enough: on the demo scene cameras adjusted after half of the steps end as exact as after all (docs/estimator.md).
+FIRST_ROUND, LEARNING = 0.5, 0.25
+
+
+def run_stage_2(stages: TwoStages) -> Finish:
+    """Steps of stage 2, twice with the adjustment of all cameras after them; what came of the last one.
+
+    Where the first adjustment finds better poses than the field's, they stand still from then on, and the field learns
+    at them for a while. It would only bend them.
+
+    Raises:
+        Interrupted: stopped; a continued run goes on from there.
+        RefinementError: ``diverged``.
+    """
+    if not stages.record.adjusted:
+        stages.run_stage_2(FIRST_ROUND)
+        if any(report.chosen and report.name != "refined" for report in adjust_cameras(stages).candidates):
+            stages.optimiser.hold_poses(LEARNING)
+        stages.record = stages.record.model_copy(update={"adjusted": True})
+    stages.run_stage_2()
+    return adjust_cameras(stages)
