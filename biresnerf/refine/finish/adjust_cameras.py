@@ -75,7 +75,7 @@ class Finish:
 
 
 def adjust_cameras(stages: TwoStages) -> Finish:
-    """Adjust all cameras at once and move them where left-out evidence says that is better.
+    """Adjust all cameras at once, and where left-out evidence says that is better move them and hold them there.
 
     Cameras that their own matches contradict are placed by those first.
 
@@ -95,6 +95,7 @@ def adjust_cameras(stages: TwoStages) -> Finish:
     choice, finish = found
     if choice.chosen.name != "refined":
         stages.place(choice.chosen.world_from_cam)
+        optimiser.poses_held = True
     if choice.chosen.lenses is not None:
         present = optimiser.lenses.refined(stages.scene.dataset).cameras
         corrected = corrected_cameras(present, choice.chosen.lenses.correction)

@@ -22,8 +22,9 @@ def run_stage_2(stages: TwoStages) -> Finish:
     """
     if not stages.record.adjusted:
         stages.run_stage_2(FIRST_ROUND)
-        if any(report.chosen and report.name != "refined" for report in adjust_cameras(stages).candidates):
-            stages.optimiser.hold_poses(LEARNING)
+        adjust_cameras(stages)
+        if stages.optimiser.poses_held:
+            stages.optimiser.end_after(LEARNING)
         stages.record = stages.record.model_copy(update={"adjusted": True})
     stages.run_stage_2()
     return adjust_cameras(stages)

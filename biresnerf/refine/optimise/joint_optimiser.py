@@ -217,10 +217,9 @@ class JointOptimiser:
         """Learning rate of the poses at this step."""
         return 0.0 if self.poses_held else self.schedule.pose_rate(self.step_index, self.switch)
 
-    def hold_poses(self, learning_share: float) -> None:
-        """Poses stand still from now on, and the run ends after so large a share of its steps."""
-        self.poses_held = True
-        self._end_at(min(self.step_index + round(learning_share * self.options.steps), self.schedule.steps))
+    def end_after(self, share: float) -> None:
+        """The run ends after so large a share of the steps that it was asked for, if not sooner."""
+        self._end_at(min(self.step_index + round(share * self.options.steps), self.schedule.steps))
 
     def _end_at(self, steps: int) -> None:
         options = self.schedule.options.model_copy(update={"steps": steps})

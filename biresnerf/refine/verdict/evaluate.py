@@ -55,17 +55,13 @@ class Evaluation:
 
 
 def evaluate(stages: TwoStages, pictures: Pictures) -> Evaluation:
-    """Score held-out views with poses fitted to the field, render views, film the orbit. Poses end as they were.
+    """Fit the poses of held-out views that no evidence placed, score and render views, film the orbit.
 
     Raises:
         Interrupted: stopped; a continued run evaluates again.
     """
-    poses = stages.optimiser.poses.poses()
-    try:
-        with stages.record.timed("evaluating"):
-            return _evaluate(stages, pictures)
-    finally:
-        stages.optimiser.poses.place(poses)
+    with stages.record.timed("evaluating"):
+        return _evaluate(stages, pictures)
 
 
 def _evaluate(stages: TwoStages, pictures: Pictures) -> Evaluation:

@@ -48,12 +48,12 @@ def fit_rays(optimiser: JointOptimiser) -> int:
 def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
     """Fit the poses of held-out views to the frozen field by their photometric error (method 2.4, item 4).
 
-    And their exposures, where those are compensated.
+    And their exposures, where those are compensated. Poses that are held stay: the field's own error would move them.
     """
-    if not held_out:
+    if not held_out or (optimiser.poses_held and optimiser.exposure.gains() is None):
         return
     mobility = torch.zeros(len(optimiser.poses), device=optimiser.device)
-    mobility[held_out] = 1.0
+    mobility[held_out] = 0.0 if optimiser.poses_held else 1.0
     mobility[torch.from_numpy(optimiser.bodies.fixed).to(optimiser.device)] = 0.0
     schedule = optimiser.schedule
     gradient = PositionGradient()

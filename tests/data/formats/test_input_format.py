@@ -135,8 +135,8 @@ def test_trajectories_and_bundles_read_back_from_what_is_written(tmp_path, form)
 
 def test_a_text_model_comes_back_as_text():
     dataset = posed_dataset("PINHOLE")
-    for form, given_back in (("text", ("colmap-text",)), ("binary", ())):
-        model = replace(random_model(0, rigs=False), form=form)
+    for file_format, given_back in (("text", ("colmap-text",)), ("binary", ())):
+        model = replace(random_model(0, rigs=False), file_format=file_format)
         assert (
             formats_given_back(replace(dataset, source=replace(dataset.source, colmap=model))) == given_back
         )
