@@ -73,6 +73,11 @@ class Finish:
     candidates: tuple[CandidateReport, ...] = ()
     fit: Fit | None = None
 
+    @property
+    def heeds_photos(self) -> bool:
+        """Whether patches of the photos were to be trusted."""
+        return self.fit is not None and self.fit.evidence.patches is not None
+
 
 def adjust_cameras(stages: TwoStages) -> Finish:
     """Adjust all cameras at once, and where left-out evidence says that is better move them and hold them there.

@@ -14,17 +14,21 @@ def run_stage_2(stages: TwoStages) -> Finish:
     """Steps of stage 2, twice with the adjustment of all cameras after them; what came of the last one.
 
     Where the first adjustment finds better poses than the field's, they stand still from then on, and the field learns
-    at them for a while. It would only bend them.
+    at them for a while. It would only bend them. They are adjusted again only if patches of the photos had no say yet:
+    the surface of a young field may have been too rough for them.
 
     Raises:
         Interrupted: stopped; a continued run goes on from there.
         RefinementError: ``diverged``.
     """
+    first = None
     if not stages.record.adjusted:
         stages.run_stage_2(FIRST_ROUND)
-        adjust_cameras(stages)
+        first = adjust_cameras(stages)
         if stages.optimiser.poses_held:
             stages.optimiser.end_after(LEARNING)
         stages.record = stages.record.model_copy(update={"adjusted": True})
     stages.run_stage_2()
+    if first is not None and stages.optimiser.poses_held and first.heeds_photos:
+        return first
     return adjust_cameras(stages)
