@@ -20,7 +20,7 @@ from biresnerf.stages import STAGES
 Device = Literal["auto", "cpu", "cuda"]
 Background = Literal["auto", "white", "black", "none"]
 ExposureChoice = Literal["auto", "none", "on"]
-StartPoses = Literal["auto", "given", "colmap", "none"]
+StartPoses = Literal["auto", "given", "colmap", "none", "turntable"]
 RefineIntrinsics = Literal["auto", "none", "focal", "all"]
 SeedingEffort = Literal["full", "low"]
 Exports = tuple[ExportName, ...]
@@ -76,7 +76,8 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         OPEN,
         description="Initial poses. auto: feature matches find missing poses, and poses that they support compete with "
         "the given ones; given: the given poses, which every image must have; colmap: COLMAP's poses even if "
-        "others are given; none: no feature matching, missing poses are guessed from similar images.",
+        "others are given; none: no feature matching, missing poses are guessed from similar images; turntable: no "
+        "feature matching, the photos go once around an object in the order of their names.",
     )
     seeding_effort: Annotated[SeedingEffort, Option("seeding", smaller=lambda _: "low")] = Field(
         "full",

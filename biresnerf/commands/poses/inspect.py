@@ -37,6 +37,7 @@ def inspect_command(
     asked = parse_options({**settings, **({"preset": preset} if preset else {})})
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.photos.images import load_images
+    from biresnerf.data.seeding.on_turntable import turning_notes
     from biresnerf.field.backends import resolve_here
 
     options, _ = resolve_here(asked)
@@ -45,6 +46,7 @@ def inspect_command(
     if pixels:
         load_images(dataset, options.max_image_size, options.background)
     found = {**contents(dataset), "pixels_checked": pixels, "plan": plan(dataset, options)}
+    found["warnings"] += turning_notes(dataset)
     found["warnings"] += [f"fixed names no image: {name}" for name in missing_names]
     show(found, "\n".join(_lines(found)), as_json=as_json)
 
@@ -110,6 +112,8 @@ def start_in_words(dataset: Dataset, options: ResolvedOptions) -> str:
             if all_given
             else f"{missing} poses are guessed from other images, without features"
         )
+    if start == "turntable":
+        return "cameras on a ring in the order of the images' names, whatever is given"
     if not can_match():
         if start == "colmap" or none:
             return "refused: the poses have to be found, and COLMAP is not installed (pip install 'biresnerf[colmap]')"

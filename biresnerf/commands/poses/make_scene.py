@@ -21,6 +21,7 @@ KINDS = {
     "phone": "a phone's walk around a table; poses drift, focal length 1 % too long",
     "half": "the same walk as a COLMAP model that lacks half of the images",
     "vase": "a plain vase without background; each pose is turned at random",
+    "turntable": "the same vase turned once before the camera, in uneven steps; without poses, those of --of too",
 }
 _FOCAL_TOO_LONG = 1.01
 
@@ -35,8 +36,10 @@ class MadeScene:
     truth: Path
 
     def __str__(self) -> str:
-        partial = f", of which the COLMAP model in sparse/0 has {self.with_pose}"
-        posed = partial if self.with_pose < self.images else ""
+        posed = " without poses"
+        if self.with_pose > 0:
+            partial = f", of which the COLMAP model in sparse/0 has {self.with_pose}"
+            posed = partial if self.with_pose < self.images else ""
         return f"{self.images} views in {self.folder}{posed}, true poses in {self.truth}"
 
 
@@ -54,7 +57,8 @@ class MadeScene:
 @click.option("--size", type=click.IntRange(16, 800), default=100, show_default=True, help="Their width, px.")
 @click.option(
     "--noise", type=click.FloatRange(0, 1), default=0.15, show_default=True,
-    help="Standard deviation of the pose noise, as in BARF, for dome and vase.",
+    help="Standard deviation of the pose noise, as in BARF, for dome and vase; for turntable, share by which its steps "
+    "are uneven.",
 )  # fmt: skip
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Seed of scene and noise."
@@ -87,7 +91,8 @@ def make_scene(
     Args:
         own: a set with poses, in any form that is read, to make wrong instead of rendering one.
         size: width of the images (px), of those rendered.
-        noise: standard deviation of the poses' noise, as BARF has it, of the kinds that are turned at random.
+        noise: standard deviation of the poses' noise, as BARF has it, of the kinds that are turned at random; the share
+            by which a turntable's steps are uneven.
 
     Raises:
         InputError: `output` is not empty, or `own` cannot be read or lacks poses.
@@ -95,21 +100,26 @@ def make_scene(
     require_empty(output)
     from biresnerf.data.formats.transforms.read_transforms import read_transforms
 
-    path = _copied(own, output) if own else _made(output, kind, views, size, seed)
+    path = _copied(own, output) if own else _made(output, kind, views, size, noise, seed)
     truth = output.with_name(f"{output.name}.truth.json")
     shutil.copyfile(path, truth)
     dataset = read_transforms(path)
     if kind == "half":
         return MadeScene(output, len(dataset), _keep_half(dataset, path), truth)
+    if kind == "turntable":
+        _take_poses_away(path)
+        return MadeScene(output, len(dataset), 0, truth)
     _perturb_file(dataset, path, kind, noise, seed)
     return MadeScene(output, len(dataset), len(dataset), truth)
 
 
-def _made(output: Path, kind: str, views: int, size: int, seed: int) -> Path:
+def _made(output: Path, kind: str, views: int, size: int, noise: float, seed: int) -> Path:
     """A rendered set with true poses; its transforms.json."""
-    from biresnerf.data.synthetic.captures import write_vase, write_walk
+    from biresnerf.data.synthetic.captures import write_turntable, write_vase, write_walk
     from biresnerf.data.synthetic.scene import write_synthetic_scene
 
+    if kind == "turntable":
+        return write_turntable(output, views, size, seed, noise)
     write = {"dome": write_synthetic_scene, "vase": write_vase}.get(kind, write_walk)
     return write(output, views, size, seed)
 
@@ -159,6 +169,16 @@ def _perturb_file(dataset: Dataset, path: Path, kind: str, noise: float, seed: i
     document = json.loads(path.read_text("utf-8"))
     for part in (document, *document["frames"]):
         part.update({key: part[key] * _FOCAL_TOO_LONG for key in ("fl_x", "fl_y") if key in part})
+    path.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+
+
+def _take_poses_away(path: Path) -> None:
+    """Leaves of a transforms file the images and their lens."""
+    import json
+
+    document = json.loads(path.read_text("utf-8"))
+    for frame in document["frames"]:
+        del frame["transform_matrix"]
     path.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
 
 

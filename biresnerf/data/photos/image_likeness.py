@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -21,8 +22,7 @@ def likeness(dataset: Dataset) -> NDArray[np.float32]:
 
     A photo of one colour is like no other (0). Raises `InputError` as `open_image` does.
     """
-    with quiet_pillow(), ThreadPoolExecutor(_DECODERS, thread_name_prefix="thumbnail") as pool:
-        small = np.stack(list(pool.map(lambda i: _thumbnail(dataset, i), range(len(dataset)))))
+    small = thumbnails(dataset, range(len(dataset)))
     small = small.reshape(len(small), -1)
     small = small - small.mean(1, keepdims=True)
     lengths = np.linalg.norm(small, axis=1, keepdims=True)
@@ -30,6 +30,15 @@ def likeness(dataset: Dataset) -> NDArray[np.float32]:
     alike: NDArray[np.float32] = unit @ unit.T
     np.fill_diagonal(alike, 1.0)
     return alike
+
+
+def thumbnails(dataset: Dataset, indices: Sequence[int]) -> NDArray[np.float32]:
+    """Photos in grey, shrunk to 24 x 24 px [n, 24, 24], as bright as they are stored (to 255 or 65535).
+
+    Raises `InputError` as `open_image` does.
+    """
+    with quiet_pillow(), ThreadPoolExecutor(_DECODERS, thread_name_prefix="thumbnail") as pool:
+        return np.stack(list(pool.map(lambda i: _thumbnail(dataset, i), indices)))
 
 
 def _thumbnail(dataset: Dataset, index: int) -> NDArray[np.float32]:

@@ -19,6 +19,7 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.seeding.map_images import MappedModel, Mapping
 from biresnerf.data.seeding.match_poses import MatchedPoses, can_match, carry_model
 from biresnerf.data.seeding.missing_poses import guess_missing
+from biresnerf.data.seeding.on_turntable import even_ring, turning_notes
 from biresnerf.data.seeding.seeding_progress import OnSeeding
 from biresnerf.errors import InputError, RefinementError
 from biresnerf.options.refine_options import SeedingEffort, StartPoses
@@ -97,7 +98,8 @@ def seed_poses(
     ``given`` takes the poses as they are. ``none`` looks for no features: missing poses are guessed from other
     images. ``auto`` lets features complete the given poses and compete with them; where there are none, COLMAP maps
     the images from scratch, in a frame and scale of its own. ``colmap`` does that in any case and then ties the result
-    to the frame of given poses. Images that COLMAP cannot place are guessed from those it can.
+    to the frame of given poses. Images that COLMAP cannot place are guessed from those it can. ``turntable`` looks for
+    no features either and puts all images evenly on a level ring, in the order of their names.
 
     COLMAP's threads make its answer differ a little from run to run. A run that is to be continued keeps it in the
     file ``remember``, with colmap.log beside it. ``on_progress`` is called only if
@@ -114,6 +116,8 @@ def seed_poses(
         return _seeding(dataset, given.without_matches())
     if start == "none":
         return _seeding(dataset, _without_features(given))
+    if start == "turntable":
+        return _seeding(dataset, even_ring(dataset))
     if not can_match():
         return _without_colmap(given, start)
     try:
@@ -237,16 +241,16 @@ def _facing_forward(given: _Given, what: str) -> Seeding:
     """All cameras at one place, if the photos are alike enough to have been taken from nearly there."""
     dataset = given.dataset
     alike = likeness(dataset)
-    pairs = alike[np.triu_indices(len(alike), 1)]
+    pairs, turns = alike[np.triu_indices(len(alike), 1)], turning_notes(dataset)
     if float(np.median(pairs)) < FACING_ALIKE:
         raise InputError(
             "insufficient_overlap",
             f"{what}, and the photos are too different to have been taken from nearly one place.",
             where=dataset.root.name,
-            hint=OVERLAP_HINT,
+            hint=" ".join((OVERLAP_HINT, *turns)),
         )
     warning = f"{what}: all cameras begin at one place, looking the same way, and find their poses without features."
-    noted = replace(dataset, warnings=(*dataset.warnings, warning))
+    noted = replace(dataset, warnings=(*dataset.warnings, warning, *turns))
     return _seeding(noted, _without_features(given))
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.synthetic.scene import (
+    CAMERA_DISTANCE,
     SHAPES,
     random_textures,
     render_shapes,
@@ -19,6 +22,7 @@ from biresnerf.data.synthetic.scene import (
     write_blender_set,
 )
 from biresnerf.data.synthetic.shapes import Shape, Texture
+from biresnerf.geometry.turntable import Ring
 
 # The objects of the scene stand on a table in a room, which fills the photos.
 TABLE_SCENE = (
@@ -42,6 +46,7 @@ _GLAZE_CONTRAST = 0.05
 PHONE_FOCAL_OF_WIDTH = 0.77
 PHONE_FROM_SCENE = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
 _METRES = 0.35
+_TABLE_ELEVATION_RAD = 0.42
 _WALK_TURNS, _WALK_DISTANCE, _WALK_ELEVATION_RAD = 1.2, 3.3, (0.42, 0.75)
 
 
@@ -110,11 +115,34 @@ def write_walk(folder: Path, n_views: int, width: int, seed: int) -> Path:
 
 def write_vase(folder: Path, n_views: int, size: int, seed: int) -> Path:
     """Writes square cut-out views of the vase and transforms.json (Blender dialect, true poses); returns its path."""
+    return _write_vase(folder, synthetic_cameras(n_views, seed), size, seed)
+
+
+def turntable_cameras(n_views: int, uneven: float, seed: int) -> NDArray[np.float64]:
+    """world_from_cam [n_views, 4, 4] before a table (z up) that turns once.
+
+    Args:
+        uneven: steps are longer or shorter than their mean by up to this share.
+    """
+    rng = np.random.default_rng([seed, 9])
+    steps = 1 + uneven * rng.uniform(-1, 1, n_views)
+    azimuth = torch.from_numpy(2 * np.pi * np.cumsum(steps) / steps.sum())
+    poses = replace(Ring.level(azimuth), elevation=torch.tensor(_TABLE_ELEVATION_RAD)).matrices()
+    poses[:, :3, 3] *= CAMERA_DISTANCE
+    return poses
+
+
+def write_turntable(folder: Path, n_views: int, size: int, seed: int, uneven: float) -> Path:
+    """Writes square cut-out views of the vase on a turntable and transforms.json as `write_vase` does."""
+    return _write_vase(folder, turntable_cameras(n_views, uneven, seed), size, seed)
+
+
+def _write_vase(folder: Path, poses: NDArray[np.float64], size: int, seed: int) -> Path:
     textures = [
         Texture.glaze(np.random.default_rng([seed, 5, index]), base, _GLAZE_CONTRAST)
         for index, base in enumerate(_GLAZE)
     ]
-    poses, focal = synthetic_cameras(n_views, seed), synthetic_focal(size)
+    focal = synthetic_focal(size)
     return write_blender_set(
         folder, poses, (render_shapes(VASE, textures, pose, size, size, focal)[0] for pose in poses)
     )

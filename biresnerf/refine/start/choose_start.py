@@ -19,6 +19,7 @@ from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.progress import TRYING_FROM, Monitor, Progress
 from biresnerf.refine.start.forward_facing import find_forward_facing
 from biresnerf.refine.start.frozen_trials import FrozenTrials, trial_views
+from biresnerf.refine.start.turntable import start_on_turntable
 from biresnerf.report import TrialReport
 
 logger = logging.getLogger(__name__)
@@ -37,16 +38,18 @@ def find_start(
     threads: int,
     monitor: Monitor,
 ) -> InitialPoses:
-    """The candidate that predicts unseen photos best; for forward-facing photos, poses found without features.
+    """The candidate that predicts unseen photos best; poses found without features where the set has no others.
 
     Raises:
-        InputError: ``insufficient_overlap``, see `find_forward_facing`.
+        InputError: ``insufficient_overlap``, see `find_forward_facing` and `start_on_turntable`.
         Interrupted: ``monitor`` asked to stop.
     """
     first = candidates[0]
-    if first.source == "forward-facing":
+    if first.source in ("forward-facing", "turntable"):
         message = "looking for poses without features"
         monitor.report(Progress(stage="seeding", fraction=TRYING_FROM, message=message))
+        if first.source == "turntable":
+            return start_on_turntable(first, images, options, device, threads, monitor.should_stop)
         found = find_forward_facing(images, options, device, threads, monitor.should_stop)
         return replace(first, world_from_cam=found)
     if len(candidates) == 1:

@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-GUESSED = GUESSES | {"forward-facing"}
+GUESSED = GUESSES | {"forward-facing", "turntable"}
 
 
 @dataclass(frozen=True, eq=False)

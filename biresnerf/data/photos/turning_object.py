@@ -1,0 +1,31 @@
+"""Whether photos, one after the other, seem to go once around an object, and whether what is behind it stands still."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+LEAST_PHOTOS = 12
+NEIGHBOUR_SHARE = 0.5  # neighbours differ by less than this share of what any two photos do
+# A border pixel stands still if it varies by less than this over the photos, and most must; a border of one colour
+# varies less than this from pixel to pixel, and turns or not without a trace. Of 1, the range of colours.
+STILL, STILL_SHARE, PLAIN = 0.02, 0.75, 0.05
+
+
+def goes_round(grey: NDArray[np.float32]) -> bool:
+    """Whether photos, shrunk, in grey and in order [n, h, w], resemble their neighbours and the last one the first."""
+    if len(grey) < LEAST_PHOTOS:
+        return False
+    flat = grey.reshape(len(grey), -1)
+    apart = np.sqrt(((flat[:, None] - flat[None]) ** 2).mean(2))
+    steps = np.diagonal(apart, offset=1)
+    typical = float(np.median(steps))
+    any_two = float(np.median(apart[np.triu_indices(len(apart), 1)]))
+    return typical < NEIGHBOUR_SHARE * any_two and float(apart[-1, 0]) < (typical + any_two) / 2
+
+
+def still_surroundings(grey: NDArray[np.float32]) -> bool:
+    """Whether the borders of all photos, shrunk and in grey [n, h, w], 0 to 1, show the same and not one colour."""
+    border = np.concatenate((grey[:, 0], grey[:, -1], grey[:, :, 0], grey[:, :, -1]), 1)
+    still = border.std(0) < STILL
+    return bool(still.mean() >= STILL_SHARE) and float(border.mean(0)[still].std()) > PLAIN

@@ -1,0 +1,75 @@
+"""Cameras that stand still before a turning table, in the frame of what turns: a ring about the z axis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Ring:
+    """Cameras at distance one from the origin, which is where their optical axes pass the z axis nearest.
+
+    Angles are in radians.
+
+    Attributes:
+        azimuth: of each camera [n].
+        elevation: of all cameras above the origin's plane [].
+        pan: by which the z axis is seen to the right of the optical axis [].
+        roll: of all cameras about their optical axes [].
+        quarters: quarter turns [n], counter-clockwise, that set each photo upright.
+    """
+
+    azimuth: Tensor
+    elevation: Tensor
+    pan: Tensor
+    roll: Tensor
+    quarters: Tensor
+
+    @classmethod
+    def level(cls, azimuth: Tensor) -> Ring:
+        """Upright cameras that look at the origin from its own height."""
+        none = azimuth.new_zeros(())
+        return cls(azimuth, none, none, none, torch.zeros_like(azimuth))
+
+    def poses(self) -> Tensor:
+        """Poses world_from_cam [n, 3, 4], differentiable."""
+        zero = torch.zeros_like(self.azimuth)
+        across, high = torch.cos(self.elevation), torch.sin(self.elevation).expand_as(zero)
+        cosine, sine = torch.cos(self.azimuth), torch.sin(self.azimuth)
+        outward = torch.stack([across * cosine, across * sine, high], 1)
+        right = torch.stack([-sine, cosine, zero], 1)
+        facing = torch.stack([right, torch.linalg.cross(-outward, right), -outward], 2)
+        turn = self.roll - self.quarters.to(zero) * (torch.pi / 2)
+        return torch.cat([facing @ _about_y(-self.pan) @ _about_z(turn), outward[:, :, None]], 2)
+
+    def matrices(self) -> NDArray[np.float64]:
+        """Poses world_from_cam [n, 4, 4], in double precision whatever that of the angles is."""
+        parts = (self.azimuth, self.elevation, self.pan, self.roll, self.quarters)
+        top = Ring(*(part.detach().double().cpu() for part in parts)).poses()
+        matrices = np.tile(np.eye(4), (len(top), 1, 1))
+        matrices[:, :3] = top.numpy()
+        return matrices
+
+
+def order_on_ring(world_from_cam: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Indices of cameras [n] in the order of their azimuths about the z axis, from poses [n, 4, 4]."""
+    azimuth = np.arctan2(world_from_cam[:, 1, 3], world_from_cam[:, 0, 3])
+    # Rounding may put the first camera just below zero.
+    return np.argsort((azimuth + 1e-6) % (2 * np.pi), kind="stable")
+
+
+def _about_y(angle: Tensor) -> Tensor:
+    """Rotation [3, 3] by an angle []."""
+    c, s, zero, one = torch.cos(angle), torch.sin(angle), torch.zeros_like(angle), torch.ones_like(angle)
+    return torch.stack([c, zero, s, zero, one, zero, -s, zero, c]).reshape(3, 3)
+
+
+def _about_z(angle: Tensor) -> Tensor:
+    """Rotations [n, 3, 3] by angles [n]."""
+    c, s, zero, one = torch.cos(angle), torch.sin(angle), torch.zeros_like(angle), torch.ones_like(angle)
+    return torch.stack([c, -s, zero, s, c, zero, zero, zero, one], 1).reshape(-1, 3, 3)
