@@ -47,10 +47,16 @@ class Ring:
         turn = self.roll - self.quarters.to(zero) * (torch.pi / 2)
         return torch.cat([facing @ _about_y(-self.pan) @ _about_z(turn), outward[:, :, None]], 2)
 
+    def detached(self) -> Ring:
+        """The same ring on the CPU, without gradient."""
+        parts = (self.azimuth, self.elevation, self.pan, self.roll, self.quarters)
+        return Ring(*(part.detach().cpu() for part in parts))
+
     def matrices(self) -> NDArray[np.float64]:
         """Poses world_from_cam [n, 4, 4], in double precision whatever that of the angles is."""
-        parts = (self.azimuth, self.elevation, self.pan, self.roll, self.quarters)
-        top = Ring(*(part.detach().double().cpu() for part in parts)).poses()
+        there = self.detached()
+        parts = (there.azimuth, there.elevation, there.pan, there.roll, there.quarters)
+        top = Ring(*(part.double() for part in parts)).poses()
         matrices = np.tile(np.eye(4), (len(top), 1, 1))
         matrices[:, :3] = top.numpy()
         return matrices

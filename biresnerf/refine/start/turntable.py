@@ -2,7 +2,7 @@
 
 A ring has few unknowns: the way it turns, its elevation, where the axis stands in the photo. Scale and distance are
 free. The order of the photos is found first (`ring_order`). Each try is a short training in which the cameras stay on
-their ring, while its roll, pan and each azimuth move (`TurntableRig`). The elevation is searched: a field that forms
+their ring, while its roll, pan and each azimuth move (`RingParameters`). The elevation is searched: a field that forms
 with a wrong one fits itself to it, so its gradient says little, but a parabola through what three elevations leave
 unexplained does.
 
@@ -29,8 +29,7 @@ from biresnerf.geometry.turntable import Ring, order_on_ring
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.optimise.photo_sampler import PhotoSampler
-from biresnerf.refine.parameters.pose_parameters import PoseParameters
-from biresnerf.refine.parameters.turntable_rig import TurntableRig
+from biresnerf.refine.parameters.ring_parameters import RingParameters
 from biresnerf.refine.scene.scene_frame import scene_frame
 from biresnerf.refine.start.frozen_trials import trial_views
 from biresnerf.refine.start.ring_order import RingOrder, axis_in_photos, find_ring, thumbnails
@@ -105,14 +104,13 @@ class RingTrials:
             self._threads,
             sampler=self._sampler,
         )
-        rig = TurntableRig(ring, self.frame.distance, self._run)
-        optimiser.poses = PoseParameters(torch.from_numpy(poses), rig, self._device)
+        moving = RingParameters(ring, self.frame.distance, self._run, self._device)
+        optimiser.poses = moving
         for _ in range(TRY_STEPS):
             if self._should_stop():
                 raise Interrupted("stopped while rings of cameras were tried")
             optimiser.step()
-        now = rig.now(optimiser.poses.rotation.detach(), optimiser.poses.translation.detach())
-        return Tried(now, self._score(optimiser))
+        return Tried(moving.now().detached(), self._score(optimiser))
 
     def _score(self, optimiser: JointOptimiser) -> float:
         matrices = optimiser.poses.matrices().detach()

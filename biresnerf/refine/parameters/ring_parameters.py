@@ -1,17 +1,19 @@
-"""Increments of cameras before a turning table: an azimuth for each, and one roll and pan for all."""
+"""Cameras before a turning table as parameters of the optimisation: an azimuth for each, one roll and pan for all."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from biresnerf.geometry.turntable import Ring
-from biresnerf.refine.parameters.parametrisations import Parametrisation
+from biresnerf.refine.parameters.pose_parameters import PoseParameters
 
 SMOOTH_STEPS = 3.0  # mean steps between photos: the reach, as a standard deviation, of what moves one azimuth
 
 
-class TurntableRig(Parametrisation):
+class RingParameters(PoseParameters):
     """Cameras that stay on one ring about the unit frame's z axis, at its elevation.
 
     A camera's azimuth grows by the mean of the first numbers of the rotations around it, weighed by how near they are
@@ -25,30 +27,27 @@ class TurntableRig(Parametrisation):
         run: number of the run [n] that each photo belongs to.
     """
 
-    moves_bodies = False
+    def __init__(self, ring: Ring, distance: float, run: Tensor, device: torch.device) -> None:
+        poses = torch.from_numpy(ring.matrices())
+        poses[:, :3, 3] *= distance
+        super().__init__(poses, distance, device)
+        parts = (ring.azimuth, ring.elevation, ring.pan, ring.roll, ring.quarters)
+        self.ring = Ring(*(part.float().to(device) for part in parts))
+        self.smoothing = smoothing(self.ring.azimuth, run.to(device))
 
-    def __init__(self, ring: Ring, distance: float, run: Tensor) -> None:
-        super().__init__(distance)
-        self.ring = ring
-        self.smoothing = smoothing(ring.azimuth, run)
-
-    def moved(self, start: Tensor, rotation: Tensor, translation: Tensor, body: Tensor | None) -> Tensor:
-        poses = self.now(rotation, translation).poses()
+    def matrices(self) -> Tensor:
+        poses = self.now().poses()
         return torch.cat([poses[:, :, :3], poses[:, :, 3:] * self.length], 2)
 
-    def now(self, rotation: Tensor, translation: Tensor) -> Ring:
-        """The ring after increments [n, 3]."""
-        start = self.ring
-        return Ring(
-            start.azimuth.to(rotation) + self.smoothing.to(rotation) @ rotation[:, 0],
-            start.elevation.to(rotation),
-            start.pan.to(rotation) + translation[:, 0].mean(),
-            start.roll.to(rotation) + rotation[:, 1].mean(),
-            start.quarters.to(rotation),
+    def now(self) -> Ring:
+        """The ring after the increments, differentiable."""
+        ring = self.ring
+        return replace(
+            ring,
+            azimuth=ring.azimuth + self.smoothing @ self.rotation[:, 0],
+            roll=ring.roll + self.rotation[:, 1].mean(),
+            pan=ring.pan + self.translation[:, 0].mean(),
         )
-
-    def start_shift(self, start: Tensor, now: Tensor, shift: Tensor) -> Tensor:
-        raise NotImplementedError("cameras of a ring do not dolly")
 
 
 def smoothing(azimuth: Tensor, run: Tensor) -> Tensor:

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 from biresnerf.geometry.turntable import Ring
-from biresnerf.refine.parameters.pose_parameters import PoseParameters
-from biresnerf.refine.parameters.turntable_rig import TurntableRig, smoothing
+from biresnerf.refine.parameters.ring_parameters import RingParameters, smoothing
 
 COUNT, DISTANCE, RATE = 7, 3.5, 1e-3
 RUN = torch.tensor([0, 0, 0, 0, 1, 1, 1])
@@ -18,26 +17,23 @@ def start() -> Ring:
     return Ring(azimuth, torch.tensor(0.3), torch.tensor(0.02), torch.tensor(-0.01), torch.zeros(COUNT))
 
 
-def parameters(rig: TurntableRig) -> PoseParameters:
-    poses = rig.ring.matrices()
-    poses[:, :3, 3] *= DISTANCE
-    return PoseParameters(torch.from_numpy(poses), rig, torch.device("cpu"))
+def parameters() -> RingParameters:
+    return RingParameters(start(), DISTANCE, RUN, torch.device("cpu"))
 
 
 def test_without_increments_cameras_are_where_the_ring_puts_them():
-    poses = parameters(TurntableRig(start(), DISTANCE, RUN)).poses().numpy()
+    poses = parameters().poses().numpy()
     expected = start().matrices()
     np.testing.assert_allclose(poses[:, :3, :3], expected[:, :3, :3], atol=1e-6)
     np.testing.assert_allclose(poses[:, :3, 3], DISTANCE * expected[:, :3, 3], atol=1e-5)
 
 
 def test_a_step_of_adam_moves_shared_angles_by_the_rate_and_azimuths_with_their_neighbours_of_one_run():
-    rig = TurntableRig(start(), DISTANCE, RUN)
-    moving = parameters(rig)
-    now = rig.now(moving.rotation, moving.translation)
+    moving = parameters()
+    now = moving.now()
     (3 * now.pan - 2 * now.roll - now.azimuth[0]).backward()
     moving.step(RATE)
-    after = rig.now(moving.rotation.detach(), moving.translation.detach())
+    after = moving.now().detached()
     moved = torch.stack([after.roll + 0.01, after.pan - 0.02, after.elevation - 0.3])
     np.testing.assert_allclose(moved.numpy(), [RATE, -RATE, 0], atol=1e-6)
     turned = (after.azimuth - start().azimuth).numpy()
