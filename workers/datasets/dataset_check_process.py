@@ -49,6 +49,7 @@ def check(folder: Path) -> dict[str, Any]:
     """
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.photos.images import load_images
+    from biresnerf.data.seeding.turning_notes import turning_notes
 
     dataset = read_dataset(folder, within=folder)
     images = load_images(dataset, THUMBNAIL_PX)
@@ -64,7 +65,7 @@ def check(folder: Path) -> dict[str, Any]:
         "format": dataset.source.dialect,
         "masks": sum(frame.mask is not None for frame in dataset.frames),
         "transparency": images.alpha is not None,
-        "warnings": list(dataset.warnings),
+        "warnings": [*dataset.warnings, *turning_notes(dataset)],
     }
 
 

@@ -19,8 +19,9 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.seeding.map_images import MappedModel, Mapping
 from biresnerf.data.seeding.match_poses import MatchedPoses, can_match, carry_model
 from biresnerf.data.seeding.missing_poses import guess_missing
-from biresnerf.data.seeding.on_turntable import even_ring, turning_notes
+from biresnerf.data.seeding.on_turntable import even_ring
 from biresnerf.data.seeding.seeding_progress import OnSeeding
+from biresnerf.data.seeding.turning_notes import turning_notes
 from biresnerf.errors import InputError, RefinementError
 from biresnerf.options.refine_options import SeedingEffort, StartPoses
 from biresnerf.report import PoseSource

@@ -72,7 +72,7 @@ def find_forward_facing(
             f"no poses were found that explain the photos: a scene built from some predicts others at {best.psnr:.1f} "
             f"dB, the mere mean of similar photos at {bound:.1f} dB.",
             hint="Photos from all around need features that match, or approximate poses; without either, only photos "
-            "that look the same way, from nearly one place, can be used.",
+            "that look the same way, from nearly one place, can be used, or of something that turned: start=turntable.",
         )
     return best.world_from_cam
 

@@ -23,7 +23,7 @@ import torch
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.photos.turning_object import still_surroundings
 from biresnerf.data.seeding.initial_poses import InitialPoses
-from biresnerf.data.seeding.on_turntable import STILL
+from biresnerf.data.seeding.turning_notes import STILL
 from biresnerf.errors import InputError, Interrupted
 from biresnerf.geometry.turntable import Ring, order_on_ring
 from biresnerf.options.refine_options import ResolvedOptions

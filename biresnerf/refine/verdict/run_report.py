@@ -8,9 +8,11 @@ import numpy as np
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.named_images import few_names
+from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.refine.lost.own_matches import LEAST_PAIRS
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
+from biresnerf.refine.start.choose_start import MARGIN_DB
 from biresnerf.refine.start.first_step import poses_in_input_frame
 from biresnerf.refine.verdict.camera_reports import camera_reports, focal_warnings
 from biresnerf.refine.verdict.judgement import Judgement, motion
@@ -69,8 +71,20 @@ def run_report(
         input_from_optimised=similarity.report(),
         warnings=dataset.warnings
         + focal_warnings(dataset, optimiser.lenses)
+        + turntable_warnings(scene.start)
         + unmatched_warnings(scene)
         + _unknown_warnings(dataset, uncertainty),
+    )
+
+
+def turntable_warnings(start: InitialPoses) -> tuple[str, ...]:
+    """A warning where photos do not tell which way the table turned; empty where they do, or there was none."""
+    if start.source != "turntable" or start.trials[0].psnr >= start.trials[1].psnr + MARGIN_DB:
+        return ()
+    better, other = start.trials
+    return (
+        f"Photos tell hardly which way the table turned ({better.psnr:.2f} dB, the other way {other.psnr:.2f} dB): the "
+        "result may be a mirror image.",
     )
 
 
