@@ -13,15 +13,9 @@ from biresnerf.uncertainty import PoseUncertainty
 SwitchReason = Literal["stable", "cap"]
 IntrinsicsSource = Literal["given", "exif", "colmap", "guessed", "refined"]
 PoseSource = Literal[
-    "given",
-    "colmap",
-    "matches-incremental",
-    "matches-global",
-    "neighbours",
-    "nearest-view",
-    "forward-facing",
+    "given", "colmap", "matches-incremental", "matches-global", "neighbours", "nearest-view", "forward-facing",
     "turntable",
-]
+]  # fmt: skip
 CandidateName = Literal["input", "matched", "refined", "adjusted-tracks", "adjusted-patches", "adjusted"]
 VerdictName = Literal["improved", "unchanged", "kept_input", "inconclusive", "failed_check"]
 Finding = Literal["better", "worse", "same", "open"]

@@ -49,7 +49,7 @@ def check(folder: Path) -> dict[str, Any]:
     """
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.photos.images import load_images
-    from biresnerf.data.seeding.turning_notes import turning_notes
+    from biresnerf.data.photos.turning_object import turning_notes
 
     dataset = read_dataset(folder, within=folder)
     images = load_images(dataset, THUMBNAIL_PX)

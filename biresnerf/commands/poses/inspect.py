@@ -37,7 +37,7 @@ def inspect_command(
     asked = parse_options({**settings, **({"preset": preset} if preset else {})})
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.photos.images import load_images
-    from biresnerf.data.seeding.turning_notes import turning_notes
+    from biresnerf.data.photos.turning_object import turning_notes
     from biresnerf.field.backends import resolve_here
 
     options, _ = resolve_here(asked)

@@ -5,6 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.image_order import natural_order
+from biresnerf.data.photos.image_likeness import thumbnails
+
+TURNING = (
+    "In the order of their names, the photos seem to go once around an object, as on a turntable: if features do not "
+    "match, start=turntable finds their poses without."
+)
+IN_THE_WAY = "The background is the same in all photos and does not turn: mask it, or make it transparent."
+
 LEAST_PHOTOS = 12
 NEIGHBOUR_SHARE = 0.5  # neighbours differ by less than this share of what any two photos do
 # A border pixel stands still if it varies by less than this over the photos, and most must; a border of one colour
@@ -29,3 +39,20 @@ def still_surroundings(grey: NDArray[np.float32]) -> bool:
     border = np.concatenate((grey[:, 0], grey[:, -1], grey[:, :, 0], grey[:, :, -1]), 1)
     still = border.std(0) < STILL
     return bool(still.mean() >= STILL_SHARE) and float(border.mean(0)[still].std()) > PLAIN
+
+
+def turning_notes(dataset: Dataset) -> tuple[str, ...]:
+    """What to tell the user where photos without any pose seem to show something that turns.
+
+    Raises `InputError` as `image_likeness.thumbnails` does.
+    """
+    if dataset.posed.any():
+        return ()
+    return notes_on(thumbnails(dataset, natural_order(dataset.file_names)) / np.float32(255))
+
+
+def notes_on(grey: NDArray[np.float32]) -> tuple[str, ...]:
+    """`turning_notes` of photos in order, shrunk and in grey [n, h, w], 0 to 1."""
+    if not goes_round(grey):
+        return ()
+    return (TURNING, IN_THE_WAY) if still_surroundings(grey) else (TURNING,)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from biresnerf.data.model.dataset import GUESSES, Dataset
 from biresnerf.data.photos.image_likeness import likeness
 from biresnerf.data.photos.named_images import MIN_IMAGES, few_names
+from biresnerf.data.photos.turning_object import turning_notes
 from biresnerf.data.seeding.cached_mapping import remembered_mapping
 from biresnerf.data.seeding.compare_models import adds_to, model_lens_problem, with_found_lenses
 from biresnerf.data.seeding.initial_poses import InitialPoses
@@ -21,7 +22,6 @@ from biresnerf.data.seeding.match_poses import MatchedPoses, can_match, carry_mo
 from biresnerf.data.seeding.missing_poses import guess_missing
 from biresnerf.data.seeding.on_turntable import even_ring
 from biresnerf.data.seeding.seeding_progress import OnSeeding
-from biresnerf.data.seeding.turning_notes import turning_notes
 from biresnerf.errors import InputError, RefinementError
 from biresnerf.options.refine_options import SeedingEffort, StartPoses
 from biresnerf.report import PoseSource

@@ -21,9 +21,8 @@ import numpy as np
 import torch
 
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.data.photos.turning_object import still_surroundings
+from biresnerf.data.photos.turning_object import IN_THE_WAY, still_surroundings
 from biresnerf.data.seeding.initial_poses import InitialPoses
-from biresnerf.data.seeding.turning_notes import STILL
 from biresnerf.errors import InputError, Interrupted
 from biresnerf.geometry.turntable import Ring, order_on_ring
 from biresnerf.options.refine_options import ResolvedOptions
@@ -213,5 +212,5 @@ def refuse_still_background(images: ImageSet) -> None:
         raise InputError(
             "insufficient_overlap",
             "all photos show the same background, before which an object turns.",
-            hint=STILL,
+            hint=IN_THE_WAY,
         )

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 from biresnerf.commands.machine.bench import bench_command
 from biresnerf.commands.poses.inspect import inspect_command
+from biresnerf.commands.poses.make_scene import make_scene_command
 from biresnerf.data.seeding.match_poses import can_match
 from biresnerf.errors import InputError
 from tests.data.formats.simple import trajectories
@@ -21,6 +22,17 @@ def inspected(*arguments: object) -> dict[str, Any]:
     result = CliRunner().invoke(inspect_command, [*map(str, arguments), "--json"])
     assert result.exit_code == 0, (result.output, result.exception)
     return json.loads(result.stdout)
+
+
+def test_photos_of_something_that_turned_are_offered_the_turntable_and_others_are_not(tmp_path: Path) -> None:
+    arguments = ["--kind", "turntable", "--views", "40", "--size", "32"]
+    assert CliRunner().invoke(make_scene_command, [str(tmp_path / "table"), *arguments]).exit_code == 0
+    assert any("start=turntable" in text for text in inspected(tmp_path / "table")["warnings"])
+    found = inspected(tmp_path / "table", "--set", "start=turntable")
+    assert "ring" in found["plan"]["start"]
+    for index in range(20):
+        write_image(tmp_path / f"same/{index}.png")
+    assert not any("turntable" in text for text in inspected(tmp_path / "same")["warnings"])
 
 
 def test_a_model_with_masks_and_unregistered_images_is_told_as_it_is(tmp_path: Path) -> None:

@@ -117,10 +117,21 @@ def test_ones_own_set_is_taken_for_true_and_left_as_it_is(tmp_path, kind):
     np.testing.assert_allclose(stacked(truth), synthetic_cameras(8, 0), atol=1e-9)
     dataset = read_dataset(tmp_path / "made")
     assert len(dataset) == 8
-    assert int(dataset.posed.sum()) == (4 if kind == "half" else 8)
+    assert int(dataset.posed.sum()) == {"half": 4, "turntable": 0}.get(kind, 8)
     assert {path: path.read_bytes() for path in before} == before
     width = json.loads(truth.read_text())["fl_x"]
     assert width == pytest.approx(synthetic_focal(24))
+
+
+def test_a_turntables_cameras_go_once_round_in_steps_as_uneven_as_asked(tmp_path):
+    truth = make(tmp_path / "table", "--kind", "turntable", "--noise", "0.2", "--views", "40")
+    true = stacked(truth)
+    azimuth = np.unwrap(np.arctan2(true[:, 1, 3], true[:, 0, 3]))
+    steps = np.diff(azimuth, append=azimuth[0] + 2 * np.pi) / (2 * np.pi / 40)
+    assert steps.sum() == pytest.approx(40)
+    assert 0.75 < steps.min() < 0.85 < 1.15 < steps.max() < 1.25
+    assert np.ptp(true[:, 2, 3]) < 1e-9
+    assert not read_dataset(tmp_path / "table").posed.any()
 
 
 def test_a_set_without_all_its_poses_is_no_truth(tmp_path):
