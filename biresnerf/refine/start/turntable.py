@@ -155,8 +155,11 @@ def start_on_turntable(
         elevation = math.degrees(float(one.ring.elevation))
         logger.info("turntable: %.2f dB at an elevation of %.1f degrees", one.psnr, elevation)
     ring, near = ways[0].ring, math.radians(NEAR_DEG)
-    beside = [trials.run(at_elevation(ring, float(ring.elevation) + sign * near)) for sign in (-1, 1)]
-    found = at_elevation(ring, likeliest_elevation([ways[0], *beside]))
+    # The one between starts where the others do, with azimuths that have moved already.
+    heights = [float(ring.elevation) + shift for shift in (-near, 0.0, near)]
+    closer = [trials.run(at_elevation(ring, height)) for height in heights]
+    best = max(closer, key=lambda one: one.psnr)
+    found = at_elevation(best.ring, likeliest_elevation(closer))
     logger.info("turntable: at an elevation of %.1f degrees", math.degrees(float(found.elevation)))
     reports = tuple(TrialReport(source="turntable", placed=0, psnr=one.psnr) for one in ways)
     return replace(even, world_from_cam=found.matrices(), trials=reports)
