@@ -62,13 +62,6 @@ class Ring:
         return matrices
 
 
-def order_on_ring(world_from_cam: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Indices of cameras [n] in the order of their azimuths about the z axis, from poses [n, 4, 4]."""
-    azimuth = np.arctan2(world_from_cam[:, 1, 3], world_from_cam[:, 0, 3])
-    # Rounding may put the first camera just below zero.
-    return np.argsort((azimuth + 1e-6) % (2 * np.pi), kind="stable")
-
-
 def _about_y(angle: Tensor) -> Tensor:
     """Rotation [3, 3] by an angle []."""
     c, s, zero, one = torch.cos(angle), torch.sin(angle), torch.zeros_like(angle), torch.ones_like(angle)

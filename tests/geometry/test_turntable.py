@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.geometry.turntable import Ring, order_on_ring
+from biresnerf.geometry.level_ring import level_ring, order_on_ring
+from biresnerf.geometry.turntable import Ring
 
 AZIMUTH = torch.tensor([0.0, 0.4, 2.0, 3.5, 5.1], dtype=torch.float64)
 
@@ -23,6 +24,10 @@ def seen(world_from_cam: np.ndarray, point: list[float]) -> np.ndarray:
     in_cam = np.einsum("nji,nj->ni", world_from_cam[:, :3, :3], np.array(point) - world_from_cam[:, :3, 3])
     assert (in_cam[:, 2] > 0).all()
     return in_cam[:, :2] / in_cam[:, 2:]
+
+
+def test_without_pan_and_roll_it_is_a_level_ring():
+    np.testing.assert_allclose(ring(0.3).matrices(), level_ring(AZIMUTH.numpy(), 0.3), atol=1e-12)
 
 
 def test_a_turned_camera_is_the_first_one_turned_about_the_axis_the_other_way():

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import torch
+import numpy as np
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.image_order import natural_order
 from biresnerf.data.seeding.initial_poses import InitialPoses
-from biresnerf.geometry.turntable import Ring
+from biresnerf.geometry.level_ring import level_ring
 from biresnerf.report import PoseSource
 
 
@@ -15,6 +15,6 @@ def even_ring(dataset: Dataset) -> InitialPoses:
     """All images evenly on a level ring about the z axis, in the order of their names."""
     name: PoseSource = "turntable"
     count = len(dataset)
-    azimuth = torch.empty(count, dtype=torch.float64)
-    azimuth[natural_order(dataset.file_names)] = torch.arange(count).double() * (2 * torch.pi / count)
-    return InitialPoses(Ring.level(azimuth).matrices(), name, (name,) * count)
+    azimuth = np.empty(count)
+    azimuth[natural_order(dataset.file_names)] = np.arange(count) * (2 * np.pi / count)
+    return InitialPoses(level_ring(azimuth), name, (name,) * count)

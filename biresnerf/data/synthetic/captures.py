@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -22,7 +20,7 @@ from biresnerf.data.synthetic.scene import (
     write_blender_set,
 )
 from biresnerf.data.synthetic.shapes import Shape, Texture
-from biresnerf.geometry.turntable import Ring
+from biresnerf.geometry.level_ring import level_ring
 
 # The objects of the scene stand on a table in a room, which fills the photos.
 TABLE_SCENE = (
@@ -126,8 +124,7 @@ def turntable_cameras(n_views: int, uneven: float, seed: int) -> NDArray[np.floa
     """
     rng = np.random.default_rng([seed, 9])
     steps = 1 + uneven * rng.uniform(-1, 1, n_views)
-    azimuth = torch.from_numpy(2 * np.pi * np.cumsum(steps) / steps.sum())
-    poses = replace(Ring.level(azimuth), elevation=torch.tensor(_TABLE_ELEVATION_RAD)).matrices()
+    poses = level_ring(2 * np.pi * np.cumsum(steps) / steps.sum(), _TABLE_ELEVATION_RAD)
     poses[:, :3, 3] *= CAMERA_DISTANCE
     return poses
 

@@ -24,7 +24,8 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.photos.turning_object import IN_THE_WAY, still_surroundings
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import InputError, Interrupted
-from biresnerf.geometry.turntable import Ring, order_on_ring
+from biresnerf.geometry.level_ring import order_on_ring
+from biresnerf.geometry.turntable import Ring
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.optimise.photo_sampler import PhotoSampler
