@@ -142,13 +142,17 @@ def judged(given: Dataset, truth: Dataset, report: Report, result: Array) -> dic
     before = errors_deg(given_poses, poses, placed)
     after = errors_deg(result[:count], poses, placed)
     old, new = float(before[placed].mean()), float(after[placed].mean())
-    verdict = report.verdict.verdict if report.verdict else "none"
+    said = report.verdict
+    assert said is not None
+    verdict = said.verdict
     silent = [
         i.name for i, error in zip(report.images, after, strict=False) if error > BEYOND_DEG and not named(i)
     ]
     unnamed = [i.name for i in report.images[count:] if not named(i)]  # of another scene: no pose is right
     return {
         "verdict": verdict,
+        "views": said.heldout.psnr.finding if said.heldout else None,
+        "matches": said.epipolar.error_px.finding if said.epipolar else None,
         "chosen": next((c.name for c in report.candidates if c.chosen), None),
         "before_deg": round(old, 3),
         "after_deg": round(new, 3),

@@ -17,9 +17,8 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-LEAST_JUDGED = (
-    3  # cameras that a kind of evidence must know with both sets of poses, else it says nothing of them
-)
+# Cameras that a kind of evidence must know with both sets of poses, else it says nothing of them.
+LEAST_JUDGED = 3
 _LEAST = 1e-6  # of a misfit, in squared noise levels: nothing fits better than that
 
 

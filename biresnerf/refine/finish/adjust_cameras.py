@@ -44,10 +44,8 @@ ORDER: tuple[CandidateName, ...] = (
 # Standard deviations of the refined poses' errors, rad and distances of the cameras from the scene: far more than they
 # have, so that only what no evidence fixes is left to them.
 PRIOR = 0.02
-MOST_NOISE_PX, MOST_NOISE = (
-    2.0,
-    0.002,
-)  # of tracks, in px or shares of the photos' size; sets have 0.1 to 0.5 px
+# Of tracks, in px or in shares of the photos' size. Sets have 0.1 to 0.5 px.
+MOST_NOISE_PX, MOST_NOISE = 2.0, 0.002
 MOST_OBSERVATIONS = 40_000  # of tracks that are adjusted to
 LEFT_OUT_ONE_IN = 5  # patches
 

@@ -25,9 +25,8 @@ Array = NDArray[np.float64]
 # the logarithm of the focal length over the guess (1.2 of the long side) has 0.4. What COLMAP found says nothing
 # before: it is of the same matches. EXIF: whole millimetres of 35 mm film, and what stabilisation cuts off.
 FOCAL_DEVIATION: dict[IntrinsicsSource, float] = {"given": 0.02, "exif": 0.05, "colmap": 0.4, "guessed": 0.4}
-RADIAL_DEVIATION = (
-    0.1  # of either radial coefficient, as it moves the image's corner, as a share of its distance
-)
+# Of either radial coefficient, as it moves the image's corner, as a share of its distance.
+RADIAL_DEVIATION = 0.1
 # A given focal length is contradicted if another one is preferred by more than so many standard deviations of what is
 # known before and of what the evidence says together.
 CONTRADICTED = 2.0

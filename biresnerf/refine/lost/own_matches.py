@@ -23,9 +23,8 @@ LEAST_PX = 0.05  # errors below it are equal: features are not that exact
 # Errors of an image beyond so many times the median image's contradict its pose. The largest of any camera of fountain-
 # P11, lego at 200 px, temple, fox and the demo scene, at true poses and at noise of 0.005 and 0.15: 3.6.
 CONTRADICTED = 8.0
-AGREE = (
-    4.0  # times the median image's error: how near to its feature a point must appear to agree with a pose
-)
+# Times the median image's error: how near to its feature a point must appear to agree with a pose.
+AGREE = 4.0
 LEAST_PARALLAX_DEG = 1.0  # of points that a camera is placed by
 
 

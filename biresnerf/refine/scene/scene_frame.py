@@ -26,9 +26,8 @@ logger = logging.getLogger(__name__)
 CONVERGING = 0.01
 FORWARD_FACING_DEPTH = 6.0  # in spreads of the camera centres, where nothing better is known
 ALPHA_MARGIN = 1.15  # poses are noisy: the silhouettes' box is widened by this
-WIDEST_SLOPE = (
-    1.5  # half an angle of view counts as no more than this tangent (56 deg): fisheyes see to their sides
-)
+# Half an angle of view counts as no more than this tangent (56 deg): fisheyes see to their sides.
+WIDEST_SLOPE = 1.5
 FAR_BOXES = 60.0  # unbounded rays end this many inner boxes away (contracted to 1.98 of 2)
 
 

@@ -147,3 +147,13 @@ def test_rays_of_a_corrected_lens_are_those_of_the_fixed_point(rng):
     correction = np.array([0.05, 0.1, -0.08])
     exact = reference.seen_by(torch.from_numpy(rays), torch.from_numpy(correction))[:, :2].numpy()
     np.testing.assert_allclose(rays[:, :2] * narrowing(correction, rays[:, :2]), exact, atol=1e-12)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("k1", [-1e3, -5.0, 0.0, 5.0, 1e3])
+@pytest.mark.parametrize("k2", [-1e6, 0.0, 1e6])
+def test_a_lens_that_folds_has_finite_rays(k1, k2):
+    slopes = np.array([[0.0, 0.0], [0.3, -0.2], [3.0, 2.0]])
+    factor = narrowing(np.array([0.5, k1, k2]), slopes)
+    assert np.isfinite(factor).all()
+    assert (factor >= 0).all()

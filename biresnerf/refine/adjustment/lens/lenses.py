@@ -15,6 +15,7 @@ LENS = 3  # unknowns of a lens: log focal length and two radial coefficients
 OBSERVABLE = 1 / 3
 RANK = 1e-13  # of the largest eigenvalue: what is smaller is rounding, or one of the motions of the whole rig
 NEWTON = 8
+FURTHEST = 2.0  # times the slope itself that Newton's method may go
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +98,8 @@ def _deviations(evidence: Array, before: Array) -> Array:
 def narrowing(lens: Array, slopes: Array) -> Array:
     """Factor [..., 1] that undoes e^l (1 + k1 t^2 + k2 t^4) for slopes [..., 2]; lens [..., 3] is l, k1, k2.
 
-    Newton's method on the radius t.
+    Newton's method on the radius t. A lens that folds within twice a slope's radius has no answer there; the factor is
+    then wrong, but finite.
     """
     radius = np.linalg.norm(slopes, axis=-1, keepdims=True)
     aim, k1, k2 = radius * np.exp(-lens[..., :1]), lens[..., 1:2], lens[..., 2:]
@@ -106,4 +108,5 @@ def narrowing(lens: Array, slopes: Array) -> Array:
         square = found**2
         value = found * (1 + square * (k1 + square * k2)) - aim
         found = found - value / np.maximum(1 + square * (3 * k1 + 5 * square * k2), 0.1)
+        found = np.clip(found, 0, FURTHEST * aim)
     return np.where(radius > 0, found / np.maximum(radius, 1e-300), np.exp(-lens[..., :1]))
