@@ -84,7 +84,7 @@ def refine_poses(
     try:
         stages.run_stage_1()
         finish = run_stage_2(stages)
-        stages.observer.at_end(stages.optimiser)
+        stages.observer.at_end(stages)
         evaluation = evaluate(stages, ResultPictures(setup.folder, scene))
         judgement = judge(stages)
         known = pose_uncertainty(stages, finish, judgement)

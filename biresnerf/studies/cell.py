@@ -11,9 +11,10 @@ from pydantic import Field
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.pose_error import PoseError
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
-from biresnerf.report import SwitchReason
+from biresnerf.report import CandidateName, SwitchReason, VerdictName
 
 LOST_FROM_DEG = 1.0  # a camera this far off after a run counts as not found
+TEST_VIEWS = "test views"  # among the seconds
 EXIT_STOPPED = 143  # of the process of a cell that was stopped
 CELL, RESULT, LOG, RUN = "cell.json", "result.json", "log.txt", "run"  # in the folder of a cell
 
@@ -108,8 +109,13 @@ class Outcome(FrozenModel):
     options: ResolvedOptions = Field(description="As used, with all values filled in.")
     before: PoseError
     after: PoseError
+    matched: PoseError | None = Field(
+        None, description="Of the poses that COLMAP's feature matches gave in this run, where it found any."
+    )
     cameras: tuple[CameraResult, ...]
     views: ViewQuality | None
+    verdict: VerdictName | None = None
+    chosen: CandidateName | None = None
     switch_step: int | None
     switch_reason: SwitchReason | None
     seconds: dict[str, float] = Field(description="Wall time per stage.")
@@ -122,6 +128,11 @@ class Outcome(FrozenModel):
     @property
     def optimisation_s(self) -> float:
         return self.seconds["coarse"] + self.seconds["fine"]
+
+    @property
+    def run_s(self) -> float:
+        """All of the run, but for what measured it."""
+        return sum(seconds for name, seconds in self.seconds.items() if name != TEST_VIEWS)
 
     @property
     def not_found(self) -> int:

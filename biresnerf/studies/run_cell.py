@@ -20,12 +20,12 @@ from biresnerf.data.formats.read_dataset import read_poses
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.errors import Interrupted
-from biresnerf.geometry.pose_error import camera_errors, pose_error
+from biresnerf.geometry.pose_error import PoseError, camera_errors, pose_error
 from biresnerf.geometry.similarity import align_by_spread, align_robust
 from biresnerf.pipeline import refine_poses
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.stages.checkpoint import CHECKPOINT
-from biresnerf.refine.stages.two_stages import Observer
+from biresnerf.refine.stages.two_stages import Observer, TwoStages
 from biresnerf.refine.views.image_metrics import psnr, ssim
 from biresnerf.report import Report
 from biresnerf.studies.cell import (
@@ -33,6 +33,7 @@ from biresnerf.studies.cell import (
     EXIT_STOPPED,
     RESULT,
     RUN,
+    TEST_VIEWS,
     CameraResult,
     Cell,
     CellResult,
@@ -64,6 +65,7 @@ class TruthObserver:
     def __init__(self, truth: NDArray[np.float64], test_views: Dataset | None) -> None:
         self.truth, self.test_views = truth, test_views
         self.quality: ViewQuality | None = None
+        self.matched: PoseError | None = None
         self.seconds = 0.0
 
     def at_check(self, optimiser: JointOptimiser) -> dict[str, float]:
@@ -76,11 +78,13 @@ class TruthObserver:
             "centre": float(errors.centre.mean()),
         }
 
-    def at_end(self, optimiser: JointOptimiser) -> None:
+    def at_end(self, stages: TwoStages) -> None:
+        matched = stages.scene.start.matched_poses
+        self.matched = None if matched is None else pose_error(matched, self.truth)
         if self.test_views is None:
             return
         started = time.monotonic()
-        views = list(render_test_views(optimiser, self.test_views, self.truth))
+        views = list(render_test_views(stages.optimiser, self.test_views, self.truth))
         pairs = [(view.render, view.photo) for view in views]
         masked = [(view.render, view.photo, view.counts) for view in views]
         distances, absent = _perceptual(pairs)
@@ -119,11 +123,14 @@ def run_cell(folder: Path, should_stop: Callable[[], bool]) -> CellResult:
         options=report.options,
         before=pose_error(rig.world_from_cam, truth),
         after=pose_error(refined, truth),
+        matched=observer.matched,
         cameras=_cameras(dataset.names, rig, refined, truth),
         views=observer.quality or _held_out_quality(report, run),
+        verdict=report.verdict.verdict if report.verdict else None,
+        chosen=next((candidate.name for candidate in report.candidates if candidate.chosen), None),
         switch_step=report.switch_step,
         switch_reason=report.switch_reason,
-        seconds={**report.seconds, "test views": round(observer.seconds, 3)},
+        seconds={**report.seconds, TEST_VIEWS: round(observer.seconds, 3)},
         peak_memory_bytes=peak_memory_bytes(),
         backend=report.backend,
         device=report.device,

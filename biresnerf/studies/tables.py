@@ -28,6 +28,9 @@ class Metric:
 # Rotation and translation as BARF and BAA-NGP define them, after BARF's alignment.
 METRICS = (
     Metric("start_deg", "start °", 2, lambda o: o.before.aligned.rotation_deg.mean),
+    Metric(
+        "matched_deg", "COLMAP °", 3, lambda o: o.matched.aligned.rotation_deg.mean if o.matched else None
+    ),
     Metric("rotation_deg", "rotation °", 3, lambda o: o.after.aligned.rotation_deg.mean, tested=True),
     Metric("rotation_median_deg", "median", 3, lambda o: o.after.aligned.rotation_deg.median),
     Metric("rotation_max_deg", "max", 2, lambda o: o.after.aligned.rotation_deg.max, max),
@@ -41,6 +44,7 @@ METRICS = (
     Metric("coarse_s", "stage 1 s", 1, lambda o: o.seconds["coarse"]),
     Metric("fine_s", "stage 2 s", 1, lambda o: o.seconds["fine"]),
     Metric("optimisation_s", "both s", 1, lambda o: o.optimisation_s, tested=True),
+    Metric("total_s", "all s", 1, lambda o: o.run_s),
     Metric("peak_mb", "memory MB", 0, lambda o: o.peak_memory_bytes / 2**20, max),
     Metric("steps", "steps", 0, lambda o: float(o.options.steps)),
     # A method of one stage has no switch.
@@ -206,8 +210,11 @@ def paired_wilcoxon(first: Sequence[float], other: Sequence[float]) -> PairedTes
 
 
 def notes_of(entry: Entry) -> Iterator[str]:
-    """Notes on the tables: which views were scored, why LPIPS is absent, how equal time was reached."""
+    """Notes on the tables: what was said, which views were scored, why LPIPS is absent, how equal time was reached."""
     outcome, equal = entry.result.outcome, entry.result.cell.equal_time
+    run = f"{entry.scene}, {entry.start.label}, seed {entry.start.seed}, {entry.variant}"
+    if outcome is not None and outcome.verdict is not None:
+        yield f"{run}: {outcome.verdict}" + (f", poses {outcome.chosen}" if outcome.chosen else "")
     if outcome is not None and outcome.views is not None:
         yield f"{entry.scene}: PSNR and SSIM over {outcome.views.count} {outcome.views.kind} views"
         if outcome.views.lpips_absent:
@@ -215,8 +222,7 @@ def notes_of(entry: Entry) -> Iterator[str]:
     if equal is not None:
         took = f", took {outcome.optimisation_s:.1f} s" if outcome is not None else ""
         yield (
-            f"{entry.scene}, {entry.start.label}, seed {entry.start.seed}, {entry.variant}: "
-            f"{equal.seconds:.1f} s at {equal.calibration_ms_per_step:.1f} ms a step "
+            f"{run}: {equal.seconds:.1f} s at {equal.calibration_ms_per_step:.1f} ms a step "
             f"(measured over {equal.calibration_steps} steps) gave {entry.result.cell.options.steps} steps{took}"
         )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from biresnerf.studies.cell import TEST_VIEWS
 from biresnerf.studies.markdown import as_markdown
 from biresnerf.studies.tables import make_tables
 from tests.studies.outcomes import entry, outcome
@@ -65,6 +66,21 @@ def test_a_failed_run_is_told_and_left_out_of_pairs():
     text = as_markdown(made)
     assert "1 (1 failed)" in text
     assert "- ship, noise 0.15, seed 2, barf: exit status 1: ValueError: bad" in text
+
+
+def test_a_row_has_what_feature_matches_alone_gave_and_the_notes_the_verdict():
+    matched = outcome(0.02).after
+    made = tables(
+        [entry("ship", 1, "ours", outcome(0.01, matched=matched, verdict="improved", chosen="adjusted"))]
+    )
+    assert row(made, "ship", "ours").values["matched_deg"] == matched.aligned.rotation_deg.mean
+    assert "- ship, noise 0.15, seed 1, ours: improved, poses adjusted" in as_markdown(made)
+
+
+def test_all_seconds_are_those_of_the_run_and_not_of_its_measurement():
+    seconds = {"preparing": 5.0, "coarse": 2.0, "fine": 6.0, "judging": 3.0, TEST_VIEWS: 40.0}
+    made = tables([entry("ship", 1, "ours", outcome(0.01).model_copy(update={"seconds": seconds}))])
+    assert row(made, "ship", "ours").values["total_s"] == 16
 
 
 def test_markdown_has_every_figure_under_its_title():

@@ -51,7 +51,7 @@ class Observer:
     """
 
     at_check: Callable[[JointOptimiser], dict[str, float]] = lambda _optimiser: {}
-    at_end: Callable[[JointOptimiser], None] = lambda _optimiser: None
+    at_end: Callable[[TwoStages], None] = lambda _stages: None
     write_preview: Callable[[TwoStages], tuple[str, ...]] = lambda _stages: ()
 
 
