@@ -27,14 +27,16 @@ def checked_path(name: str) -> str:
     bytes, bidirectional controls, device names, empty parts, parts longer than 255 bytes and nesting
     deeper than 16.
     """
-    problem = _problem(name)
+    kept = "/".join(part for part in name.split("/") if part != ".")
+    problem = _problem(name, kept)
     if problem:
         raise InputError("unsafe_path", problem, where=_printable(name), hint=_HINT)
-    return "/".join(part for part in name.split("/") if part != ".")
+    return kept
 
 
-def _problem(name: str) -> str | None:
-    parts = name.split("/")
+def _problem(name: str, kept: str) -> str | None:
+    """What is wrong with a name, of which `kept` is left without parts `.`."""
+    parts = kept.split("/")
     # U+FFFD stands where bytes could not be decoded.
     if any(char == "\ufffd" or unicodedata.category(char) in {"Cc", "Cs", "Zl", "Zp"} for char in name):
         return "The name has a control character or bytes that are not text."
@@ -44,20 +46,19 @@ def _problem(name: str) -> str | None:
         return "The name has a backslash."
     if name.startswith("/"):
         return "The name is absolute."
-    if _DRIVE.match(name):
+    if _DRIVE.match(kept):
         return "The name begins with a drive letter."
     if ".." in parts:
         return "The name has a part `..`."
-    kept = [part for part in parts if part != "."]
-    if not kept or "" in kept:
+    if "" in parts:
         return "The name has an empty part."
-    if any(_DEVICE.match(part) for part in kept):
+    if any(_DEVICE.match(part) for part in parts):
         return "A part of the name is the name of a device."
-    if max(len(part.encode()) for part in kept) > PART_BYTES_MAX:
+    if max(len(part.encode()) for part in parts) > PART_BYTES_MAX:
         return f"A part of the name is longer than {PART_BYTES_MAX} bytes."
     if len(name.encode()) > PATH_BYTES_MAX:
         return f"The name is longer than {PATH_BYTES_MAX} bytes."
-    if len(kept) > DEPTH_MAX:
+    if len(parts) > DEPTH_MAX:
         return f"The name is nested deeper than {DEPTH_MAX} folders."
     return None
 

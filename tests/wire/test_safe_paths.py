@@ -36,6 +36,12 @@ def test_what_passes_stays_below_the_folder_and_is_its_own_normal_form(name: str
     assert not any(unicodedata.category(char).startswith("Cc") for char in path)
 
 
+@pytest.mark.parametrize("name", ["C:", "./C:", "././c:/a.png"])
+def test_a_drive_letter_is_refused_wherever_it_would_end_up_first(name: str) -> None:
+    with pytest.raises(InputError, match="drive letter"):
+        checked_path(name)
+
+
 def test_the_names_of_real_sets_pass() -> None:
     for name in (
         "images/0001.png",
