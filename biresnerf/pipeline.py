@@ -88,7 +88,7 @@ def refine_poses(
         evaluation = evaluate(stages, ResultPictures(setup.folder, scene))
         judgement = judge(stages)
         known = pose_uncertainty(stages, finish, judgement)
-        report = run_report(stages, evaluation.scores, judgement, "complete", finish.candidates, known)
+        report = run_report(stages, evaluation.scores, judgement, "complete", finish, known)
         return write_result(setup.folder, stages, evaluation, report)
     except Interrupted:
         report = run_report(stages, evaluation.scores, judgement, "partial")

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.uncertainty import PoseUncertainty
+from biresnerf.uncertainty import InputAccuracy, PoseUncertainty
 
 SwitchReason = Literal["stable", "cap"]
 IntrinsicsSource = Literal["given", "exif", "colmap", "guessed", "refined"]
@@ -270,6 +270,9 @@ class Report(FrozenModel):
     candidates: tuple[CandidateReport, ...] = Field(
         (),
         description="The poses that were compared at the end; one of them is the refined ones of the verdict.",
+    )
+    input_accuracy: InputAccuracy | None = Field(
+        None, description="None where fewer than six poses were given, or nothing tells of them."
     )
     steps_done: int = Field(examples=[2000])
     switch_step: int | None = Field(None, examples=[700], description="The step at which stage 2 began.")

@@ -1,4 +1,4 @@
-"""What a result says of how exact a pose is. No torch: the service reads it too."""
+"""What a result says of how exact poses are. No torch: the service reads it too."""
 
 from __future__ import annotations
 
@@ -30,4 +30,19 @@ class PoseUncertainty(FrozenModel, allow_inf_nan=False):
     )
     why_unknown: str | None = Field(
         None, examples=["nothing but the field speaks for it"], description="None where the bounds are known."
+    )
+
+
+class InputAccuracy(FrozenModel):
+    """How accurate the input's poses are, measured against the poses that tracks and patches gave.
+
+    Standard deviations of each component of the errors, after alignment. The errors of the other poses are in them.
+    """
+
+    rotation_deg: float = Field(examples=[0.4])
+    position: float = Field(examples=[0.03], description="In the input's unit.")
+    body_from_camera: tuple[tuple[float, float, float, float], ...] | None = Field(
+        None,
+        description="Offset between the tracked body (robot hand, phone) and the camera that all poses of the input "
+        "share, 4 x 4 in the input's unit. None where the errors show none.",
     )

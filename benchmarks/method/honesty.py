@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.method.seeding import shrunk, with_focal
-from biresnerf.data.formats.read_dataset import read_dataset, read_poses
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.formats.simple.poses_json import POSES, matrix_of, read_poses_json
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
@@ -178,9 +179,9 @@ def run(
     ):
         output = Path(folder) / "out"
         report = refine_poses(given, output, asked)
-        found = {Path(name).stem: pose for name, pose in read_poses(output / "transforms.json").items()}
-    # Foreign photos may share a stem with others; they come last and have no truth.
-    result = np.stack([found[Path(image.name).stem] for image in report.images[: len(truth)]])
+        document = read_poses_json(output / POSES)
+    found = {image.name: matrix_of(image.world_from_cam) for image in document.images}
+    result = np.stack([found[image.name] for image in report.images])
     return judged(given, truth, report, result)
 
 

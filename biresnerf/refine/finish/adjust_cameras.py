@@ -19,6 +19,7 @@ from biresnerf.refine.adjustment.adjustment import NOTHING_FITS, Adjustment, Hal
 from biresnerf.refine.adjustment.choice import Candidate, Choice, choose
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
 from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
+from biresnerf.refine.finish.given_poses import GivenPoses, input_accuracy
 from biresnerf.refine.finish.lens_evidence import (
     contradicted_focals,
     corrected_cameras,
@@ -66,10 +67,12 @@ class Finish:
     Attributes:
         candidates: the poses that were compared, and how they did.
         fit: of the poses to all evidence that is to be trusted; None where there is none.
+        given: how accurate the input's poses are; None where that is not known.
     """
 
     candidates: tuple[CandidateReport, ...] = ()
     fit: Fit | None = None
+    given: GivenPoses | None = None
 
     @property
     def heeds_photos(self) -> bool:
@@ -131,6 +134,11 @@ def _choice(
         logger.info("tracks say nothing: their noise is %.1f px", noise.track_px)
         split = _Split(replace(split.fitted, tracks=None), replace(split.left_out, tracks=None))
         results = {name: each for name, each in results.items() if name == "adjusted-patches"}
+    given = input_accuracy(scene.dataset, _most_heeded(results), split.fitted)
+    if given is not None and given.tells(prior):
+        prior = given.prior(prior)
+        patched = results.get("adjusted-patches")
+        results = _adjusted(refined, split.fitted, prior, announce, patched.halves if patched else None)
     cameras = optimiser.lenses.refined(scene.dataset).cameras
     adjusted = [_candidate(name, each, split.fitted, cameras) for name, each in results.items()]
     found = [Candidate("refined", refined), *_earlier(scene, refined), *filter(None, adjusted)]
@@ -152,7 +160,12 @@ def _choice(
     optimiser.lenses.certainty = focal_certainty(
         best, split.fitted, contradicted_focals(refined, split.fitted, split.left_out, prior, noise, kept)
     )
-    return choice, Finish(choice.reports, _fit(candidates, results, split.fitted))
+    return choice, Finish(choice.reports, _fit(candidates, results, split.fitted), given)
+
+
+def _most_heeded(results: Mapping[CandidateName, Adjustment]) -> Adjustment | None:
+    """The adjustment to most kinds of evidence that is to be believed."""
+    return next((results[name] for name in ORDER if name in results and _usable(results[name])), None)
 
 
 def _fit(
@@ -188,9 +201,13 @@ def _tells(misfits: Array) -> bool:
 
 
 def _adjusted(
-    refined: Array, evidence: Evidence, prior: PosePrior, announce: Callable[[], None]
+    refined: Array,
+    evidence: Evidence,
+    prior: PosePrior,
+    announce: Callable[[], None],
+    halves: Halves | None = None,
 ) -> dict[CandidateName, Adjustment]:
-    """Adjusted to tracks, to patches and to both."""
+    """Adjusted to tracks, to patches and to both; ``halves`` of the patches where they are known."""
     found: dict[CandidateName, Adjustment] = {}
 
     def add(name: CandidateName, evidence: Evidence, halves: Halves | None = None) -> Adjustment:
@@ -202,7 +219,7 @@ def _adjusted(
     if evidence.tracks:
         add("adjusted-tracks", replace(evidence, patches=None))
     if evidence.patches:
-        patched = add("adjusted-patches", replace(evidence, tracks=None))
+        patched = add("adjusted-patches", replace(evidence, tracks=None), halves)
         if evidence.tracks and _usable(patched):
             add("adjusted", evidence, patched.halves)
     return found

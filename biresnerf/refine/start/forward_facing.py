@@ -21,7 +21,7 @@ from biresnerf.errors import InputError, Interrupted
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene_frame import SceneFrame, scene_frame
-from biresnerf.refine.start.frozen_trials import trial_views
+from biresnerf.refine.start.pose_trials import trial_views
 from biresnerf.refine.views.evaluation import score_views
 
 logger = logging.getLogger(__name__)

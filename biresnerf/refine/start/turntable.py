@@ -31,7 +31,7 @@ from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.optimise.photo_sampler import PhotoSampler
 from biresnerf.refine.parameters.ring_parameters import RingParameters
 from biresnerf.refine.scene.scene_frame import scene_frame
-from biresnerf.refine.start.frozen_trials import trial_views
+from biresnerf.refine.start.pose_trials import trial_views
 from biresnerf.refine.start.ring_order import RingOrder, axis_in_photos, find_ring, thumbnails
 from biresnerf.refine.views.evaluation import render_view
 from biresnerf.refine.views.image_metrics import psnr

@@ -17,7 +17,7 @@ from biresnerf.geometry.focus import focus_point
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.adjustment.paired import paired
 from biresnerf.refine.lost.own_matches import LEAST_PX, OwnMatches
-from biresnerf.refine.start.frozen_trials import FrozenTrials, TrialScores, joined
+from biresnerf.refine.start.pose_trials import PoseTrials, TrialScores, joined
 from biresnerf.refine.verdict.verdict import EPIPOLAR_MATTERS, PSNR_MATTERS, SSIM_MATTERS
 from biresnerf.refine.views.held_out_views import unseen_rounds
 from biresnerf.report import EpipolarEvidence, HeldOutEvidence
@@ -87,7 +87,7 @@ def compare_on_unseen_views(
     rigs = [before.world_from_cam, after.world_from_cam]
     scores: tuple[list[TrialScores], list[TrialScores]] = ([], [])
     for views in rounds:
-        trials = FrozenTrials(images, views, rigs, options, steps, device, threads, should_stop)
+        trials = PoseTrials(images, views, rigs, options, steps, device, threads, should_stop)
         for side, rig in zip(scores, (before, after), strict=True):
             side.append(trials.score(rig.world_from_cam, rig.lenses(images)))
             report(sum(map(len, scores)) / (2 * len(rounds)))

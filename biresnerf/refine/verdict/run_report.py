@@ -9,6 +9,8 @@ import numpy as np
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.named_images import few_names
 from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.refine.finish.adjust_cameras import Finish
+from biresnerf.refine.finish.given_poses import accuracy_report
 from biresnerf.refine.lost.own_matches import LEAST_PAIRS
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
@@ -18,7 +20,7 @@ from biresnerf.refine.verdict.camera_reports import camera_reports, focal_warnin
 from biresnerf.refine.verdict.judgement import Judgement, motion
 from biresnerf.refine.verdict.pose_uncertainty import FIXED
 from biresnerf.refine.views.evaluation import ViewScore
-from biresnerf.report import CandidateReport, HeldOut, ImageReport, Report
+from biresnerf.report import HeldOut, ImageReport, Report
 from biresnerf.uncertainty import PoseUncertainty
 
 
@@ -27,7 +29,7 @@ def run_report(
     scores: list[ViewScore],
     judgement: Judgement | None,
     state: Literal["complete", "partial"],
-    candidates: tuple[CandidateReport, ...] = (),
+    finish: Finish = Finish(),
     uncertainty: tuple[PoseUncertainty, ...] = (),
 ) -> Report:
     """The report of a run as it is now.
@@ -35,7 +37,7 @@ def run_report(
     Args:
         scores: of held-out views, as far as they are scored.
         judgement: None where there is no verdict.
-        candidates: the poses that were compared at the end.
+        finish: what came of the adjustment of all cameras.
         uncertainty: of each image's returned pose, or nothing.
     """
     from biresnerf import __version__
@@ -58,7 +60,8 @@ def run_report(
         if scores
         else None,
         start_trials=scene.start.trials,
-        candidates=candidates,
+        candidates=finish.candidates,
+        input_accuracy=finish.given and accuracy_report(finish.given),
         steps_done=optimiser.step_index,
         switch_step=optimiser.switch if optimiser.method.two_stages else None,
         switch_reason=record.switch_reason,

@@ -9,6 +9,7 @@ import torch
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refine.adjustment.lens.corrected_camera import corrected_camera
 from biresnerf.refine.finish.adjust_cameras import adjust_cameras
+from biresnerf.refine.finish.given_poses import accuracy_report
 from biresnerf.refine.finish.photo_evidence import photo_patches
 from biresnerf.refine.finish.rounds import FIRST_ROUND, LEARNING, run_stage_2
 from biresnerf.refine.lost.lost_cameras import LostCameraRepair
@@ -195,3 +196,20 @@ def test_a_run_resumed_after_the_first_adjustment_ends_at_the_same_poses(tmp_pat
     assert again.optimiser.schedule.steps == run.optimiser.step_index
     run_stage_2(again)
     torch.testing.assert_close(again.optimiser.poses.poses(), run.optimiser.poses.poses())
+
+
+def test_the_accuracy_of_the_input_is_measured_where_poses_were_given(tmp_path, rng):
+    run, _ = stages(tmp_path, rng, given=lambda truth: disturbed(truth, rng, 0.004, 0.02))
+    found = adjust_cameras(run).given
+    assert found is not None
+    report = accuracy_report(found)
+    assert report.rotation_deg == pytest.approx(np.degrees(0.004), rel=0.4)
+    assert report.position == pytest.approx(0.02, rel=0.4)
+    assert report.body_from_camera is None
+
+
+def test_guessed_poses_have_no_accuracy(tmp_path, rng):
+    run, _ = stages(tmp_path, rng, given=wild(rng))
+    guessed = tuple(replace(frame, pose_source="neighbours") for frame in run.scene.dataset.frames)
+    run.scene = replace(run.scene, dataset=replace(run.scene.dataset, frames=guessed))
+    assert adjust_cameras(run).given is None

@@ -187,7 +187,7 @@ def test_the_report_names_those_that_stay_lost_and_those_repaired(scene, tmp_pat
     stages.repair.repaired = [ORBITED]
     dataset = scene[0]
     known = pose_uncertainty(stages, Finish(), None)
-    partial = run_report(stages, [], None, "partial", (), known)
+    partial = run_report(stages, [], None, "partial", uncertainty=known)
     report = write_result(OutputFolder(tmp_path), stages, Evaluation(), partial)
     lost = [image.name for image in report.images if image.uncertainty.why_unknown == LOST]
     assert lost == [dataset.names[TURNED]]

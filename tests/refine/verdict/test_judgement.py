@@ -12,7 +12,7 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.progress import Monitor
-from biresnerf.refine.start import frozen_trials
+from biresnerf.refine.start import pose_trials
 from biresnerf.refine.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refine.verdict.judgement import Judgement, judge_poses
 from biresnerf.refine.verdict.pose_evidence import Rig, compare_on_matches, moved_px
@@ -175,7 +175,7 @@ def test_outliers_in_exposure_and_motion_are_flagged_and_they_alone():
 
 def test_trainings_are_the_same_again(scene):
     dataset, images = scene
-    trials = frozen_trials.FrozenTrials(
+    trials = pose_trials.PoseTrials(
         images, [2, 6], [dataset.world_from_cam], OPTIONS, 20, CPU, 2, lambda: False
     )
     first, again = trials.score(dataset.world_from_cam), trials.score(dataset.world_from_cam)

@@ -1,9 +1,9 @@
-"""Equal short trainings on sets of poses held still: which set lets a field predict photos it was not shown?
+"""Equal short trainings on sets of poses: which set lets a field predict photos it was not shown?
 
 Everything but the poses (and the lenses, where they were refined too) is the same in each: photos, unseen views, scene
 box, steps, samples and random seed. Unseen views are rendered from the poses as they stand, fitted to no field: a fit
 would hide the errors under comparison. Each set is scored within its own field, so it need not share its frame's last
-digits with the others.
+digits with the others. Where poses move, those of the unseen views follow the field without training it.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def joined(parts: Sequence[TrialScores]) -> TrialScores:
     return TrialScores(np.concatenate([p.psnr for p in parts]), np.concatenate([p.ssim for p in parts]))
 
 
-class FrozenTrials:
+class PoseTrials:
     """Scores sets of poses, one after the other, under the same conditions.
 
     Args:
@@ -95,13 +95,18 @@ class FrozenTrials:
         self._stride = max(1, math.ceil(math.sqrt(pixels / (RAYS_PER_STEP * self.steps))))
 
     def score(
-        self, world_from_cam: NDArray[np.float64], cameras: tuple[Camera, ...] | None = None
+        self,
+        world_from_cam: NDArray[np.float64],
+        cameras: tuple[Camera, ...] | None = None,
+        *,
+        moving: bool = False,
     ) -> TrialScores:
         """Train a field on all but the unseen views, from these poses and lenses, and score it on the unseen.
 
         Args:
             world_from_cam: [n, 4, 4], in the frame of the rigs.
             cameras: of each image at working size; the photos' own where left out.
+            moving: whether poses are optimised with the field.
 
         Raises:
             Interrupted: ``should_stop`` returned true.
@@ -112,7 +117,7 @@ class FrozenTrials:
             images, self.frame, poses, self._options, self.unseen, self._device, self._threads,
             sampler=self._sampler,
         )  # fmt: skip
-        optimiser.poses_held = True
+        optimiser.poses_held = not moving
         for _ in range(self.steps):
             if self._should_stop():
                 raise Interrupted("stopped while sets of poses were compared")
