@@ -75,6 +75,11 @@ class Finish:
     given: GivenPoses | None = None
 
     @property
+    def kept(self) -> bool:
+        """Whether nothing was better than the poses as they were."""
+        return any(each.chosen and each.name == "refined" for each in self.candidates)
+
+    @property
     def heeds_photos(self) -> bool:
         """Whether patches of the photos were to be trusted."""
         return self.fit is not None and self.fit.evidence.patches is not None
@@ -83,9 +88,8 @@ class Finish:
 def adjust_cameras(stages: TwoStages) -> Finish:
     """Adjust all cameras at once, and where left-out evidence says that is better move them and hold them there.
 
-    Cameras that their own matches contradict are placed by those first.
-
-    Cameras that are fixed or tied to each other, fisheyes, and methods of others are left alone.
+    Cameras that their own matches contradict are placed by those first. Cameras that are fixed or tied
+    to each other, fisheyes, and methods of others are left alone.
 
     Raises:
         Interrupted: stopped; a continued run adjusts again.

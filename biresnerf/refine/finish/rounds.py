@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 
 from biresnerf.refine.finish.adjust_cameras import Finish, adjust_cameras
 from biresnerf.refine.stages.earlier_state import EarlierState
@@ -50,6 +51,9 @@ def run_stage_2(stages: TwoStages) -> Finish:
     if stages.record.taken_back:
         seen = first.candidates if first is not None else ()
         return Finish(tuple(each.model_copy(update={"chosen": each.name == "refined"}) for each in seen))
-    if first is not None and stages.optimiser.poses_held and first.heeds_photos:
+    held = stages.optimiser.poses_held
+    if first is not None and held and first.heeds_photos:
         return first
-    return adjust_cameras(stages)
+    last = adjust_cameras(stages)
+    # The poses that are held are what the first adjustment made of the field's.
+    return replace(last, candidates=first.candidates) if first is not None and held and last.kept else last

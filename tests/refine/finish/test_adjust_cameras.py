@@ -170,7 +170,8 @@ def test_the_field_learns_at_adjusted_poses_that_stand_still(tmp_path, rng):
         return step()
 
     run.optimiser.step = watched
-    run_stage_2(run)
+    finish = run_stage_2(run)
+    assert [each.name for each in finish.candidates if each.chosen] == ["adjusted-tracks"]
     steps = run.optimiser.options.steps
     assert run.optimiser.step_index == (FIRST_ROUND + LEARNING) * steps
     assert all(torch.equal(ends[-1], poses) for poses in ends[-round(LEARNING * steps) :])
