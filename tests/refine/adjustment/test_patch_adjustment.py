@@ -75,6 +75,7 @@ def test_a_blur_keeps_the_mean_and_lowers_the_contrast(rng):
     assert smooth.std() < 0.5 * photo.std()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "correction", [None, [[0.02, 0.05, -0.03], [-0.01, 0.0, 0.04]]], ids=["held", "free"]
 )

@@ -22,6 +22,8 @@ from biresnerf.refine.verdict.camera_reports import camera_reports, focal_warnin
 from tests.refine.adjustment.rig import disturbed, observed, rotation_errors_deg
 from tests.refine.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
 
+pytestmark = pytest.mark.slow
+
 VIEWS = 9
 
 
