@@ -77,7 +77,6 @@ def choose_start(
         Interrupted: ``should_stop`` returned true.
     """
     rigs = [candidate.world_from_cam for candidate in candidates]
-
     unseen = trial_views(len(images))
 
     def scored(steps: int, *, moving: bool) -> list[float]:

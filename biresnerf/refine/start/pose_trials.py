@@ -122,15 +122,22 @@ class PoseTrials:
             if self._should_stop():
                 raise Interrupted("stopped while sets of poses were compared")
             optimiser.step()
-        matrices = optimiser.poses.matrices().detach()
-        scores = []
-        for view in self.unseen:
-            view_of = render_view(optimiser, matrices[view], view, stride=self._stride, as_photo=True)
-            rendered = torch.from_numpy(view_of.colour)
-            sampled = images.image(view)[:: self._stride, :: self._stride]
-            photo = torch.from_numpy(sampled.astype(np.float32) / 255)
-            mask = images.counts_image(view)
-            counts = None if mask is None else torch.from_numpy(mask[:: self._stride, :: self._stride].copy())
-            scores.append((psnr(rendered, photo, counts), ssim(rendered, photo, counts)))
-        table = np.array(scores, dtype=np.float64).reshape(-1, 2)
-        return TrialScores(table[:, 0], table[:, 1])
+        return score_unseen(optimiser, images, self.unseen, self._stride)
+
+
+def score_unseen(
+    optimiser: JointOptimiser, images: ImageSet, unseen: Sequence[int], stride: int
+) -> TrialScores:
+    """How well the field predicts unseen views from where they stand, on every `stride`-th pixel across and down."""
+    matrices = optimiser.poses.matrices().detach()
+    scores = []
+    for view in unseen:
+        rendered = torch.from_numpy(
+            render_view(optimiser, matrices[view], view, stride=stride, as_photo=True).colour
+        )
+        photo = torch.from_numpy(images.image(view)[::stride, ::stride].astype(np.float32) / 255)
+        mask = images.counts_image(view)
+        counts = None if mask is None else torch.from_numpy(mask[::stride, ::stride].copy())
+        scores.append((psnr(rendered, photo, counts), ssim(rendered, photo, counts)))
+    table = np.array(scores, dtype=np.float64).reshape(-1, 2)
+    return TrialScores(table[:, 0], table[:, 1])

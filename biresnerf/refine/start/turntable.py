@@ -17,7 +17,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 
 from biresnerf.data.photos.images import ImageSet
@@ -31,10 +30,8 @@ from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.optimise.photo_sampler import PhotoSampler
 from biresnerf.refine.parameters.ring_parameters import RingParameters
 from biresnerf.refine.scene.scene_frame import scene_frame
-from biresnerf.refine.start.pose_trials import trial_views
+from biresnerf.refine.start.pose_trials import score_unseen, trial_views
 from biresnerf.refine.start.ring_order import RingOrder, axis_in_photos, find_ring, thumbnails
-from biresnerf.refine.views.evaluation import render_view
-from biresnerf.refine.views.image_metrics import psnr
 from biresnerf.report import TrialReport
 
 logger = logging.getLogger(__name__)
@@ -110,18 +107,8 @@ class RingTrials:
             if self._should_stop():
                 raise Interrupted("stopped while rings of cameras were tried")
             optimiser.step()
-        return Tried(moving.now().detached(), self._score(optimiser))
-
-    def _score(self, optimiser: JointOptimiser) -> float:
-        matrices = optimiser.poses.matrices().detach()
-        scores = []
-        for view in self.unseen:
-            rendered = render_view(optimiser, matrices[view], view, stride=self._stride, as_photo=True).colour
-            photo = self.images.image(view)[:: self._stride, :: self._stride].astype(np.float32) / 255
-            mask = self.images.counts_image(view)
-            counts = None if mask is None else torch.from_numpy(mask[:: self._stride, :: self._stride].copy())
-            scores.append(psnr(torch.from_numpy(rendered), torch.from_numpy(photo), counts))
-        return float(np.mean(scores))
+        unseen = score_unseen(optimiser, self.images, self.unseen, self._stride)
+        return Tried(moving.now().detached(), float(unseen.psnr.mean()))
 
 
 def start_on_turntable(

@@ -17,6 +17,7 @@ from biresnerf.refine.start import choose_start as start_module
 from biresnerf.refine.start import pose_trials
 from biresnerf.refine.start.choose_start import choose_start, find_start
 from biresnerf.refine.start.first_step import MATCHED_MOBILITY, pose_mobility, stage_lengths
+from biresnerf.refine.start.pose_trials import PoseTrials, trial_views
 from tests.refine.tiny_scene import CPU, tiny_options, tiny_set
 
 pytestmark = pytest.mark.slow
@@ -82,6 +83,13 @@ def test_on_a_tie_the_given_poses_stay_if_matches_agree(scene):
     dataset, images = scene
     poses = dataset.world_from_cam
     assert choose(images, candidates(dataset, poses, poses.copy())).source == "given"
+
+
+def test_poses_that_may_move_in_a_trial_improve(scene):
+    dataset, images = scene
+    noisy = perturb_poses(dataset.world_from_cam, 0.05, seed=1)
+    trials = PoseTrials(images, trial_views(VIEWS), [noisy], tiny_options(), 150, CPU, 2, lambda: False)
+    assert trials.score(noisy, moving=True).psnr.mean() > trials.score(noisy).psnr.mean() + 0.5
 
 
 def test_where_poses_as_they_are_do_not_tell_those_win_that_improve_with_the_field(scene, monkeypatch):
