@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from biresnerf.field.adam_state import adam_state, load_adam_state
+from biresnerf.field.adam import Adam
 from biresnerf.field.coarse_to_fine import level_mixing
 from biresnerf.field.grid_levels import FEATURES
 from biresnerf.field.radiance_field import FieldRates, FieldShape, RadianceField
@@ -77,9 +77,9 @@ class GridField(RadianceField):
             for rows, columns in sizes
         ]
 
-    def _adam(self, parameters: list[Tensor]) -> torch.optim.Optimizer:
-        fused = True if self.device.type == "cuda" else None  # one launch instead of a dozen
-        return torch.optim.Adam(parameters, betas=(BETA1, BETA2), eps=EPSILON, fused=fused)
+    def _adam(self, parameters: list[Tensor]) -> Adam:
+        fused = self.device.type == "cuda"  # one launch instead of a dozen
+        return Adam(parameters, betas=(BETA1, BETA2), eps=EPSILON, fused=fused)
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -110,22 +110,16 @@ class GridField(RadianceField):
         self._update_table("pose", np.full(self.shape.pose_grid.levels, rates.pose, np.float32))
         if self._mixing is not None and self.networks[0].grad is not None:
             self._first.grad = self.networks[0].grad @ self._mixing.T
-        self._step_networks(self._networks_adam, rates.networks)
+        self._networks_adam.step(rates.networks)
         self._mix()
         if self.reconstructing:
             self.steps["reconstruction"] += 1
             self._update_table("reconstruction", np.asarray(rates.reconstruction, np.float32))
-            self._step_networks(self._columns_adam, rates.reconstruction_columns)
+            self._columns_adam.step(rates.reconstruction_columns)
         self.discard_gradients()
 
-    @staticmethod
-    def _step_networks(optimiser: torch.optim.Optimizer, rate: float) -> None:
-        optimiser.param_groups[0]["lr"] = rate
-        optimiser.step()
-        optimiser.zero_grad(set_to_none=True)
-
     def discard_gradients(self) -> None:
-        for parameter in (*self.tables.values(), *self.networks, self.reconstruction_columns):
+        for parameter in (*self.tables.values(), self._first, *self.networks, self.reconstruction_columns):
             parameter.grad = None
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -140,8 +134,8 @@ class GridField(RadianceField):
 
     def state(self) -> dict[str, Tensor]:
         state = self._tensors()
-        state.update(adam_state("adam_networks", self._networks_adam))
-        state.update(adam_state("adam_columns", self._columns_adam))
+        state.update(self._networks_adam.state("adam_networks"))
+        state.update(self._columns_adam.state("adam_columns"))
         state["counters"] = torch.tensor([*self.steps.values(), int(self.reconstructing)])
         return state
 
@@ -152,6 +146,6 @@ class GridField(RadianceField):
         *steps, reconstructing = state["counters"].tolist()
         self.steps = dict(zip(MODULES, steps, strict=True))
         self.reconstructing = bool(reconstructing)
-        load_adam_state("adam_networks", self._networks_adam, state)
-        load_adam_state("adam_columns", self._columns_adam, state)
+        self._networks_adam.load_state("adam_networks", state)
+        self._columns_adam.load_state("adam_columns", state)
         self._mix()

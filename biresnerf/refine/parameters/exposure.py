@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.field.adam_state import adam_state, load_adam_state
+from biresnerf.field.adam import Adam
 from biresnerf.field.radiance_field import Rendering
 from biresnerf.options.refine_options import ExposureChoice
 
@@ -74,7 +74,7 @@ class Exposure:
 
     def restart_adam(self) -> None:
         """Forget the momentum of the steps so far."""
-        self._adam = torch.optim.Adam([self.log_gain], betas=(0.9, 0.99), eps=1e-8)
+        self._adam = Adam([self.log_gain], betas=(0.9, 0.99), eps=1e-8)
 
     def shown(self, rendering: Rendering, image: Tensor) -> Tensor:
         """Rendered colours [rays, 3] as the photos `image` [rays] show them."""
@@ -113,9 +113,8 @@ class Exposure:
         if self.log_gain.grad is None:
             return
         self.log_gain.grad += PRIOR / len(self.log_gain) * self.log_gain
-        self._adam.param_groups[0]["lr"] = RATE_SHARE * rate
-        self._adam.step()
-        self._adam.zero_grad(set_to_none=True)
+        self._adam.step(RATE_SHARE * rate)
+        self._adam.zero_grad()
         mean = (self.log_gain * self._training).sum(0) / self._training.sum()
         self.log_gain.sub_(mean).clamp_(-math.log(MOST), math.log(MOST))
 
@@ -123,18 +122,16 @@ class Exposure:
     def forget(self, camera: int) -> None:
         """Reset one photo's factors, after its pose was replaced."""
         self.log_gain[camera] = 0
-        for moment in self._adam.state.get(self.log_gain, {}).values():
-            if moment.shape == self.log_gain.shape:
-                moment[camera] = 0
+        self._adam.forget_row(camera)
 
     def gains(self) -> NDArray[np.float64] | None:
         """The factors [n, 3]; None without compensation."""
         return self.log_gain.detach().double().exp().cpu().numpy() if self.on else None
 
     def state(self) -> dict[str, Tensor]:
-        return {"log_gain": self.log_gain.detach(), **adam_state("adam", self._adam)}
+        return {"log_gain": self.log_gain.detach(), **self._adam.state("adam")}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         with torch.no_grad():
             self.log_gain.copy_(state["log_gain"])
-        load_adam_state("adam", self._adam, state)
+        self._adam.load_state("adam", state)

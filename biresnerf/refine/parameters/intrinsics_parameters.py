@@ -10,7 +10,7 @@ from torch import Tensor
 
 from biresnerf.data.model.dataset import Dataset, IntrinsicsSource
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.field.adam_state import adam_state, load_adam_state
+from biresnerf.field.adam import Adam
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import RefineIntrinsics
@@ -116,7 +116,7 @@ class IntrinsicsParameters:
         self.precision = PRIOR_WEIGHT / torch.tensor(DEVIATIONS, dtype=torch.float64, device=device) ** 2
         self.increments = torch.zeros(len(cameras), COLUMNS, dtype=torch.float64, device=device)
         self.increments.requires_grad_()
-        self._adam = torch.optim.Adam([self.increments], betas=BETAS, eps=EPSILON)
+        self._adam = Adam([self.increments], betas=BETAS, eps=EPSILON)
         self.certainty: tuple[FocalCertainty | None, ...] = (None,) * len(cameras)
         self._show()
 
@@ -173,8 +173,7 @@ class IntrinsicsParameters:
         before = self.increments.detach().clone()
         if self.increments.grad is not None:
             self.increments.grad += 2 * self.precision * before * self.free
-        self._adam.param_groups[0]["lr"] = rate
-        self._adam.step()
+        self._adam.step(rate)
         self.forget_gradients()
         if not focal:
             with torch.no_grad():
@@ -193,14 +192,14 @@ class IntrinsicsParameters:
         """Take other intrinsics than those of the set, `before`; in the same models, and with no history."""
         for row, (old, new) in enumerate(zip(before, after, strict=True)):
             self.increments[row] = increments_between(old, new, self.unit[row].cpu())
-        self._adam.state.clear()
+        self._adam.forget()
         self._show()
 
     @torch.no_grad()
     def forget(self) -> None:
         """The set's own lenses again, with no history."""
         self.increments.zero_()
-        self._adam.state.clear()
+        self._adam.forget()
         self._show()
 
     @property
@@ -218,7 +217,7 @@ class IntrinsicsParameters:
         self._present = self.differentiable()
 
     def forget_gradients(self) -> None:
-        self._adam.zero_grad(set_to_none=True)
+        self._adam.zero_grad()
 
     @property
     def refined_parts(self) -> tuple[RefinedPart, ...]:
@@ -257,12 +256,12 @@ class IntrinsicsParameters:
     def state(self) -> dict[str, Tensor]:
         if not (self.moving or any(self._placed)):
             return {}
-        return {"increments": self.increments.detach(), **adam_state("adam", self._adam)}
+        return {"increments": self.increments.detach(), **self._adam.state("adam")}
 
     @torch.no_grad()
     def load_state(self, state: dict[str, Tensor]) -> None:
         if "increments" not in state:
             return
         self.increments.copy_(state["increments"])
-        load_adam_state("adam", self._adam, state)
+        self._adam.load_state("adam", state)
         self._show()

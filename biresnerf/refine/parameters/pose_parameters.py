@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from biresnerf.field.adam_state import adam_state, load_adam_state
+from biresnerf.field.adam import Adam
 from biresnerf.geometry.lie import se3_exp
 
 EPSILON = 1e-12
@@ -78,12 +78,10 @@ class PoseParameters:
 
         A body moves as far as its least mobile camera.
         """
-        self._adam.param_groups[0]["lr"] = rate
         before = [(p, p.detach().clone()) for p in (self.rotation, self.translation)]
-        self._adam.step()
+        self._adam.step(rate)
         if self._second is not None and field_rate > 0:
-            self._second.param_groups[0]["lr"] = field_rate
-            self._second.step()
+            self._second.step(field_rate)
         if mobility is not None:
             if self.body is not None:
                 least = torch.ones_like(self.rotation[:, 0])
@@ -107,12 +105,10 @@ class PoseParameters:
     def restart_adam(self) -> None:
         """Reset the moments, before another optimisation."""
         parameters = [self.rotation, self.translation]
-        self._adam = torch.optim.Adam(parameters, betas=self.betas, eps=EPSILON)
+        self._adam = Adam(parameters, betas=self.betas, eps=EPSILON)
         self._second = None
         if self.double_step:
-            self._second = torch.optim.Adam(
-                parameters, betas=self.betas, eps=SECOND_EPSILON, weight_decay=SECOND_DECAY
-            )
+            self._second = Adam(parameters, betas=self.betas, eps=SECOND_EPSILON, weight_decay=SECOND_DECAY)
 
     def replace(self, camera: int, unit_from_cam: Tensor) -> None:
         """Restart one camera, with its body, at another pose [3, 4] and without momentum."""
@@ -121,10 +117,8 @@ class PoseParameters:
             row = camera if self.body is None else int(self.body[camera])
             for parameter in (self.rotation, self.translation):
                 parameter[row] = 0
-                for adam in self._adams().values():
-                    for moment in adam.state.get(parameter, {}).values():
-                        if moment.shape == parameter.shape:
-                            moment[row] = 0
+            for adam in self._adams().values():
+                adam.forget_row(row)
 
     def _carry_body(self, camera: int, unit_from_cam: Tensor) -> None:
         """Set the start poses of a camera's body so that the camera begins at `unit_from_cam` [3, 4]."""
@@ -146,7 +140,7 @@ class PoseParameters:
         self.restart_adam()
 
     def forget_gradients(self) -> None:
-        self._adam.zero_grad(set_to_none=True)
+        self._adam.zero_grad()
 
     def _tensors(self) -> dict[str, Tensor]:
         return {
@@ -155,20 +149,20 @@ class PoseParameters:
             "translation": self.translation.detach(),
         }
 
-    def _adams(self) -> dict[str, torch.optim.Adam]:
+    def _adams(self) -> dict[str, Adam]:
         return {"adam": self._adam} if self._second is None else {"adam": self._adam, "second": self._second}
 
     def state(self) -> dict[str, Tensor]:
         state = self._tensors()
         for name, adam in self._adams().items():
-            state.update(adam_state(name, adam))
+            state.update(adam.state(name))
         return state
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         for name, tensor in self._tensors().items():
             tensor.copy_(state[name])
         for name, adam in self._adams().items():
-            load_adam_state(name, adam, state)
+            adam.load_state(name, state)
 
 
 def dolly_directions(unit_from_cam: Tensor) -> Tensor:

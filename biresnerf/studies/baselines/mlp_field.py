@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import relu, softplus
 
-from biresnerf.field.adam_state import adam_state, load_adam_state
+from biresnerf.field.adam import Adam
 from biresnerf.field.coarse_to_fine import band_weights
 from biresnerf.field.radiance_field import (
     FieldRates,
@@ -82,7 +82,7 @@ class MlpField(RadianceField):
         layer(3, hidden // 2, plain_rows=3)
         for parameter in self.parameters:
             parameter.requires_grad_()
-        self._adam = torch.optim.Adam(self.parameters)
+        self._adam = Adam(self.parameters)
 
     def network(self, x: Tensor, view: Tensor, parameters: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Density [n] per unit of the unit frame and colour [n, 3] at x [n, 3], seen along unit `view` [n, 3]."""
@@ -174,19 +174,18 @@ class MlpField(RadianceField):
         self.progress = progress
 
     def step(self, rates: FieldRates) -> None:
-        self._adam.param_groups[0]["lr"] = rates.networks
-        self._adam.step()
+        self._adam.step(rates.networks)
         self.discard_gradients()
 
     def discard_gradients(self) -> None:
-        self._adam.zero_grad(set_to_none=True)
+        self._adam.zero_grad()
 
     def state(self) -> dict[str, Tensor]:
         state = {f"parameter{i}": parameter.detach() for i, parameter in enumerate(self.parameters)}
-        return {**state, **adam_state("adam", self._adam)}
+        return {**state, **self._adam.state("adam")}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         with torch.no_grad():
             for i, parameter in enumerate(self.parameters):
                 parameter.copy_(state[f"parameter{i}"])
-        load_adam_state("adam", self._adam, state)
+        self._adam.load_state("adam", state)
