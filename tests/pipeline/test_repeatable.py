@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 OPTIONS = RefineOptions(
     preset="fast", device="cpu", start="given", steps=60, coarse_steps_min=20, coarse_steps_max=30,
-    max_image_size=24, samples_per_step=4096, table_size_log2=12, orbit_frames=0, verdict=False,
+    max_image_size=24, samples_per_step=4096, table_size_log2=12, orbit_frames=0, holdout=0, verdict=False,
 )  # fmt: skip
 
 

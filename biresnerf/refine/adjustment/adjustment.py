@@ -29,7 +29,7 @@ class Agreement:
     Attributes:
         apart_deg: mean rotation between the two results, aligned.
         moved_deg: mean rotation from the start to their mean, aligned.
-        inliers: share of comparisons within the robust scale.
+        inliers: share of comparisons within the robust scale; if it was too small from the start, nothing was adjusted.
     """
 
     apart_deg: float
@@ -95,7 +95,8 @@ def adjust_poses(
 ) -> Adjustment:
     """Adjust poses [n, 4, 4] to evidence, from where they are, and its lenses as far as it tells of them.
 
-    Never raises on poor evidence: where it fixes nothing, poses and lenses stay.
+    Never raises on poor evidence: where it fixes nothing, poses and lenses stay. Patches whose halves disagree have no
+    say.
 
     Args:
         halves: of the same patches from the same poses and lenses, where they are known.
@@ -124,6 +125,8 @@ def _adjusted(
     if halves is None and evidence.patches is not None and len(evidence.patches) > 1:
         halves = _halves(cameras, evidence, before)
     start, patch_noise = (cameras, 1.0) if halves is None else (halves.middle, halves.noise)
+    if halves is not None and not halves.agreement.trusted:
+        start, evidence = cameras, replace(evidence, patches=None)
     tracks, patches = track_term(start, evidence, None), patch_term(start, evidence, patch_noise)
     terms: list[Term] = [term for term in (tracks, patches) if term is not None]
     found = minimise(start, terms, before) if terms else cameras
@@ -143,15 +146,18 @@ def _adjusted(
 
 
 def _halves(cameras: Cameras, evidence: Evidence, prior: Prior) -> Halves:
-    """Adjust to two halves of the patches, each on its own.
+    """Adjust to two halves of the patches, each on its own, if enough of them fit the coarsest scale from the start.
 
     The noise level is what makes the covariance of the difference as large as the difference is.
     """
     assert evidence.patches is not None
     even = np.arange(len(evidence.patches)) % 2 == 0
+    terms = [PatchTerm(evidence.patches.of(half), evidence.intrinsics, cameras) for half in (even, ~even)]
+    fitting = float(np.mean([term.inliers(cameras).mean() for term in terms]))
+    if not fitting > LEAST_INLIERS:  # the field shows no surface that photos agree on
+        return Halves(cameras, 1.0, Agreement(0.0, 0.0, fitting))
     ends, expected, inliers = [], 0.0, []
-    for half in (even, ~even):
-        term = PatchTerm(evidence.patches.of(half), evidence.intrinsics, cameras)
+    for term in terms:
         end = minimise(cameras, [term], prior)
         ends.append(end)
         inliers.append(float(term.inliers(end).mean()))

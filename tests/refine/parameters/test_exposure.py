@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 VIEWS, SIZE, STEPS = 14, 32, 250
 RUN = {
     **{"steps": 2 * STEPS, "coarse_steps_min": STEPS // 4, "coarse_steps_max": STEPS, "max_image_size": SIZE},
-    **{"samples_per_step": 8192, "pose_resolution_max": 48},
+    **{"samples_per_step": 4096, "pose_resolution_max": 48},
 }
 # Short runs are chaotic, and end elsewhere on other processors: what compensation gains is claimed of their mean.
 DRAWS = [np.random.default_rng(seed).uniform(0.7, 1.4, VIEWS) for seed in range(4)]
