@@ -17,6 +17,7 @@ from rich.progress import Progress as ProgressBar
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.settings_option import settings_option
+from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.errors import Interrupted
 from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import parse_options
@@ -127,12 +128,15 @@ def refine_command(
         format="%(message)s",
         handlers=[RichHandler(show_path=False)] if sys.stderr.isatty() else None,
     )
-    from biresnerf.pipeline import refine_poses
-
     stop = StopRequest()
     try:
         with ProgressPrinter() as printer:
-            report = refine_poses(input_path, output, options, printer, stop)
+            dataset = read_dataset(input_path)
+            from biresnerf.pipeline import (
+                refine_poses,
+            )  # loads torch, for seconds: what cannot be read is told before
+
+            report = refine_poses(dataset, output, options, printer, stop)
     except Interrupted as interrupted:
         click.echo(str(interrupted), err=True)
         return 128 + (stop.signal or signal.SIGINT)

@@ -98,6 +98,24 @@ def test_an_input_that_is_not_there_is_named(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_what_cannot_be_read_is_told_before_torch_is_loaded(tmp_path):
+    program = """
+import sys
+from biresnerf.command_line import main
+try:
+    main()
+finally:
+    print("torch" in sys.modules)
+"""
+    arguments = ["refine", str(tmp_path), "-o", str(tmp_path / "out")]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "no_images" in done.stderr
+    assert done.stdout.split() == ["False"]
+
+
 def test_every_wrong_option_is_named_with_what_is_wrong(scene, tmp_path):
     result = run(scene, tmp_path / "out", stepz=5, steps=3, pose_rate=-1)
     assert_refused(
