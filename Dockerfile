@@ -57,7 +57,7 @@ RUN pip --python /opt/venv install --no-deps .
 # Numba and Python know a file by its size and time. An image keeps whole seconds, so the times are made whole first.
 # Then each process is loaded once, which leaves the bytecode of what it uses: half of what is installed is never used.
 RUN find /opt/venv/lib -name '*.py' -exec touch -d @1700000000 {} + \
-    && NUMBA_CACHE_DIR=/opt/kernels /opt/venv/bin/python -m biresnerf.field.cpu.compile_kernels \
+    && NUMBA_CACHE_DIR=/opt/kernels /opt/venv/bin/python -m biresnerf.compile_kernels \
     && find /opt/kernels -type f -exec sha256sum {} + | sort | sha256sum > /opt/kernels/made-from \
     && for module in biresnerf.pipeline biresnerf.command_line service.commands.serve service.server workers.queue.slot \
          workers.run.job_process workers.datasets.dataset_check_process zlib,pycolmap; do \

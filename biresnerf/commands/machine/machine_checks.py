@@ -21,7 +21,7 @@ _SLOW_S = 6.0  # loading from the cache takes less, compiling far more
 # Processor time: on a busy machine loading takes long, too.
 _TIME_KERNELS = """
 import time
-from biresnerf.field.cpu.compile_kernels import compile_kernels
+from biresnerf.compile_kernels import compile_kernels
 began = time.process_time()
 compile_kernels()
 print(time.process_time() - began)

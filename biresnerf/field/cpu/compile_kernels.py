@@ -1,12 +1,6 @@
-"""Compile the CPU kernels, or load them from Numba's cache: `python -m biresnerf.field.cpu.compile_kernels`.
-
-Run at install time, it keeps half a minute of compilation off the first refinement.
-"""
+"""Compile the kernels of the field, or load them from Numba's cache."""
 
 from __future__ import annotations
-
-import logging
-import time
 
 import torch
 
@@ -14,13 +8,9 @@ from biresnerf.field.cpu.field import CpuField
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldRates, FieldShape, Marching, PositionGradient, Rays
 
-logger = logging.getLogger(__name__)
-SLOW_S = 3.0  # loading from the cache takes a fraction of this
 
-
-def compile_kernels() -> float:
-    """Every kernel once on a tiny field, on the way a step takes. Returns the seconds it took."""
-    started = time.monotonic()
+def compile_field_kernels() -> None:
+    """Every kernel once on a tiny field, on the way a step takes."""
     shape = FieldShape(grid_levels(2, 4, 8, 10), grid_levels(2, 16, 32, 10), unbounded=False)
     field = CpuField(shape, 0, torch.device("cpu"), workers=1)
     field.start_reconstruction()
@@ -31,12 +21,3 @@ def compile_kernels() -> float:
     field.render(rays, marching, PositionGradient()).colour.sum().backward()
     field.step(FieldRates(1e-3, 1e-3, (1e-3,) * 2, 1e-3))
     field.density(torch.full((1, 3), 0.5))
-    seconds = time.monotonic() - started
-    if seconds > SLOW_S:
-        logger.info("compiled the CPU kernels in %.0f s; later runs load them from the cache", seconds)
-    return seconds
-
-
-if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    compile_kernels()

@@ -1,0 +1,44 @@
+"""What is compiled at install time is all that a run needs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+from biresnerf.compile_kernels import compile_kernels
+from biresnerf.refine.adjustment.adjustment import adjust_poses, misfit
+from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refine.adjustment.kernels import patches, tracks
+from biresnerf.refine.adjustment.lens.lenses import Lenses
+from tests.refine.adjustment.rig import disturbed, observed
+from tests.refine.adjustment.test_patch_adjustment import Plane
+
+pytestmark = pytest.mark.slow
+
+
+def compiled() -> dict[str, int]:
+    """For how many kinds of arguments each kernel of the adjustment is compiled; those inside others are not listed."""
+    kernels = {f"{room.__name__}.{name}": k for room in (patches, tracks) for name, k in vars(room).items()}
+    return {
+        name: len(kernel.signatures)
+        for name, kernel in kernels.items()
+        if isinstance(kernel, Dispatcher) and kernel.signatures
+    }
+
+
+def test_an_adjustment_of_cameras_and_lenses_compiles_nothing_more():
+    compile_kernels(field=False)
+    before = compiled()
+    rng = np.random.default_rng(2)
+    plane = Plane(rng)
+    start = disturbed(plane.truth, rng, 0.004, 0.004)
+    points = np.column_stack([rng.uniform(-0.5, 0.5, (80, 2)), np.zeros(80)])
+    seen = observed(plane.truth, points, plane.intrinsics, rng, noise_px=0.1)
+    lenses = Lenses(np.zeros(9, np.int64), np.zeros((1, 3)), np.array([[0.1, 0.0, 0.0]]))
+    evidence = Evidence(plane.intrinsics, seen, plane.evidence(start).patches, lenses)
+    found = adjust_poses(start, evidence, PosePrior.equal(start, 0.02, 0.06))
+    misfit(found.world_from_cam, evidence, NoiseLevels())
+    assert found.used
+    assert len(before) >= 7
+    assert compiled() == before
