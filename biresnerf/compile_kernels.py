@@ -1,6 +1,6 @@
 """Compile all CPU kernels, or load them from Numba's cache: `python -m biresnerf.compile_kernels`.
 
-Run at install time, it keeps two minutes of compilation off the first refinement.
+Run at install time, it keeps a minute and a half of compilation off the first refinement.
 """
 
 from __future__ import annotations

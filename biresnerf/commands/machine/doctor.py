@@ -20,7 +20,7 @@ SERVICE_CHECKS = "service.commands.doctor_checks:CHECKS"
 def doctor_command(as_json: bool) -> int:
     """Check this installation: versions, kernels, GPU, COLMAP, PostgreSQL, disks, built pages.
 
-    The first run compiles the kernels, which takes half a minute. The exit status is 1 if something is broken;
+    The first run compiles the kernels, which takes a minute or two. The exit status is 1 if something is broken;
     whatever is only missing is optional.
     """
     found = []

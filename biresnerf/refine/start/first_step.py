@@ -18,10 +18,6 @@ from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.scene.scene_depth import matched_depth
 from biresnerf.refine.scene.scene_frame import scene_frame
 
-# Factors of the pose rate, in stage 1 and 2, for cameras placed by matches. They are off by tenths of a degree, and at
-# the full rate the steps alone carry them further before the field can tell: fox, from 0.29 deg, ended 1,500 steps
-# later at 1.03 with the full rate, 0.64 with a fifth of it, 0.28 with these.
-MATCHED_MOBILITY = (0.0, 0.3)
 LEAST_ADJUSTED, MOST_ADJUSTED = 3, 500  # cameras; the system of all of them is dense
 # Where matches placed most cameras, stage 1 has only to form the field: its lengths shrink to this share.
 MATCHED_COARSE_SHARE = 2 / 3
@@ -56,8 +52,11 @@ def adjusts_cameras(dataset: Dataset, method: Method, bodies: RigidBodies) -> bo
 
 
 def pose_mobility(start: InitialPoses) -> NDArray[np.float64]:
-    """Each camera's factor of the pose rate [2, n] in stage 1 and stage 2."""
-    return np.where(start.matched[None], np.array(MATCHED_MOBILITY)[:, None], 1.0)
+    """Each camera's factor of the pose rate [2, n] in stage 1 and stage 2.
+
+    Cameras placed by matches keep still until the field has formed: an unformed field would carry them away.
+    """
+    return np.stack([np.where(start.matched, 0.0, 1.0), np.ones(len(start.matched))])
 
 
 def stage_lengths(start: InitialPoses, asked: RefineOptions, resolved: ResolvedOptions) -> ResolvedOptions:
