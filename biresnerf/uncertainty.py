@@ -46,3 +46,5 @@ class InputAccuracy(FrozenModel):
         description="Offset between the tracked body (robot hand, phone) and the camera that all poses of the input "
         "share, 4 x 4 in the input's unit. None where the errors show none.",
     )
+    stated_rotation_deg: float | None = Field(None, description="As stated by an option; None: not stated.")
+    stated_position: float | None = Field(None, description="As stated by an option, in the input's unit.")

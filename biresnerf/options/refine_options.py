@@ -93,6 +93,19 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         description="Intrinsics to refine; auto: focal length and distortion of cameras not given; all: of every "
         "camera, and without feature matches the principal point as well.",
     )
+    input_rotation_deg: Annotated[float, Option("fine")] = Field(
+        0.0,
+        ge=0,
+        le=180,
+        description="How exact the given rotations are: standard deviation about each axis, degrees; 0: measured.",
+    )
+    input_position: Annotated[float, Option("fine")] = Field(
+        0.0,
+        ge=0,
+        le=1e9,
+        description="How exact the given positions are: standard deviation along each axis, in the input's unit; 0: "
+        "measured.",
+    )
     steps: Annotated[int | Open, Option("coarse", level="usual")] = Field(
         OPEN, ge=20, le=1_000_000, description="Optimisation steps of both stages together."
     )

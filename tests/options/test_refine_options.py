@@ -88,7 +88,14 @@ def test_what_changes_no_result_may_change_on_resuming_and_what_comes_later_keep
     }
     assert set(OPTIONS) - STAGE_1_OPTIONS == {
         *("reconstruction_levels", "reconstruction_resolution_min", "reconstruction_resolution_max"),
-        *("table_size_log2", "warmup_steps", "verdict", "trial_steps"),
+        *(
+            "table_size_log2",
+            "warmup_steps",
+            "verdict",
+            "trial_steps",
+            "input_rotation_deg",
+            "input_position",
+        ),
         *("threads", "checkpoint_every_s", "orbit_frames", "shown_views", "exports"),
     }
 

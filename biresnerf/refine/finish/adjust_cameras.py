@@ -138,7 +138,7 @@ def _choice(
         logger.info("tracks say nothing: their noise is %.1f px", noise.track_px)
         split = _Split(replace(split.fitted, tracks=None), replace(split.left_out, tracks=None))
         results = {name: each for name, each in results.items() if name == "adjusted-patches"}
-    given = input_accuracy(scene.dataset, _most_heeded(results), split.fitted)
+    given = input_accuracy(scene.dataset, _most_heeded(results), split.fitted, optimiser.options)
     if given is not None and given.tells(prior):
         prior = given.prior(prior)
         patched = results.get("adjusted-patches")

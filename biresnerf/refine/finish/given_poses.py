@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.similarity import Similarity, align_robust
+from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.adjustment.adjustment import Adjustment
 from biresnerf.refine.adjustment.cameras import Cameras
 from biresnerf.refine.adjustment.evidence import Evidence, PosePrior
@@ -25,6 +26,7 @@ Array = NDArray[np.float64]
 
 FRAME, OFFSET = 7, 6  # unknowns
 LEAST_CAMERAS = 6
+CONTRADICTED = 3.0  # errors so many times as large as stated are worth a warning
 # Of six deviates, as large for each as that of an observation of a feature.
 SCALE = 3 * ROBUST_SCALE**2
 # Neighbours' errors are alike where poses come from tracking or feature matches, and do not average out: by how much
@@ -49,6 +51,7 @@ class GivenPoses:
         rotation, position: standard deviation of each component of the errors: rad, and the unit of `world_from_cam`.
         unit: that unit, in the input's.
         weight: of each camera [n], 0 to 1; 0 where it had no pose, or one far off.
+        stated: rotation and position as the user knows them, in place of the measured ones; 0 where not stated.
     """
 
     world_from_cam: Array
@@ -57,6 +60,21 @@ class GivenPoses:
     position: float
     unit: float
     weight: Array
+    stated: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def deviations(self) -> tuple[float, float]:
+        """Of rotation and position in a prior: as stated, or else as measured and shared."""
+        rotation, position = self.stated
+        return rotation or SHARED_ERRORS * self.rotation, position or SHARED_ERRORS * self.position
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether errors are far larger than stated."""
+        measured = (self.rotation, self.position)
+        return any(
+            0 < known * CONTRADICTED < found for known, found in zip(self.stated, measured, strict=True)
+        )
 
     @property
     def has_offset(self) -> bool:
@@ -64,13 +82,13 @@ class GivenPoses:
 
     def tells(self, prior: PosePrior) -> bool:
         """Whether these poses are known better than some camera is before."""
-        better = self.rotation < prior.rotation.max() or self.position < prior.position.max()
+        rotation, position = self.stated[0] or self.rotation, self.stated[1] or self.position
+        better = rotation < prior.rotation.max() or position < prior.position.max()
         return bool(better and self.weight.any())
 
     def prior(self, other: PosePrior) -> PosePrior:
         """What these poses and another prior say together."""
-        deviations = SHARED_ERRORS * np.array([self.rotation, self.position])
-        mine = self.weight[:, None] / deviations**2
+        mine = self.weight[:, None] / np.array(self.deviations) ** 2
         theirs = 1 / np.stack([other.rotation, other.position], 1) ** 2
         share = (mine / (mine + theirs)).repeat(3, axis=1)
         between = Cameras.of(other.world_from_cam)
@@ -170,8 +188,12 @@ def _turn(rotation_vector: Array) -> Array:
     return np.asarray(so3_exp(torch.from_numpy(rotation_vector)).numpy())
 
 
-def input_accuracy(dataset: Dataset, adjusted: Adjustment | None, evidence: Evidence) -> GivenPoses | None:
+def input_accuracy(
+    dataset: Dataset, adjusted: Adjustment | None, evidence: Evidence, options: ResolvedOptions
+) -> GivenPoses | None:
     """Of poses that the user gave: those of feature matches are of the same evidence, and guesses of none.
+
+    What `options` state of it holds in place of what is measured.
 
     None where nothing tells, or too few cameras are known.
     """
@@ -184,8 +206,11 @@ def input_accuracy(dataset: Dataset, adjusted: Adjustment | None, evidence: Evid
     if evidence.patches is not None:
         seen[evidence.patches.host] = seen[evidence.patches.target] = True
     found = given_poses(dataset.world_from_cam, adjusted.world_from_cam, known & seen)
-    if found is not None:
-        logger.info("the input's poses: %s", accuracy_report(found))
+    if found is None:
+        return None
+    stated = (math.radians(options.input_rotation_deg), options.input_position / found.unit)
+    found = replace(found, stated=stated)
+    logger.info("the input's poses: %s", accuracy_report(found))
     return found
 
 
@@ -196,5 +221,18 @@ def accuracy_report(given: GivenPoses) -> InputAccuracy:
             "rotation_deg": math.degrees(given.rotation),
             "position": given.position * given.unit,
             "body_from_camera": given.body_from_cam.tolist() if given.has_offset else None,
+            "stated_rotation_deg": math.degrees(given.stated[0]) or None,
+            "stated_position": given.stated[1] * given.unit or None,
         }
+    )
+
+
+def accuracy_warnings(given: GivenPoses | None) -> tuple[str, ...]:
+    """A warning where the input's poses are far less exact than stated."""
+    if given is None or not given.contradicted:
+        return ()
+    found = accuracy_report(given)
+    return (
+        f"The given poses are off by {found.rotation_deg:.2g} degrees and {found.position:.2g} in the input's unit "
+        "(standard deviation about each axis), far more than stated (input_rotation_deg, input_position).",
     )

@@ -10,7 +10,7 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.named_images import few_names
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.refine.finish.adjust_cameras import Finish
-from biresnerf.refine.finish.given_poses import accuracy_report
+from biresnerf.refine.finish.given_poses import accuracy_report, accuracy_warnings
 from biresnerf.refine.lost.own_matches import LEAST_PAIRS
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
@@ -75,6 +75,7 @@ def run_report(
         warnings=dataset.warnings
         + focal_warnings(dataset, optimiser.lenses)
         + turntable_warnings(scene.start)
+        + accuracy_warnings(finish.given)
         + unmatched_warnings(scene)
         + _unknown_warnings(dataset, uncertainty),
     )

@@ -1,6 +1,7 @@
 """The input's poses as evidence: how accurate they are is measured, and what is known so is used."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,12 @@ from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.adjustment.adjustment import adjust_poses
 from biresnerf.refine.adjustment.evidence import Evidence, PosePrior
-from biresnerf.refine.finish.given_poses import SHARED_ERRORS, given_poses
+from biresnerf.refine.finish.given_poses import (
+    SHARED_ERRORS,
+    accuracy_report,
+    accuracy_warnings,
+    given_poses,
+)
 from tests.refine.adjustment.rig import disturbed, observed, pinholes, ring, rotation_errors_deg
 
 COUNT, ROTATION, POSITION = 40, 0.01, 0.06
@@ -91,6 +97,44 @@ def test_two_priors_weigh_by_their_information(rng):
     share = (found.weight / (1 + found.weight))[:, None]
     between = truth[:, :3, 3] + share * (found.world_from_cam[:, :3, 3] - truth[:, :3, 3])
     np.testing.assert_allclose(prior.world_from_cam[:, :3, 3], between, atol=1e-9)
+
+
+def test_what_the_user_states_of_the_accuracy_holds_in_place_of_what_is_measured(rng):
+    truth = ring(COUNT, rng)
+    found = given_poses(given_by(truth, rng), truth, ALL)
+    other = PosePrior.equal(truth, 0.004, 0.03)
+    stated = replace(found, stated=(0.004, 0.0))
+    prior = stated.prior(other)
+    np.testing.assert_allclose(prior.rotation, 0.004 / np.sqrt(1 + found.weight), rtol=1e-9)
+    np.testing.assert_allclose(prior.position, found.prior(other).position, rtol=1e-9)
+    report = accuracy_report(stated)
+    assert report.stated_rotation_deg == pytest.approx(math.degrees(0.004))
+    assert report.stated_position is None
+    assert report.rotation_deg == pytest.approx(math.degrees(found.rotation))
+
+
+@pytest.mark.parametrize("known", [1e-12, 1e9])
+def test_absurd_accuracies_leave_a_prior_that_can_be_used(rng, known):
+    truth = ring(COUNT, rng)
+    found = replace(given_poses(given_by(truth, rng), truth, ALL), stated=(known, known))
+    other = PosePrior.equal(truth, 0.02, 0.08)
+    prior = found.prior(other)
+    for part in (prior.world_from_cam, prior.rotation, prior.position):
+        assert np.isfinite(part).all()
+    assert (prior.rotation > 0).all()
+    if known > 1:
+        assert not found.tells(other)
+        np.testing.assert_allclose(prior.world_from_cam, truth, atol=1e-6)
+
+
+def test_poses_far_less_exact_than_stated_are_warned_of(rng):
+    truth = ring(COUNT, rng)
+    found = given_poses(given_by(truth, rng), truth, ALL)
+    honest = replace(found, stated=(ROTATION, POSITION))
+    assert accuracy_warnings(honest) == accuracy_warnings(None) == ()
+    (warning,) = accuracy_warnings(replace(found, stated=(ROTATION / 10, 0.0)))
+    assert "input_rotation_deg" in warning
+    assert f"{math.degrees(found.rotation):.2g} degrees" in warning
 
 
 def test_where_feature_matches_are_few_accurate_poses_help_and_wild_ones_do_no_harm(rng):
