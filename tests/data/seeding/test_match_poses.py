@@ -146,6 +146,16 @@ def test_a_camera_that_strays_alone_is_not_believed(noisy, truth):
     np.testing.assert_array_equal(carried.world_from_cam[3], noisy.world_from_cam[3])
 
 
+def test_a_camera_whose_given_position_alone_is_far_off_is_believed_within_reason(noisy, truth):
+    off = np.linalg.norm(noisy.world_from_cam[:, :3, 3] - truth.world_from_cam[:, :3, 3], axis=1)
+    for medians, believed in ((5.0, True), (20.0, False)):
+        given = noisy.world_from_cam
+        given[3, :3, 3] = truth.world_from_cam[3, :3, 3] + [0, medians * np.median(off), 0]
+        carried = carry_model(model(truth), given, noisy.posed)
+        assert carried is not None
+        assert np.flatnonzero(~carried.placed).tolist() == ([] if believed else [3])
+
+
 def test_a_model_with_many_strays_is_not_offered(noisy, truth):
     assert carry_model(model(truth, turned=(1, 4, 8)), noisy.world_from_cam, noisy.posed) is None
 
