@@ -110,7 +110,7 @@ class Outcome(FrozenModel):
     before: PoseError
     after: PoseError
     matched: PoseError | None = Field(
-        None, description="Of the poses that COLMAP's feature matches gave in this run, where it found any."
+        None, description="Of the cameras that COLMAP placed in this run, aligned by them, if it did."
     )
     cameras: tuple[CameraResult, ...]
     views: ViewQuality | None

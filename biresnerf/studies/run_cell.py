@@ -80,7 +80,8 @@ class TruthObserver:
 
     def at_end(self, stages: TwoStages) -> None:
         matched = stages.scene.start.matched_poses
-        self.matched = None if matched is None else pose_error(matched, self.truth)
+        if matched is not None:
+            self.matched = matched_error(matched, stages.scene.dataset.world_from_cam, self.truth)
         if self.test_views is None:
             return
         started = time.monotonic()
@@ -97,6 +98,18 @@ class TruthObserver:
             lpips_absent=absent,
         )
         self.seconds = time.monotonic() - started
+
+
+def matched_error(
+    matched: NDArray[np.float64], given: NDArray[np.float64], truth: NDArray[np.float64]
+) -> PoseError:
+    """Error of the cameras that feature matches placed, aligned by them; the others stand at their given poses.
+
+    Args:
+        matched, given, truth: world_from_cam [n, 4, 4].
+    """
+    placed = (matched != given).any(axis=(1, 2))
+    return pose_error(matched[placed], truth[placed])
 
 
 def run_cell(folder: Path, should_stop: Callable[[], bool]) -> CellResult:

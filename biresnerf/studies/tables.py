@@ -31,6 +31,7 @@ METRICS = (
     Metric(
         "matched_deg", "COLMAP °", 3, lambda o: o.matched.aligned.rotation_deg.mean if o.matched else None
     ),
+    Metric("matched_cameras", "COLMAP placed", 1, lambda o: float(o.matched.cameras) if o.matched else None),
     Metric("rotation_deg", "rotation °", 3, lambda o: o.after.aligned.rotation_deg.mean, tested=True),
     Metric("rotation_median_deg", "median", 3, lambda o: o.after.aligned.rotation_deg.median),
     Metric("rotation_max_deg", "max", 2, lambda o: o.after.aligned.rotation_deg.max, max),

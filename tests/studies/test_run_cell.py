@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import Interrupted
+from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.refine.stages.checkpoint import CHECKPOINT
 from biresnerf.report import Report
 from biresnerf.studies.cell import CELL, RUN, Cell, Perturbation
-from biresnerf.studies.run_cell import run_cell
+from biresnerf.studies.run_cell import matched_error, run_cell
 from biresnerf.studies.scenes import find_scene
+from tests.geometry.rigs import dome
 from tests.refine.tiny_scene import tiny_run
 
 pytestmark = pytest.mark.slow
@@ -40,3 +43,13 @@ def test_a_stopped_cell_goes_on_and_is_measured_from_an_identity_start(tmp_path)
     assert outcome.views.psnr == report.heldout.psnr
     assert len(outcome.cameras) == 7
     assert outcome.seconds["test views"] == 0
+
+
+def test_a_camera_that_matches_did_not_place_is_no_error_of_theirs():
+    truth = dome(8, np.random.default_rng(2))
+    given = perturb_poses(truth, 0.15, seed=1)
+    matched = truth.copy()
+    matched[3] = given[3]
+    error = matched_error(matched, given, truth)
+    assert error.cameras == 7
+    assert error.aligned.rotation_deg.max < 1e-6

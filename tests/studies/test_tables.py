@@ -74,6 +74,7 @@ def test_a_row_has_what_feature_matches_alone_gave_and_the_notes_the_verdict():
         [entry("ship", 1, "ours", outcome(0.01, matched=matched, verdict="improved", chosen="adjusted"))]
     )
     assert row(made, "ship", "ours").values["matched_deg"] == matched.aligned.rotation_deg.mean
+    assert row(made, "ship", "ours").values["matched_cameras"] == matched.cameras
     assert "- ship, noise 0.15, seed 1, ours: improved, poses adjusted" in as_markdown(made)
 
 
