@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.method import peers
 from benchmarks.speed import scene
 from benchmarks.speed.torch_forms import (
     UnrolledField,
@@ -17,10 +18,16 @@ from benchmarks.speed.torch_forms import (
     march_at_once,
 )
 from benchmarks.speed.yardstick import build_yardstick, check_yardstick
+from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
+from biresnerf.data.synthetic.scene import synthetic_focal
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays
 from biresnerf.field.reference import operations as reference
 from biresnerf.field.reference.field import ReferenceField
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.studies.scenes import with_poses
+from tests.data.scenes import textured_arc
 
 pytestmark = pytest.mark.slow
 
@@ -89,3 +96,20 @@ def test_a_step_of_the_torch_forms_computes_what_the_definitions_step_does(form,
     for mine, theirs in zip(*gradients, strict=True):
         # Not entry by entry: samples whose midpoint lies on a cell's face are taken by one form and not the other.
         assert float((mine - theirs).norm() / theirs.norm()) < 0.02
+
+
+def test_colmap_on_a_rendered_arc_is_measured_against_its_truth(tmp_path):
+    pytest.importorskip("pycolmap", reason="needs pycolmap (pip install 'biresnerf[colmap]')")
+    poses = textured_arc(tmp_path, 10, 300)
+    camera = Camera("SIMPLE_PINHOLE", 300, 300, (synthetic_focal(300), 150, 150))
+    photos = sorted(tmp_path.iterdir())
+    frames = tuple(Frame(p.name, p, 0, pose, "given") for p, pose in zip(photos, poses, strict=True))
+    truth = Dataset(tmp_path, (camera,), frames, SourceFormat("nerfstudio", None, {}, np.eye(4)))
+    lines = list(peers.measured("arc", truth, with_poses(truth, perturb_poses(poses, 0.1, seed=2)), seed=1))
+    assert [line["peer"] for line in lines] == list(peers.PEERS)
+    for line in lines:
+        assert line["placed"] == 10
+        assert line["rotation_deg"] <= line["worst_deg"] < 2  # of 12 with the noise
+        assert line["centre_percent"] < 2
+    assert lines[0]["rotation_deg"] != lines[1]["rotation_deg"], "priors have a say"
+    assert len(peers.table(lines).splitlines()) == 3

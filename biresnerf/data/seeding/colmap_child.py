@@ -54,7 +54,7 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     database, images = work / DATABASE, Path(request["root"])
     count = sum(len(camera["names"]) for camera in request["cameras"])
     pycolmap.set_random_seed(request["seed"])
-    numbers = extract_features(request, database, images)
+    numbers = extract_features(request, database, images, extraction_options(request))
     say(f"features of {count} images found")
     match_features(request, database, work)
     tracks = write_tracks(database, work)
@@ -87,8 +87,8 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     return {"models": answer, "matches": matches}
 
 
-def extract_features(request: dict[str, Any], database: Path, images: Path) -> list[int]:
-    """Features of all images; returns the database's number of each camera asked for."""
+def extraction_options(request: dict[str, Any]) -> Any:
+    """How thoroughly to look for features: pycolmap's options."""
     import pycolmap
 
     extraction = pycolmap.FeatureExtractionOptions()
@@ -97,6 +97,13 @@ def extract_features(request: dict[str, Any], database: Path, images: Path) -> l
     extraction.sift.max_num_features = request["most_features"]
     extraction.sift.peak_threshold = FAINTEST_PEAK
     extraction.sift.domain_size_pooling = extraction.sift.estimate_affine_shape = request["thorough"]
+    return extraction
+
+
+def extract_features(request: dict[str, Any], database: Path, images: Path, extraction: Any) -> list[int]:
+    """Features of all images; returns the database's number of each camera asked for."""
+    import pycolmap
+
     for camera in request["cameras"]:
         if not camera["names"]:
             continue

@@ -105,19 +105,13 @@ def ask_colmap(
         Interrupted: ``should_stop`` said so.
         RefinementError: ``seeding_crashed``.
     """
-    names, posed = _numbered(dataset), dataset.posed
+    posed = dataset.posed
     with tempfile.TemporaryDirectory(prefix="biresnerf-colmap-") as work:
-        _link_photos(dataset, names, Path(work, "photos"))
-        masks = Path(work, "masks")
         request = {
-            "set": str(dataset.root),
-            "root": str(Path(work, "photos")),
-            "masks": str(masks) if write_masks(dataset, names, masks) else None,
-            "work": work,
+            **lay_out(dataset, Path(work)),
             "answer": str(Path(work, "answer.json")),
             "seed": seed,
             "threads": 1 if posed.all() or effort == "low" else -1,
-            **_request_images(dataset, names),
             **_thoroughness(dataset, effort),
         }
         watch = SeedingWatch(Path(work, DATABASE), on_progress)
@@ -125,6 +119,19 @@ def ask_colmap(
         if log_folder is not None:
             keep_tracks(Path(work), dataset.names, log_folder / KEPT)
         return answer
+
+
+def lay_out(dataset: Dataset, work: Path) -> dict[str, Any]:
+    """The photos and masks in the folder ``work``, and what COLMAP may know of them: cameras, poses, pairs."""
+    names, masks = _numbered(dataset), work / "masks"
+    _link_photos(dataset, names, work / "photos")
+    return {
+        "set": str(dataset.root),
+        "root": str(work / "photos"),
+        "masks": str(masks) if write_masks(dataset, names, masks) else None,
+        "work": str(work),
+        **_request_images(dataset, names),
+    }
 
 
 def _numbered(dataset: Dataset) -> list[str]:
