@@ -38,9 +38,11 @@ class HistoryLine(FrozenModel):
         None, description="Stage 1: cameras that rotated by less count as settled, degrees."
     )
     trend_db: float | None = Field(
-        None, description="Stage 1: change of the error over the detector's window; from its 10th check on."
+        None, description="Stage 1: what the later half of its checks gained; from the sixth check on."
     )
-    level_db: float | None = Field(None, description="How large a trend still counts as none.")
+    level_db: float | None = Field(
+        None, description="How large a trend still counts as level: 15 % of all that was gained."
+    )
     confirmed: int | None = Field(None, description="Checks in a row that found the error stable.")
 
 

@@ -1,8 +1,8 @@
 """Error-stability detection, Algorithm 1 of Guo et al. 2023: when the coarse stage has converged.
 
-The paper gives no formula. Here a line is fitted to the error (dB), averaged over the blocks between checks, over a
-window of blocks. The error is stable when the line neither rises nor falls by more than the error's own fluctuation,
-twice in a row, and the floor is reached.
+The paper gives no formula. Errors fall by about as much whenever the number of steps doubles, so a bound in dB would
+suit one length of run only. Here the error (dB), averaged over the blocks between checks, counts as stable when the
+later half of the steps has brought little of all that was gained, twice in a row, and the floor is reached.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from biresnerf.frozen_model import FrozenModel
 
 Verdict = Literal["running", "stable", "cap"]
 
-WINDOW = 10  # blocks
-SLOPE_DB = 0.15  # net change over the window that still counts as flat
-FLUCTUATION_DB = 0.35  # standard deviation about the line that still counts as calm
+LEAST_CHECKS = 6  # before anything is said: three in the later half make a line with a deviation
+LEVEL_SHARE = 0.15  # of all that was gained: what the later half may bring, or scatter by
 CONFIRMATIONS = 2  # checks in a row
 STILL_DEG = 0.05  # 90 % quantile of rotation change per block below which cameras have settled
 # Adam's steps have the size of the learning rate whatever the gradient: settled cameras still stagger by about
@@ -60,36 +59,32 @@ class StabilityDetector:
     ) -> Verdict:
         """One block's result at `step`. `moved_deg`: 90 % quantile of the cameras' rotation during the block."""
         self.decibels.append(-10 * math.log10(max(mean_squared_error, 1e-12)))
-        if len(self.decibels) >= WINDOW:
-            still = moved_deg < (still_deg or self.motion_deg) or not self.guarded
-            self.confirmed = self.confirmed + 1 if self._flat() and still else 0
+        still = moved_deg < (still_deg or self.motion_deg) or not self.guarded
+        self.confirmed = self.confirmed + 1 if still and self._level() else 0
         if step >= self.cap:
             return "cap"
-        if self.confirmed >= CONFIRMATIONS and step >= self.floor:
-            return "stable"
-        return "running"
+        return "stable" if self.confirmed >= CONFIRMATIONS and step >= self.floor else "running"
 
     def signal(self) -> dict[str, float]:
-        """Its figures for curves: trend over the window and what counts as level, dB; confirmations in a row."""
-        if len(self.decibels) < WINDOW:
+        """Its figures for curves: what the later half of the checks gained, and what counts as level, dB."""
+        if len(self.decibels) < LEAST_CHECKS:
             return {"confirmed": self.confirmed}
-        change, fluctuation = self._trend()
-        return {"trend_db": change, "level_db": max(SLOPE_DB, fluctuation), "confirmed": self.confirmed}
+        trend, _, gained = self._later_half()
+        return {"trend_db": trend, "level_db": max(0.0, LEVEL_SHARE * gained), "confirmed": self.confirmed}
 
-    def _flat(self) -> bool:
-        """Whether the last window shows neither trend nor unrest."""
-        imbalance = abs(int(np.sign(np.diff(self.decibels[-WINDOW:])).sum()))
-        change, fluctuation = self._trend()
-        tolerance = max(SLOPE_DB, fluctuation)
-        return abs(change) <= tolerance and fluctuation <= FLUCTUATION_DB and imbalance <= WINDOW // 2
+    def _level(self) -> bool:
+        if len(self.decibels) < LEAST_CHECKS:
+            return False
+        trend, scatter, gained = self._later_half()
+        return max(abs(trend), scatter) <= LEVEL_SHARE * gained
 
-    def _trend(self) -> tuple[float, float]:
-        """Net change (dB) over the window, and standard deviation about the line."""
-        values = np.array(self.decibels[-WINDOW:])
-        x = np.arange(WINDOW)
+    def _later_half(self) -> tuple[float, float, float]:
+        """Gain of the later half, standard deviation about its line, and gain since the first check; dB."""
+        values = np.array(self.decibels[len(self.decibels) // 2 :])
+        x = np.arange(len(values))
         slope, intercept = np.polyfit(x, values, 1)
-        fluctuation = float(np.std(values - (slope * x + intercept)))
-        return float(slope * (WINDOW - 1)), fluctuation
+        line = slope * x + intercept
+        return float(line[-1] - line[0]), float(np.std(values - line)), float(line[-1] - self.decibels[0])
 
     def state(self) -> DetectorState:
         return DetectorState(decibels=tuple(self.decibels), confirmed=self.confirmed)

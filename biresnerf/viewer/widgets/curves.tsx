@@ -59,9 +59,9 @@ const CHARTS: readonly Chart[] = [
   },
   {
     title: "Stability signal",
-    axis: "dB over the window",
+    axis: "dB over the later half of the steps",
     of: (line) => line.still_deg != null,
-    later: "begins at the detector's 10th check",
+    later: "begins at the detector's sixth check",
     curves: [
       { label: "trend of the error, dB", colour: "--curve-1", value: (line) => line.trend_db },
       { label: "level within ±", colour: "--curve-3", value: (line) => line.level_db, dashed: true },
@@ -70,7 +70,7 @@ const CHARTS: readonly Chart[] = [
     summary: (lines) =>
       ends(
         lines.filter((line) => line.trend_db != null),
-        "Trend of the error over the detector's window, in stage 1",
+        "Trend of the error over the later half of the steps, in stage 1",
         (line) => `${fixed(line.trend_db, 2)} dB`,
       ),
   },
