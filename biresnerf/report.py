@@ -8,7 +8,7 @@ from pydantic import Field
 
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.uncertainty import InputAccuracy, PoseUncertainty
+from biresnerf.uncertainty import GeoReference, InputAccuracy, PoseUncertainty
 
 SwitchReason = Literal["stable", "cap"]
 IntrinsicsSource = Literal["given", "exif", "colmap", "guessed", "refined"]
@@ -274,6 +274,7 @@ class Report(FrozenModel):
     input_accuracy: InputAccuracy | None = Field(
         None, description="None where fewer than six poses were given, or nothing tells of them."
     )
+    geo_reference: GeoReference | None = Field(None, description="None unless GPS gave frame and scale.")
     steps_done: int = Field(examples=[2000])
     switch_step: int | None = Field(None, examples=[700], description="The step at which stage 2 began.")
     switch_reason: SwitchReason | None = Field(None, examples=["stable"])

@@ -1,4 +1,4 @@
-"""What a result says of how exact poses are. No torch: the service reads it too."""
+"""What a result says of how exact poses are, and GPS. No torch: the service reads it too."""
 
 from __future__ import annotations
 
@@ -30,6 +30,18 @@ class PoseUncertainty(FrozenModel, allow_inf_nan=False):
     )
     why_unknown: str | None = Field(
         None, examples=["nothing but the field speaks for it"], description="None where the bounds are known."
+    )
+
+
+class GeoReference(FrozenModel, allow_inf_nan=False):
+    """Where on Earth the poses are: x points east, y north and z up, in metres, from a place given in WGS84."""
+
+    latitude: float = Field(examples=[50.0874], description="Degrees, north above zero.")
+    longitude: float = Field(examples=[14.4213], description="Degrees, east above zero.")
+    altitude: float = Field(examples=[195.0], description="Metres, as the photos have it.")
+    images: int = Field(examples=[48], description="How many photos with a GPS position this rests on.")
+    residual_m: float = Field(
+        examples=[2.1], description="Median distance of a camera from its GPS position."
     )
 
 

@@ -11,6 +11,7 @@ from pydantic import PlainSerializer, PlainValidator
 
 from biresnerf.data.model.dataset import GUESSES
 from biresnerf.report import PoseSource, TrialReport
+from biresnerf.uncertainty import GeoReference
 
 MATCHED_SOURCES: frozenset[PoseSource] = frozenset({"colmap", "matches-incremental", "matches-global"})
 MOSTLY_MATCHED = 0.8  # share of the cameras from which on feature matches placed most
@@ -42,6 +43,7 @@ class InitialPoses:
         trials: how every candidate did in the choice between several; empty if there was only one.
         matched_poses: float64 [n, 4, 4], the best set that feature matches support, whichever set is started from; None
             where there is none.
+        geo_reference: where GPS gave the frame, which then is in metres.
     """
 
     world_from_cam: PoseArray
@@ -49,6 +51,7 @@ class InitialPoses:
     sources: tuple[PoseSource, ...]
     trials: tuple[TrialReport, ...] = ()
     matched_poses: MaybePoseArray = None
+    geo_reference: GeoReference | None = None
 
     @property
     def matched(self) -> NDArray[np.bool_]:

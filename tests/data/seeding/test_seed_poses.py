@@ -22,6 +22,7 @@ from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error, rotation_between_deg
+from tests.data.photos.geotagged import write_geotagged
 from tests.data.scenes import arc_poses, assert_complete, plain_features, textured_arc, write_image
 
 pytestmark = pytest.mark.slow
@@ -97,6 +98,22 @@ def test_poses_and_focal_length_are_found_and_a_stranger_is_guessed_by_name(fold
     assert again.names == dataset.names
     np.testing.assert_allclose(again.world_from_cam, dataset.world_from_cam, atol=1e-12)
     assert again.cameras[0].full() == dataset.cameras[0].full()
+
+
+@needs_colmap
+def test_photos_with_gps_give_poses_in_metres_on_earth(photos, tmp_path):
+    (tmp_path / "images").mkdir()
+    poses = arc_poses(VIEWS)
+    for i, (east, north, up) in enumerate(10 * poses[:, :3, 3]):
+        place = (north / 110_574.0, 20 + east / 111_320.0, 50 + up)  # metres of a degree at the equator
+        picture = Image.open(photos / f"images/{i:02}.png")
+        write_geotagged(tmp_path / f"images/{i:02}.jpg", place, picture)
+    seeding = seed_poses(read_dataset(tmp_path))
+    found, reference = seeding.dataset.world_from_cam, seeding.candidates[0].geo_reference
+    assert reference.images == VIEWS
+    assert reference.residual_m < 0.3
+    apart = found[1:, :3, 3] - found[0, :3, 3] - 10 * (poses[1:, :3, 3] - poses[0, :3, 3])
+    assert np.linalg.norm(apart, axis=1).max() < 0.5
 
 
 @needs_colmap

@@ -1,0 +1,35 @@
+"""Positions on Earth: WGS84, and local axes that point east, north and up."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# WGS84 (NIMA TR8350.2): the ellipsoid's semi-major axis, m, and flattening.
+SEMI_MAJOR_AXIS, FLATTENING = 6_378_137.0, 1 / 298.257223563
+
+
+def earth_centred(place: Array) -> Array:
+    """Earth-centred, Earth-fixed coordinates [..., 3], m, of latitude, longitude (degrees) and height (m) [..., 3]."""
+    latitude, longitude, height = np.radians(place[..., 0]), np.radians(place[..., 1]), place[..., 2]
+    squared = FLATTENING * (2 - FLATTENING)  # of the eccentricity
+    normal = SEMI_MAJOR_AXIS / np.sqrt(1 - squared * np.sin(latitude) ** 2)
+    across = (normal + height) * np.cos(latitude)
+    along = (normal * (1 - squared) + height) * np.sin(latitude)
+    return np.stack([across * np.cos(longitude), across * np.sin(longitude), along], -1)
+
+
+def east_north_up(place: Array, origin: Array) -> Array:
+    """Coordinates [..., 3], m, along east, north and up at `origin` [3]; both as in `earth_centred`."""
+    latitude, longitude = np.radians(origin[:2])
+    sines, cosines = np.sin([latitude, longitude]), np.cos([latitude, longitude])
+    axes = np.array(
+        [
+            [-sines[1], cosines[1], 0],
+            [-sines[0] * cosines[1], -sines[0] * sines[1], cosines[0]],
+            [cosines[0] * cosines[1], cosines[0] * sines[1], sines[0]],
+        ]
+    )
+    return np.asarray((earth_centred(place) - earth_centred(origin)) @ axes.T)

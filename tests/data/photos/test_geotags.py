@@ -1,0 +1,38 @@
+"""GPS positions of photos, written as cameras write them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from biresnerf.data.photos.geotags import read_geotag
+from tests.data.photos.geotagged import write_geotagged
+
+
+@pytest.mark.parametrize(
+    "place", [(50.0874, 14.4213, 195.0), (-33.8568, 151.2153, 4.5), (31.5, -35.5, -430.0)]
+)
+def test_signs_minutes_and_seconds_are_read(tmp_path, place):
+    write_geotagged(tmp_path / "photo.jpg", place)
+    np.testing.assert_allclose(read_geotag(tmp_path / "photo.jpg", "photo.jpg"), place, atol=1e-6)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (91.0, 14.0, 100.0)])
+def test_what_devices_write_without_a_fix_is_no_position(tmp_path, place):
+    write_geotagged(tmp_path / "photo.jpg", place)
+    assert read_geotag(tmp_path / "photo.jpg", "photo.jpg") is None
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_photos_without_gps_have_no_position(tmp_path, suffix):
+    path = tmp_path / f"photo{suffix}"
+    Image.new("RGB", (16, 16)).save(path)
+    assert read_geotag(path, path.name) is None
+
+
+def test_broken_tags_spoil_nothing(tmp_path):
+    exif = Image.Exif()
+    exif[0x8825] = {2: (48.0, 51.0), 4: (1.0, 2.0, 0.0), 6: 7.0}
+    Image.new("RGB", (16, 16)).save(tmp_path / "photo.jpg", exif=exif)
+    assert read_geotag(tmp_path / "photo.jpg", "photo.jpg") is None
