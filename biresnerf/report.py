@@ -202,6 +202,12 @@ class HeldOut(FrozenModel):
     count: int = Field(examples=[6])
     psnr: float = Field(examples=[26.1])
     ssim: float = Field(examples=[0.84])
+    unshared_opacity: float | None = Field(
+        None,
+        examples=[0.03],
+        description="Share of the rendered opacity where fewer than two training cameras look: floaters, and what lies "
+        "at the edge of the photos. None in reports of earlier versions.",
+    )
 
 
 class TrialReport(FrozenModel):

@@ -98,6 +98,14 @@ class ViewQuality(FrozenModel):
     count: int
     psnr: float
     ssim: float
+    unshared_opacity: float | None = Field(
+        None, description="Share of the rendered opacity where fewer than two training cameras look."
+    )
+    depth_error: float | None = Field(
+        None,
+        description="Mean of |z - z*| / z* over the pixels that show something, z* the true depth; of scenes that "
+        "make-scene rendered.",
+    )
     lpips: float | None = None
     lpips_absent: str | None = Field(None, description="Why there is no LPIPS.")
 

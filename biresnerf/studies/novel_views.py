@@ -21,6 +21,7 @@ from biresnerf.geometry.similarity import align_robust
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 from biresnerf.refine.views.evaluation import FIT_RATE, FIT_STEPS, fit_rays, render_view
+from biresnerf.refine.views.floaters import unshared_opacity
 
 # torchvision's name of the file. The package would download it, which a measurement must not do.
 VGG_WEIGHTS = "vgg16-397923af.pth"
@@ -28,10 +29,14 @@ VGG_WEIGHTS = "vgg16-397923af.pth"
 
 @dataclass(frozen=True, eq=False)
 class PhotoAndRender:
-    """Both [h, w, 3] in 0..1, at working size; `counts` [h, w] marks the pixels to compare, None means all."""
+    """Both [h, w, 3] in 0..1, at working size; `counts` [h, w] marks the pixels to compare, None means all.
+
+    And the render's `unshared_opacity`.
+    """
 
     photo: Tensor
     render: Tensor
+    unshared: float
     counts: Tensor | None = None
 
 
@@ -54,7 +59,8 @@ def render_test_views(
         counts = None if mask is None else torch.from_numpy(mask)
         matrix = _fitted(optimiser, unit_from_cam[index], photo, counts, index, intrinsics)
         colour = render_view(optimiser, matrix, index, intrinsics).colour
-        yield PhotoAndRender(photo, torch.from_numpy(colour), counts)
+        unshared = unshared_opacity(optimiser, matrix, index, intrinsics)
+        yield PhotoAndRender(photo, torch.from_numpy(colour), unshared, counts)
 
 
 def _fitted(

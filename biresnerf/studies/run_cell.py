@@ -40,6 +40,7 @@ from biresnerf.studies.cell import (
     Outcome,
     ViewQuality,
 )
+from biresnerf.studies.depth_error import depth_error
 from biresnerf.studies.novel_views import lpips_absent, lpips_vgg, render_test_views
 from biresnerf.studies.scenes import StartingRig, read_scene, read_test_views, starting_rig, with_poses
 
@@ -66,6 +67,7 @@ class TruthObserver:
         self.truth, self.test_views = truth, test_views
         self.quality: ViewQuality | None = None
         self.matched: PoseError | None = None
+        self.depth_error: float | None = None
         self.seconds = 0.0
 
     def at_check(self, optimiser: JointOptimiser) -> dict[str, float]:
@@ -82,6 +84,7 @@ class TruthObserver:
         matched = stages.scene.start.matched_poses
         if matched is not None:
             self.matched = matched_error(matched, stages.scene.dataset.world_from_cam, self.truth)
+        self.depth_error = depth_error(stages.optimiser, stages.scene, self.truth)
         if self.test_views is None:
             return
         started = time.monotonic()
@@ -94,6 +97,8 @@ class TruthObserver:
             count=len(pairs),
             psnr=float(np.mean([psnr(*view) for view in masked])),
             ssim=float(np.mean([ssim(*view) for view in masked])),
+            unshared_opacity=float(np.mean([view.unshared for view in views])),
+            depth_error=self.depth_error,
             lpips=distances,
             lpips_absent=absent,
         )
@@ -138,7 +143,7 @@ def run_cell(folder: Path, should_stop: Callable[[], bool]) -> CellResult:
         after=pose_error(refined, truth),
         matched=observer.matched,
         cameras=_cameras(dataset.names, rig, refined, truth),
-        views=observer.quality or _held_out_quality(report, run),
+        views=observer.quality or _held_out_quality(report, run, observer.depth_error),
         verdict=report.verdict.verdict if report.verdict else None,
         chosen=next((candidate.name for candidate in report.candidates if candidate.chosen), None),
         switch_step=report.switch_step,
@@ -168,7 +173,7 @@ def _cameras(
     )
 
 
-def _held_out_quality(report: Report, run: Path) -> ViewQuality | None:
+def _held_out_quality(report: Report, run: Path, depth_error: float | None) -> ViewQuality | None:
     if report.heldout is None:
         return None
     pairs = []
@@ -182,6 +187,8 @@ def _held_out_quality(report: Report, run: Path) -> ViewQuality | None:
         count=report.heldout.count,
         psnr=report.heldout.psnr,
         ssim=report.heldout.ssim,
+        unshared_opacity=report.heldout.unshared_opacity,
+        depth_error=depth_error,
         lpips=distances,
         lpips_absent=absent,
     )

@@ -117,6 +117,9 @@ function factsOf(report: Report): string[] {
     `${report.options.preset}, ${report.options.method}`,
     count(report.steps_done, "step"),
     `${report.working_size[0]} × ${report.working_size[1]} px`,
+    ...(report.heldout?.unshared_opacity != null
+      ? [`${fixed(100 * report.heldout.unshared_opacity, 1)} % of what is rendered lies where no second camera looks`]
+      : []),
     ...(report.heldout ? [`held-out PSNR ${fixed(report.heldout.psnr, 2)} dB, SSIM ${fixed(report.heldout.ssim, 3)}`] : []),
     `${duration(seconds)} on ${report.device}`,
   ];

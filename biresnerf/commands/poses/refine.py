@@ -159,6 +159,10 @@ def summary(report: Report, output: Path) -> str:
             f"held-out views ({report.heldout.count}): "
             f"PSNR {report.heldout.psnr:.2f} dB, SSIM {report.heldout.ssim:.3f}"
         )
+        if report.heldout.unshared_opacity is not None:
+            lines.append(
+                f"{100 * report.heldout.unshared_opacity:.1f} % of what they show lies where no second camera looks"
+            )
     lines += [f"warning: {warning}" for warning in report.warnings]
     lines.append(f"time: {sum(report.seconds.values()):.0f} s; results in {output}")
     return "\n".join(lines)

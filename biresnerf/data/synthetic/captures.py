@@ -12,6 +12,7 @@ from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.synthetic.scene import (
     CAMERA_DISTANCE,
+    MADE_SCENE,
     SHAPES,
     random_textures,
     render_shapes,
@@ -43,7 +44,7 @@ _GLAZE_CONTRAST = 0.05
 # A phone's main camera held across, 4:3; its world has y up and metres, where the scene has z up.
 PHONE_FOCAL_OF_WIDTH = 0.77
 PHONE_FROM_SCENE = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
-_METRES = 0.35
+TABLE_METRES = 0.35
 _TABLE_ELEVATION_RAD = 0.42
 _WALK_TURNS, _WALK_DISTANCE, _WALK_ELEVATION_RAD = 1.2, 3.3, (0.42, 0.75)
 
@@ -93,7 +94,7 @@ def write_walk(folder: Path, n_views: int, width: int, seed: int) -> Path:
         pixels = render_shapes(TABLE_SCENE, textures, pose, width, height, focal)[0]
         Image.fromarray(pixels[..., :3].copy()).save(folder / "images" / f"{index}.png", compress_level=3)
     in_metres = PHONE_FROM_SCENE @ poses
-    in_metres[:, :3, 3] *= _METRES
+    in_metres[:, :3, 3] *= TABLE_METRES
     lens = {
         "fl_x": focal,
         "fl_y": focal,
@@ -107,7 +108,7 @@ def write_walk(folder: Path, n_views: int, width: int, seed: int) -> Path:
         for index, matrix in enumerate(file_from_world_from_cam(in_metres, np.eye(4), 1.0))
     ]
     path = folder / "transforms.json"
-    write_json(path, {**lens, "frames": frames}, indent=1)
+    write_json(path, {**lens, MADE_SCENE: "table", "frames": frames}, indent=1)
     return path
 
 
@@ -141,5 +142,5 @@ def _write_vase(folder: Path, poses: NDArray[np.float64], size: int, seed: int) 
     ]
     focal = synthetic_focal(size)
     return write_blender_set(
-        folder, poses, (render_shapes(VASE, textures, pose, size, size, focal)[0] for pose in poses)
+        folder, poses, (render_shapes(VASE, textures, pose, size, size, focal)[0] for pose in poses), "vase"
     )

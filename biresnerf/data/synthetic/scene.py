@@ -16,6 +16,7 @@ from biresnerf.data.synthetic.shapes import Shape, Texture
 CAMERA_DISTANCE = 4.0  # like the NeRF-synthetic sets, as is the angle of view
 CAMERA_ANGLE_X = 0.6911112
 _ELEVATION_RAD = (0.09, 1.30)  # from just above the ground to nearly overhead
+MADE_SCENE = "made_scene"  # key of the transforms file: which shapes were rendered (`true_depth`)
 _SUBSAMPLES = 3  # per pixel and axis; odd, so that one lies in the pixel's centre
 
 # No rotation or mirror maps this onto itself, and no two sides look alike.
@@ -145,13 +146,17 @@ def write_synthetic_scene(folder: Path, n_views: int, size: int, seed: int) -> P
         the path of transforms.json, written last.
     """
     poses = synthetic_cameras(n_views, seed)
-    return write_blender_set(folder, poses, (render_synthetic(pose, size, seed)[0] for pose in poses))
+    return write_blender_set(folder, poses, (render_synthetic(pose, size, seed)[0] for pose in poses), "dome")
 
 
 def write_blender_set(
-    folder: Path, poses: NDArray[np.float64], pictures: Iterable[NDArray[np.uint8]]
+    folder: Path, poses: NDArray[np.float64], pictures: Iterable[NDArray[np.uint8]], made: str
 ) -> Path:
-    """Writes the picture of each pose [n, 4, 4] to train/, then transforms.json (Blender dialect); returns its path."""
+    """Writes the picture of each pose [n, 4, 4] to train/, then transforms.json (Blender dialect); returns its path.
+
+    Args:
+        made: the shapes' name, for `true_depth`.
+    """
     (folder / "train").mkdir(parents=True, exist_ok=True)
     for index, picture in enumerate(pictures):
         Image.fromarray(picture).save(folder / "train" / f"r_{index}.png", compress_level=3)
@@ -160,5 +165,5 @@ def write_blender_set(
         for index, matrix in enumerate(file_from_world_from_cam(poses, np.eye(4), 1.0))
     ]
     path = folder / "transforms.json"
-    write_json(path, {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}, indent=1)
+    write_json(path, {"camera_angle_x": CAMERA_ANGLE_X, MADE_SCENE: made, "frames": frames}, indent=1)
     return path

@@ -71,6 +71,21 @@ def shared_shares(points: Tensor, seer: Tensor, unit_from_cam: Tensor, intrinsic
     return torch.stack(shares)
 
 
+def witnessed(points: Tensor, cameras: Tensor, unit_from_cam: Tensor, intrinsics: Intrinsics) -> Tensor:
+    """Whether two or more of the cameras [c], indices into ``unit_from_cam``, have points [m, 3] in view, bool [m].
+
+    Args:
+        unit_from_cam: [n, 3, 4], in the frame of the points.
+        intrinsics: of the n cameras.
+    """
+    count = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+    doubtful = torch.arange(len(points), device=points.device)
+    for camera in cameras:  # one by one, as points are many and a few cameras settle most of them
+        count[doubtful] += _seen_by(camera[None], points[doubtful], unit_from_cam, intrinsics)[0]
+        doubtful = doubtful[count[doubtful] < WITNESSES]
+    return count >= WITNESSES
+
+
 def _seen_by(cameras: Tensor, points: Tensor, unit_from_cam: Tensor, intrinsics: Intrinsics) -> Tensor:
     """Whether each of the cameras [c], indices into ``unit_from_cam``, has points [m, 3] in view, bool [c, m]."""
     matrices = unit_from_cam[cameras]

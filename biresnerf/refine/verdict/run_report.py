@@ -56,6 +56,7 @@ def run_report(
             count=len(scores),
             psnr=float(np.mean([s.psnr for s in scores])),
             ssim=float(np.mean([s.ssim for s in scores])),
+            unshared_opacity=float(np.mean([s.unshared for s in scores])),
         )
         if scores
         else None,

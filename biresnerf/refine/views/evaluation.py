@@ -13,6 +13,7 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.views.floaters import unshared_opacity
 from biresnerf.refine.views.image_metrics import psnr, ssim
 
 FIT_STEPS, FIT_RATE, FIT_RAYS = 100, 1e-3, 1024  # BARF's test-time pose refinement
@@ -32,12 +33,13 @@ class RenderedView:
 
 @dataclass(frozen=True, eq=False)
 class ViewScore:
-    """A view scored against its photo."""
+    """A view scored against its photo; and its `unshared_opacity`."""
 
     image: int
     view: RenderedView
     psnr: float
     ssim: float
+    unshared: float
 
 
 def fit_rays(optimiser: JointOptimiser) -> int:
@@ -117,7 +119,8 @@ def score_views(optimiser: JointOptimiser, images: ImageSet, views: Iterable[int
         colour = torch.from_numpy(view.colour)
         mask = images.counts_image(image)
         counts = None if mask is None else torch.from_numpy(mask)
-        yield ViewScore(image, view, psnr(colour, photo, counts), ssim(colour, photo, counts))
+        unshared = unshared_opacity(optimiser, matrices[image], image)
+        yield ViewScore(image, view, psnr(colour, photo, counts), ssim(colour, photo, counts), unshared)
 
 
 def orbit_poses(unit_from_cam: np.ndarray, frames: int) -> np.ndarray:

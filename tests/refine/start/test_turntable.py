@@ -33,7 +33,9 @@ def turned_set(folder: Path, *, backwards: bool) -> tuple[InitialPoses, ImageSet
     poses = turntable_cameras(VIEWS, uneven=0.2, seed=1)
     if backwards:
         poses = poses[::-1]
-    dataset = read_dataset(write_blender_set(folder, poses, (render_synthetic(p, SIZE, 3)[0] for p in poses)))
+    dataset = read_dataset(
+        write_blender_set(folder, poses, (render_synthetic(p, SIZE, 3)[0] for p in poses), "dome")
+    )
     seeding = seed_poses(dataset, "turntable")
     return seeding.candidates[0], load_images(seeding.dataset, SIZE), dataset.world_from_cam
 
