@@ -93,11 +93,12 @@ def read_test_views(scene: Scene) -> Dataset | None:
 
 
 def with_poses(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> Dataset:
-    """The same set with these poses [n, 4, 4]."""
-    frames = (
-        replace(frame, world_from_cam=pose)
-        for frame, pose in zip(dataset.frames, world_from_cam, strict=True)
-    )
+    """The same set with these poses [n, 4, 4], as if its file had them."""
+    frames = []
+    for frame, pose in zip(dataset.frames, world_from_cam, strict=True):
+        # Poses that are kept are written in the digits of the file, and these are the true ones.
+        raw = {key: value for key, value in frame.raw.items() if key != "transform_matrix"}
+        frames.append(replace(frame, world_from_cam=pose, raw=raw))
     return replace(dataset, frames=tuple(frames))
 
 

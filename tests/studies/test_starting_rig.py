@@ -5,14 +5,28 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from biresnerf.data.formats.read_dataset import read_poses
+from biresnerf.data.formats.transforms.read_transforms import read_transforms
+from biresnerf.data.formats.transforms.write_transforms import write_transforms
+from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import camera_errors, pose_error
 from biresnerf.studies.cell import Perturbation
-from biresnerf.studies.scenes import starting_rig
+from biresnerf.studies.scenes import starting_rig, with_poses
 from tests.geometry.rigs import dome
 
 TRUTH = dome(40, np.random.default_rng(2), radius=4.0)
+
+
+def test_perturbed_poses_that_are_kept_are_written_as_perturbed(tmp_path):
+    """A file's own digits are kept for poses that did not move; those of a comparison are the true ones."""
+    write_synthetic_scene(tmp_path / "scene", n_views=4, size=16, seed=1)
+    dataset = read_transforms(tmp_path / "scene/transforms.json")
+    perturbed = perturb_poses(dataset.world_from_cam, 0.1, 1)
+    write_transforms(with_poses(dataset, perturbed), perturbed, tmp_path / "kept.json")
+    kept = np.stack(list(read_poses(tmp_path / "kept.json").values()))
+    np.testing.assert_allclose(kept, perturbed, atol=1e-9)
 
 
 def test_the_start_is_barfs_noise_and_no_more():

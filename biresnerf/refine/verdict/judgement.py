@@ -28,7 +28,7 @@ from biresnerf.refine.verdict.pose_evidence import (
     compare_on_unseen_views,
     moved_px,
 )
-from biresnerf.refine.verdict.verdict import MEASURABLE_PX, Findings, decide, failed_checks
+from biresnerf.refine.verdict.verdict import MEASURABLE_PX, Findings, decide, failed_checks, frame_doubt
 from biresnerf.report import Verdict
 
 logger = logging.getLogger(__name__)
@@ -92,7 +92,7 @@ def judge_poses(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Ju
     spread = rms_spread(before.world_from_cam[:, :3, 3])
     grounded = sum(frame.pose_source not in GUESSED for frame in dataset.frames) > len(dataset) / 2
     lost = int(optimiser.camera_errors.lost.sum())
-    failed = failed_checks(after.world_from_cam, lost, turned, shifted, spread, grounded)
+    failed = failed_checks(after.world_from_cam, lost)
     heldout: HeldOutComparison | None = None
     epipolar: EpipolarComparison | None = None
     moved = 0.0
@@ -116,6 +116,7 @@ def judge_poses(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Ju
             epipolar=epipolar.evidence if epipolar else None,
             compared_with=_source_of_poses(dataset),
             grounded=grounded,
+            out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
         )
     )
     return _with_images(verdict, images, optimiser, before, heldout, epipolar, turned, shifted)

@@ -29,7 +29,9 @@ MEASURABLE_PX = 0.1  # at working size: less motion cannot be seen in photos of 
 # Feature matches that miss by more than this share of the image fit no scene: neither set of poses can be trusted.
 FITS_BELOW = 0.02
 MOSTLY = 0.5  # share of cameras; if more fail a check, the whole set fails it
-FAR_DEG, FAR_SHARE = 60.0, 0.5  # median residuals; beyond, the result is not in the input's frame
+FAR_DEG, FAR_SHARE = 60.0, 0.5  # median residuals; beyond, the result is only roughly in the input's frame
+VIEWS, MATCHES = "unseen views", "feature matches"
+BY_ALL = f"{VIEWS} and {MATCHES}"
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class Findings:
 
     Attributes:
         failed: sentences on what is inconsistent; empty where all is well.
+        out_of_frame: a sentence if the refined poses fit the input's frame only roughly, else empty.
         compared_with: where the input's poses come from.
         grounded: whether the input's poses are given ones or come from matches, and are not mere guesses.
     """
@@ -48,31 +51,32 @@ class Findings:
     epipolar: EpipolarEvidence | None
     compared_with: Literal["given", "seeded", "mixed"]
     grounded: bool
+    out_of_frame: str = ""
 
 
-def failed_checks(
-    refined: Array, lost: int, turned_deg: Array, shifted: Array, spread: float, grounded: bool
-) -> tuple[str, ...]:
-    """Sentences on what is inconsistent about refined poses [n, 4, 4].
-
-    Args:
-        lost: cameras that agree with no pose that was found.
-        turned_deg, shifted: how far each camera ends from its input pose, in the input's frame.
-        spread: root-mean-square distance of the input's centres from their mean.
-        grounded: see `Findings`; from a guess poses may go any way.
-    """
+def failed_checks(refined: Array, lost: int) -> tuple[str, ...]:
+    """Sentences on what is inconsistent about refined poses [n, 4, 4]; `lost` cameras agree with no pose found."""
     if not np.isfinite(refined).all():
         return ("Refined poses are not finite.",)
-    failed = []
     if lost > MOSTLY * len(refined):
-        failed.append(f"{lost} of {len(refined)} cameras are lost: they agree with no pose that was found.")
+        return (f"{lost} of {len(refined)} cameras are lost: they agree with no pose that was found.",)
+    return ()
+
+
+def frame_doubt(turned_deg: Array, shifted: Array, spread: float) -> str:
+    """A sentence if refined poses end so far from the input's that its frame and scale are known only roughly.
+
+    Args:
+        turned_deg, shifted: how far each camera ends from its input pose, in the input's frame.
+        spread: root-mean-square distance of the input's centres from their mean.
+    """
     turn, shift = float(np.median(turned_deg)), float(np.median(shifted))
-    if grounded and (turn > FAR_DEG or shift > FAR_SHARE * spread > 0):
-        failed.append(
-            f"The refined cameras do not fit the input's frame any more: half of them are off by {turn:.3g} deg and "
-            f"{shift:.3g} units (the cameras' spread is {spread:.3g}) or more."
-        )
-    return tuple(failed)
+    if not (turn > FAR_DEG or shift > FAR_SHARE * spread > 0):
+        return ""
+    return (
+        f"The refined poses fit the input's frame and scale only roughly: half of them are {turn:.3g} deg and "
+        f"{shift:.3g} units (the cameras' spread is {spread:.3g}) or more from the input's."
+    )
 
 
 def decide(findings: Findings) -> Verdict:
@@ -97,6 +101,8 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
     if f.moved_px < MEASURABLE_PX:
         return "unchanged", f"The poses moved by less than can be measured (below {MEASURABLE_PX:g} px)."
     speaks_for, speaks_against = _for(f), _against(f)
+    if f.out_of_frame and (speaks_against or speaks_for != BY_ALL):
+        return "failed_check", f.out_of_frame
     if speaks_for and speaks_against:
         return (
             "inconclusive",
@@ -110,7 +116,9 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
             "Neither the input's poses nor the refined ones agree with the feature matches.",
         )
     if speaks_for:
-        return "improved", f"The refined poses are better by {speaks_for}."
+        return "improved", " ".join(
+            filter(None, (f"The refined poses are better by {speaks_for}.", f.out_of_frame))
+        )
     findings = [item.finding for item in _counted(f)]
     if findings and all(finding == "same" for finding in findings):
         return "kept_input", "The refined poses are no better than the input's by any measure."
@@ -129,9 +137,9 @@ def _for(f: Findings) -> str:
     """What speaks for the refined poses, empty if nothing does."""
     names = []
     if f.heldout is not None and f.heldout.psnr.finding == "better":
-        names.append("unseen views")
+        names.append(VIEWS)
     if f.epipolar is not None and f.epipolar.independent and f.epipolar.error_px.finding == "better":
-        names.append("feature matches")
+        names.append(MATCHES)
     return " and ".join(names)
 
 
@@ -139,9 +147,9 @@ def _against(f: Findings) -> str:
     """What speaks against them; matches that the start came from may do so as well."""
     names = []
     if f.heldout is not None and "worse" in (f.heldout.psnr.finding, f.heldout.ssim.finding):
-        names.append("unseen views")
+        names.append(VIEWS)
     if f.epipolar is not None and f.epipolar.error_px.finding == "worse":
-        names.append("feature matches")
+        names.append(MATCHES)
     return " and ".join(names)
 
 

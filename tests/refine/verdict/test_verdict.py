@@ -18,6 +18,7 @@ from biresnerf.refine.verdict.verdict import (
     Findings,
     decide,
     failed_checks,
+    frame_doubt,
 )
 from biresnerf.report import EpipolarEvidence, HeldOutEvidence
 
@@ -76,6 +77,10 @@ def findings(
         (findings(), "inconclusive", "input"),
         (findings(held_out(4.0), moved_px=MEASURABLE_PX / 2), "unchanged", "input"),
         (findings(held_out(4.0), failed=("Gone.",)), "failed_check", "input"),
+        (findings(held_out(4.0), matched(1.0), out_of_frame="Far."), "improved", "refined"),
+        (findings(held_out(4.0), out_of_frame="Far."), "failed_check", "input"),
+        (findings(held_out(0.05), matched(1.0), out_of_frame="Far."), "failed_check", "input"),
+        (findings(held_out(4.0), matched(-1.0), out_of_frame="Far."), "failed_check", "input"),
         (findings(held_out(4.0), matched(1.0, share=2 * FITS_BELOW)), "inconclusive", "input"),
     ],
 )
@@ -127,13 +132,18 @@ def test_chance_alone_rarely_improves():
 
 
 def test_what_is_inconsistent_fails_the_check():
-    poses, still = np.tile(np.eye(4), (6, 1, 1)), np.zeros(6)
-    fine = {"lost": 0, "turned_deg": still, "shifted": still, "spread": 1.0, "grounded": True}
-    assert failed_checks(poses, **fine) == ()
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    assert failed_checks(poses, lost=3) == ()
     broken = poses.copy()
     broken[2, 0, 3] = np.nan
-    assert "not finite" in failed_checks(broken, **fine)[0]
-    assert "lost" in failed_checks(poses, **{**fine, "lost": 4})[0]
-    assert "frame" in failed_checks(poses, **{**fine, "turned_deg": still + 100})[0]
-    assert "frame" in failed_checks(poses, **{**fine, "shifted": still + 2})[0]
-    assert failed_checks(poses, **{**fine, "shifted": still + 2, "grounded": False}) == ()
+    assert "not finite" in failed_checks(broken, lost=0)[0]
+    assert "lost" in failed_checks(poses, lost=4)[0]
+
+
+def test_poses_far_from_the_input_doubt_its_frame_and_the_verdict_says_so():
+    still = np.zeros(6)
+    assert frame_doubt(still + 59, still + 0.4, 1.0) == ""
+    for turned, shifted in ((still + 100, still), (still, still + 2)):
+        doubt = frame_doubt(turned, shifted, 1.0)
+        assert "only roughly" in doubt
+        assert doubt in decide(findings(held_out(4.0), matched(1.0), out_of_frame=doubt)).why[0]
