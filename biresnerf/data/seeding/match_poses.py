@@ -31,6 +31,7 @@ STRAY_MOST = 0.15
 # share of how far they spread along their second axis: the turn about the first is off by about as many radians,
 # over the root of the number of photos.
 LEAST_GEOTAGGED, MOST_SCATTER = 6, 0.2
+FARTHEST = 10  # median distances from the middle: a position beyond is wrong
 JUDGED_FROM = 3  # given poses in a model; fewer tie it to their frame and say nothing of it
 
 
@@ -104,11 +105,19 @@ def in_earth_frame(matched: MatchedPoses, dataset: Dataset) -> MatchedPoses:
         if matched.placed[i] and (tag := read_geotag(frame.path, frame.name)) is not None
     }
     if len(tags) < LEAST_GEOTAGGED:
+        if tags:
+            logger.info(
+                "GPS gives no frame: %d placed photos have a position, %d needed", len(tags), LEAST_GEOTAGGED
+            )
         return matched
-    rows, places = list(tags), np.stack(list(tags.values()))
+    rows, places = np.array(list(tags)), np.stack(list(tags.values()))
     origin = np.median(places, axis=0)
     there = np.tile(np.eye(4), (len(rows), 1, 1))
     there[:, :3, 3] = east_north_up(places, origin)
+    # The fit is robust from a start that a few gross errors must not spoil.
+    away = np.linalg.norm(there[:, :3, 3], axis=1)
+    sound = away <= FARTHEST * np.median(away)
+    rows, there = rows[sound], there[sound]
     try:
         earth_from_model = align_robust(matched.world_from_cam[rows], there)
     except ValueError:  # all at one place

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.geometry.focus import rms_spread
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.similarity import Similarity, align_robust
 from biresnerf.options.refine_options import ResolvedOptions
@@ -67,6 +68,17 @@ class GivenPoses:
         """Of rotation and position in a prior: as stated, or else as measured and shared."""
         rotation, position = self.stated
         return rotation or SHARED_ERRORS * self.rotation, position or SHARED_ERRORS * self.position
+
+    def as_stated(self, rotation: float, position: float) -> GivenPoses:
+        """With what the user states: rad, and the input's unit; 0 where nothing is stated."""
+        exact = EXACT * rms_spread(self.world_from_cam[:, :3, 3])
+        return replace(
+            self,
+            stated=(
+                max(rotation, EXACT) if rotation else 0.0,
+                max(position / self.unit, exact) if position else 0.0,
+            ),
+        )
 
     @property
     def contradicted(self) -> bool:
@@ -208,8 +220,7 @@ def input_accuracy(
     found = given_poses(dataset.world_from_cam, adjusted.world_from_cam, known & seen)
     if found is None:
         return None
-    stated = (math.radians(options.input_rotation_deg), options.input_position / found.unit)
-    found = replace(found, stated=stated)
+    found = found.as_stated(math.radians(options.input_rotation_deg), options.input_position)
     logger.info("the input's poses: %s", accuracy_report(found))
     return found
 
@@ -227,9 +238,16 @@ def accuracy_report(given: GivenPoses) -> InputAccuracy:
     )
 
 
-def accuracy_warnings(given: GivenPoses | None) -> tuple[str, ...]:
-    """A warning where the input's poses are far less exact than stated."""
-    if given is None or not given.contradicted:
+def accuracy_warnings(given: GivenPoses | None, options: ResolvedOptions) -> tuple[str, ...]:
+    """A warning where what is stated of the input's poses is not used, or they are far less exact."""
+    if given is None:
+        if not (options.input_rotation_deg or options.input_position):
+            return ()
+        return (
+            "What input_rotation_deg and input_position state was not used: it takes six given poses that feature "
+            "matches or photos tell of as well.",
+        )
+    if not given.contradicted:
         return ()
     found = accuracy_report(given)
     return (

@@ -77,7 +77,7 @@ def run_report(
         warnings=dataset.warnings
         + focal_warnings(dataset, optimiser.lenses)
         + turntable_warnings(scene.start)
-        + accuracy_warnings(finish.given)
+        + accuracy_warnings(finish.given, optimiser.options)
         + unmatched_warnings(scene)
         + _unknown_warnings(dataset, uncertainty),
     )

@@ -82,6 +82,16 @@ def test_noise_and_one_wrong_position_do_little(tmp_path, seed):
     assert np.abs(offsets(found.world_from_cam, poses)).max() < 2.0
 
 
+@pytest.mark.parametrize("off", [(1e3, 0, 0), (0, 0, 3e3), (0, 1e6, 0)])
+def test_a_gross_error_among_few_positions_does_not_cost_the_frame(tmp_path, off):
+    poses = truth()[::3]
+    centres = poses[:, :3, 3].copy()
+    centres[2] += off
+    found = in_earth_frame(matched(poses), photographed(tmp_path, centres, noise_m=0.5))
+    assert found.geo_reference.images == len(poses) - 1
+    assert rotation_between_deg(found.world_from_cam, poses).max() < 3.0
+
+
 def test_positions_on_a_line_or_at_one_place_or_of_few_photos_give_no_frame(tmp_path):
     for name, centres, noise in (
         ("line", truth(line=True)[:, :3, 3], 0.5),

@@ -1,7 +1,6 @@
 """The input's poses as evidence: how accurate they are is measured, and what is known so is used."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +8,7 @@ import torch
 
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.similarity import Similarity
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refine.adjustment.adjustment import adjust_poses
 from biresnerf.refine.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refine.finish.given_poses import (
@@ -103,7 +103,7 @@ def test_what_the_user_states_of_the_accuracy_holds_in_place_of_what_is_measured
     truth = ring(COUNT, rng)
     found = given_poses(given_by(truth, rng), truth, ALL)
     other = PosePrior.equal(truth, 0.004, 0.03)
-    stated = replace(found, stated=(0.004, 0.0))
+    stated = found.as_stated(0.004, 0.0)
     prior = stated.prior(other)
     np.testing.assert_allclose(prior.rotation, 0.004 / np.sqrt(1 + found.weight), rtol=1e-9)
     np.testing.assert_allclose(prior.position, found.prior(other).position, rtol=1e-9)
@@ -113,10 +113,10 @@ def test_what_the_user_states_of_the_accuracy_holds_in_place_of_what_is_measured
     assert report.rotation_deg == pytest.approx(math.degrees(found.rotation))
 
 
-@pytest.mark.parametrize("known", [1e-12, 1e9])
+@pytest.mark.parametrize("known", [1e-300, 1e-12, 1e9])
 def test_absurd_accuracies_leave_a_prior_that_can_be_used(rng, known):
     truth = ring(COUNT, rng)
-    found = replace(given_poses(given_by(truth, rng), truth, ALL), stated=(known, known))
+    found = given_poses(given_by(truth, rng), truth, ALL).as_stated(known, known)
     other = PosePrior.equal(truth, 0.02, 0.08)
     prior = found.prior(other)
     for part in (prior.world_from_cam, prior.rotation, prior.position):
@@ -130,9 +130,11 @@ def test_absurd_accuracies_leave_a_prior_that_can_be_used(rng, known):
 def test_poses_far_less_exact_than_stated_are_warned_of(rng):
     truth = ring(COUNT, rng)
     found = given_poses(given_by(truth, rng), truth, ALL)
-    honest = replace(found, stated=(ROTATION, POSITION))
-    assert accuracy_warnings(honest) == accuracy_warnings(None) == ()
-    (warning,) = accuracy_warnings(replace(found, stated=(ROTATION / 10, 0.0)))
+    silent, stated = (RefineOptions(input_position=p).resolved("cpu") for p in (0.0, 0.1))
+    honest = found.as_stated(ROTATION, POSITION * found.unit)
+    assert accuracy_warnings(honest, stated) == accuracy_warnings(None, silent) == ()
+    assert "was not used" in accuracy_warnings(None, stated)[0]
+    (warning,) = accuracy_warnings(found.as_stated(ROTATION / 10, 0.0), stated)
     assert "input_rotation_deg" in warning
     assert f"{math.degrees(found.rotation):.2g} degrees" in warning
 
