@@ -20,6 +20,7 @@ from benchmarks.chaos.faults import Faults
 from benchmarks.chaos.installation import Installation
 from benchmarks.chaos.verdict import Claim, claims_about_jobs, claims_about_rest, told
 from workers.database.database import open_database
+from workers.store.trash import RETRY_S
 
 
 async def storm(
@@ -41,7 +42,9 @@ async def storm(
         seconds = time.monotonic() - began
         claims = claims_about_jobs(clients)
         async with open_database(installation.postgres.url, connections=2) as database:
-            claims += await claims_about_rest(installation, database, 20 + 4 * installation.settings.stall_s)
+            # A folder that got a file while it was deleted is tried again after a while.
+            patience_s = RETRY_S + 20 + 4 * installation.settings.stall_s
+            claims += await claims_about_rest(installation, database, patience_s)
     claims.append(Claim("no process is left", installation.left_over()))
     states = Counter(f"{seen.kind}: {seen.job['state']}" for seen in clients.seen)
     happened = {

@@ -96,7 +96,7 @@ def test_progress_carries_what_the_detector_saw_last_and_in_stage_2_nothing_of_i
 def test_a_stable_error_begins_stage_2_before_the_cap(scene, tmp_path):
     options = tiny_options(steps=30, coarse_steps_min=12, coarse_steps_max=30)
     stages = start(scene, tmp_path, options, stop_at=16)
-    stages.detector.decibels = [20.0] * 20
+    stages.detector.decibels = [8.0] + [20.0] * 19
     check = stages.detector.check
 
     def flat(step: int, *_):
