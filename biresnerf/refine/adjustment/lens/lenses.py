@@ -14,6 +14,7 @@ LENS = 3  # unknowns of a lens: log focal length and two radial coefficients
 # evidence then has eight ninths of the say.
 OBSERVABLE = 1 / 3
 RANK = 1e-13  # of the largest eigenvalue: what is smaller is rounding, or one of the motions of the whole rig
+ROUNDING = 1e-12  # of a lens's own information: what poses leave of it, if that is not more, is rounding
 NEWTON = 8
 FURTHEST = 2.0  # times the slope itself that Newton's method may go
 
@@ -79,15 +80,15 @@ def posterior(information: Array, poses: int, lenses: Lenses) -> Array:
     seen = (vectors[:, known].T @ (mixed / size[:, None])) / np.sqrt(values[known])[:, None]
     before = np.diag(1 / lenses.deviation.reshape(-1)[free] ** 2)
     deviation = np.full(len(free), np.nan)
-    deviation[free] = _deviations(own - seen.T @ seen, before)
+    deviation[free] = _deviations(own, seen.T @ seen, before)
     return deviation.reshape(-1, LENS)
 
 
-def _deviations(evidence: Array, before: Array) -> Array:
-    """Of the sum of two informations; what rounding has made negative of the first is nothing."""
-    size = np.sqrt(np.maximum(np.diagonal(evidence) + np.diagonal(before), 1e-300))
-    values, vectors = np.linalg.eigh(evidence / size[:, None] / size[None, :])
-    evidence = (vectors * np.maximum(values, 0)) @ vectors.T
+def _deviations(own: Array, shared: Array, before: Array) -> Array:
+    """Of the information `own` less `shared`, and of what was known before; what rounding has left of it is nothing."""
+    size = np.sqrt(np.maximum(np.diagonal(own) + np.diagonal(before), 1e-300))
+    values, vectors = np.linalg.eigh((own - shared) / size[:, None] / size[None, :])
+    evidence = (vectors * np.where(values > ROUNDING, values, 0)) @ vectors.T
     total = evidence + before / size[:, None] / size[None, :]
     values, vectors = np.linalg.eigh(total)
     with np.errstate(divide="ignore", invalid="ignore"):
