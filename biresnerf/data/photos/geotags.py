@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from biresnerf.data.photos.image_files import DAMAGED, open_image, quiet_pillow
+from biresnerf.data.photos.image_files import from_exif, open_image, quiet_pillow
 
 _GPS_IFD = 0x8825
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
@@ -22,12 +22,7 @@ def read_geotag(path: Path, name: str) -> NDArray[np.float64] | None:
         InputError: as `open_image`.
     """
     with quiet_pillow(), open_image(path, name) as image:
-        if image.format == "PNG" and "exif" not in image.info:
-            return None  # Pillow would decode all of it in search of EXIF behind its pixels
-        try:
-            return _place(image.getexif())
-        except DAMAGED:
-            return None
+        return from_exif(image, _place)
 
 
 def _place(exif: Image.Exif) -> NDArray[np.float64] | None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from PIL import Image
 from PIL.TiffImagePlugin import TiffImageFile
@@ -32,6 +32,8 @@ DAMAGED: tuple[type[Exception], ...] = (
     *(OSError, SyntaxError, ValueError, EOFError, TypeError, KeyError, IndexError, OverflowError),
     *(AttributeError, MemoryError, struct.error, zlib.error, Image.DecompressionBombError),
 )
+
+T = TypeVar("T")
 
 
 class FocalPlane(NamedTuple):
@@ -136,13 +138,18 @@ def read_header(path: Path, name: str) -> ImageHeader:
 def header_of(image: Image.Image) -> ImageHeader:
     """Size, EXIF orientation and focal length of an opened image that is not decoded yet."""
     header = ImageHeader(*stored_size(image), several=_holds_several(image))
+    return from_exif(image, lambda exif: _with_exif(header, exif)) or header
+
+
+def from_exif(image: Image.Image, read: Callable[[Image.Exif], T]) -> T | None:
+    """What ``read`` finds in the EXIF data of an opened image; None where these are damaged, or it has none."""
     # Pillow would decode a whole PNG in search of EXIF behind its pixels.
     if image.format == "PNG" and "exif" not in image.info:
-        return header
+        return None
     try:
-        return _with_exif(header, image.getexif())
+        return read(image.getexif())
     except DAMAGED:  # broken metadata does not spoil the picture
-        return header
+        return None
 
 
 def stored_size(image: Image.Image) -> tuple[int, int]:
