@@ -31,7 +31,6 @@ FITS_BELOW = 0.02
 MOSTLY = 0.5  # share of cameras; if more fail a check, the whole set fails it
 FAR_DEG, FAR_SHARE = 60.0, 0.5  # median residuals; beyond, the result is only roughly in the input's frame
 VIEWS, MATCHES = "unseen views", "feature matches"
-BY_ALL = f"{VIEWS} and {MATCHES}"
 
 
 @dataclass(frozen=True)
@@ -101,15 +100,15 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
     if f.moved_px < MEASURABLE_PX:
         return "unchanged", f"The poses moved by less than can be measured (below {MEASURABLE_PX:g} px)."
     speaks_for, speaks_against = _for(f), _against(f)
-    if f.out_of_frame and (speaks_against or speaks_for != BY_ALL):
+    if f.out_of_frame and (speaks_against or set(speaks_for) != {VIEWS, MATCHES}):
         return "failed_check", f.out_of_frame
     if speaks_for and speaks_against:
         return (
             "inconclusive",
-            f"The evidence disagrees: {speaks_for} for the refined poses, {speaks_against} against.",
+            f"The evidence disagrees: {_named(speaks_for)} for the refined poses, {_named(speaks_against)} against.",
         )
     if speaks_against:
-        return "kept_input", f"The refined poses are worse by {speaks_against}."
+        return "kept_input", f"The refined poses are worse by {_named(speaks_against)}."
     if f.epipolar is not None and f.epipolar.share_of_image > FITS_BELOW:
         return (
             "inconclusive",
@@ -117,7 +116,7 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
         )
     if speaks_for:
         return "improved", " ".join(
-            filter(None, (f"The refined poses are better by {speaks_for}.", f.out_of_frame))
+            filter(None, (f"The refined poses are better by {_named(speaks_for)}.", f.out_of_frame))
         )
     findings = [item.finding for item in _counted(f)]
     if findings and all(finding == "same" for finding in findings):
@@ -133,24 +132,28 @@ def _counted(f: Findings) -> list[PairedDifference]:
     return counted
 
 
-def _for(f: Findings) -> str:
-    """What speaks for the refined poses, empty if nothing does."""
+def _for(f: Findings) -> list[str]:
+    """What speaks for the refined poses."""
     names = []
     if f.heldout is not None and f.heldout.psnr.finding == "better":
         names.append(VIEWS)
     if f.epipolar is not None and f.epipolar.independent and f.epipolar.error_px.finding == "better":
         names.append(MATCHES)
-    return " and ".join(names)
+    return names
 
 
-def _against(f: Findings) -> str:
+def _against(f: Findings) -> list[str]:
     """What speaks against them; matches that the start came from may do so as well."""
     names = []
     if f.heldout is not None and "worse" in (f.heldout.psnr.finding, f.heldout.ssim.finding):
         names.append(VIEWS)
     if f.epipolar is not None and f.epipolar.error_px.finding == "worse":
         names.append(MATCHES)
-    return " and ".join(names)
+    return names
+
+
+def _named(evidence: list[str]) -> str:
+    return " and ".join(evidence)
 
 
 def _sentences(f: Findings) -> list[str]:
