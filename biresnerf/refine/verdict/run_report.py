@@ -12,6 +12,7 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.refine.finish.adjust_cameras import Finish
 from biresnerf.refine.finish.given_poses import accuracy_report, accuracy_warnings
 from biresnerf.refine.lost.own_matches import LEAST_PAIRS
+from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.choose_start import MARGIN_DB
@@ -20,6 +21,7 @@ from biresnerf.refine.verdict.camera_reports import camera_reports, focal_warnin
 from biresnerf.refine.verdict.judgement import Judgement, motion
 from biresnerf.refine.verdict.pose_uncertainty import FIXED
 from biresnerf.refine.views.evaluation import ViewScore
+from biresnerf.refine.views.floaters import unshared_opacity
 from biresnerf.report import HeldOut, ImageReport, Report
 from biresnerf.uncertainty import PoseUncertainty
 
@@ -52,14 +54,7 @@ def run_report(
         verdict=judgement.verdict if judgement is not None else None,
         images=_image_reports(stages, scores, judgement, refined, uncertainty),
         cameras=camera_reports(dataset, optimiser.lenses),
-        heldout=HeldOut(
-            count=len(scores),
-            psnr=float(np.mean([s.psnr for s in scores])),
-            ssim=float(np.mean([s.ssim for s in scores])),
-            unshared_opacity=float(np.mean([s.unshared for s in scores])),
-        )
-        if scores
-        else None,
+        heldout=held_out_report(optimiser, scores) if scores else None,
         start_trials=scene.start.trials,
         candidates=finish.candidates,
         input_accuracy=finish.given and accuracy_report(finish.given),
@@ -80,6 +75,19 @@ def run_report(
         + accuracy_warnings(finish.given, optimiser.options)
         + unmatched_warnings(scene)
         + _unknown_warnings(dataset, uncertainty),
+    )
+
+
+def held_out_report(optimiser: JointOptimiser, scores: list[ViewScore]) -> HeldOut:
+    """Means over the held-out views, at their present poses."""
+    matrices = optimiser.poses.matrices().detach()
+    return HeldOut(
+        count=len(scores),
+        psnr=float(np.mean([s.psnr for s in scores])),
+        ssim=float(np.mean([s.ssim for s in scores])),
+        unshared_opacity=float(
+            np.mean([unshared_opacity(optimiser, matrices[s.image], s.image) for s in scores])
+        ),
     )
 
 

@@ -13,7 +13,6 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refine.views.floaters import unshared_opacity
 from biresnerf.refine.views.image_metrics import psnr, ssim
 
 FIT_STEPS, FIT_RATE, FIT_RAYS = 100, 1e-3, 1024  # BARF's test-time pose refinement
@@ -33,13 +32,12 @@ class RenderedView:
 
 @dataclass(frozen=True, eq=False)
 class ViewScore:
-    """A view scored against its photo; and its `unshared_opacity`."""
+    """A view scored against its photo."""
 
     image: int
     view: RenderedView
     psnr: float
     ssim: float
-    unshared: float
 
 
 def fit_rays(optimiser: JointOptimiser) -> int:
@@ -119,8 +117,7 @@ def score_views(optimiser: JointOptimiser, images: ImageSet, views: Iterable[int
         colour = torch.from_numpy(view.colour)
         mask = images.counts_image(image)
         counts = None if mask is None else torch.from_numpy(mask)
-        unshared = unshared_opacity(optimiser, matrices[image], image)
-        yield ViewScore(image, view, psnr(colour, photo, counts), ssim(colour, photo, counts), unshared)
+        yield ViewScore(image, view, psnr(colour, photo, counts), ssim(colour, photo, counts))
 
 
 def orbit_poses(unit_from_cam: np.ndarray, frames: int) -> np.ndarray:

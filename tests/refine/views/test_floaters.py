@@ -12,6 +12,7 @@ from biresnerf.data.synthetic.scene import CAMERA_ANGLE_X
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene_frame import SceneFrame
+from biresnerf.refine.verdict.run_report import held_out_report
 from biresnerf.refine.views.evaluation import score_views
 from biresnerf.refine.views.floaters import unshared_opacity
 from tests.refine.analytic_field import AnalyticField
@@ -80,7 +81,9 @@ def test_an_empty_view_has_none(images):
     assert share(optimiser_of(images, lambda points: torch.zeros(len(points))), 0) == 0.0
 
 
-def test_views_are_scored_with_it(images):
-    optimiser = optimiser_of(images, wall(1.0), held_out=[2])
-    (score,) = score_views(optimiser, images, [2])
-    assert score.unshared == share(optimiser, 2)
+def test_the_report_has_its_mean_over_held_out_views(images):
+    optimiser = optimiser_of(images, wall(1.0), held_out=[2, 3])
+    scores = list(score_views(optimiser, images, [2, 3]))
+    assert share(optimiser, 2) != share(optimiser, 3)
+    mean = (share(optimiser, 2) + share(optimiser, 3)) / 2
+    assert held_out_report(optimiser, scores).unshared_opacity == pytest.approx(mean)
