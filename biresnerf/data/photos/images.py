@@ -59,6 +59,22 @@ class ImageSet:
     def __len__(self) -> int:
         return len(self.cameras)
 
+    def of(self, images: NDArray[np.int64]) -> ImageSet:
+        """Those images [m] alone, copied."""
+        starts, lengths = self.offsets[images], np.diff(self.offsets)[images]
+        offsets = np.concatenate(([0], np.cumsum(lengths)))
+        pixels = np.arange(offsets[-1]) + np.repeat(starts - offsets[:-1], lengths)
+        return replace(
+            self,
+            pixels=self.pixels[pixels],
+            alpha=None if self.alpha is None else self.alpha[pixels],
+            offsets=offsets,
+            widths=self.widths[images],
+            heights=self.heights[images],
+            cameras=tuple(self.cameras[i] for i in images),
+            counts=None if self.counts is None else self.counts[pixels],
+        )
+
     def image(self, index: int) -> NDArray[np.uint8]:
         """uint8 [h, w, 3], a view of image ``index``."""
         rows = self.pixels[self.offsets[index] : self.offsets[index + 1]]

@@ -71,12 +71,15 @@ def choose_start(
     """The candidate whose poses let a field predict unseen views best, as they are or after some steps.
 
     Where none is clearly the best as they are, the poses move with the field: those near the truth improve, those of a
-    wrong model do not. On a tie after that, too, the first one is kept.
+    wrong model do not. On a tie after that, too, the first one is kept. Cameras that all candidates guess have no say.
 
     Raises:
         Interrupted: ``should_stop`` returned true.
     """
-    rigs = [candidate.world_from_cam for candidate in candidates]
+    placed = np.flatnonzero(~np.logical_and.reduce([candidate.guessed for candidate in candidates]))
+    if len(placed) < len(images):
+        images = images.of(placed)
+    rigs = [candidate.world_from_cam[placed] for candidate in candidates]
     unseen = trial_views(len(images))
 
     def scored(steps: int, *, moving: bool) -> list[float]:
@@ -96,6 +99,6 @@ def choose_start(
     )
     chosen = candidates[best]
     matched = [i for i, candidate in enumerate(candidates) if candidate.matched.any()]
-    likeliest = rigs[max(matched, key=lambda i: scores[i])] if matched else None
+    likeliest = candidates[max(matched, key=lambda i: scores[i])].world_from_cam if matched else None
     logger.info("start: %s of %s", chosen.source, ", ".join(f"{t.source} {t.psnr:.2f} dB" for t in trials))
     return replace(chosen, trials=trials, matched_poses=likeliest)

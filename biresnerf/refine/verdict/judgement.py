@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -96,16 +97,16 @@ def judge_poses(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Ju
     heldout: HeldOutComparison | None = None
     epipolar: EpipolarComparison | None = None
     moved = 0.0
+    placed = np.array([frame.pose_source not in GUESSES for frame in dataset.frames])
     if np.isfinite(after.world_from_cam).all():
         moved = moved_px(before, after, images)
         if scene.tracks is not None:
-            placed = np.array([frame.pose_source not in GUESSES for frame in dataset.frames])
             epipolar = compare_on_matches(
                 before, after, scene.tracks, placed, started_from_matches=bool(scene.start.matched.any())
             )
         if moved >= MEASURABLE_PX:
-            heldout = compare_on_unseen_views(
-                before, after, images, scene.held_out, optimiser.options, optimiser.device, optimiser.threads,
+            heldout = _on_unseen_views(
+                before, after, scene, optimiser, np.flatnonzero(placed | (not grounded)),
                 monitor.should_stop, lambda share: report(0.9 * share),
             )  # fmt: skip
     verdict = decide(
@@ -120,6 +121,25 @@ def judge_poses(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Ju
         )
     )
     return _with_images(verdict, images, optimiser, before, heldout, epipolar, turned, shifted)
+
+
+def _on_unseen_views(
+    before: Rig,
+    after: Rig,
+    scene: Scene,
+    optimiser: JointOptimiser,
+    counted: NDArray[np.int64],
+    should_stop: Callable[[], bool],
+    report: Callable[[float], None],
+) -> HeldOutComparison | None:
+    """`compare_on_unseen_views` of the images counted [m] alone: others would spoil the fields of both rigs."""
+    images = scene.images if len(counted) == len(scene.images) else scene.images.of(counted)
+    held_out = np.flatnonzero(np.isin(counted, scene.held_out)).tolist()
+    found = compare_on_unseen_views(
+        before.of(counted), after.of(counted), images, held_out, optimiser.options, optimiser.device,
+        optimiser.threads, should_stop, report,
+    )  # fmt: skip
+    return found and replace(found, views=counted[found.views].tolist())
 
 
 def motion(before: Array, after: Array) -> tuple[Array, Array]:

@@ -35,6 +35,10 @@ class Rig:
     world_from_cam: Array
     cameras: tuple[Camera, ...]
 
+    def of(self, images: NDArray[np.int64]) -> Rig:
+        """Those images [m] alone."""
+        return Rig(self.world_from_cam[images], tuple(self.cameras[i] for i in images))
+
     def lenses(self, images: ImageSet) -> tuple[Camera, ...]:
         """The lenses at the photos' working size."""
         return tuple(

@@ -63,6 +63,10 @@ def test_images_of_mixed_sizes_lie_one_after_another(tmp_path):
     assert np.array_equal(images.image(2), stored)
     halves = np.asarray(Image.open(tmp_path / "images/m3.png")).astype(float).reshape(10, 2, 20, 2, 3)
     np.testing.assert_allclose(images.image(3), halves.mean(axis=(1, 3)), atol=0.51)
+    some = images.of(np.array([3, 0]))
+    assert some.cameras == (images.cameras[3], images.cameras[0])
+    for i, index in enumerate((3, 0)):
+        np.testing.assert_array_equal(some.image(i), images.image(index))
 
 
 def test_cameras_follow_the_true_ratios(tmp_path):

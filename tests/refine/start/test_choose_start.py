@@ -85,6 +85,30 @@ def test_on_a_tie_the_given_poses_stay_if_matches_agree(scene):
     assert choose(images, candidates(dataset, poses, poses.copy())).source == "given"
 
 
+def test_cameras_that_all_candidates_guess_have_no_say(scene):
+    dataset, images = scene
+    truth = dataset.world_from_cam
+    noisy = perturb_poses(truth, 0.15, seed=1)
+    placed = np.arange(VIEWS - 1)
+
+    def with_a_guess(poses: np.ndarray, name: str) -> InitialPoses:
+        guessed = poses.copy()
+        guessed[-1] = guessed[0]  # where another photo was taken from
+        return InitialPoses(guessed, name, (name,) * (VIEWS - 1) + ("nearest-view",))
+
+    found = choose(images, [with_a_guess(noisy, "given"), with_a_guess(truth, "matches-incremental")])
+    without = choose(
+        images.of(placed),
+        [
+            InitialPoses(poses[placed], name, (name,) * (VIEWS - 1))
+            for poses, name in ((noisy, "given"), (truth, "matches-incremental"))
+        ],
+    )
+    assert [trial.psnr for trial in found.trials] == [trial.psnr for trial in without.trials]
+    assert found.source == "matches-incremental"
+    assert len(found.matched_poses) == len(found.world_from_cam) == VIEWS
+
+
 def test_poses_that_may_move_in_a_trial_improve(scene):
     dataset, images = scene
     noisy = perturb_poses(dataset.world_from_cam, 0.05, seed=1)

@@ -113,6 +113,30 @@ def test_lost_frames_fail_the_check(scene):
     assert judgement.verdict.returned == "input"
 
 
+def test_images_whose_poses_were_guessed_have_no_part_in_the_trials(scene, noisy):
+    dataset, images = scene
+    truth = dataset.world_from_cam
+
+    def judged_with_a_guess(guess: np.ndarray) -> Judgement:
+        given, refined = noisy.copy(), truth.copy()
+        given[1] = refined[1] = guess
+        frames = list(with_poses(dataset, given).frames)
+        frames[1] = replace(frames[1], pose_source="nearest-view")
+        run = given_scene(replace(dataset, frames=tuple(frames)), images, [3])
+        return judge_poses(
+            run, tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3]), Monitor()
+        )
+
+    found = judged_with_a_guess(truth[0])
+    assert found.verdict.verdict == "improved"
+    assert found.verdict.heldout.strictly == 1
+    assert np.isnan(found.trial_psnr[:, 1]).all()
+    assert np.isfinite(found.trial_psnr[:, 3]).all()
+    # Trials are the same wherever the guess is, but for rounding of the frame that poses are carried to.
+    other = judged_with_a_guess(truth[5])
+    np.testing.assert_allclose(other.trial_psnr[0], found.trial_psnr[0], atol=0.05)
+
+
 def test_motion_in_the_image_is_that_of_a_turned_camera(scene):
     dataset, images = scene
     cameras = tuple(dataset.camera_of(i) for i in range(VIEWS))
