@@ -99,7 +99,6 @@ def plain_features() -> Iterator[None]:
     """Plain features do for these scenes, at a seventh of the time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(map_images, "THOROUGH_UP_TO", 0)
-        patch.setattr(map_images, "THOROUGH_ALONE_UP_TO", 0)
         yield
 
 

@@ -34,17 +34,20 @@ BY_NAME, BY_LIKENESS = 12, 10
 # Standard deviation of given positions, of the cameras' distance: holds what matches leave open (the drift of narrow
 # views, the mirror of flat scenes) and, under a robust loss, no more.
 POSITION_DEVIATION = 0.2
-# A start for the optimisation needs no more, and matching costs the features' square. Where nothing else says where
-# photos were taken, or with what lens, more is spent.
-WIDEST_IMAGE, MOST_FEATURES = 1000, 2048
-WIDEST_ALONE, MOST_FEATURES_ALONE = 1600, 4096
+WIDEST_IMAGE = 1600  # long side, px, at which features are looked for
+# Of a photo, at most. Matching compares the features of each pair: as many are allowed as take a minute of one core.
+# COLMAP leaves out the finest first, which are the most exact: fountain-P11 (768 px), adjusted to the tracks of 2048,
+# ends at 0.056 deg, of 8192 at 0.029 (`benchmarks.method.features`).
+COMPARISONS = 1.3e10
+FEWEST_FEATURES, FEWEST_ALONE, MOST_FEATURES = 2048, 4096, 8192
 # COLMAP's bounds on reprojection errors are made for photos of thousands of px. At 200 px they let wrong matches pass:
 # with 0.35 of them temple's mean rotation error went from 6.8 to 1.4 deg, entry-P10's from 4.9 to 0.8.
 ERROR_SIZE = 1600  # px, long side at which COLMAP's own bounds hold; they shrink with the root of the size
 # Where memory is short.
 WIDEST_LOW, MOST_FEATURES_LOW = 800, 1024
-# Pixels in all: affine shapes and pooled scales find more and cost several times as much, by the number of features.
-THOROUGH_UP_TO, THOROUGH_ALONE_UP_TO = 10e6, 4e6
+# Small photos have few features. Affine shapes and pooled scales then place more cameras, and cost three times as much;
+# from 400 px on they gain nothing. In px, of the long side and of all photos.
+THOROUGH_BELOW, THOROUGH_UP_TO = 400, 10e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,23 +100,24 @@ def ask_colmap(
 ) -> dict[str, Any]:
     """What COLMAP finds, as plain data for `read_mapping`. Poses that the set has guide it.
 
-    Beside the log in ``log_folder`` the tracks are left, for `Tracks.load`. One thread where all poses are
-    given: more would make the answer differ from run to run. One where little is asked of it, too: each takes memory.
+    Beside the log in ``log_folder`` the tracks are left, for `Tracks.load`. Mapping has one thread where all poses
+    are given: more would make the answer differ from run to run. Where little is asked, all has: each takes memory.
 
     Raises:
         InputError: ``seed_timeout``, or a code of `open_image`.
         Interrupted: ``should_stop`` said so.
         RefinementError: ``seeding_crashed``.
     """
-    posed = dataset.posed
+    low = effort == "low"
     with tempfile.TemporaryDirectory(prefix="biresnerf-colmap-") as work:
         request = {
             **lay_out(dataset, Path(work)),
             "answer": str(Path(work, "answer.json")),
             "seed": seed,
-            "threads": 1 if posed.all() or effort == "low" else -1,
-            **_thoroughness(dataset, effort),
+            "threads": 1 if low else -1,
+            "mapping_threads": 1 if low or dataset.posed.all() else -1,
         }
+        request |= thoroughness(dataset, effort, request["pairs"])
         watch = SeedingWatch(Path(work, DATABASE), on_progress)
         answer = run_colmap(request, Path(work), should_stop, limit_s, log_folder, watch.look)
         if log_folder is not None:
@@ -173,18 +177,25 @@ def _request_images(dataset: Dataset, names: list[str]) -> dict[str, Any]:
     }
 
 
-def _thoroughness(dataset: Dataset, effort: SeedingEffort) -> dict[str, Any]:
+def thoroughness(
+    dataset: Dataset, effort: SeedingEffort, pairs: list[tuple[str, str]] | None
+) -> dict[str, Any]:
+    """How large photos are and how many features are looked for where these pairs, None for all, are matched."""
     sizes = [dataset.camera_of(i) for i in range(len(dataset))]
-    alone = not dataset.posed.all()
     low = effort == "low"
-    most = WIDEST_LOW if low else WIDEST_ALONE if alone else WIDEST_IMAGE
+    most = WIDEST_LOW if low else WIDEST_IMAGE
     widest = min(most, float(np.median([max(c.width, c.height) for c in sizes])))
+    count = len(sizes) * (len(sizes) - 1) / 2 if pairs is None else len(pairs)
+    # Where nothing else says where photos were taken, more is spent.
+    fewest = FEWEST_FEATURES if dataset.posed.all() else FEWEST_ALONE
+    features = int(np.clip((COMPARISONS / max(1.0, count)) ** 0.5, fewest, MOST_FEATURES))
     return {
         "widest_image": most,
-        "most_features": MOST_FEATURES_LOW if low else MOST_FEATURES_ALONE if alone else MOST_FEATURES,
+        "most_features": MOST_FEATURES_LOW if low else features,
         "error_scale": min(1.0, (widest / ERROR_SIZE) ** 0.5),
         "thorough": not low
-        and sum(c.width * c.height for c in sizes) <= (THOROUGH_ALONE_UP_TO if alone else THOROUGH_UP_TO),
+        and widest < THOROUGH_BELOW
+        and sum(c.width * c.height for c in sizes) <= THOROUGH_UP_TO,
     }
 
 
