@@ -1,6 +1,6 @@
 """Which initial poses to start from: the given ones, or those that feature matches support, as the photos decide.
 
-The trial is short and treats all candidates alike: see `biresnerf.refine.start.pose_trials`.
+The trial is short and treats all candidates alike: see `biresnerf.refine.views.pose_trials`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.progress import TRYING_FROM, Monitor, Progress
 from biresnerf.refine.start.forward_facing import find_forward_facing
-from biresnerf.refine.start.pose_trials import PoseTrials, trial_views
 from biresnerf.refine.start.turntable import start_on_turntable
+from biresnerf.refine.views.pose_trials import PoseTrials, trial_views
 from biresnerf.report import TrialReport
 
 logger = logging.getLogger(__name__)

@@ -21,8 +21,8 @@ from biresnerf.errors import InputError, Interrupted
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene_frame import SceneFrame, scene_frame
-from biresnerf.refine.start.pose_trials import trial_views
 from biresnerf.refine.views.evaluation import score_views
+from biresnerf.refine.views.pose_trials import trial_views
 
 logger = logging.getLogger(__name__)
 

@@ -30,8 +30,8 @@ from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.optimise.photo_sampler import PhotoSampler
 from biresnerf.refine.parameters.ring_parameters import RingParameters
 from biresnerf.refine.scene.scene_frame import scene_frame
-from biresnerf.refine.start.pose_trials import score_unseen, trial_views
 from biresnerf.refine.start.ring_order import RingOrder, axis_in_photos, find_ring, thumbnails
+from biresnerf.refine.views.pose_trials import score_unseen, trial_views
 from biresnerf.report import TrialReport
 
 logger = logging.getLogger(__name__)

@@ -17,9 +17,9 @@ from biresnerf.geometry.focus import focus_point
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.adjustment.paired import paired
 from biresnerf.refine.lost.own_matches import LEAST_PX, OwnMatches
-from biresnerf.refine.start.pose_trials import PoseTrials, TrialScores, joined
 from biresnerf.refine.verdict.verdict import EPIPOLAR_MATTERS, PSNR_MATTERS, SSIM_MATTERS
 from biresnerf.refine.views.held_out_views import unseen_rounds
+from biresnerf.refine.views.pose_trials import PoseTrials, TrialScores, joined
 from biresnerf.report import EpipolarEvidence, HeldOutEvidence
 
 Array = NDArray[np.float64]

@@ -14,10 +14,10 @@ from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.progress import Monitor
 from biresnerf.refine.start import choose_start as start_module
-from biresnerf.refine.start import pose_trials
 from biresnerf.refine.start.choose_start import choose_start, find_start
 from biresnerf.refine.start.first_step import pose_mobility, stage_lengths
-from biresnerf.refine.start.pose_trials import PoseTrials, trial_views
+from biresnerf.refine.views import pose_trials
+from biresnerf.refine.views.pose_trials import PoseTrials, trial_views
 from tests.refine.tiny_scene import CPU, tiny_options, tiny_set
 
 pytestmark = pytest.mark.slow

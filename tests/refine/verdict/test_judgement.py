@@ -12,10 +12,10 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.progress import Monitor
-from biresnerf.refine.start import pose_trials
 from biresnerf.refine.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refine.verdict.judgement import Judgement, judge_poses
 from biresnerf.refine.verdict.pose_evidence import Rig, compare_on_matches, moved_px
+from biresnerf.refine.views import pose_trials
 from biresnerf.refine.views.held_out_views import held_out_views, unseen_rounds, unseen_views
 from biresnerf.report import EpipolarEvidence
 from tests.refine.tiny_scene import CPU, given_scene, tiny_optimiser, tiny_options, tiny_set
