@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -23,13 +22,11 @@ from biresnerf.refine.start.first_step import poses_in_input_frame
 from biresnerf.refine.verdict import image_flags
 from biresnerf.refine.verdict.pose_evidence import (
     EpipolarComparison,
-    HeldOutComparison,
-    Rig,
     compare_on_matches,
-    compare_on_unseen_views,
     moved_px,
 )
 from biresnerf.refine.verdict.verdict import MEASURABLE_PX, Findings, decide, failed_checks, frame_doubt
+from biresnerf.refine.views.compare_rigs import HeldOutComparison, Rig, compare_placed
 from biresnerf.report import Verdict
 
 logger = logging.getLogger(__name__)
@@ -105,8 +102,8 @@ def judge_poses(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Ju
                 before, after, scene.tracks, placed, started_from_matches=bool(scene.start.matched.any())
             )
         if moved >= MEASURABLE_PX:
-            heldout = _on_unseen_views(
-                before, after, scene, optimiser, np.flatnonzero(placed | (not grounded)),
+            heldout = compare_placed(
+                before, after, scene, optimiser, placed | (not grounded),
                 monitor.should_stop, lambda share: report(0.9 * share),
             )  # fmt: skip
     verdict = decide(
@@ -121,25 +118,6 @@ def judge_poses(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Ju
         )
     )
     return _with_images(verdict, images, optimiser, before, heldout, epipolar, turned, shifted)
-
-
-def _on_unseen_views(
-    before: Rig,
-    after: Rig,
-    scene: Scene,
-    optimiser: JointOptimiser,
-    counted: NDArray[np.int64],
-    should_stop: Callable[[], bool],
-    report: Callable[[float], None],
-) -> HeldOutComparison | None:
-    """`compare_on_unseen_views` of the images counted [m] alone: others would spoil the fields of both rigs."""
-    images = scene.images if len(counted) == len(scene.images) else scene.images.of(counted)
-    held_out = np.flatnonzero(np.isin(counted, scene.held_out)).tolist()
-    found = compare_on_unseen_views(
-        before.of(counted), after.of(counted), images, held_out, optimiser.options, optimiser.device,
-        optimiser.threads, should_stop, report,
-    )  # fmt: skip
-    return found and replace(found, views=counted[found.views].tolist())
 
 
 def motion(before: Array, after: Array) -> tuple[Array, Array]:

@@ -1,8 +1,7 @@
-"""The evidence for or against refined poses: unseen views after equal trainings, feature matches, motion."""
+"""The evidence for or against refined poses beside unseen views: feature matches and motion."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,49 +11,17 @@ from numpy.typing import NDArray
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project
-from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.focus import focus_point
-from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.adjustment.paired import paired
 from biresnerf.refine.lost.own_matches import LEAST_PX, OwnMatches
-from biresnerf.refine.verdict.verdict import EPIPOLAR_MATTERS, PSNR_MATTERS, SSIM_MATTERS
-from biresnerf.refine.views.held_out_views import unseen_rounds
-from biresnerf.refine.views.pose_trials import PoseTrials, TrialScores, joined
-from biresnerf.report import EpipolarEvidence, HeldOutEvidence
+from biresnerf.refine.verdict.verdict import EPIPOLAR_MATTERS
+from biresnerf.refine.views.compare_rigs import Rig
+from biresnerf.report import EpipolarEvidence
 
 Array = NDArray[np.float64]
 
 LEAST_MATCHED = 4  # images
 MOTION_GRID = 5  # points across and down
-
-
-@dataclass(frozen=True, eq=False)
-class Rig:
-    """Poses [n, 4, 4] in the input's frame and the lens of each image at full size."""
-
-    world_from_cam: Array
-    cameras: tuple[Camera, ...]
-
-    def of(self, images: NDArray[np.int64]) -> Rig:
-        """Those images [m] alone."""
-        return Rig(self.world_from_cam[images], tuple(self.cameras[i] for i in images))
-
-    def lenses(self, images: ImageSet) -> tuple[Camera, ...]:
-        """The lenses at the photos' working size."""
-        return tuple(
-            camera.resized(small.width, small.height)
-            for camera, small in zip(self.cameras, images.cameras, strict=True)
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class HeldOutComparison:
-    """Scores of the unseen `views` after two trainings."""
-
-    views: list[int]
-    before: TrialScores
-    after: TrialScores
-    evidence: HeldOutEvidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,46 +31,6 @@ class EpipolarComparison:
     before: Array
     after: Array
     evidence: EpipolarEvidence
-
-
-def compare_on_unseen_views(
-    before: Rig,
-    after: Rig,
-    images: ImageSet,
-    held_out: Sequence[int],
-    options: ResolvedOptions,
-    device: torch.device,
-    threads: int,
-    should_stop: Callable[[], bool],
-    report: Callable[[float], None] = lambda _share: None,
-) -> HeldOutComparison | None:
-    """Train a field on either rig, held still, and score both on the same unseen views; None of too few images.
-
-    Small sets are trained several times, with other views left out. ``report`` is called with the share of work done.
-
-    Raises:
-        Interrupted: ``should_stop`` returned true.
-    """
-    steps = options.trial_steps
-    rounds = unseen_rounds(len(images), held_out, most=16)
-    if steps == 0 or not rounds[0]:
-        return None
-    rigs = [before.world_from_cam, after.world_from_cam]
-    scores: tuple[list[TrialScores], list[TrialScores]] = ([], [])
-    for views in rounds:
-        trials = PoseTrials(images, views, rigs, options, steps, device, threads, should_stop)
-        for side, rig in zip(scores, (before, after), strict=True):
-            side.append(trials.score(rig.world_from_cam, rig.lenses(images)))
-            report(sum(map(len, scores)) / (2 * len(rounds)))
-    old, new = (joined(side) for side in scores)
-    seen = [view for views in rounds for view in views]
-    evidence = HeldOutEvidence(
-        steps=trials.steps,
-        strictly=len(set(seen) & set(held_out)),
-        psnr=paired(old.psnr, new.psnr, PSNR_MATTERS),
-        ssim=paired(old.ssim, new.ssim, SSIM_MATTERS),
-    )
-    return HeldOutComparison(seen, old, new, evidence)
 
 
 def compare_on_matches(

@@ -22,9 +22,7 @@ from biresnerf.report import (
 
 Array = NDArray[np.float64]
 
-# Differences that matter and are larger than chance: trainings on the same poses differ by less (docs/verdict.md).
-PSNR_MATTERS, SSIM_MATTERS = 0.5, 0.01  # dB, and 1
-EPIPOLAR_MATTERS = 0.1  # log2: 7 % of the error
+EPIPOLAR_MATTERS = 0.1  # log2, a difference that matters: 7 % of the error
 MEASURABLE_PX = 0.1  # at working size: less motion cannot be seen in photos of that size
 # Feature matches that miss by more than this share of the image fit no scene: neither set of poses can be trusted.
 FITS_BELOW = 0.02

@@ -14,8 +14,9 @@ from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.progress import Monitor
 from biresnerf.refine.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refine.verdict.judgement import Judgement, judge_poses
-from biresnerf.refine.verdict.pose_evidence import Rig, compare_on_matches, moved_px
+from biresnerf.refine.verdict.pose_evidence import compare_on_matches, moved_px
 from biresnerf.refine.views import pose_trials
+from biresnerf.refine.views.compare_rigs import Rig
 from biresnerf.refine.views.held_out_views import held_out_views, unseen_rounds, unseen_views
 from biresnerf.report import EpipolarEvidence
 from tests.refine.tiny_scene import CPU, given_scene, tiny_optimiser, tiny_options, tiny_set
@@ -89,7 +90,7 @@ def test_poses_that_stayed_are_unchanged(scene):
 
 
 def test_matches_alone_tell_good_poses_from_bad_ones(scene, noisy, monkeypatch):
-    monkeypatch.setattr(f"{judge_poses.__module__}.compare_on_unseen_views", lambda *_: None)
+    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_: None)
     truth, matches = scene[0].world_from_cam, true_matches(scene[0])
     better, worse = judged(scene, noisy, truth, matches), judged(scene, truth, noisy, matches)
     assert (better.verdict.verdict, worse.verdict.verdict) == ("improved", "kept_input")
@@ -229,7 +230,7 @@ def test_matches_of_points_left_out_judge_and_photos_placed_by_a_guess_do_not(sc
 
 
 def test_a_camera_that_its_own_matches_contradict_is_named(scene, monkeypatch):
-    monkeypatch.setattr(f"{judge_poses.__module__}.compare_on_unseen_views", lambda *_: None)
+    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_: None)
     truth, refined = scene[0].world_from_cam, scene[0].world_from_cam.copy()
     refined[5] = refined[6]
     found = judged(scene, truth, refined, true_matches(scene[0]))

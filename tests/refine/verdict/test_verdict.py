@@ -13,13 +13,12 @@ from biresnerf.refine.verdict.verdict import (
     EPIPOLAR_MATTERS,
     FITS_BELOW,
     MEASURABLE_PX,
-    PSNR_MATTERS,
-    SSIM_MATTERS,
     Findings,
     decide,
     failed_checks,
     frame_doubt,
 )
+from biresnerf.refine.views.compare_rigs import PSNR_MATTERS, SSIM_MATTERS
 from biresnerf.report import EpipolarEvidence, HeldOutEvidence
 
 OPPOSITE = {"better": "worse", "worse": "better", "same": "same", "open": "open"}

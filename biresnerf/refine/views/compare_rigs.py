@@ -1,0 +1,114 @@
+"""Two sets of poses of the same photos compared on unseen views, each in fields trained on it alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.options.refine_options import ResolvedOptions
+from biresnerf.refine.adjustment.paired import paired
+from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.scene.scene import Scene
+from biresnerf.refine.views.held_out_views import unseen_rounds
+from biresnerf.refine.views.pose_trials import PoseTrials, TrialScores, joined
+from biresnerf.report import HeldOutEvidence
+
+Array = NDArray[np.float64]
+
+# Differences that matter and are larger than chance: trainings on the same poses differ by less (docs/verdict.md).
+PSNR_MATTERS, SSIM_MATTERS = 0.5, 0.01  # dB, and 1
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Poses [n, 4, 4] in the input's frame and the lens of each image at full size."""
+
+    world_from_cam: Array
+    cameras: tuple[Camera, ...]
+
+    def of(self, images: NDArray[np.int64]) -> Rig:
+        """Those images [m] alone."""
+        return Rig(self.world_from_cam[images], tuple(self.cameras[i] for i in images))
+
+    def lenses(self, images: ImageSet) -> tuple[Camera, ...]:
+        """The lenses at the photos' working size."""
+        return tuple(
+            camera.resized(small.width, small.height)
+            for camera, small in zip(self.cameras, images.cameras, strict=True)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutComparison:
+    """Scores of the unseen `views` after two trainings."""
+
+    views: list[int]
+    before: TrialScores
+    after: TrialScores
+    evidence: HeldOutEvidence
+
+
+def compare_on_unseen_views(
+    before: Rig,
+    after: Rig,
+    images: ImageSet,
+    held_out: Sequence[int],
+    options: ResolvedOptions,
+    device: torch.device,
+    threads: int,
+    should_stop: Callable[[], bool],
+    report: Callable[[float], None] = lambda _share: None,
+) -> HeldOutComparison | None:
+    """Train a field on either rig, held still, and score both on the same unseen views; None of too few images.
+
+    Small sets are trained several times, with other views left out. ``report`` is called with the share of work done.
+
+    Raises:
+        Interrupted: ``should_stop`` returned true.
+    """
+    steps = options.trial_steps
+    rounds = unseen_rounds(len(images), held_out, most=16)
+    if steps == 0 or not rounds[0]:
+        return None
+    rigs = [before.world_from_cam, after.world_from_cam]
+    scores: tuple[list[TrialScores], list[TrialScores]] = ([], [])
+    for views in rounds:
+        trials = PoseTrials(images, views, rigs, options, steps, device, threads, should_stop)
+        for side, rig in zip(scores, (before, after), strict=True):
+            side.append(trials.score(rig.world_from_cam, rig.lenses(images)))
+            report(sum(map(len, scores)) / (2 * len(rounds)))
+    old, new = (joined(side) for side in scores)
+    seen = [view for views in rounds for view in views]
+    evidence = HeldOutEvidence(
+        steps=trials.steps,
+        strictly=len(set(seen) & set(held_out)),
+        psnr=paired(old.psnr, new.psnr, PSNR_MATTERS),
+        ssim=paired(old.ssim, new.ssim, SSIM_MATTERS),
+    )
+    return HeldOutComparison(seen, old, new, evidence)
+
+
+def compare_placed(
+    before: Rig,
+    after: Rig,
+    scene: Scene,
+    optimiser: JointOptimiser,
+    placed: NDArray[np.bool_],
+    should_stop: Callable[[], bool],
+    report: Callable[[float], None] = lambda _share: None,
+) -> HeldOutComparison | None:
+    """`compare_on_unseen_views` of the images placed [n] alone: others would spoil the fields of both rigs."""
+    rows = np.flatnonzero(placed)
+    images = scene.images if placed.all() else scene.images.of(rows)
+    held_out = np.flatnonzero(np.isin(rows, scene.held_out)).tolist()
+    found = compare_on_unseen_views(
+        before.of(rows), after.of(rows), images, held_out, optimiser.options, optimiser.device,
+        optimiser.threads, should_stop, report,
+    )  # fmt: skip
+    return found and replace(found, views=rows[found.views].tolist())
