@@ -33,7 +33,8 @@ from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.adjustment.adjustment import adjust_poses
 from biresnerf.refine.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
-from biresnerf.refine.finish.adjust_cameras import MOST_OBSERVATIONS, PRIOR
+from biresnerf.refine.finish.adjust_cameras import PRIOR
+from biresnerf.refine.finish.gather_evidence import MOST_OBSERVATIONS
 from biresnerf.studies.scenes import with_poses
 
 Array = NDArray[np.float64]

@@ -29,7 +29,8 @@ from biresnerf.refine.adjustment.adjustment import adjust_poses
 from biresnerf.refine.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
 from biresnerf.refine.adjustment.lens.corrected_camera import corrected_camera
-from biresnerf.refine.finish.adjust_cameras import MOST_OBSERVATIONS, PRIOR
+from biresnerf.refine.finish.adjust_cameras import PRIOR
+from biresnerf.refine.finish.gather_evidence import MOST_OBSERVATIONS
 from biresnerf.refine.finish.lens_evidence import lenses_before
 
 DISTURBED = 0.01  # rad, and shares of the cameras' distance

@@ -27,8 +27,9 @@ from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.adjustment.adjustment import adjust_poses
 from biresnerf.refine.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
-from biresnerf.refine.finish.adjust_cameras import MOST_OBSERVATIONS, PRIOR
+from biresnerf.refine.finish.adjust_cameras import PRIOR
 from biresnerf.refine.finish.expected_errors import expected_errors
+from biresnerf.refine.finish.gather_evidence import MOST_OBSERVATIONS
 
 Array = NDArray[np.float64]
 

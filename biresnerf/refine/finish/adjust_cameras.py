@@ -11,23 +11,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from biresnerf.data.points.tracks import Tracks
-from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.refine.adjustment.adjustment import NOTHING_FITS, Adjustment, Halves, adjust_poses, misfit
 from biresnerf.refine.adjustment.choice import Candidate, Choice, choose
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
-from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
+from biresnerf.refine.finish.gather_evidence import SplitEvidence, gather_evidence
 from biresnerf.refine.finish.given_poses import GivenPoses, input_accuracy
 from biresnerf.refine.finish.lens_evidence import (
     contradicted_focals,
     corrected_cameras,
     focal_certainty,
     given_focals,
-    lenses_before,
 )
-from biresnerf.refine.finish.photo_evidence import photo_patches
+from biresnerf.refine.finish.photo_trial import photos_object
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
@@ -47,8 +44,6 @@ ORDER: tuple[CandidateName, ...] = (
 PRIOR = 0.02
 # Of tracks, in px or in shares of the photos' size. Sets have 0.1 to 0.5 px.
 MOST_NOISE_PX, MOST_NOISE = 2.0, 0.002
-MOST_OBSERVATIONS = 40_000  # of tracks that are adjusted to
-LEFT_OUT_ONE_IN = 5  # patches
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +79,17 @@ class Finish:
         """Whether patches of the photos were to be trusted."""
         return self.fit is not None and self.fit.evidence.patches is not None
 
+    def refused(self) -> Finish:
+        """The same where the chosen poses are not taken, and the evidence that prefers them is not believed."""
+        kept = (each.model_copy(update={"chosen": each.name == "refined"}) for each in self.candidates)
+        return Finish(tuple(kept))
+
 
 def adjust_cameras(stages: TwoStages) -> Finish:
     """Adjust all cameras at once, and where left-out evidence says that is better move them and hold them there.
 
-    Cameras that their own matches contradict are placed by those first. Cameras that are fixed or tied
-    to each other, fisheyes, and methods of others are left alone.
+    Cameras that their own matches contradict are placed by those first. Photos have the last word: nothing is moved
+    where they object. Cameras that are fixed or tied to each other, fisheyes, and methods of others are left alone.
 
     Raises:
         Interrupted: stopped; a continued run adjusts again.
@@ -97,35 +97,34 @@ def adjust_cameras(stages: TwoStages) -> Finish:
     optimiser = stages.optimiser
     if not adjusts_cameras(stages.scene.dataset, optimiser.method, optimiser.bodies):
         return Finish()
+    certainty = optimiser.lenses.certainty
     with stages.record.timed("adjusting"):
         stages.repair.place_by_matches()
         found = _choice(stages.scene, optimiser, partial(_announce, stages))
     if found is None:
         return Finish()
     choice, finish = found
-    if choice.chosen.name != "refined":
-        stages.place(choice.chosen.world_from_cam)
+    cameras = optimiser.lenses.refined(stages.scene.dataset).cameras
+    chosen, lenses = choice.chosen, choice.chosen.lenses
+    if lenses is not None:
+        cameras = corrected_cameras(cameras, lenses.correction) or cameras
+    if chosen.name != "refined" and photos_object(stages, chosen.world_from_cam, cameras):
+        logger.info("the photos contradict these poses, which are not taken")
+        optimiser.lenses.certainty = certainty
+        return finish.refused()
+    if chosen.name != "refined":
+        stages.place(chosen.world_from_cam)
         optimiser.poses_held = True
-    if choice.chosen.lenses is not None:
-        present = optimiser.lenses.refined(stages.scene.dataset).cameras
-        corrected = corrected_cameras(present, choice.chosen.lenses.correction)
-        optimiser.lenses.place(stages.scene.dataset.cameras, corrected or present)
+    if lenses is not None:
+        optimiser.lenses.place(stages.scene.dataset.cameras, cameras)
     return finish
-
-
-@dataclass(frozen=True, eq=False)
-class _Split:
-    """Evidence to adjust to, and evidence to judge by."""
-
-    fitted: Evidence
-    left_out: Evidence
 
 
 def _choice(
     scene: Scene, optimiser: JointOptimiser, announce: Callable[[], None]
 ) -> tuple[Choice, Finish] | None:
     """None where no evidence can tell. Candidates are in the unit frame."""
-    split = _evidence(scene, optimiser)
+    split = gather_evidence(scene, optimiser)
     if split is None:
         return None
     refined = optimiser.poses.poses().numpy()
@@ -136,7 +135,7 @@ def _choice(
     noise = results["adjusted-tracks"].noise if "adjusted-tracks" in results else NoiseLevels()
     if noise.track_px > _most_noise_px(split.fitted):
         logger.info("tracks say nothing: their noise is %.1f px", noise.track_px)
-        split = _Split(replace(split.fitted, tracks=None), replace(split.left_out, tracks=None))
+        split = SplitEvidence(replace(split.fitted, tracks=None), replace(split.left_out, tracks=None))
         results = {name: each for name, each in results.items() if name == "adjusted-patches"}
     given = input_accuracy(scene.dataset, _most_heeded(results), split.fitted, optimiser.options)
     if given is not None and given.tells(prior):
@@ -270,29 +269,6 @@ def _earlier(scene: Scene, refined: Array) -> list[Candidate]:
         for name, poses in given
         if poses is not None and np.isfinite(poses).all()
     ]
-
-
-def _evidence(scene: Scene, optimiser: JointOptimiser) -> _Split | None:
-    """What there is of tracks and patches, for ideal cameras; None where cameras cannot be made ideal."""
-    dataset = optimiser.lenses.refined(scene.dataset)
-    intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
-    ideal = ideal_pinholes(intrinsics)
-    if ideal is None:
-        return None
-    before = lenses_before(scene.dataset, optimiser.options.refine_intrinsics)
-    lenses = before if before.free.any() else None
-    fitted: Tracks | None = None
-    judging: Tracks | None = None
-    if scene.tracks is not None:
-        fitted, judging = straight_tracks(scene.tracks, intrinsics, ideal).split()
-        fitted = fitted and fitted.thinned(MOST_OBSERVATIONS, len(dataset))
-    patches = photo_patches(scene, optimiser, intrinsics, ideal)
-    if patches is None:
-        return _Split(Evidence(ideal, fitted, None, lenses), Evidence(ideal, judging))
-    spared = np.arange(len(patches)) % LEFT_OUT_ONE_IN == 0
-    return _Split(
-        Evidence(ideal, fitted, patches.of(~spared), lenses), Evidence(ideal, judging, patches.of(spared))
-    )
 
 
 def _announce(stages: TwoStages) -> None:

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import logging
-import math
 from dataclasses import replace
 
 from biresnerf.refine.finish.adjust_cameras import Finish, adjust_cameras
-from biresnerf.refine.stages.earlier_state import EarlierState
 from biresnerf.refine.stages.two_stages import TwoStages
-
-logger = logging.getLogger(__name__)
 
 # Shares of all steps: where cameras are adjusted first, and how long the field then learns at their poses. The first is
 # soon enough: on the demo scene cameras adjusted after half of the steps end as exact as after all (docs/estimator.md).
@@ -24,10 +19,6 @@ def run_stage_2(stages: TwoStages) -> Finish:
     at them for a while. It would only bend them. They are adjusted again only if patches of the photos had no say yet:
     the surface of a young field may have been too rough for them.
 
-    Photos have the last word on the first adjustment. Where the field explains them less well than it did before,
-    feature matches were wrong, however well they agree: all is as it was before, and the run goes on with the field
-    alone.
-
     Raises:
         Interrupted: stopped; a continued run goes on from there.
         RefinementError: ``diverged``.
@@ -35,22 +26,11 @@ def run_stage_2(stages: TwoStages) -> Finish:
     first = None
     if not stages.record.adjusted:
         stages.run_stage_2(FIRST_ROUND)
-        earlier = EarlierState.of(stages.optimiser, stages.block_error or math.inf)
         first = adjust_cameras(stages)
         if stages.optimiser.poses_held:
             stages.optimiser.end_after(LEARNING)
-            stages.earlier = earlier
         stages.record = stages.record.model_copy(update={"adjusted": True})
     stages.run_stage_2()
-    if stages.earlier is not None and (stages.block_error or 0.0) > stages.earlier.error:
-        logger.info("the adjusted poses explain the photos less well than those before, which are put back")
-        stages.take_back()
-        stages.record = stages.record.model_copy(update={"taken_back": True})
-        stages.run_stage_2()
-    stages.earlier = None
-    if stages.record.taken_back:
-        seen = first.candidates if first is not None else ()
-        return Finish(tuple(each.model_copy(update={"chosen": each.name == "refined"}) for each in seen))
     held = stages.optimiser.poses_held
     if first is not None and held and first.heeds_photos:
         return first

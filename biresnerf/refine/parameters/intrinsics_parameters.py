@@ -195,13 +195,6 @@ class IntrinsicsParameters:
         self._adam.forget()
         self._show()
 
-    @torch.no_grad()
-    def forget(self) -> None:
-        """The set's own lenses again, with no history."""
-        self.increments.zero_()
-        self._adam.forget()
-        self._show()
-
     @property
     def _placed(self) -> list[bool]:
         """Of each camera, whether it is not as the set has it."""

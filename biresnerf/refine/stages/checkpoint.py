@@ -31,7 +31,7 @@ CHECKPOINT = Path("checkpoint") / "latest.safetensors"
 SEEDING = CHECKPOINT.with_name("seeding.json")  # COLMAP's result; every checkpoint carries a copy
 TRACKS = CHECKPOINT.with_name(KEPT)  # through feature matches; every checkpoint carries them, too
 COARSE = CHECKPOINT.with_name("coarse.safetensors")  # the state at the end of stage 1, for runs that share it
-FORMAT = "7"
+FORMAT = "8"
 TRACKED = "tracks."  # before the names of tensors
 OTHER_FOLDER = "Choose another output folder, or remove this one."
 
@@ -57,14 +57,12 @@ class RunRecord(FrozenModel, arbitrary_types_allowed=True):
         resumed: how often.
         switch_reason: why stage 2 began.
         adjusted: whether all cameras were adjusted on the way through stage 2.
-        taken_back: whether photos spoke against that.
         seconds: spent in each part of the run.
     """
 
     resumed: int = 0
     switch_reason: SwitchReason | None = None
     adjusted: bool = False
-    taken_back: bool = False
     seconds: dict[str, float] = Field(default_factory=lambda: {"coarse": 0.0, "fine": 0.0})
 
     @contextmanager
@@ -81,8 +79,6 @@ class Checkpoint(FrozenModel, arbitrary_types_allowed=True):
     Attributes:
         ends_stage_1: whether this is the state at the end of stage 1, kept for other runs.
         block_errors: mean squared errors of the steps since the detector's last check.
-        block_error: their mean at the last check.
-        earlier_error: of the state before the cameras were adjusted, whose tensors it carries as well.
         tensors: of the optimisation and the tracks, on the CPU.
     """
 
@@ -94,8 +90,6 @@ class Checkpoint(FrozenModel, arbitrary_types_allowed=True):
     detector: DetectorState
     repair: RepairState
     block_errors: tuple[float, ...] = ()
-    block_error: float | None = None
-    earlier_error: float | None = None
     tensors: dict[str, Tensor] = Field(exclude=True, repr=False)
 
     @property

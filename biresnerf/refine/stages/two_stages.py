@@ -30,7 +30,6 @@ from biresnerf.refine.stages.checkpoint import (
     save_checkpoint,
     track_tensors,
 )
-from biresnerf.refine.stages.earlier_state import EarlierState
 from biresnerf.refine.stages.history import History, HistoryLine
 from biresnerf.refine.stages.stability import StabilityDetector
 from biresnerf.refine.stages.timing import Estimate, PreviewTimer, StageName
@@ -84,8 +83,6 @@ class TwoStages:
             guarded=optimiser.method.robust_extensions,
         )
         self.estimate, self._previews = Estimate(), PreviewTimer(options.checkpoint_every_s)
-        self.block_error: float | None = None  # mean squared, at the last check
-        self.earlier: EarlierState | None = None  # before the cameras were adjusted, while that is on trial
         self._reported = self._saved = 0.0
         self._errors: list[float] = []
         self._losses: list[float] = []
@@ -124,13 +121,6 @@ class TwoStages:
         """Move all cameras to other poses [n, 4, 4]; that does not count as motion within the block."""
         self.optimiser.poses.place(torch.from_numpy(unit_from_cam))
         self._poses_at_check = self.optimiser.poses.poses()
-
-    def take_back(self) -> None:
-        """Undo the adjustment of all cameras, and what was learnt since."""
-        if self.earlier is None:
-            raise ValueError("nothing was adjusted that could be taken back")
-        self.earlier.put_back(self.optimiser)
-        self.earlier, self._poses_at_check = None, self.optimiser.poses.poses()
 
     def announce(self, message: str) -> None:
         """Report what is done between steps."""
@@ -173,7 +163,7 @@ class TwoStages:
     def _check(self, last: StepResult) -> None:
         """The end of a block of steps: the detector decides how to continue."""
         optimiser = self.optimiser
-        self.block_error = error = float(np.mean(self._errors))
+        error = float(np.mean(self._errors))
         self._errors = []
         now = optimiser.poses.poses()
         turned = rotation_between_deg(self._poses_at_check.numpy(), now.numpy())
@@ -256,10 +246,7 @@ class TwoStages:
 
     def _save(self, *, ends_stage_1: bool = False) -> None:
         state = self.optimiser.coarse_state() if ends_stage_1 else self.optimiser.state()
-        earlier = self.earlier.for_checkpoint() if self.earlier is not None else {}
-        tensors = {
-            **track_tensors(self.scene.tracks), **earlier, **state, "poses_at_check": self._poses_at_check
-        }  # fmt: skip
+        tensors = {**track_tensors(self.scene.tracks), **state, "poses_at_check": self._poses_at_check}
         checkpoint = Checkpoint(
             ends_stage_1=ends_stage_1,
             origin=self.origin,
@@ -269,8 +256,6 @@ class TwoStages:
             detector=self.detector.state(),
             repair=self.repair.state(),
             block_errors=tuple(self._errors),
-            block_error=self.block_error,
-            earlier_error=self.earlier.error if self.earlier is not None else None,
             tensors=tensors,
         )
         save_checkpoint(self.folder, checkpoint)
@@ -282,9 +267,6 @@ class TwoStages:
             tensors = {**optimiser.state(), **tensors}
         optimiser.load_state(tensors, checkpoint.optimiser)
         self._poses_at_check, self._errors = tensors["poses_at_check"], list(checkpoint.block_errors)
-        self.block_error = checkpoint.block_error
-        if checkpoint.earlier_error is not None:
-            self.earlier = EarlierState.kept(checkpoint.earlier_error, tensors)
         self.repair.load_state(checkpoint.repair)
         self.record = checkpoint.record
         if checkpoint.ends_stage_1:

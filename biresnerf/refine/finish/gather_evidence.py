@@ -1,0 +1,50 @@
+"""The evidence of a run that all cameras are adjusted to, and what of it is left out to judge by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from biresnerf.data.points.tracks import Tracks
+from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.refine.adjustment.evidence import Evidence
+from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
+from biresnerf.refine.finish.lens_evidence import lenses_before
+from biresnerf.refine.finish.photo_evidence import photo_patches
+from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.scene.scene import Scene
+
+MOST_OBSERVATIONS = 40_000  # of tracks that are adjusted to
+LEFT_OUT_ONE_IN = 5  # patches
+
+
+@dataclass(frozen=True, eq=False)
+class SplitEvidence:
+    """Evidence to adjust to, and evidence to judge by."""
+
+    fitted: Evidence
+    left_out: Evidence
+
+
+def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence | None:
+    """What there is of tracks and patches, for ideal cameras; None where cameras cannot be made ideal."""
+    dataset = optimiser.lenses.refined(scene.dataset)
+    intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
+    ideal = ideal_pinholes(intrinsics)
+    if ideal is None:
+        return None
+    before = lenses_before(scene.dataset, optimiser.options.refine_intrinsics)
+    lenses = before if before.free.any() else None
+    fitted: Tracks | None = None
+    judging: Tracks | None = None
+    if scene.tracks is not None:
+        fitted, judging = straight_tracks(scene.tracks, intrinsics, ideal).split()
+        fitted = fitted and fitted.thinned(MOST_OBSERVATIONS, len(dataset))
+    patches = photo_patches(scene, optimiser, intrinsics, ideal)
+    if patches is None:
+        return SplitEvidence(Evidence(ideal, fitted, None, lenses), Evidence(ideal, judging))
+    spared = np.arange(len(patches)) % LEFT_OUT_ONE_IN == 0
+    return SplitEvidence(
+        Evidence(ideal, fitted, patches.of(~spared), lenses), Evidence(ideal, judging, patches.of(spared))
+    )

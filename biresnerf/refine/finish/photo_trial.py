@@ -1,0 +1,38 @@
+"""What photos say of poses that cameras were adjusted to."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.refine.stages.two_stages import TwoStages
+from biresnerf.refine.views.compare_rigs import Rig, compare_placed
+
+logger = logging.getLogger(__name__)
+
+
+def photos_object(stages: TwoStages, unit_from_cam: NDArray[np.float64], cameras: Sequence[Camera]) -> bool:
+    """Whether fields trained at other poses [n, 4, 4] predict unseen views less well than at the present ones.
+
+    The feature matches of a symmetric thing may agree on poses that are wrong.
+
+    Args:
+        cameras: of the dataset, that the other poses see through.
+
+    Raises:
+        Interrupted: stopped.
+    """
+    scene, optimiser = stages.scene, stages.optimiser
+    refined = optimiser.lenses.refined(scene.dataset)
+    present = Rig(optimiser.poses.poses().numpy(), tuple(refined.camera_of(i) for i in range(len(refined))))
+    other = Rig(unit_from_cam, tuple(cameras[frame.camera] for frame in refined.frames))
+    found = compare_placed(present, other, scene, optimiser, ~scene.start.guessed, stages.monitor.should_stop)
+    if found is None:
+        return False
+    evidence = found.evidence
+    logger.info("unseen views: %.2f dB, adjusted %.2f dB", evidence.psnr.before, evidence.psnr.after)
+    return "worse" in (evidence.psnr.finding, evidence.ssim.finding)
