@@ -187,6 +187,8 @@ def test_tracks_that_agree_on_other_poses_than_the_photos_are_not_believed(tmp_p
     tracks = observed(folded, rng.uniform(-0.5, 0.5, (120, 3)), lenses(run.scene.dataset), rng, 0.02)
     run.scene = replace(run.scene, tracks=tracks)
     run.repair = LostCameraRepair(run.optimiser, None)
+    # So many as tell poses apart in photos of that size.
+    run.optimiser.options = run.optimiser.options.model_copy(update={"trial_steps": 60})
     before = errors_deg(run, truth)
     finish = run_stage_2(run)
     assert [each.name for each in finish.candidates if each.chosen] == ["refined"]
