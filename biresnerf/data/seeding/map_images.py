@@ -34,7 +34,9 @@ BY_NAME, BY_LIKENESS = 12, 10
 # Standard deviation of given positions, of the cameras' distance: holds what matches leave open (the drift of narrow
 # views, the mirror of flat scenes) and, under a robust loss, no more.
 POSITION_DEVIATION = 0.2
-WIDEST_IMAGE = 1600  # long side, px, at which features are looked for
+# Long side, px, at which features are looked for; where poses are given so large that all photos have so many pixels,
+# three minutes of one core.
+NARROWEST_IMAGE, WIDEST_IMAGE, PIXELS = 1000, 1600, 6e7
 # Of a photo, at most. Matching compares the features of each pair: as many are allowed as take a minute of one core.
 # COLMAP leaves out the finest first, which are the most exact: fountain-P11 (768 px), adjusted to the tracks of 2048,
 # ends at 0.056 deg, of 8192 at 0.029 (`benchmarks.method.features`).
@@ -100,8 +102,9 @@ def ask_colmap(
 ) -> dict[str, Any]:
     """What COLMAP finds, as plain data for `read_mapping`. Poses that the set has guide it.
 
-    Beside the log in ``log_folder`` the tracks are left, for `Tracks.load`. Mapping has one thread where all poses
-    are given: more would make the answer differ from run to run. Where little is asked, all has: each takes memory.
+    Beside the log in ``log_folder`` the tracks are left, for `Tracks.load`. One thread where all poses are
+    given: more would make the answer differ from run to run, even that of the features alone, as COLMAP numbers photos
+    in the order in which they are done. One where little is asked of it, too: each takes memory.
 
     Raises:
         InputError: ``seed_timeout``, or a code of `open_image`.
@@ -114,8 +117,7 @@ def ask_colmap(
             **lay_out(dataset, Path(work)),
             "answer": str(Path(work, "answer.json")),
             "seed": seed,
-            "threads": 1 if low else -1,
-            "mapping_threads": 1 if low or dataset.posed.all() else -1,
+            "threads": 1 if low or dataset.posed.all() else -1,
         }
         request |= thoroughness(dataset, effort, request["pairs"])
         watch = SeedingWatch(Path(work, DATABASE), on_progress)
@@ -182,12 +184,15 @@ def thoroughness(
 ) -> dict[str, Any]:
     """How large photos are and how many features are looked for where these pairs, None for all, are matched."""
     sizes = [dataset.camera_of(i) for i in range(len(dataset))]
-    low = effort == "low"
-    most = WIDEST_LOW if low else WIDEST_IMAGE
+    low, guided = effort == "low", dataset.posed.all()
+    side = (PIXELS * 4 / 3 / len(dataset)) ** 0.5  # of photos of 4 to 3
+    # Where nothing else says where photos were taken, more is spent.
+    most = (
+        WIDEST_LOW if low else int(np.clip(side, NARROWEST_IMAGE, WIDEST_IMAGE)) if guided else WIDEST_IMAGE
+    )
     widest = min(most, float(np.median([max(c.width, c.height) for c in sizes])))
     count = len(sizes) * (len(sizes) - 1) / 2 if pairs is None else len(pairs)
-    # Where nothing else says where photos were taken, more is spent.
-    fewest = FEWEST_FEATURES if dataset.posed.all() else FEWEST_ALONE
+    fewest = FEWEST_FEATURES if guided else FEWEST_ALONE
     features = int(np.clip((COMPARISONS / max(1.0, count)) ** 0.5, fewest, MOST_FEATURES))
     return {
         "widest_image": most,
