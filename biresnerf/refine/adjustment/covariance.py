@@ -59,6 +59,23 @@ def of_each(whole: Array) -> Array:
     return np.stack([whole[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(n)])
 
 
+def largest_group(information: Array, count: int) -> NDArray[np.bool_]:
+    """Which cameras [n] evidence ties together, directly or through others; of several groups the largest.
+
+    Args:
+        information: [6n or more, 6n or more], with the cameras first.
+        count: n.
+    """
+    own = information[: POSE * count, : POSE * count].reshape(count, POSE, count, POSE)
+    tied = (own != 0).any(axis=(1, 3)) | np.eye(count, dtype=np.bool_)
+    group = np.arange(count)
+    while True:
+        joined = np.where(tied, group, count).min(1)
+        if (joined == group).all():
+            return np.asarray(group == np.bincount(group).argmax())
+        group = joined
+
+
 def _common_motions(cameras: Cameras, spread: float, aligned: NDArray[np.bool_]) -> Array:
     """Orthonormal basis [6n, 7 or fewer] of what turns, moves or scales the aligned cameras; positions in spreads."""
     n = len(cameras)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from biresnerf.geometry.similarity import Similarity, align_by_spread
 from biresnerf.refine.adjustment.adjustment import patch_term, track_term
 from biresnerf.refine.adjustment.cameras import Cameras
-from biresnerf.refine.adjustment.covariance import covariance, of_each, without_lenses
+from biresnerf.refine.adjustment.covariance import covariance, largest_group, of_each, without_lenses
 from biresnerf.refine.adjustment.evidence import Evidence
 from biresnerf.refine.adjustment.solve import ROUNDS, SETTLED
 
@@ -89,12 +89,14 @@ def expected_errors(
         patches.settle(cameras)
         by_patches[patches.patches.target] = by_patches[patches.patches.host] = True
         information += patches.linearise(cameras, 0.0).system / PATCH_MODEL_ERROR**2
+    # Photos of another scene match each other, but say nothing of where the others stand.
+    together = largest_group(information, n)
     if lenses is not None:
         before = np.where(lenses.free, 1 / np.where(lenses.free, lenses.deviation, 1.0) ** 2, 0.0).reshape(-1)
         information[6 * n :, 6 * n :] += np.diag(before)
         information = without_lenses(information, cameras, lenses.free.reshape(-1))
-    found = of_each(covariance(cameras, information, by_tracks | by_patches))
-    known = _rotation(found) < MOST_ROTATION
+    found = of_each(covariance(cameras, information, (by_tracks | by_patches) & together))
+    known = together & (_rotation(found) < MOST_ROTATION)
     if not known.all():  # what is not known must not turn the others' frame
         found = of_each(covariance(cameras, information, known))
     away = np.full((n, 6), np.nan)

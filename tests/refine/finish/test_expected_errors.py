@@ -82,6 +82,31 @@ def test_a_camera_without_evidence_is_not_known_and_leaves_the_others_known(rng)
         np.testing.assert_allclose(alone[others], of_all[others], rtol=0.5)
 
 
+def test_photos_of_another_scene_are_not_known_and_leave_the_others_known(rng):
+    truth = ring(CAMERAS + 3, rng)
+    here, there = np.arange(CAMERAS), np.arange(CAMERAS, CAMERAS + 3)
+
+    def seen_by(cameras, count):
+        tracks = observed(
+            truth[cameras], rng.uniform(-0.8, 0.8, (count, 3)), pinholes(len(cameras)), rng, 0.2
+        )
+        return replace(tracks, image=cameras[tracks.image])
+
+    own, foreign = seen_by(here, 120), seen_by(there, 60)
+    both = Tracks(
+        np.concatenate([own.point, foreign.point + own.points]),
+        np.concatenate([own.image, foreign.image]),
+        np.concatenate([own.xy, foreign.xy]),
+    )
+    intrinsics = pinholes(len(truth))
+    found = expected_errors(truth, truth, Evidence(intrinsics, both))
+    assert found.known.tolist() == [True] * CAMERAS + [False] * 3
+    assert found.by_tracks.all()
+    alone = expected_errors(truth[:CAMERAS], truth[:CAMERAS], Evidence(pinholes(CAMERAS), own))
+    for one, other in zip(found.bounds_90(), alone.bounds_90(), strict=True):
+        np.testing.assert_allclose(one[:CAMERAS], other, rtol=0.1)
+
+
 def test_nothing_is_known_of_wrong_matches(rng):
     truth = ring(CAMERAS, rng)
     tracks = observed(truth, rng.uniform(-0.8, 0.8, (120, 3)), pinholes(CAMERAS), rng)
