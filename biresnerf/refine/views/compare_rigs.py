@@ -102,13 +102,19 @@ def compare_placed(
     placed: NDArray[np.bool_],
     should_stop: Callable[[], bool],
     report: Callable[[float], None] = lambda _share: None,
+    times: int = 1,
 ) -> HeldOutComparison | None:
-    """`compare_on_unseen_views` of the images placed [n] alone: others would spoil the fields of both rigs."""
+    """`compare_on_unseen_views` of the images placed [n] alone: others would spoil the fields of both rigs.
+
+    Fields are trained ``times`` as long as the options say.
+    """
+    options = optimiser.options
+    options = options.model_copy(update={"trial_steps": times * options.trial_steps})
     rows = np.flatnonzero(placed)
     images = scene.images if placed.all() else scene.images.of(rows)
     held_out = np.flatnonzero(np.isin(rows, scene.held_out)).tolist()
     found = compare_on_unseen_views(
-        before.of(rows), after.of(rows), images, held_out, optimiser.options, optimiser.device,
+        before.of(rows), after.of(rows), images, held_out, options, optimiser.device,
         optimiser.threads, should_stop, report,
     )  # fmt: skip
     return found and replace(found, views=rows[found.views].tolist())
