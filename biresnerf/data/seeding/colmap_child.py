@@ -104,6 +104,7 @@ def extract_features(request: dict[str, Any], database: Path, images: Path, extr
     """Features of all images; returns the database's number of each camera asked for."""
     import pycolmap
 
+    pycolmap.Database.open(database).close()
     for camera in request["cameras"]:
         if not camera["names"]:
             continue
@@ -113,6 +114,14 @@ def extract_features(request: dict[str, Any], database: Path, images: Path, extr
             reader.mask_path = request["masks"]
         if camera["params"] is not None:
             reader.camera_params = ",".join(repr(float(value)) for value in camera["params"])
+        # Numbers photos in their order; else those come first that a thread is done with first.
+        pycolmap.import_images(
+            database,
+            images,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            image_names=camera["names"],
+            options=reader,
+        )
         pycolmap.extract_features(
             database, images, image_names=camera["names"], camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader, extraction_options=extraction,
@@ -132,7 +141,7 @@ def map_incrementally(
 
     known = [number for number, c in zip(numbers, request["cameras"], strict=True) if c["known"]]
     options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed, options.num_threads = request["seed"], request["threads"]
+    options.random_seed, options.num_threads = request["seed"], request["matching_threads"]
     options.min_model_size, options.min_num_matches = 3, 10
     options.ba_refine_focal_length = options.ba_refine_extra_params = len(known) < len(numbers)
     options.constant_cameras = set(known)
@@ -154,8 +163,8 @@ def map_globally(
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
-    options.random_seed, options.num_threads = request["seed"], request["threads"]
-    options.mapper.random_seed, options.mapper.num_threads = request["seed"], request["threads"]
+    options.random_seed, options.num_threads = request["seed"], request["matching_threads"]
+    options.mapper.random_seed, options.mapper.num_threads = request["seed"], request["matching_threads"]
     fixed = all(camera["known"] for camera in request["cameras"])
     adjustment = options.mapper.bundle_adjustment
     adjustment.refine_focal_length = adjustment.refine_extra_params = not fixed

@@ -52,7 +52,17 @@ def test_a_second_try_reaches_colmap(photos: Path, asked: list[dict[str, Any]], 
     assert (before["thorough"], after["thorough"]) == (True, False)
     assert after["widest_image"] <= before["widest_image"] / 2
     assert after["most_features"] <= before["most_features"] / 4
-    same = {"threads", "thorough", "widest_image", "most_features", "error_scale", "root", "work", "answer"}
+    same = {
+        "threads",
+        "matching_threads",
+        "thorough",
+        "widest_image",
+        "most_features",
+        "error_scale",
+        "root",
+        "work",
+        "answer",
+    }
     assert {k: v for k, v in before.items() if k not in same} == {
         k: v for k, v in after.items() if k not in same
     }
