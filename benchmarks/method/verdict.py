@@ -63,7 +63,7 @@ def main() -> None:
             preset="fast", device="cpu", seed=seed, max_image_size=asked.size, trial_steps=asked.steps
         ).resolved("cpu")
         found = compare_on_unseen_views(
-            before, after, images, held_out_views(len(dataset), "auto"), options, torch.device("cpu"),
+            (before, after), images, held_out_views(len(dataset), "auto"), options, torch.device("cpu"),
             use_threads(0), lambda: False,
         )  # fmt: skip
         if found is None:

@@ -37,8 +37,9 @@ def photos_object(stages: TwoStages, unit_from_cam: NDArray[np.float64], cameras
     stages.announce("checking the adjusted cameras by the photos")
     with stages.record.timed("adjusting"):
         found = compare_placed(
-            present, other, scene, optimiser, ~scene.start.guessed, stages.monitor.should_stop, times=TIMES
-        )
+            present, other, scene, optimiser, ~scene.start.guessed, stages.monitor.should_stop,
+            times=TIMES, rounds_most=1,
+        )  # fmt: skip
     if found is None:
         return False
     psnr = found.evidence.psnr

@@ -15,7 +15,7 @@ from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.adjustment.paired import paired
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
-from biresnerf.refine.views.held_out_views import unseen_rounds
+from biresnerf.refine.views.held_out_views import ROUNDS_MOST, unseen_rounds
 from biresnerf.refine.views.pose_trials import PoseTrials, TrialScores, joined
 from biresnerf.report import HeldOutEvidence
 
@@ -55,8 +55,7 @@ class HeldOutComparison:
 
 
 def compare_on_unseen_views(
-    before: Rig,
-    after: Rig,
+    pair: tuple[Rig, Rig],
     images: ImageSet,
     held_out: Sequence[int],
     options: ResolvedOptions,
@@ -64,23 +63,27 @@ def compare_on_unseen_views(
     threads: int,
     should_stop: Callable[[], bool],
     report: Callable[[float], None] = lambda _share: None,
+    rounds_most: int = ROUNDS_MOST,
 ) -> HeldOutComparison | None:
     """Train a field on either rig, held still, and score both on the same unseen views; None of too few images.
 
-    Small sets are trained several times, with other views left out. ``report`` is called with the share of work done.
+    Args:
+        held_out: views that the refinement never trained on; others join them where these are few.
+        report: called with the share of work done.
+        rounds_most: small sets are trained so often, with other views left out.
 
     Raises:
         Interrupted: ``should_stop`` returned true.
     """
     steps = options.trial_steps
-    rounds = unseen_rounds(len(images), held_out, most=16)
+    rounds = unseen_rounds(len(images), held_out, most=16)[:rounds_most]
     if steps == 0 or not rounds[0]:
         return None
-    rigs = [before.world_from_cam, after.world_from_cam]
+    rigs = [rig.world_from_cam for rig in pair]
     scores: tuple[list[TrialScores], list[TrialScores]] = ([], [])
     for views in rounds:
         trials = PoseTrials(images, views, rigs, options, steps, device, threads, should_stop)
-        for side, rig in zip(scores, (before, after), strict=True):
+        for side, rig in zip(scores, pair, strict=True):
             side.append(trials.score(rig.world_from_cam, rig.lenses(images)))
             report(sum(map(len, scores)) / (2 * len(rounds)))
     old, new = (joined(side) for side in scores)
@@ -103,10 +106,11 @@ def compare_placed(
     should_stop: Callable[[], bool],
     report: Callable[[float], None] = lambda _share: None,
     times: int = 1,
+    rounds_most: int = ROUNDS_MOST,
 ) -> HeldOutComparison | None:
     """`compare_on_unseen_views` of the images placed [n] alone: others would spoil the fields of both rigs.
 
-    Fields are trained ``times`` as long as the options say.
+    Fields are trained ``times`` as long as the options say, in ``rounds_most`` rounds at most.
     """
     options = optimiser.options
     options = options.model_copy(update={"trial_steps": times * options.trial_steps})
@@ -114,7 +118,7 @@ def compare_placed(
     images = scene.images if placed.all() else scene.images.of(rows)
     held_out = np.flatnonzero(np.isin(rows, scene.held_out)).tolist()
     found = compare_on_unseen_views(
-        before.of(rows), after.of(rows), images, held_out, options, optimiser.device,
-        optimiser.threads, should_stop, report,
+        (before.of(rows), after.of(rows)), images, held_out, options, optimiser.device, optimiser.threads,
+        should_stop, report, rounds_most,
     )  # fmt: skip
     return found and replace(found, views=rows[found.views].tolist())
