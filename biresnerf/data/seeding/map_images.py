@@ -48,7 +48,7 @@ ERROR_SIZE = 1600  # px, long side at which COLMAP's own bounds hold; they shrin
 # Where memory is short.
 WIDEST_LOW, MOST_FEATURES_LOW = 800, 1024
 # Small photos have few features. Affine shapes and pooled scales then place more cameras, and cost three times as much;
-# from 400 px on they gain nothing. In px, of the long side and of all photos.
+# from 400 px on they rarely gain anything. In px, of the long side and of all photos.
 THOROUGH_BELOW, THOROUGH_UP_TO = 400, 10e6
 
 
