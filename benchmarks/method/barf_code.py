@@ -50,10 +50,10 @@ def published_code(checkout: Path) -> tuple[ModuleType, ModuleType]:
     return importlib.import_module("model.barf"), importlib.import_module("camera")
 
 
-def published_options(device: str = "cpu") -> Any:
+def published_options() -> Any:
     """Its options of the Blender scenes (options/nerf_blender.yaml, barf_blender.yaml), of the network and renderer."""
     return SimpleNamespace(
-        device=device,
+        device="cpu",
         arch=SimpleNamespace(
             layers_feat=[None, *[BARF_HIDDEN] * LAYERS], layers_rgb=[None, BARF_HIDDEN // 2, 3], skip=[SKIP],
             posenc=SimpleNamespace(L_3D=POSITION_BANDS, L_view=VIEW_BANDS), density_activ="softplus", tf_init=True,
@@ -116,8 +116,8 @@ def theirs(
     matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 2, 2] = lens.fx, lens.fy, 1.0
     matrix[:, 0, 2], matrix[:, 1, 2] = lens.cx, lens.cy
     centre, ray = camera.get_center_and_ray(options, poses, intr=matrix)
-    pixel = (xy[:, 1].long() * SIZE + xy[:, 0].long())[None]
-    centre, ray = (each[image, pixel[0]][None] for each in (centre, ray))
+    pixel = xy[:, 1].long() * SIZE + xy[:, 0].long()
+    centre, ray = (each[image, pixel][None] for each in (centre, ray))
     marching = optimiser.marching(optimiser.schedule.fine_interval)
     middles = (torch.arange(BARF_SAMPLES) + 0.5) / BARF_SAMPLES
     along = (marching.near + middles * (marching.far - marching.near)) / field.length

@@ -27,7 +27,7 @@ PSNR_MATTERS, SSIM_MATTERS = 0.5, 0.01  # dB, and 1
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Poses [n, 4, 4] in the input's frame and the lens of each image at full size."""
+    """Poses [n, 4, 4], in one frame where they are compared, and the lens of each image at full size."""
 
     world_from_cam: Array
     cameras: tuple[Camera, ...]

@@ -1,0 +1,54 @@
+"""How many features are looked for, and that their photos are numbered in order however many threads look."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.seeding.colmap_child import extract_features
+from biresnerf.data.seeding.map_images import COMPARISONS, MOST_FEATURES, thoroughness
+from tests.data.scenes import nerfstudio_scene, save
+
+
+@pytest.fixture(name="dataset")
+def posed_set(tmp_path):
+    return read_dataset(save(tmp_path, nerfstudio_scene(tmp_path)))
+
+
+def test_matching_takes_the_same_however_many_pairs_there_are(dataset):
+    few, many = ([("a", "b")] * pairs for pairs in (10, 2000))
+    assert thoroughness(dataset, "full", few)["most_features"] == MOST_FEATURES
+    assert thoroughness(dataset, "full", many)["most_features"] ** 2 * 2000 == pytest.approx(
+        COMPARISONS, rel=0.01
+    )
+
+
+def test_large_photos_get_plain_features_and_small_ones_thorough_ones(dataset):
+    camera = dataset.cameras[0]
+    for width, thorough in ((200, True), (399, True), (400, False), (2000, False)):
+        sized = replace(dataset, cameras=(camera.resized(width, width // 2),))
+        assert thoroughness(sized, "full", None)["thorough"] is thorough
+        assert not thoroughness(sized, "low", None)["thorough"]
+
+
+def test_photos_are_numbered_in_their_order_however_long_each_takes(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    rng = np.random.default_rng(0)
+    names = [f"{i}.png" for i in range(4)]
+    noise = Image.fromarray(rng.integers(0, 255, (100, 100, 3), dtype=np.uint8))
+    noise.resize((600, 600), Image.Resampling.BICUBIC).save(tmp_path / names[0])  # full of features
+    for name in names[1:]:
+        Image.new("RGB", (600, 600)).save(tmp_path / name)
+    camera = {"names": names, "model": "SIMPLE_PINHOLE", "params": None}
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = 2
+    database = Path(tmp_path, "database.db")
+    extract_features({"cameras": [camera], "masks": None}, database, tmp_path, options)
+    opened = pycolmap.Database.open(database)
+    assert [image.name for image in sorted(opened.read_all_images(), key=lambda i: i.image_id)] == names
+    opened.close()
