@@ -20,21 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.method.seeding import shrunk
+from benchmarks.method.track_evidence import fitted_tracks
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.points.tracks import KEPT, Tracks
 from biresnerf.data.seeding import map_images
 from biresnerf.data.seeding.seed_poses import Seeding, seed_poses
-from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.adjustment.adjustment import adjust_poses
-from biresnerf.refine.adjustment.evidence import Evidence, PosePrior
-from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
+from biresnerf.refine.adjustment.evidence import PosePrior
 from biresnerf.refine.finish.adjust_cameras import PRIOR
-from biresnerf.refine.finish.gather_evidence import MOST_OBSERVATIONS
 from biresnerf.studies.scenes import with_poses
 
 Array = NDArray[np.float64]
@@ -59,15 +57,9 @@ def seeded(given: Dataset, features: dict[str, object], seed: int) -> tuple[Seed
 
 def adjusted(truth: Dataset, tracks: Tracks) -> Array:
     """Poses [n, 4, 4] that fit the tracks, found from the truth."""
-    intrinsics = Intrinsics.from_cameras([truth.camera_of(i) for i in range(len(truth))])
-    ideal = ideal_pinholes(intrinsics)
-    assert ideal is not None
-    fitted = straight_tracks(tracks, intrinsics, ideal).split()[0]
-    assert fitted is not None
-    evidence = Evidence(ideal, fitted.thinned(MOST_OBSERVATIONS, len(truth)))
     poses = truth.world_from_cam
     prior = PosePrior.equal(poses, PRIOR, PRIOR * focus_point(poses).mean_distance)
-    return adjust_poses(poses, evidence, prior).world_from_cam
+    return adjust_poses(poses, fitted_tracks(truth, tracks), prior).world_from_cam
 
 
 def measured(truth: Dataset, features: dict[str, object], noise: float, seed: int) -> dict[str, object]:

@@ -20,18 +20,17 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.method.honesty import without_poses
+from benchmarks.method.track_evidence import fitted_tracks
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.points.tracks import KEPT, Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
-from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.adjustment.adjustment import adjust_poses
-from biresnerf.refine.adjustment.evidence import Evidence, PosePrior
-from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
+from biresnerf.refine.adjustment.evidence import PosePrior
 from biresnerf.refine.finish import given_poses as room
 from biresnerf.refine.finish.adjust_cameras import PRIOR
 from biresnerf.refine.finish.gather_evidence import MOST_OBSERVATIONS
@@ -58,13 +57,9 @@ def measured(truth: Dataset, seed: int) -> Iterator[dict[str, object]]:
     with tempfile.TemporaryDirectory() as folder:
         seeding = seed_poses(without_poses(truth), seed=seed, remember=Path(folder) / "seeding.json")
         tracks = Tracks.load(Path(folder) / KEPT, truth.names)
-    intrinsics = Intrinsics.from_cameras([truth.camera_of(i) for i in range(len(truth))])
-    ideal = ideal_pinholes(intrinsics)
     matched = next((c for c in seeding.candidates if c.matched.any()), None)
-    if tracks is None or ideal is None or matched is None:
+    if matched is None:
         raise SystemExit("no feature matches of perspective cameras")
-    fitted = straight_tracks(tracks, intrinsics, ideal).split()[0]
-    assert fitted is not None
     poses = truth.world_from_cam
     distance, known = focus_point(poses).mean_distance, np.ones(len(truth), np.bool_)
     start = disturbed(poses, DISTURBED, distance, seed)
@@ -78,7 +73,7 @@ def measured(truth: Dataset, seed: int) -> Iterator[dict[str, object]]:
     inputs = {f"{np.degrees(e):.2f} deg": disturbed(poses, e, distance, seed + 1) for e in ERRORS}
     inputs["COLMAP"] = matched.world_from_cam
     for amount, most in (("all", MOST_OBSERVATIONS), ("few", FEW * len(truth))):
-        evidence = Evidence(ideal, fitted.thinned(most, len(truth)))
+        evidence = fitted_tracks(truth, tracks, most)
         alone = adjust_poses(start, evidence, loose).world_from_cam
         for name, given in inputs.items():
             found = room.given_poses(given, alone, matched.matched if name == "COLMAP" else known)

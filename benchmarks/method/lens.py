@@ -17,20 +17,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.method.track_evidence import fitted_tracks
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.points.tracks import KEPT, Tracks
 from biresnerf.data.seeding.map_images import ask_colmap
-from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.adjustment.adjustment import adjust_poses
-from biresnerf.refine.adjustment.evidence import Evidence, PosePrior
-from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
+from biresnerf.refine.adjustment.evidence import PosePrior
 from biresnerf.refine.adjustment.lens.corrected_camera import corrected_camera
 from biresnerf.refine.finish.adjust_cameras import PRIOR
-from biresnerf.refine.finish.gather_evidence import MOST_OBSERVATIONS
 from biresnerf.refine.finish.lens_evidence import lenses_before
 
 DISTURBED = 0.01  # rad, and shares of the cameras' distance
@@ -52,13 +50,7 @@ def main() -> None:
         raise SystemExit("no feature matches")
     wrong = tuple(corrected_camera(c, np.array([np.log(asked.focal), 0.0, 0.0])) for c in given.cameras)
     given = replace(given, cameras=wrong)
-    intrinsics = Intrinsics.from_cameras([given.camera_of(i) for i in range(len(given))])
-    ideal = ideal_pinholes(intrinsics)
-    if ideal is None:
-        raise SystemExit("a fisheye is no pinhole")
-    fitted, _ = straight_tracks(tracks, intrinsics, ideal).split()
-    assert fitted is not None
-    evidence = Evidence(ideal, fitted.thinned(MOST_OBSERVATIONS, len(given)))
+    evidence = fitted_tracks(given, tracks)
     truth, distance = given.world_from_cam, focus_point(given.world_from_cam).mean_distance
     rng = np.random.default_rng(asked.seed)
     start = truth.copy()

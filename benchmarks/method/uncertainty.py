@@ -15,21 +15,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.method.track_evidence import fitted_tracks
 from biresnerf.commands.poses.evaluate import matched_names
 from biresnerf.data.formats.read_dataset import read_dataset, read_poses
 from biresnerf.data.formats.simple.poses_json import POSES, matrix_of, read_poses_json
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
-from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.adjustment.adjustment import adjust_poses
-from biresnerf.refine.adjustment.evidence import Evidence, PosePrior
-from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
+from biresnerf.refine.adjustment.evidence import PosePrior
 from biresnerf.refine.finish.adjust_cameras import PRIOR
 from biresnerf.refine.finish.expected_errors import expected_errors
-from biresnerf.refine.finish.gather_evidence import MOST_OBSERVATIONS
 
 Array = NDArray[np.float64]
 
@@ -40,13 +38,7 @@ def of_set(folder: Path) -> tuple[Array, Array]:
     with tempfile.TemporaryDirectory() as work:
         seed_poses(truth, seed=1, remember=Path(work) / "seeding.json")
         tracks = Tracks.load(Path(work) / "tracks.npz", truth.names)
-    intrinsics = Intrinsics.from_cameras([truth.camera_of(i) for i in range(len(truth))])
-    ideal = ideal_pinholes(intrinsics)
-    if tracks is None or ideal is None:
-        raise SystemExit(f"{folder}: no feature matches of perspective cameras")
-    fitted = straight_tracks(tracks, intrinsics, ideal).split()[0]
-    assert fitted is not None
-    evidence = Evidence(ideal, fitted.thinned(MOST_OBSERVATIONS, len(truth)))
+    evidence = fitted_tracks(truth, tracks)
     distance = focus_point(truth.world_from_cam).mean_distance
     prior = PosePrior.equal(truth.world_from_cam, PRIOR, PRIOR * distance)
     poses = adjust_poses(truth.world_from_cam, evidence, prior).world_from_cam
