@@ -15,6 +15,7 @@ from biresnerf.field.backends import directions_for, make_occupancy
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
 from biresnerf.geometry.camera.camera import Intrinsics, directions_with_gradient
 from biresnerf.geometry.perturb import RIG_DISTANCE
+from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.optimise.async_metrics import AsyncMetrics, StepResult
 from biresnerf.refine.optimise.camera_errors import CameraErrors
@@ -25,7 +26,6 @@ from biresnerf.refine.optimise.pose_hypotheses import photo_distances
 from biresnerf.refine.parameters.exposure import Exposure
 from biresnerf.refine.parameters.intrinsics_parameters import IntrinsicsParameters
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
-from biresnerf.refine.parameters.rigid_bodies import RigidBodies
 from biresnerf.refine.scene.scene_frame import SceneFrame
 
 MOST_SAMPLES = 768  # per ray

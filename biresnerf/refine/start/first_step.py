@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.optimise.methods import Method, find_method
 from biresnerf.refine.parameters.intrinsics_parameters import lenses_of
-from biresnerf.refine.parameters.rigid_bodies import RigidBodies, rigid_bodies
+from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.scene.scene_depth import matched_depth
 from biresnerf.refine.scene.scene_frame import scene_frame

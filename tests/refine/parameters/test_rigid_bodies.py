@@ -16,10 +16,11 @@ from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.errors import InputError
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.rigid import rigid_inverse
+from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
-from biresnerf.refine.parameters.rigid_bodies import RigidBodies, rigid_bodies
+from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
 from tests.data.formats.random_sets import random_model, random_poses
 from tests.data.scenes import assert_complete
 from tests.refine.tiny_scene import CPU
