@@ -41,9 +41,14 @@ class RigidBodies:
         return [group for group in groups if len(group) > 1]
 
     @property
+    def alone(self) -> NDArray[np.bool_]:
+        """Cameras [n] that may move whatever the others do."""
+        return np.asarray(~self.fixed & (np.bincount(self.of)[self.of] == 1))
+
+    @property
     def tied(self) -> bool:
         """Whether any camera cannot move independently."""
-        return bool(self.fixed.any() or self.shared)
+        return not self.alone.all()
 
     def held(self, world_from_cam: NDArray[np.float64], given: NDArray[np.float64]) -> NDArray[np.float64]:
         """Poses [n, 4, 4] with every body's relative poses, and all fixed poses, as in ``given``.

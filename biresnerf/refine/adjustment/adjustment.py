@@ -163,7 +163,7 @@ def _halves(cameras: Cameras, evidence: Evidence, prior: Prior) -> Halves:
         inliers.append(float(term.inliers(end).mean()))
         information, _ = normal_equations(end, [term.linearise(end, 0.0)], prior)
         among = without_lenses(information, end, prior.free[POSE * len(end) :])
-        turned = of_each(covariance(end, among))[:, :3, :3]
+        turned = of_each(covariance(end, among, bodies=prior.bodies))[:, :3, :3]
         expected += float(np.trace(turned, axis1=1, axis2=2).mean())
     middle = ends[1].moved(ends[0].apart(ends[1]) / 2)
     apart = _rotations_deg(ends[0], ends[1])

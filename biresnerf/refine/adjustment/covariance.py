@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.geometry.rigid_bodies import RigidBodies
+from biresnerf.refine.adjustment.body_motions import allowed_motions, body_columns
 from biresnerf.refine.adjustment.cameras import POSE, Cameras
 
 Array = NDArray[np.float64]
@@ -16,7 +18,12 @@ NOTHING_KNOWN = 1.0
 ROTATIONS_WEIGHT = 1e-3
 
 
-def covariance(cameras: Cameras, information: Array, aligned: NDArray[np.bool_] | None = None) -> Array:
+def covariance(
+    cameras: Cameras,
+    information: Array,
+    aligned: NDArray[np.bool_] | None = None,
+    bodies: RigidBodies | None = None,
+) -> Array:
     """Covariance [6n, 6n] of the cameras' rotation vectors (rad) and positions, along the world's axes.
 
     Turning, moving and scaling the whole rig changes no evidence. Errors are measured after the similarity that aligns
@@ -26,18 +33,32 @@ def covariance(cameras: Cameras, information: Array, aligned: NDArray[np.bool_] 
     Args:
         information: N [6n, 6n], the cameras' normal equations without damping.
         aligned: the cameras [n] whose centres count in the alignment; all where None.
+        bodies: cameras that are fixed or move as one. The alignment is by what they leave of turning, moving and
+            scaling: nothing where two cameras are fixed, no scale where a body has several centres.
     """
-    size = 6 * len(cameras)
     spread = float(np.sqrt(((cameras.centre - cameras.centre.mean(0)) ** 2).sum(1).mean())) or 1.0
-    unit = np.tile(
-        np.r_[np.ones(3), np.full(3, spread)], len(cameras)
-    )  # positions count in spreads of the rig
-    scaled = information * unit[:, None] * unit[None, :] + np.eye(size) / NOTHING_KNOWN**2
-    common = _common_motions(cameras, spread, np.ones(len(cameras), np.bool_) if aligned is None else aligned)
-    held = common * float(np.diagonal(scaled).mean())  # as large as the rest: only their directions count
-    bordered = np.block([[scaled, held], [held.T, np.zeros((held.shape[1],) * 2)]])
-    found = np.linalg.inv(bordered)[:size, :size]
+    # Positions count in spreads of the rig.
+    unit = np.tile(np.r_[np.ones(3), np.full(3, spread)], len(cameras))
+    scaled = information * unit[:, None] * unit[None, :]
+    counted = np.ones(len(cameras), np.bool_) if aligned is None else aligned
+    in_spreads = Cameras(cameras.rotation, cameras.centre / spread)
+    common = _common_motions(in_spreads, counted)
+    if bodies is None or not bodies.tied:
+        found = _inverse(scaled, _seen_aligning(common, counted))
+    else:
+        moves = body_columns(in_spreads, bodies)
+        seen = _seen_aligning(common @ allowed_motions(moves, common), counted)
+        found = moves @ _inverse(moves.T @ scaled @ moves, moves.T @ seen) @ moves.T
     return np.asarray((found + found.T) / 2 * unit[:, None] * unit[None, :])
+
+
+def _inverse(information: Array, common: Array) -> Array:
+    """Of [k, k], where errors have no part along common motions [k, m]."""
+    size = len(information)
+    known = information + np.eye(size) / NOTHING_KNOWN**2
+    held = common * float(np.diagonal(known).mean())  # as large as the rest: only their directions count
+    bordered = np.block([[known, held], [held.T, np.zeros((held.shape[1],) * 2)]])
+    return np.asarray(np.linalg.inv(bordered)[:size, :size])
 
 
 def without_lenses(information: Array, cameras: Cameras, free: NDArray[np.bool_]) -> Array:
@@ -76,19 +97,22 @@ def largest_group(information: Array, count: int) -> NDArray[np.bool_]:
         group = joined
 
 
-def _common_motions(cameras: Cameras, spread: float, aligned: NDArray[np.bool_]) -> Array:
-    """Orthonormal basis [6n, 7 or fewer] of what turns, moves or scales the aligned cameras; positions in spreads."""
+def _common_motions(cameras: Cameras, counted: NDArray[np.bool_]) -> Array:
+    """What turns, moves and scales all cameras [6n, 7], about the middle of some."""
     n = len(cameras)
-    if not aligned.any():
-        return np.zeros((6 * n, 0))
-    away = (cameras.centre - cameras.centre[aligned].mean(0)) / spread
+    away = cameras.centre - (cameras.centre[counted].mean(0) if counted.any() else 0.0)
     motions = np.zeros((n, 6, 7))
     for axis in range(3):
         unit = np.eye(3)[axis]
-        motions[:, :3, axis] = ROTATIONS_WEIGHT * unit
+        motions[:, :3, axis] = unit
         motions[:, 3:, axis] = np.cross(unit, away)
         motions[:, 3 + axis, 3 + axis] = 1.0
     motions[:, 3:, 6] = away
-    motions[~aligned] = 0.0
-    basis, sizes, _ = np.linalg.svd(motions.reshape(6 * n, 7), full_matrices=False)
-    return np.asarray(basis[:, sizes > 1e-9 * sizes[0]])
+    return motions.reshape(6 * n, 7)
+
+
+def _seen_aligning(motions: Array, counted: NDArray[np.bool_]) -> Array:
+    """Orthonormal basis [6n, m or fewer] of common motions [6n, m] as an alignment of some cameras weighs them."""
+    weight = counted[:, None] * np.r_[np.full(3, ROTATIONS_WEIGHT), np.ones(3)]
+    basis, sizes, _ = np.linalg.svd(motions * weight.reshape(-1, 1), full_matrices=False)
+    return np.asarray(basis[:, sizes > 1e-9 * sizes.max(initial=0.0)])

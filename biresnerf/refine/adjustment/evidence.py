@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refine.adjustment.lens.lenses import Lenses
 from biresnerf.refine.adjustment.splines import blurred, spline_coefficients
 
@@ -117,22 +118,27 @@ class PosePrior:
         world_from_cam: [n, 4, 4].
         rotation: rad [n], of each component of the rotation vector. Infinite: not known. Zero: the camera is fixed.
         position: [n], of each coordinate, in the poses' unit.
+        bodies: cameras that move as one, and cameras that are fixed as well; None where each moves independently.
     """
 
     world_from_cam: Array
     rotation: Array
     position: Array
+    bodies: RigidBodies | None = None
 
     @classmethod
-    def equal(cls, world_from_cam: Array, rotation: float, position: float) -> PosePrior:
+    def equal(
+        cls, world_from_cam: Array, rotation: float, position: float, bodies: RigidBodies | None = None
+    ) -> PosePrior:
         """All cameras known equally well."""
         n = len(world_from_cam)
-        return cls(world_from_cam, np.full(n, rotation), np.full(n, position))
+        return cls(world_from_cam, np.full(n, rotation), np.full(n, position), bodies)
 
     @property
     def fixed(self) -> NDArray[np.bool_]:
         """Cameras [n] that are known exactly."""
-        return (self.rotation <= 0) | (self.position <= 0)
+        exact = (self.rotation <= 0) | (self.position <= 0)
+        return exact if self.bodies is None else exact | self.bodies.fixed
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.geometry.rigid_bodies import RigidBodies
+from biresnerf.refine.adjustment.body_motions import body_columns, rigid_motion
 from biresnerf.refine.adjustment.cameras import POSE, Cameras
 from biresnerf.refine.adjustment.evidence import PosePrior
 from biresnerf.refine.adjustment.lens.lenses import Lenses
@@ -30,11 +32,13 @@ class Prior:
         mean: the cameras before.
         weight: inverse variances [u]; zero where nothing is known.
         free: which of the u = 6n + 3g unknowns may move.
+        bodies: of the cameras, where some are fixed or move as one.
     """
 
     mean: Cameras
     weight: Array
     free: NDArray[np.bool_]
+    bodies: RigidBodies | None = None
 
     @classmethod
     def of(cls, prior: PosePrior, lenses: Lenses | None = None) -> Prior:
@@ -45,7 +49,7 @@ class Prior:
             free = np.concatenate([free, lenses.free.reshape(-1)])
         usable = np.isfinite(deviation) & (deviation > 0)
         weight = np.where(usable, 1 / np.where(usable, deviation, 1.0) ** 2, 0.0)
-        return cls(Cameras.of(prior.world_from_cam, lenses), weight, free)
+        return cls(Cameras.of(prior.world_from_cam, lenses), weight, free, prior.bodies)
 
     def cost(self, cameras: Cameras) -> float:
         return float((self.weight * cameras.apart(self.mean) ** 2).sum())
@@ -53,6 +57,23 @@ class Prior:
     def right(self, cameras: Cameras) -> Array:
         """Half the gradient [u], to first order in the rotations' distance."""
         return np.asarray(self.weight * cameras.apart(self.mean))
+
+    def directions(self, cameras: Cameras) -> Array | None:
+        """Increments [u, k] of cameras and lenses that k free numbers make; None where each is free for itself."""
+        if self.bodies is None or not self.bodies.shared:
+            return None
+        columns, (_, lenses) = body_columns(cameras, self.bodies), np.split(self.free, [POSE * len(cameras)])
+        found = np.zeros((len(self.free), columns.shape[1] + int(lenses.sum())))
+        found[: len(columns), : columns.shape[1]] = columns
+        found[len(columns) + np.flatnonzero(lenses), columns.shape[1] + np.arange(lenses.sum())] = 1.0
+        return found
+
+    def rigid(self, cameras: Cameras, motion: Array) -> Array:
+        """An increment [u] along `directions`, with bodies rigid to more than first order."""
+        if self.bodies is None or not self.bodies.shared:
+            return motion
+        poses, lenses = cameras.split(motion)
+        return np.concatenate([rigid_motion(cameras, self.bodies, poses).reshape(-1), lenses.reshape(-1)])
 
 
 def minimise(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> Cameras:
@@ -93,17 +114,13 @@ def _step(
 ) -> tuple[Cameras, float] | None:
     """Cameras and cost after a step that lowers it, the terms' unknowns moved along; None where it does not."""
     system, right = normal_equations(cameras, linear, prior)
-    motion = np.zeros(len(right))
-    free = prior.free & (np.diagonal(system) > 0)
-    if not free.any():
-        return None
-    part = system[np.ix_(free, free)]
-    part = part + np.diag(damping * np.diagonal(part))
-    try:
-        motion[free] = -np.linalg.solve(part, right[free])
-    except np.linalg.LinAlgError:
-        return None
-    if not np.isfinite(motion).all():
+    directions = prior.directions(cameras)
+    if directions is None:
+        motion = _damped(system, right, prior.free, damping)
+    else:
+        along = _damped(directions.T @ system @ directions, directions.T @ right, None, damping)
+        motion = None if along is None else prior.rigid(cameras, directions @ along)
+    if motion is None:
         return None
     moved = cameras.moved(motion)
     unknowns = [term.stepped(at, motion) for term, at in zip(terms, linear, strict=True)]
@@ -113,6 +130,21 @@ def _step(
     for term, found in zip(terms, unknowns, strict=True):
         term.unknowns = found
     return moved, after
+
+
+def _damped(system: Array, right: Array, free: NDArray[np.bool_] | None, damping: float) -> Array | None:
+    """The damped step of the unknowns that are free and that anything is known of; None where there is none."""
+    free = (np.diagonal(system) > 0) & (True if free is None else free)
+    if not free.any():
+        return None
+    part = system[np.ix_(free, free)]
+    part = part + np.diag(damping * np.diagonal(part))
+    step = np.zeros(len(right))
+    try:
+        step[free] = -np.linalg.solve(part, right[free])
+    except np.linalg.LinAlgError:
+        return None
+    return step if np.isfinite(step).all() else None
 
 
 def total_cost(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> float:

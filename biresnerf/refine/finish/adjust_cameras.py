@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.refine.adjustment.adjustment import NOTHING_FITS, Adjustment, Halves, adjust_poses, misfit
 from biresnerf.refine.adjustment.choice import Candidate, Choice, choose
@@ -89,13 +90,13 @@ def adjust_cameras(stages: TwoStages) -> Finish:
     """Adjust all cameras at once, and where left-out evidence says that is better move them and hold them there.
 
     Cameras that their own matches contradict are placed by those first. Photos have the last word: nothing is moved
-    where they object. Cameras that are fixed or tied to each other, fisheyes, and methods of others are left alone.
+    where they object. Fisheyes and methods of others are left alone.
 
     Raises:
         Interrupted: stopped; a continued run adjusts again.
     """
     optimiser = stages.optimiser
-    if not adjusts_cameras(stages.scene.dataset, optimiser.method, optimiser.bodies):
+    if not adjusts_cameras(stages.scene.dataset, optimiser.method):
         return Finish()
     certainty = optimiser.lenses.certainty
     with stages.record.timed("adjusting"):
@@ -130,7 +131,7 @@ def _choice(
     refined = optimiser.poses.poses().numpy()
     if not np.isfinite(refined).all():
         return None
-    prior = PosePrior.equal(refined, PRIOR, PRIOR * optimiser.frame.distance)
+    prior = PosePrior.equal(refined, PRIOR, PRIOR * optimiser.frame.distance, optimiser.bodies)
     results = _adjusted(refined, split.fitted, prior, announce)
     noise = results["adjusted-tracks"].noise if "adjusted-tracks" in results else NoiseLevels()
     if noise.track_px > _most_noise_px(split.fitted):
@@ -144,7 +145,11 @@ def _choice(
         results = _adjusted(refined, split.fitted, prior, announce, patched.halves if patched else None)
     cameras = optimiser.lenses.refined(scene.dataset).cameras
     adjusted = [_candidate(name, each, split.fitted, cameras) for name, each in results.items()]
-    found = [Candidate("refined", refined), *_earlier(scene, refined), *filter(None, adjusted)]
+    found = [
+        Candidate("refined", refined),
+        *_earlier(scene, refined, optimiser.bodies),
+        *filter(None, adjusted),
+    ]
     candidates = sorted(found, key=lambda candidate: ORDER.index(candidate.name))
     misfits: dict[str, Array] = {}
     for kind, left_out in (
@@ -153,7 +158,8 @@ def _choice(
     ):
         if left_out.tracks is not None or left_out.patches is not None:
             announce()
-            misfits[kind] = np.stack([_misfit(each, left_out, noise) for each in candidates])
+            # Fixed cameras are the same in all: theirs tell only whose points fit them.
+            misfits[kind] = np.stack([_misfit(each, left_out, noise) for each in candidates])[:, ~prior.fixed]
     if not any(map(_tells, misfits.values())):
         return None
     choice = choose(candidates, misfits)
@@ -198,7 +204,7 @@ def _misfit(candidate: Candidate, evidence: Evidence, noise: NoiseLevels) -> Arr
 def _tells(misfits: Array) -> bool:
     """Whether evidence [candidates, n] knows half of the cameras, and fits them with the best candidate."""
     known = np.isfinite(misfits).all(0)
-    if known.mean() < 0.5:
+    if not known.any() or known.mean() < 0.5:
         return False
     return bool(np.median(misfits[:, known], axis=1).min() < NOTHING_FITS / 2)
 
@@ -258,14 +264,17 @@ def _described(found: Adjustment) -> str:
     )
 
 
-def _earlier(scene: Scene, refined: Array) -> list[Candidate]:
-    """The input's poses, and those of matches where there are any, carried to the refined ones' frame."""
+def _earlier(scene: Scene, refined: Array, bodies: RigidBodies) -> list[Candidate]:
+    """The input's poses, and those of matches where there are any, carried to the refined ones' frame and bodies."""
     given: list[tuple[CandidateName, Array | None]] = [
         ("input", scene.dataset.world_from_cam),
         ("matched", scene.start.matched_poses),
     ]
     return [
-        Candidate(name, align_robust(poses, refined, with_rotations=True).apply_to_poses(poses))
+        Candidate(
+            name,
+            bodies.held(align_robust(poses, refined, with_rotations=True).apply_to_poses(poses), refined),
+        )
         for name, poses in given
         if poses is not None and np.isfinite(poses).all()
     ]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.geometry.similarity import Similarity, align_by_spread
 from biresnerf.refine.adjustment.adjustment import patch_term, track_term
 from biresnerf.refine.adjustment.cameras import Cameras
@@ -65,7 +66,11 @@ class ExpectedErrors:
 
 
 def expected_errors(
-    world_from_cam: Array, preferred: Array, evidence: Evidence, patch_noise: float = 1.0
+    world_from_cam: Array,
+    preferred: Array,
+    evidence: Evidence,
+    patch_noise: float = 1.0,
+    bodies: RigidBodies | None = None,
 ) -> ExpectedErrors:
     """Of poses [n, 4, 4]: the covariance of those that the evidence prefers [n, 4, 4], and the way there.
 
@@ -73,6 +78,7 @@ def expected_errors(
         evidence: in the frame of the preferred poses, which were adjusted to it; its lenses as found, with what was
             known of them before.
         patch_noise: level of the patches' noise, as the adjustment found it.
+        bodies: cameras that are fixed or move as one; they say what of the frame is free.
     """
     cameras, lenses = Cameras.of(preferred, evidence.lenses), evidence.lenses
     n = len(cameras)
@@ -95,13 +101,14 @@ def expected_errors(
         before = np.where(lenses.free, 1 / np.where(lenses.free, lenses.deviation, 1.0) ** 2, 0.0).reshape(-1)
         information[6 * n :, 6 * n :] += np.diag(before)
         information = without_lenses(information, cameras, lenses.free.reshape(-1))
-    found = of_each(covariance(cameras, information, (by_tracks | by_patches) & together))
+    found = of_each(covariance(cameras, information, (by_tracks | by_patches) & together, bodies))
     known = together & (_rotation(found) < MOST_ROTATION)
     if not known.all():  # what is not known must not turn the others' frame
-        found = of_each(covariance(cameras, information, known))
+        found = of_each(covariance(cameras, information, known, bodies))
     away = np.full((n, 6), np.nan)
     if known.any():
-        frame = align_by_spread(preferred[known], world_from_cam[known])
+        frame = bodies and bodies.input_from_optimised(preferred, world_from_cam)
+        frame = frame or align_by_spread(preferred[known], world_from_cam[known])
         away = Cameras.of(frame.apply_to_poses(preferred)).apart(Cameras.of(world_from_cam)).reshape(n, 6)
         found = _turn(frame) @ found @ _turn(frame).T
         known &= np.sqrt((away[:, :3] ** 2).sum(1)) < MOST_ROTATION

@@ -106,7 +106,8 @@ class GivenPoses:
         between = Cameras.of(other.world_from_cam)
         step = Cameras.of(self.world_from_cam).apart(between).reshape(-1, 6)
         rotation, position = (1 / np.sqrt(mine + theirs)).T
-        return PosePrior(between.moved((share * step).reshape(-1)).world_from_cam(), rotation, position)
+        mean = between.moved((share * step).reshape(-1)).world_from_cam()
+        return PosePrior(mean, rotation, position, other.bodies)
 
 
 def given_poses(given: Array, fitted: Array, known: NDArray[np.bool_]) -> GivenPoses | None:

@@ -30,7 +30,7 @@ class MatchedRepair:
             return []
         optimiser, placed = self.optimiser, []
         errors = self._own.errors_px(optimiser.poses.poses().numpy())
-        wrong = contradicted(errors) & ~optimiser.bodies.fixed
+        wrong = contradicted(errors) & optimiser.bodies.alone
         trusted = ~(wrong | optimiser.camera_errors.suspects.cpu().numpy())
         for camera in np.argsort(-np.nan_to_num(errors) * wrong)[: int(wrong.sum())].tolist():
             found = self._own.placed(camera, optimiser.poses.poses().numpy(), trusted)

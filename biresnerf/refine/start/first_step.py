@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding.initial_poses import InitialPoses
-from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
@@ -32,7 +31,7 @@ def first_step(scene: Scene, options: ResolvedOptions, device: torch.device, thr
     frame = scene_frame(world_from_cam, images, matched_depth(dataset, world_from_cam, scene.tracks))
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
     excluded = scene.excluded_from_training
-    adjusted = scene.tracks is not None and adjusts_cameras(dataset, find_method(options.method), bodies)
+    adjusted = scene.tracks is not None and adjusts_cameras(dataset, find_method(options.method))
     by_photos = "none" if adjusted else options.refine_intrinsics
     lenses = lenses_of(dataset, images, by_photos, excluded, device, dollies=not bodies.tied)
     optimiser = JointOptimiser(
@@ -42,14 +41,14 @@ def first_step(scene: Scene, options: ResolvedOptions, device: torch.device, thr
     return optimiser
 
 
-def adjusts_cameras(dataset: Dataset, method: Method, bodies: RigidBodies) -> bool:
+def adjusts_cameras(dataset: Dataset, method: Method) -> bool:
     """Whether all cameras are adjusted at the end, and lenses with them where there are tracks.
 
-    Not cameras that are fixed or tied to each other, fisheyes, and methods of others.
+    Not fisheyes and methods of others.
     """
     fisheye = any(camera.full().fisheye for camera in dataset.cameras)
     enough = LEAST_ADJUSTED <= len(dataset) <= MOST_ADJUSTED
-    return method.robust_extensions and enough and not bodies.tied and not fisheye
+    return method.robust_extensions and enough and not fisheye
 
 
 def pose_mobility(start: InitialPoses) -> NDArray[np.float64]:

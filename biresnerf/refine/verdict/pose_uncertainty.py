@@ -41,9 +41,10 @@ def pose_uncertainty(
     if finish.fit is not None and np.isfinite(poses).all():
         input_from_unit = input_from_optimised @ optimiser.frame.unit_from_world.inverse()
         in_unit, fit = input_from_unit.inverse().apply_to_poses(poses), finish.fit
-        found = expected_errors(in_unit, fit.world_from_cam, fit.evidence, fit.patch_noise).carried(
-            input_from_unit
+        in_unit_errors = expected_errors(
+            in_unit, fit.world_from_cam, fit.evidence, fit.patch_noise, optimiser.bodies
         )
+        found = in_unit_errors.carried(input_from_unit)
     lost = optimiser.camera_errors.lost.tolist()
     reasons = [
         FIXED if optimiser.bodies.fixed[i]

@@ -7,6 +7,9 @@ import pytest
 import torch
 
 from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.pose_error import camera_errors
+from biresnerf.geometry.rigid import rigid_inverse
+from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refine.adjustment.lens.corrected_camera import corrected_camera
 from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.finish.given_poses import accuracy_report
@@ -68,6 +71,29 @@ def test_cameras_are_adjusted_where_tracks_left_out_prefer_it(tmp_path, rng):
     reports = adjust_cameras(run).candidates
     assert [report.name for report in reports if report.chosen] == ["adjusted-tracks"]
     assert errors_deg(run, truth).mean() < 0.2 * before.mean()
+
+
+FIXED = RigidBodies(np.arange(VIEWS), np.arange(VIEWS) < 3)
+TRIPLES = RigidBodies(np.arange(VIEWS) // 3, np.zeros(VIEWS, np.bool_))
+
+
+@pytest.mark.parametrize("bodies", [FIXED, TRIPLES], ids=["fixed", "rigs"])
+def test_fixed_cameras_and_rigs_are_adjusted_within_what_is_held(tmp_path, rng, bodies):
+    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    optimiser, truth = run.optimiser, run.optimiser.frame.unit_from_world.apply_to_poses(truth)
+    optimiser.bodies = bodies
+    start = optimiser.poses.poses().numpy()
+    for group in bodies.shared:
+        motion = start[group[0]] @ rigid_inverse(truth[group[0]])
+        start[group] = motion @ truth[group]
+    start[bodies.fixed] = truth[bodies.fixed]
+    optimiser.poses.place(torch.from_numpy(start))
+    assert [r.name for r in adjust_cameras(run).candidates if r.chosen] == ["adjusted-tracks"]
+    found = optimiser.poses.poses().numpy()
+    tie = bodies.input_from_optimised(found, truth)
+    before, after = (camera_errors(tie.apply_to_poses(p), truth).rotation_deg for p in (start, found))
+    assert after.mean() < 0.2 * before.mean()
+    np.testing.assert_allclose(found, bodies.held(found, start), atol=1e-6)
 
 
 def test_true_poses_of_the_input_are_returned(tmp_path, rng):
