@@ -6,16 +6,16 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refine.adjustment.evidence import Evidence
-from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
+from biresnerf.refine.adjustment.ideal import ideal_cameras, straight_tracks
 from biresnerf.refine.finish.gather_evidence import MOST_OBSERVATIONS
 
 
 def fitted_tracks(dataset: Dataset, tracks: Tracks | None, most: int = MOST_OBSERVATIONS) -> Evidence:
     """The points that estimates may be fitted to, with `most` observations at most, through the set's lenses."""
     intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
-    ideal = ideal_pinholes(intrinsics)
-    if tracks is None or ideal is None:
-        raise SystemExit("no feature matches of perspective cameras")
+    ideal = ideal_cameras(intrinsics)
+    if tracks is None:
+        raise SystemExit("no feature matches")
     fitted = straight_tracks(tracks, intrinsics, ideal).split()[0]
     assert fitted is not None
     return Evidence(ideal, fitted.thinned(most, len(dataset)))

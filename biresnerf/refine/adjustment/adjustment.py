@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.adjustment.cameras import POSE, Cameras
-from biresnerf.refine.adjustment.covariance import covariance, of_each, without_lenses
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
 from biresnerf.refine.adjustment.kernels.patches import UNSEEN
 from biresnerf.refine.adjustment.lens.lenses import LENS, OBSERVABLE, Lenses, LensEstimate, posterior
 from biresnerf.refine.adjustment.patch_term import PatchTerm
-from biresnerf.refine.adjustment.solve import Prior, minimise, normal_equations
-from biresnerf.refine.adjustment.term import Term
+from biresnerf.refine.adjustment.solver.covariance import covariance, of_each, without_lenses
+from biresnerf.refine.adjustment.solver.solve import Prior, minimise, normal_equations
+from biresnerf.refine.adjustment.solver.term import Term
 from biresnerf.refine.adjustment.track_term import ROBUST_SCALE, TrackTerm
 
 Array = NDArray[np.float64]

@@ -94,7 +94,8 @@ class Evidence:
     """What the poses are adjusted to.
 
     Attributes:
-        intrinsics: of all images at full size, without distortion: `biresnerf.refine.adjustment.ideal` makes them.
+        intrinsics: of all images at full size, without distortion but for fisheyes: `biresnerf.refine.adjustment.ideal`
+            makes them.
         tracks: None where there are none.
         patches: None where there are none.
         lenses: how the lenses differ from the intrinsics, and how well that is known; None: not at all.
@@ -106,8 +107,8 @@ class Evidence:
     lenses: Lenses | None = None
 
     def __post_init__(self) -> None:
-        if self.intrinsics.distorted or self.intrinsics.some_fisheye:
-            raise ValueError("evidence is of ideal pinhole cameras: straighten photos and tracks first")
+        if bool(self.intrinsics.distortion[~self.intrinsics.fisheye].any()):
+            raise ValueError("evidence is of ideal cameras: straighten photos and tracks first")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Photos and tracks as ideal pinhole cameras would have them: straightened once, before anything is adjusted."""
+"""Photos and tracks as ideal cameras would have them: straightened once, before anything is adjusted."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project
 
 
-def ideal_pinholes(intrinsics: Intrinsics) -> Intrinsics | None:
-    """The same cameras without distortion; None where one is a fisheye, which no pinhole can stand for."""
-    if intrinsics.some_fisheye:
-        return None
-    return replace(intrinsics, distortion=torch.zeros_like(intrinsics.distortion), terms=(0, 0, 0))
+def ideal_cameras(intrinsics: Intrinsics) -> Intrinsics:
+    """The same cameras without distortion; fisheyes, which no pinhole can stand for, as they are."""
+    if not intrinsics.some_fisheye:
+        return replace(intrinsics, distortion=torch.zeros_like(intrinsics.distortion), terms=(0, 0, 0))
+    return replace(intrinsics, distortion=intrinsics.distortion * intrinsics.fisheye[:, None])
 
 
 def resized(intrinsics: Intrinsics, widths: NDArray[np.int64], heights: NDArray[np.int64]) -> Intrinsics:

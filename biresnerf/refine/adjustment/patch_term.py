@@ -20,7 +20,7 @@ from biresnerf.refine.adjustment.kernels.patches import (
     patch_system,
     settle_scales,
 )
-from biresnerf.refine.adjustment.term import Linearised
+from biresnerf.refine.adjustment.solver.term import Linearised
 
 Array = NDArray[np.float64]
 Seen = tuple[object, ...]  # what all kernels read

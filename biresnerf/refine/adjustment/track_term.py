@@ -11,7 +11,8 @@ from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.triangulation import triangulate
 from biresnerf.refine.adjustment.cameras import Cameras, lens_rows
 from biresnerf.refine.adjustment.kernels.tracks import settle_points, track_cost, track_errors, track_system
-from biresnerf.refine.adjustment.term import Linearised
+from biresnerf.refine.adjustment.solver.term import Linearised
+from biresnerf.refine.adjustment.tangent_views import TangentViews
 
 Array = NDArray[np.float64]
 
@@ -23,7 +24,7 @@ SETTLING = 30
 
 
 class TrackTerm:
-    """Reprojection residuals in px of the full-size photos.
+    """Reprojection residuals in px of the full-size photos, as if lenses had no distortion.
 
     Args:
         cameras: where points are triangulated first.
@@ -46,8 +47,12 @@ class TrackTerm:
         self._given_noise = noise_px
         self.noise_px = 1.0 if noise_px is None else noise_px
         rays = directions_in_cam(intrinsics, torch.from_numpy(self.image), torch.from_numpy(self.xy)).numpy()
-        rays = cameras.rays_of(self.image, rays / rays[:, 2:])
+        flat = ~intrinsics.fisheye.numpy()[self.image]
+        rays[flat] = cameras.rays_of(self.image[flat], rays[flat] / rays[flat, 2:])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        self._views: TangentViews | None = None
+        if intrinsics.some_fisheye:
+            self._views = TangentViews.looking_at(rays, self.xy, self.image, intrinsics, self.lens[:, 4])
         world = np.einsum("mij,mj->mi", cameras.rotation[self.image], rays)
         focal = np.sqrt(self.lens[:, 0] * self.lens[:, 1])[self.image]
         self.unknowns = triangulate(cameras.centre[self.image], world, focal, self.point, count)
@@ -102,4 +107,7 @@ class TrackTerm:
 
     def _seen(self, cameras: Cameras, points: Array) -> tuple[NDArray[np.generic], ...]:
         lens = cameras.lens_rows(self.lens)
-        return cameras.rotation, cameras.centre, lens, points, self.start, self.image, self.xy
+        if self._views is None:
+            return cameras.rotation, cameras.centre, lens, points, self.start, self.image, self.xy
+        rotation, centre, lens, view = self._views.seen(cameras, lens)
+        return rotation, centre, lens, points, self.start, view, self._views.xy

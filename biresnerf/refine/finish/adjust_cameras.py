@@ -90,7 +90,7 @@ def adjust_cameras(stages: TwoStages) -> Finish:
     """Adjust all cameras at once, and where left-out evidence says that is better move them and hold them there.
 
     Cameras that their own matches contradict are placed by those first. Photos have the last word: nothing is moved
-    where they object. Fisheyes and methods of others are left alone.
+    where they object. Methods of others are left alone.
 
     Raises:
         Interrupted: stopped; a continued run adjusts again.
@@ -126,8 +126,6 @@ def _choice(
 ) -> tuple[Choice, Finish] | None:
     """None where no evidence can tell. Candidates are in the unit frame."""
     split = gather_evidence(scene, optimiser)
-    if split is None:
-        return None
     refined = optimiser.poses.poses().numpy()
     if not np.isfinite(refined).all():
         return None

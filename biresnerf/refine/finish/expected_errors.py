@@ -11,9 +11,9 @@ from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.geometry.similarity import Similarity, align_by_spread
 from biresnerf.refine.adjustment.adjustment import patch_term, track_term
 from biresnerf.refine.adjustment.cameras import Cameras
-from biresnerf.refine.adjustment.covariance import covariance, largest_group, of_each, without_lenses
 from biresnerf.refine.adjustment.evidence import Evidence
-from biresnerf.refine.adjustment.solve import ROUNDS, SETTLED
+from biresnerf.refine.adjustment.solver.covariance import covariance, largest_group, of_each, without_lenses
+from biresnerf.refine.adjustment.solver.solve import ROUNDS, SETTLED
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refine.adjustment.evidence import Evidence
-from biresnerf.refine.adjustment.ideal import ideal_pinholes, straight_tracks
+from biresnerf.refine.adjustment.ideal import ideal_cameras, straight_tracks
 from biresnerf.refine.finish.lens_evidence import lenses_before
 from biresnerf.refine.finish.photo_evidence import photo_patches
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
@@ -27,13 +27,11 @@ class SplitEvidence:
     left_out: Evidence
 
 
-def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence | None:
-    """What there is of tracks and patches, for ideal cameras; None where cameras cannot be made ideal."""
+def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
+    """What there is of tracks and patches, for ideal cameras."""
     dataset = optimiser.lenses.refined(scene.dataset)
     intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
-    ideal = ideal_pinholes(intrinsics)
-    if ideal is None:
-        return None
+    ideal = ideal_cameras(intrinsics)
     before = lenses_before(scene.dataset, optimiser.options.refine_intrinsics)
     lenses = before if before.free.any() else None
     fitted: Tracks | None = None

@@ -22,7 +22,9 @@ MOST_PATCHES, PATCHES_OF_PHOTO = 3000, (20, 200)  # in all, and the least and th
 def photo_patches(
     scene: Scene, optimiser: JointOptimiser, intrinsics: Intrinsics, ideal: Intrinsics
 ) -> Patches | None:
-    """Patches of all photos at the present poses; None where the field shows no surface to put them on."""
+    """Patches of all photos at the present poses; None for fisheyes, and where the field shows no surface for them."""
+    if intrinsics.some_fisheye:
+        return None
     images = _larger(scene, optimiser)
     widths, heights = images.widths.astype(np.int64), images.heights.astype(np.int64)
     lenses, straight = resized(intrinsics, widths, heights), resized(ideal, widths, heights)

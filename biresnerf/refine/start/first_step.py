@@ -32,7 +32,8 @@ def first_step(scene: Scene, options: ResolvedOptions, device: torch.device, thr
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
     excluded = scene.excluded_from_training
     adjusted = scene.tracks is not None and adjusts_cameras(dataset, find_method(options.method))
-    by_photos = "none" if adjusted else options.refine_intrinsics
+    fisheye = any(camera.full().fisheye for camera in dataset.cameras)
+    by_photos = "none" if adjusted and not fisheye else options.refine_intrinsics
     lenses = lenses_of(dataset, images, by_photos, excluded, device, dollies=not bodies.tied)
     optimiser = JointOptimiser(
         images, frame, poses, options, excluded, device, threads, pose_mobility(start), bodies, lenses
@@ -42,13 +43,11 @@ def first_step(scene: Scene, options: ResolvedOptions, device: torch.device, thr
 
 
 def adjusts_cameras(dataset: Dataset, method: Method) -> bool:
-    """Whether all cameras are adjusted at the end, and lenses with them where there are tracks.
+    """Whether all cameras are adjusted at the end, and perspective lenses with them where there are tracks.
 
-    Not fisheyes and methods of others.
+    Not by methods of others.
     """
-    fisheye = any(camera.full().fisheye for camera in dataset.cameras)
-    enough = LEAST_ADJUSTED <= len(dataset) <= MOST_ADJUSTED
-    return method.robust_extensions and enough and not fisheye
+    return method.robust_extensions and LEAST_ADJUSTED <= len(dataset) <= MOST_ADJUSTED
 
 
 def pose_mobility(start: InitialPoses) -> NDArray[np.float64]:

@@ -8,9 +8,9 @@ from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.geometry.similarity import Similarity, align_robust
 from biresnerf.refine.adjustment.adjustment import adjust_poses
-from biresnerf.refine.adjustment.body_motions import body_columns, rigid_motion
 from biresnerf.refine.adjustment.cameras import Cameras
 from biresnerf.refine.adjustment.evidence import Evidence, PosePrior
+from biresnerf.refine.adjustment.solver.body_motions import body_columns, rigid_motion
 from biresnerf.refine.finish.expected_errors import TRACK_MODEL_ERROR, expected_errors
 from tests.refine.adjustment.rig import disturbed, observed, pinholes, ring
 

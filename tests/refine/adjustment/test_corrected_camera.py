@@ -6,7 +6,7 @@ import torch
 
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project
 from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.refine.adjustment.ideal import ideal_pinholes
+from biresnerf.refine.adjustment.ideal import ideal_cameras
 from biresnerf.refine.adjustment.lens.corrected_camera import corrected_camera
 
 CAMERAS = {
@@ -22,7 +22,7 @@ CAMERAS = {
 def largest_difference_px(camera, correction):
     """Over the image, between the corrected camera and the camera behind its correction."""
     old, new = (Intrinsics.from_cameras([each]) for each in (camera, corrected_camera(camera, correction)))
-    ideal = ideal_pinholes(old)
+    ideal = ideal_cameras(old)
     x, y = np.meshgrid(np.linspace(0, 400, 21), np.linspace(0, 300, 16))
     xy = torch.from_numpy(np.stack([x, y], -1).reshape(-1, 2))
     image = torch.zeros(len(xy), dtype=torch.int64)

@@ -13,12 +13,14 @@ RADII = 64
 
 
 def corrected_camera(camera: Camera, correction: NDArray[np.float64]) -> Camera:
-    """A perspective camera after a correction [3] (log focal length, k1, k2; see `Cameras`), in the same model.
+    """A camera after a correction [3] (log focal length, k1, k2; see `Cameras`), in the same model.
 
     The corrected lens shows slopes u where the camera shows e^l (1 + k1 |u|^2 + k2 |u|^4) u. For the focal length that
     is a lens of the same model, exactly; so it is for a camera without distortion. Otherwise the coefficients k1 and k2
-    that the model has are fitted, over all radii within the image.
+    that the model has are fitted, over all radii within the image. Fisheyes have no correction.
     """
+    if not correction.any():
+        return camera
     longer = float(np.exp(correction[0]))
     old = camera.full()
     lens = old._replace(

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.geometry.rigid_bodies import RigidBodies
-from biresnerf.refine.adjustment.body_motions import body_columns, rigid_motion
 from biresnerf.refine.adjustment.cameras import POSE, Cameras
 from biresnerf.refine.adjustment.evidence import PosePrior
 from biresnerf.refine.adjustment.lens.lenses import Lenses
-from biresnerf.refine.adjustment.term import Linearised, Term
+from biresnerf.refine.adjustment.solver.body_motions import body_columns, rigid_motion
+from biresnerf.refine.adjustment.solver.term import Linearised, Term
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.geometry.rigid_bodies import RigidBodies
-from biresnerf.refine.adjustment.body_motions import allowed_motions, body_columns
 from biresnerf.refine.adjustment.cameras import POSE, Cameras
+from biresnerf.refine.adjustment.solver.body_motions import allowed_motions, body_columns
 
 Array = NDArray[np.float64]
 
