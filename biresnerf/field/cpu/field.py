@@ -126,6 +126,7 @@ class CpuField(GridField):
         ray_kernels.pack(
             origin, direction, t_buffer, dt_buffer, count, offset, self.shape.unbounded, x, t, dt, ray
         )
+        ray_kernels.bring_inside(x)
         return offset, x, t, dt, ray
 
     def render_forward(self, origin: np.ndarray, direction: np.ndarray, view: np.ndarray, rays: Rays,

@@ -15,6 +15,7 @@ from biresnerf.field.reference import operations
 f4, i4 = np.float32, np.int32
 ONE, TWO = f4(1), f4(2)
 EDGE = f4(operations.EDGE)  # keeps grid positions strictly inside [0, 1)
+_LARGEST_BITS = np.array(ONE - EDGE, f4).view(np.uint32)
 
 
 @njit(inline="always", fastmath=True)
@@ -94,6 +95,15 @@ def pack(origin, direction, t_buffer, dt_buffer, count, offset, unbounded, x, t,
             )
             x[3 * i], x[3 * i + 1], x[3 * i + 2] = _inside(gx), _inside(gy), _inside(gz)
             t[i], dt[i], ray[i] = middle, length, r
+
+
+def bring_inside(x):
+    """Positions [3 n] that are no numbers to the grid's edge, in place: tables are read without a check of bounds.
+
+    As unsigned numbers, positive floats are ordered as they are, and what is negative or not finite is larger.
+    """
+    bits = x.view(np.uint32)
+    np.minimum(bits, _LARGEST_BITS, out=bits)
 
 
 @njit(**PARALLEL_KERNEL)

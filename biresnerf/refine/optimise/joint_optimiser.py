@@ -204,7 +204,8 @@ class JointOptimiser:
         shown = colour.detach().clamp(max=1)
         self.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach())
         error = ((shown - batch.sharp) ** 2)[: batch.trained].mean()
-        loss_value, error_value = self.metrics.read(loss.detach(), error)
+        # Poses that are no numbers see nothing, of which the loss would not tell.
+        loss_value, error_value = self.metrics.read(loss.detach() + self.poses.zero_if_finite(), error)
         return StepResult(loss_value, error_value, len(origin), rendering.samples)
 
     def _loss(self, colour: Tensor, batch: PixelBatch) -> Tensor:

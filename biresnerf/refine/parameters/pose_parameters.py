@@ -139,6 +139,10 @@ class PoseParameters:
             parameter.zero_()
         self.restart_adam()
 
+    def zero_if_finite(self) -> Tensor:
+        """Zero; not a number where some increment is not finite. Does not wait for the device."""
+        return 0 * (self.rotation.detach().sum() + self.translation.detach().sum())
+
     def forget_gradients(self) -> None:
         self._adam.zero_grad()
 

@@ -1,5 +1,7 @@
 """The CPU backend against the plain-torch definition: values and every gradient."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -146,3 +148,25 @@ def test_state_restores_the_next_step_exactly():
     step(other)
     for key, value in expected.items():
         assert np.array_equal(other.state()[key].numpy(), value.numpy()), key
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf"), -float("inf"), 1e30, -3e38])
+def test_rays_that_are_no_numbers_break_nothing_and_leave_the_others_as_they_are(unbounded, wrong):
+    """Kernels read tables without a check of bounds: what is out of range must not reach them."""
+    generator = torch.Generator().manual_seed(9)
+    bad = torch.rand(60, 6, generator=generator) < 0.3
+    bad[40:] = False
+    _, field = _pair(unbounded, True)
+    clean = _rays(60, 60, unbounded, moving=False)
+    expected = field.render(clean, _marching(), PositionGradient())
+    hostile = replace(
+        clean,
+        origin=torch.where(bad[:, :3], wrong, clean.origin).requires_grad_(),
+        direction=torch.where(bad[:, 3:], wrong, clean.direction).requires_grad_(),
+    )
+    found = field.render(hostile, _marching(), PositionGradient())
+    _close(found.colour[40:], expected.colour[40:], 1e-5)
+    found.colour.sum().backward()
+    field.step(FieldRates(1e-2, 1e-2, (1e-2,) * 5, 1e-2))
+    assert torch.isfinite(hostile.origin.grad[40:]).all()

@@ -142,3 +142,13 @@ def test_a_loss_that_is_no_number_ends_the_run_with_a_reason(scene, tmp_path):
         finished(stages)
     assert caught.value.code == "diverged"
     assert "step 1" in str(caught.value)
+
+
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
+def test_a_pose_that_is_no_number_ends_the_run_with_a_reason(scene, tmp_path, wrong):
+    stages = start(scene, tmp_path, tiny_options())
+    with torch.no_grad():
+        stages.optimiser.poses.translation[0, 1] = wrong
+    with pytest.raises(RefinementError) as caught:
+        finished(stages)
+    assert caught.value.code == "diverged"
