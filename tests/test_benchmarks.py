@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import importlib.util
 import shutil
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from benchmarks.method import peers
-from benchmarks.speed import scene
+from benchmarks.speed import gpu_report, scene
 from benchmarks.speed.torch_forms import (
     UnrolledField,
     VectorisedField,
@@ -28,6 +31,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.studies.scenes import with_poses
 from tests.data.scenes import textured_arc
+from tests.docs.forms_of_commands import check_shell
 
 pytestmark = pytest.mark.slow
 
@@ -113,3 +117,27 @@ def test_colmap_on_a_rendered_arc_is_measured_against_its_truth(tmp_path):
         assert line["centre_percent"] < 2
     assert lines[0]["rotation_deg"] != lines[1]["rotation_deg"], "priors have a say"
     assert len(peers.table(lines).splitlines()) == 3
+
+
+def test_a_gpu_report_holds_what_each_command_printed_and_how_it_ended(tmp_path, monkeypatch):
+    works, fails = (sys.executable, "-c", "print(6 * 7)"), (sys.executable, "-c", "raise SystemExit(3)")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(gpu_report, "commands", lambda _work: [works, fails, ("no-such-program",)])
+    gpu_report.main()
+    parts = (tmp_path / "gpu-report.txt").read_text().split("$ ")[1:]
+    for part, expected in zip(
+        parts, ("42\n\nexit status 0", "exit status 3", "exit status not there"), strict=True
+    ):
+        assert expected in part
+
+
+def test_the_commands_of_a_gpu_report_are_there(tmp_path):
+    for command in gpu_report.commands(tmp_path):
+        words = list(command)
+        if words[0] == sys.executable:
+            assert importlib.util.find_spec(words[2]) is not None
+        elif words[0] != "nvidia-smi":
+            assert Path(words[0]).is_file()
+            check_shell(" ".join(["biresnerf", *words[1:]]))
+        for path in (word for word in words if word.startswith("tests/")):
+            assert (Path(__file__).parents[1] / path).exists()

@@ -85,9 +85,18 @@ def make_occupancy(side: int, device: torch.device) -> OccupancyGrid:
     return DeviceOccupancyGrid(side, device) if device.type == "cuda" else OccupancyGrid(side, device)
 
 
+def gpu_faults(device: torch.device) -> tuple[str, ...]:
+    """What the kernels compute otherwise on a GPU than defined; nothing on a CPU, where tests have told."""
+    if device.type != "cuda":
+        return ()
+    from biresnerf.field.cuda.device_check import remembered_faults
+
+    return remembered_faults()
+
+
 def directions_for(device: torch.device) -> Directions:
-    """`directions_in_cam`, on CUDA the form that never waits for the device."""
-    if device.type == "cuda":
+    """`directions_in_cam`, on a GPU that can be relied on the form that never waits for the device."""
+    if device.type == "cuda" and not gpu_faults(device):
         from biresnerf.field.cuda.lens import directions_in_cam as on_device
 
         return on_device
@@ -95,12 +104,20 @@ def directions_for(device: torch.device) -> Directions:
 
 
 def make_field(shape: FieldShape, seed: int, device: torch.device, threads: int) -> RadianceField:
-    """The fastest backend for the device: Numba kernels on the CPU, Triton kernels on CUDA."""
+    """The fastest backend for the device: Numba kernels on the CPU, Triton kernels on CUDA.
+
+    Plain torch takes the place of kernels that compute otherwise on this GPU than they should.
+    """
     field: RadianceField
     if device.type == "cpu":
         from biresnerf.field.cpu.field import CpuField
 
         field = CpuField(shape, seed, device, threads)
+    elif faults := gpu_faults(device):
+        from biresnerf.field.reference.field import ReferenceField
+
+        logger.warning("plain torch takes the place of the kernels, which fail on this GPU: %s", faults[0])
+        field = ReferenceField(shape, seed, device)
     else:
         from biresnerf.field.cuda.field import CudaField
 

@@ -28,9 +28,10 @@ print(time.process_time() - began)
 """
 _FIND_GPU = """
 import json, torch
-from biresnerf.field.backends import cuda_problem
+from biresnerf.field.backends import cuda_problem, gpu_faults
 problem = cuda_problem()
-print(json.dumps([problem, None if problem else torch.cuda.get_device_name()]))
+found = [None, []] if problem else [torch.cuda.get_device_name(), gpu_faults(torch.device("cuda"))]
+print(json.dumps([problem, *found]))
 """
 
 # good: works; missing: only something optional is unavailable; broken: should work and does not.
@@ -80,17 +81,22 @@ def kernels() -> Found:
 
 
 def gpu() -> Found:
-    """Whether the CUDA kernels can run. A GPU is optional."""
+    """Whether the CUDA kernels can run, and compute what they should. A GPU is optional."""
     hint = "Reinstall torch: https://pytorch.org/get-started/locally/"
-    output = _in_child("GPU", _FIND_GPU, _IMPORT_S, hint)
+    output = _in_child("GPU", _FIND_GPU, _COMPILE_S, hint)
     if isinstance(output, Found):
         return output
-    problem, name = json.loads(output.splitlines()[-1])
+    problem, name, faults = json.loads(output.splitlines()[-1])
     if problem is not None:
         return Found(
             "GPU", "missing", f"not used: {problem}", "Optional: the CPU kernels do the same. docs/cuda.md"
         )
-    return Found("GPU", "good", name)
+    if faults:
+        return Found(
+            "GPU", "broken", f"{name}: {'; '.join(faults)}",
+            "Plain torch takes the place of its kernels. Update the driver, or use --device cpu. docs/cuda.md",
+        )  # fmt: skip
+    return Found("GPU", "good", f"{name}, kernels checked")
 
 
 def colmap() -> Found:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+import torch
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.named_images import few_names
 from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.field.backends import gpu_faults
 from biresnerf.refine.finish.adjust_cameras import Finish
 from biresnerf.refine.finish.given_poses import accuracy_report, accuracy_warnings
 from biresnerf.refine.lost.own_matches import LEAST_PAIRS
@@ -74,6 +76,7 @@ def run_report(
         + turntable_warnings(scene.start)
         + accuracy_warnings(finish.given, optimiser.options)
         + unmatched_warnings(scene)
+        + gpu_warnings(optimiser.device)
         + _unknown_warnings(dataset, uncertainty),
     )
 
@@ -99,6 +102,17 @@ def turntable_warnings(start: InitialPoses) -> tuple[str, ...]:
     return (
         f"Photos tell hardly which way the table turned ({better.psnr:.2f} dB, the other way {other.psnr:.2f} dB): the "
         "result may be a mirror image.",
+    )
+
+
+def gpu_warnings(device: torch.device) -> tuple[str, ...]:
+    """A warning where kernels could not be relied on."""
+    faults = gpu_faults(device)
+    if not faults:
+        return ()
+    return (
+        f"The kernels do not compute on this GPU what they should ({faults[0]}). Plain torch took their place, which "
+        "is many times slower. docs/cuda.md says what to send.",
     )
 
 

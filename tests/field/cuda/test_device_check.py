@@ -1,0 +1,90 @@
+"""The check of a GPU's kernels: right ones pass, wrong ones are named, and each machine is asked once."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+pytest.importorskip("triton", reason="the CUDA backend's kernels need Triton, which exists for Linux only")
+
+from biresnerf.field import backends
+from biresnerf.field.cuda import device_check
+from biresnerf.field.cuda.field import CudaField
+from biresnerf.field.reference.field import ReferenceField
+from biresnerf.geometry.camera.camera import directions_in_cam
+from biresnerf.refine.verdict import run_report
+from tests.field.cuda.fields import DEVICE, SHAPES
+
+pytestmark = pytest.mark.slow
+
+
+def test_kernels_that_compute_what_is_defined_have_no_faults():
+    assert device_check.faults(CudaField, DEVICE) == ()
+
+
+class WrongDensity(ReferenceField):
+    def density(self, position):
+        return 1.1 * super().density(position)
+
+
+class WrongTables(ReferenceField):
+    def _update_table(self, name, rates):
+        super()._update_table(name, rates)
+        self.moments[name][0].mul_(1.1)
+
+
+class NoNumber(ReferenceField):
+    def render(self, rays, marching, gradient):
+        rendering = super().render(rays, marching, gradient)
+        return replace(rendering, depth=rendering.depth * float("nan"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "named"),
+    [(WrongDensity, "density"), (WrongTables, "gradient by tables"), (NoNumber, "depth")],
+)
+def test_what_is_computed_otherwise_is_named(kind, named):
+    found = device_check.faults(kind, torch.device("cpu"))
+    assert len(found) == 4  # in either stage, of either kind of scene
+    assert all(fault.startswith(named) for fault in found)
+
+
+def test_each_gpu_is_checked_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    asked = []
+    monkeypatch.setattr(device_check, "_asked", lambda: asked.append(1) or ("colour differs",))
+    for name, expected in (("one GPU", 1), ("one GPU", 1), ("another GPU", 2)):
+        monkeypatch.setattr(device_check, "_installation", lambda name=name: name)
+        device_check.remembered_faults.cache_clear()
+        assert device_check.remembered_faults() == ("colour differs",)
+        assert len(asked) == expected
+    assert set(json.loads((tmp_path / "biresnerf/gpu-checks.json").read_text())) == {"one GPU", "another GPU"}
+    device_check.remembered_faults.cache_clear()
+
+
+def test_a_check_that_fails_is_a_fault(monkeypatch):
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU, on which the check does not fail")
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    (fault,) = device_check._asked()
+    assert "CUDA" in fault or "NVIDIA" in fault
+
+
+def test_plain_torch_takes_the_place_of_kernels_that_fail(monkeypatch, caplog):
+    monkeypatch.setattr(backends, "gpu_faults", lambda _device: ("colour differs by 30%",))
+    monkeypatch.setattr(run_report, "gpu_faults", lambda _device: ("colour differs by 30%",))
+    # Stands for a GPU: neither needs one to be made.
+    field = backends.make_field(SHAPES[False], 3, torch.device("meta"), 1)
+    assert field.backend == "reference"
+    assert "colour differs by 30%" in caplog.text
+    assert backends.directions_for(torch.device("cuda")) is directions_in_cam
+    (warning,) = run_report.gpu_warnings(torch.device("cuda"))
+    assert "colour differs by 30%" in warning
+
+
+def test_the_cpu_is_not_checked():
+    assert backends.gpu_faults(torch.device("cpu")) == ()
+    assert run_report.gpu_warnings(torch.device("cpu")) == ()
