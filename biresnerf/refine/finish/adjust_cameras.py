@@ -149,6 +149,8 @@ def _choice(
         *filter(None, adjusted),
     ]
     candidates = sorted(found, key=lambda candidate: ORDER.index(candidate.name))
+    # Fixed cameras are the same in all candidates: theirs tell only whose points fit them.
+    judging = ~prior.fixed & ~optimiser.camera_errors.doubted.cpu().numpy()
     misfits: dict[str, Array] = {}
     for kind, left_out in (
         ("tracks", replace(split.left_out, patches=None)),
@@ -156,8 +158,7 @@ def _choice(
     ):
         if left_out.tracks is not None or left_out.patches is not None:
             announce()
-            # Fixed cameras are the same in all: theirs tell only whose points fit them.
-            misfits[kind] = np.stack([_misfit(each, left_out, noise) for each in candidates])[:, ~prior.fixed]
+            misfits[kind] = np.stack([_misfit(each, left_out, noise) for each in candidates])[:, judging]
     if not any(map(_tells, misfits.values())):
         return None
     choice = choose(candidates, misfits)

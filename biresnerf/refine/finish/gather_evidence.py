@@ -28,7 +28,11 @@ class SplitEvidence:
 
 
 def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
-    """What there is of tracks and patches, for ideal cameras."""
+    """What there is of tracks and patches, for ideal cameras; without cameras that are at a guess still.
+
+    Photos of another scene match each other, and would say much of themselves where the others say little.
+    """
+    placed = ~optimiser.camera_errors.doubted.cpu().numpy()
     dataset = optimiser.lenses.refined(scene.dataset)
     intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
     ideal = ideal_cameras(intrinsics)
@@ -36,10 +40,11 @@ def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
     lenses = before if before.free.any() else None
     fitted: Tracks | None = None
     judging: Tracks | None = None
-    if scene.tracks is not None:
-        fitted, judging = straight_tracks(scene.tracks, intrinsics, ideal).split()
+    tracks = scene.tracks and scene.tracks.where(placed[scene.tracks.image])
+    if tracks is not None:
+        fitted, judging = straight_tracks(tracks, intrinsics, ideal).split()
         fitted = fitted and fitted.thinned(MOST_OBSERVATIONS, len(dataset))
-    patches = photo_patches(scene, optimiser, intrinsics, ideal)
+    patches = photo_patches(scene, optimiser, intrinsics, ideal, placed)
     if patches is None:
         return SplitEvidence(Evidence(ideal, fitted, None, lenses), Evidence(ideal, judging))
     spared = np.arange(len(patches)) % LEFT_OUT_ONE_IN == 0

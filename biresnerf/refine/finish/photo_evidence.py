@@ -20,9 +20,16 @@ MOST_PATCHES, PATCHES_OF_PHOTO = 3000, (20, 200)  # in all, and the least and th
 
 
 def photo_patches(
-    scene: Scene, optimiser: JointOptimiser, intrinsics: Intrinsics, ideal: Intrinsics
+    scene: Scene,
+    optimiser: JointOptimiser,
+    intrinsics: Intrinsics,
+    ideal: Intrinsics,
+    placed: NDArray[np.bool_],
 ) -> Patches | None:
-    """Patches of all photos at the present poses; None for fisheyes, and where the field shows no surface for them."""
+    """Patches of the photos that are `placed` [n], at the present poses.
+
+    None for fisheyes, and where the field shows no surface to put them on.
+    """
     if intrinsics.some_fisheye:
         return None
     images = _larger(scene, optimiser)
@@ -36,7 +43,7 @@ def photo_patches(
         if gains is not None:
             photo = photo / gains[i].astype(np.float32)
         counts = images.counts_image(i)
-        shown = np.ones(photo.shape[:2], np.bool_) if counts is None else counts
+        shown = (np.ones(photo.shape[:2], np.bool_) if counts is None else counts) & placed[i]
         if lenses.distorted:
             masked = np.concatenate([photo, shown[..., None].astype(np.float32)], 2)
             masked, inside = straight_photo(masked, i, lenses, straight)

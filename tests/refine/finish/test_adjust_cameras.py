@@ -119,6 +119,17 @@ def test_refined_poses_stay_where_all_tracks_are_wrong(tmp_path, rng):
     assert errors_deg(run, truth).mean() < 1.5 * before.mean()
 
 
+def test_guessed_cameras_that_match_each_other_have_no_say(tmp_path, rng):
+    """Like photos of another scene among those of a plain thing."""
+    run, _ = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    foreign = np.arange(VIEWS) >= 4
+    run.scene = replace(run.scene, tracks=run.scene.tracks.where(foreign[run.scene.tracks.image]))
+    believed = run.optimiser.poses.poses()
+    run.optimiser.camera_errors.doubt(foreign)
+    assert adjust_cameras(run).candidates == ()
+    assert torch.equal(run.optimiser.poses.poses(), believed)
+
+
 def test_methods_of_others_are_left_alone(tmp_path, rng):
     run, _ = stages(tmp_path, rng)
     run.optimiser.method = replace(run.optimiser.method, robust_extensions=False)
@@ -128,7 +139,7 @@ def test_methods_of_others_are_left_alone(tmp_path, rng):
 def test_a_field_without_surface_gives_no_patches(tmp_path, rng):
     run, _ = stages(tmp_path, rng)
     intrinsics = lenses(run.scene.dataset)
-    assert photo_patches(run.scene, run.optimiser, intrinsics, intrinsics) is None
+    assert photo_patches(run.scene, run.optimiser, intrinsics, intrinsics, np.ones(VIEWS, np.bool_)) is None
 
 
 def test_a_lost_camera_is_placed_by_its_matches_and_adjusted_with_the_others(tmp_path, rng):
