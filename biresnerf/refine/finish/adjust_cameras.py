@@ -40,6 +40,8 @@ Array = NDArray[np.float64]
 ORDER: tuple[CandidateName, ...] = (
     "input", "refined", "adjusted", "adjusted-patches", "adjusted-tracks", "matched",
 )  # fmt: skip
+# Candidates that patches were to be trusted for, and that patches left out prefer: photos have spoken for them.
+BY_PATCHES: tuple[CandidateName, ...] = ("adjusted", "adjusted-patches")
 # Standard deviations of the refined poses' errors, rad and distances of the cameras from the scene: far more than they
 # have, so that only what no evidence fixes is left to them.
 PRIOR = 0.02
@@ -90,7 +92,8 @@ def adjust_cameras(stages: TwoStages) -> Finish:
     """Adjust all cameras at once, and where left-out evidence says that is better move them and hold them there.
 
     Cameras that their own matches contradict are placed by those first. Photos have the last word: nothing is moved
-    where they object. Methods of others are left alone.
+    where they object, by fields that are trained on them unless patches of them speak for it. Methods of others are
+    left alone.
 
     Raises:
         Interrupted: stopped; a continued run adjusts again.
@@ -109,7 +112,8 @@ def adjust_cameras(stages: TwoStages) -> Finish:
     chosen, lenses = choice.chosen, choice.chosen.lenses
     if lenses is not None:
         cameras = corrected_cameras(cameras, lenses.correction) or cameras
-    if chosen.name != "refined" and photos_object(stages, chosen.world_from_cam, cameras):
+    asked = chosen.name not in ("refined", *BY_PATCHES)
+    if asked and photos_object(stages, chosen.world_from_cam, cameras):
         logger.info("the photos contradict these poses, which are not taken")
         optimiser.lenses.certainty = certainty
         return finish.refused()

@@ -11,6 +11,7 @@ from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refine.adjustment.lens.corrected_camera import corrected_camera
+from biresnerf.refine.finish import adjust_cameras as module
 from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.finish.given_poses import accuracy_report
 from biresnerf.refine.finish.photo_evidence import photo_patches
@@ -234,6 +235,19 @@ def test_tracks_that_agree_on_other_poses_than_the_photos_are_not_believed(tmp_p
     assert run.optimiser.lenses.certainty == (None,)
     assert finish.fit is None
     assert errors_deg(run, truth).mean() < 2 * before.mean() + 0.5
+
+
+@pytest.mark.parametrize("name", ["adjusted", "adjusted-tracks"])
+def test_fields_are_trained_only_where_patches_of_the_photos_have_not_spoken(
+    tmp_path, rng, monkeypatch, name
+):
+    run, _ = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    adjusted, asked = module._adjusted, []
+    monkeypatch.setattr(module, "_adjusted", lambda *given: {name: next(iter(adjusted(*given).values()))})
+    monkeypatch.setattr(module, "photos_object", lambda *_: bool(asked.append(name)))
+    (chosen,) = (each.name for each in adjust_cameras(run).candidates if each.chosen)
+    assert chosen == name
+    assert asked == (["adjusted-tracks"] if name == "adjusted-tracks" else [])
 
 
 def test_poses_go_on_with_the_field_to_the_last_step_where_no_evidence_tells(tmp_path, rng):
