@@ -194,6 +194,13 @@ def test_plain_borders_show_the_background_and_others_do_not():
     assert _background([_framed(6, rng) for _ in range(5)] + [_framed(90, rng) for _ in range(5)]) is None
 
 
+def test_a_few_photos_of_another_scene_leave_the_background_known():
+    rng = np.random.default_rng(0)
+    foreign = [_framed(128, rng) for _ in range(3)]
+    assert _background([_framed(255, rng) for _ in range(25)] + foreign) == [1, 1, 1]
+    assert _background([_framed(255, rng) for _ in range(7)] + foreign) is None
+
+
 def test_masked_borders_have_no_say_about_the_background():
     rng = np.random.default_rng(0)
     images = [_framed(6, rng) for _ in range(10)]
