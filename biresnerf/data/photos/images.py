@@ -29,7 +29,7 @@ _DECODING_BYTES_PER_PX = 24  # RGBA as bytes and as floats, and the float copy b
 BLACK_BELOW = 24  # of 255: sensors and JPEG leave some light in black
 WHITE_ABOVE = 250  # of 255: bright walls and skies stay below it or vary
 BORDER_SHARE = 0.75  # of an image's border pixels that must show the colour; a pedestal may cover one side
-IMAGE_SHARE = 0.75  # of the images that must agree; in others the border may cut the object, or show another scene
+IMAGE_SHARE = 0.75  # of the images that must agree; others may show the object cut, or another scene
 
 
 @dataclass(frozen=True, eq=False)
