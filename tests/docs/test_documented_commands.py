@@ -27,7 +27,6 @@ NOT_RUN = {
     "TLS_CERTIFICATE=": "needs Docker and a certificate",
     "sh deploy/prepare.sh": "tests/deploy writes secrets where the file stands",
     "python -m benchmarks": "takes minutes to hours; the figures stand beside the command",
-    "python -m pytest": "the tests themselves",
     "biresnerf compare": "takes hours; tests/studies/commands/test_compare.py runs a small one",
     "biresnerf study": "takes hours; tests/studies/commands/test_compare.py runs a small one",
     "biresnerf up": "the service that all other commands here ask is it, on a free port",
