@@ -16,12 +16,14 @@ from biresnerf.field.cuda.field import CudaField
 from biresnerf.field.reference.field import ReferenceField
 from biresnerf.geometry.camera.camera import directions_in_cam
 from biresnerf.refine.verdict import run_report
-from tests.field.cuda.fields import DEVICE, SHAPES
+from tests.field.cuda.fields import DEVICE, HAS_GPU, SHAPES
 
 pytestmark = pytest.mark.slow
 
 
-def test_kernels_that_compute_what_is_defined_have_no_faults():
+def test_kernels_that_compute_what_is_defined_have_no_faults(monkeypatch):
+    if not HAS_GPU:
+        monkeypatch.setattr(device_check, "RAYS", 6)  # Triton's interpreter takes its time
     assert device_check.faults(CudaField, DEVICE) == ()
 
 
