@@ -34,8 +34,9 @@ ROUNDS = ((6, 48, 40), (2, 128, 50))  # poses kept, rays a step of each, steps
 RATES = (1e-2, 1e-3)  # pose learning rate of the first and the last step
 DISTINCT_DEG = 8.0  # poses nearer than this to a better one are not tried beside it
 LEAST_INTERVAL = 1.2e-2  # unit lengths: scoring needs no finer samples
-# A pose is accepted below these shares of the old error, and of the others' median.
-BETTER, NEAR_MEDIAN = 0.7, 1.5
+# A pose is accepted below these shares of the old error, and of the others' median; or below the third one of the old
+# error alone (table in docs/studies.md).
+BETTER, NEAR_MEDIAN, FAR_BETTER = 0.7, 1.5, 0.25
 ALONE = 0.2  # sharing less of its view than this, a camera of an open scene must go elsewhere, however small its error
 ALONE_SIDE = 8  # as seen by 8 x 8 pixels
 ALONE_MOST = 0.2  # of all cameras: where more are alone, the photos were taken so
@@ -165,7 +166,7 @@ class LostCameraRepair:
         old = float(scores[0])
         # A guess need not be clearly beaten.
         better = 1.0 if bool(optimiser.camera_errors.doubted[camera]) else BETTER
-        bound = min(better * old, NEAR_MEDIAN * median)
+        bound = min(better * old, max(NEAR_MEDIAN * median, FAR_BETTER * old))
         if alone:  # its own error says nothing, nor does that of another pose that shares no view
             bound = NEAR_MEDIAN * median
             shared = self._shared(tried, image) >= ALONE
