@@ -86,7 +86,7 @@ def make_occupancy(side: int, device: torch.device) -> OccupancyGrid:
 
 
 def gpu_faults(device: torch.device) -> tuple[str, ...]:
-    """What the kernels compute otherwise on a GPU than defined; nothing on a CPU, where tests have told."""
+    """Differences between the kernels' results on this GPU and the plain-torch definition; empty on a CPU."""
     if device.type != "cuda":
         return ()
     from biresnerf.field.cuda.device_check import remembered_faults
@@ -95,7 +95,7 @@ def gpu_faults(device: torch.device) -> tuple[str, ...]:
 
 
 def directions_for(device: torch.device) -> Directions:
-    """`directions_in_cam`, on a GPU that can be relied on the form that never waits for the device."""
+    """`directions_in_cam`; on a GPU whose kernels are right, the form that never waits for the device."""
     if device.type == "cuda" and not gpu_faults(device):
         from biresnerf.field.cuda.lens import directions_in_cam as on_device
 
@@ -106,7 +106,7 @@ def directions_for(device: torch.device) -> Directions:
 def make_field(shape: FieldShape, seed: int, device: torch.device, threads: int) -> RadianceField:
     """The fastest backend for the device: Numba kernels on the CPU, Triton kernels on CUDA.
 
-    Plain torch takes the place of kernels that compute otherwise on this GPU than they should.
+    Plain torch replaces kernels that give wrong results on this GPU.
     """
     field: RadianceField
     if device.type == "cpu":
@@ -116,7 +116,7 @@ def make_field(shape: FieldShape, seed: int, device: torch.device, threads: int)
     elif faults := gpu_faults(device):
         from biresnerf.field.reference.field import ReferenceField
 
-        logger.warning("plain torch takes the place of the kernels, which fail on this GPU: %s", faults[0])
+        logger.warning("using plain torch: the CUDA kernels give wrong results on this GPU (%s)", faults[0])
         field = ReferenceField(shape, seed, device)
     else:
         from biresnerf.field.cuda.field import CudaField

@@ -46,7 +46,7 @@ def finite_numbers(words: Sequence[str], where: str, hint: str) -> NDArray[np.fl
     try:
         values = np.array([float(word) for word in words], dtype=np.float64)
     except ValueError:
-        raise invalid_file(where, "holds a word that is no number.", hint) from None
+        raise invalid_file(where, "holds a word that is not a number.", hint) from None
     if not np.isfinite(values).all():
         raise InputError("pose_not_finite", "NaN or an infinite number.", where=where, hint=hint)
     return values

@@ -51,7 +51,7 @@ class CudaField(GridField):
         self._workspace: Workspace | None = None
         self._sample_count = SampleCount(device)
         self._forward_number = 0  # of the forward pass whose samples the buffers hold
-        self._pending = False
+        self._pending: int | None = None  # the forward pass whose gradients wait for `step`
 
     def start_reconstruction(self) -> None:
         super().start_reconstruction()
@@ -62,7 +62,7 @@ class CudaField(GridField):
         self._drop_workspace()
 
     def _drop_workspace(self) -> None:
-        self._workspace, self._pending = None, False
+        self._workspace, self._pending = None, None
 
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
         moving = rays.origin.requires_grad or rays.direction.requires_grad
@@ -149,7 +149,7 @@ class CudaField(GridField):
         w.buffers["g_opacity"][:count].copy_(g_opacity)
         w.plan(plans.backward).run()
         if trained:
-            self._pending = True
+            self._pending = number
             weights = (*w.density_weights, *w.colour_weights)
             for weight, gradient in zip(weights, w.weight_gradients(), strict=True):
                 weight.grad = gradient
@@ -157,8 +157,10 @@ class CudaField(GridField):
 
     def _update_table(self, name: str, rates: np.ndarray) -> None:
         w = self._workspace
-        if not self._pending or w is None:
+        if self._pending is None:
             return
+        if w is None or self._pending != self._forward_number:
+            raise RuntimeError("the field was used for something else between backward and step")
         step = self.steps[name]
         table = w.tables[name]
         table["rates"].copy_(torch.from_numpy(rates), non_blocking=True)
@@ -167,7 +169,7 @@ class CudaField(GridField):
         w.plan(plans.update, name).run()
 
     def discard_gradients(self) -> None:
-        self._pending = False
+        self._pending = None
         super().discard_gradients()
 
     def _most_of_a_ray(self, marching: Marching) -> int:
@@ -185,7 +187,7 @@ class CudaField(GridField):
         rays = max(before.rays, 1 << (rays - 1).bit_length() if rays else 0)
         self._samples = max(before.samples, samples)
         held = None
-        self._drop_workspace()  # frees its memory before the larger one takes its own
+        self._workspace = None  # frees its memory before the larger one takes its own
         self._forward_number += 1
         self._workspace = Workspace(self, Capacity(rays, self._samples, max(before.most, most), side))
         return self._workspace

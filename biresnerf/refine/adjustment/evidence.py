@@ -137,9 +137,16 @@ class PosePrior:
 
     @property
     def fixed(self) -> NDArray[np.bool_]:
-        """Cameras [n] that are known exactly."""
+        """Cameras [n] that are known exactly, or move as one with such a camera."""
         exact = (self.rotation <= 0) | (self.position <= 0)
-        return exact if self.bodies is None else exact | self.bodies.fixed
+        if self.bodies is None:
+            return exact
+        return np.isin(self.bodies.of, self.bodies.of[exact | self.bodies.fixed])
+
+    @property
+    def fixed_bodies(self) -> RigidBodies | None:
+        """The bodies with all cameras fixed that cannot move."""
+        return None if self.bodies is None else RigidBodies(self.bodies.of, self.fixed)
 
 
 @dataclass(frozen=True)

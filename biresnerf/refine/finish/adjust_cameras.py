@@ -138,7 +138,9 @@ def _choice(
     noise = results["adjusted-tracks"].noise if "adjusted-tracks" in results else NoiseLevels()
     if noise.track_px > _most_noise_px(split.fitted):
         logger.info("tracks say nothing: their noise is %.1f px", noise.track_px)
-        split = SplitEvidence(replace(split.fitted, tracks=None), replace(split.left_out, tracks=None))
+        split = replace(
+            split, fitted=replace(split.fitted, tracks=None), left_out=replace(split.left_out, tracks=None)
+        )
         results = {name: each for name, each in results.items() if name == "adjusted-patches"}
     given = input_accuracy(scene.dataset, _most_heeded(results), split.fitted, optimiser.options)
     if given is not None and given.tells(prior):
@@ -154,7 +156,7 @@ def _choice(
     ]
     candidates = sorted(found, key=lambda candidate: ORDER.index(candidate.name))
     # Fixed cameras are the same in all candidates: theirs tell only whose points fit them.
-    judging = ~prior.fixed & ~optimiser.camera_errors.doubted.cpu().numpy()
+    judging = ~prior.fixed & split.placed
     misfits: dict[str, Array] = {}
     for kind, left_out in (
         ("tracks", replace(split.left_out, patches=None)),

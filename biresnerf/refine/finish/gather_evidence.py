@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
@@ -21,16 +22,22 @@ LEFT_OUT_ONE_IN = 5  # patches
 
 @dataclass(frozen=True, eq=False)
 class SplitEvidence:
-    """Evidence to adjust to, and evidence to judge by."""
+    """Evidence in two parts.
+
+    Attributes:
+        fitted, left_out: what is adjusted to, and what is judged by.
+        placed: bool [n], cameras that are not at a guess still; the evidence is of their photos alone.
+    """
 
     fitted: Evidence
     left_out: Evidence
+    placed: NDArray[np.bool_]
 
 
 def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
-    """What there is of tracks and patches, for ideal cameras; without cameras that are at a guess still.
+    """Tracks and patches for ideal cameras, without cameras that are at a guess still.
 
-    Photos of another scene match each other, and would say much of themselves where the others say little.
+    Photos of another scene match each other, and could outweigh the scene's own.
     """
     placed = ~optimiser.camera_errors.doubted.cpu().numpy()
     dataset = optimiser.lenses.refined(scene.dataset)
@@ -46,8 +53,10 @@ def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
         fitted = fitted and fitted.thinned(MOST_OBSERVATIONS, len(dataset))
     patches = photo_patches(scene, optimiser, intrinsics, ideal, placed)
     if patches is None:
-        return SplitEvidence(Evidence(ideal, fitted, None, lenses), Evidence(ideal, judging))
+        return SplitEvidence(Evidence(ideal, fitted, None, lenses), Evidence(ideal, judging), placed)
     spared = np.arange(len(patches)) % LEFT_OUT_ONE_IN == 0
     return SplitEvidence(
-        Evidence(ideal, fitted, patches.of(~spared), lenses), Evidence(ideal, judging, patches.of(spared))
+        Evidence(ideal, fitted, patches.of(~spared), lenses),
+        Evidence(ideal, judging, patches.of(spared)),
+        placed,
     )

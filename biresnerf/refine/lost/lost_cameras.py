@@ -35,7 +35,7 @@ RATES = (1e-2, 1e-3)  # pose learning rate of the first and the last step
 DISTINCT_DEG = 8.0  # poses nearer than this to a better one are not tried beside it
 LEAST_INTERVAL = 1.2e-2  # unit lengths: scoring needs no finer samples
 # A pose is accepted below these shares of the old error, and of the others' median; or below the third one of the old
-# error alone (table in docs/studies.md).
+# error alone (docs/studies.md).
 BETTER, NEAR_MEDIAN, FAR_BETTER = 0.7, 1.5, 0.25
 ALONE = 0.2  # sharing less of its view than this, a camera of an open scene must go elsewhere, however small its error
 ALONE_SIDE = 8  # as seen by 8 x 8 pixels

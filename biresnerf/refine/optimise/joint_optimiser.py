@@ -204,7 +204,7 @@ class JointOptimiser:
         shown = colour.detach().clamp(max=1)
         self.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach())
         error = ((shown - batch.sharp) ** 2)[: batch.trained].mean()
-        # Poses that are no numbers see nothing, of which the loss would not tell.
+        # A pose that is not finite sees nothing, so the loss stays finite.
         loss_value, error_value = self.metrics.read(loss.detach() + self.poses.zero_if_finite(), error)
         return StepResult(loss_value, error_value, len(origin), rendering.samples)
 

@@ -106,13 +106,13 @@ def turntable_warnings(start: InitialPoses) -> tuple[str, ...]:
 
 
 def gpu_warnings(device: torch.device) -> tuple[str, ...]:
-    """A warning where kernels could not be relied on."""
+    """A warning where the CUDA kernels were not used."""
     faults = gpu_faults(device)
     if not faults:
         return ()
     return (
-        f"The kernels do not compute on this GPU what they should ({faults[0]}). Plain torch took their place, which "
-        "is many times slower. docs/cuda.md says what to send.",
+        f"The CUDA kernels give wrong results on this GPU ({faults[0]}). Plain torch was used instead, which is many "
+        "times slower. docs/cuda.md says what to send.",
     )
 
 

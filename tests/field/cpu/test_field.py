@@ -152,7 +152,7 @@ def test_state_restores_the_next_step_exactly():
 
 @pytest.mark.parametrize("unbounded", [False, True])
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf"), -float("inf"), 1e30, -3e38])
-def test_rays_that_are_no_numbers_break_nothing_and_leave_the_others_as_they_are(unbounded, wrong):
+def test_rays_that_are_not_finite_break_nothing_and_leave_the_others_as_they_are(unbounded, wrong):
     """Kernels read tables without a check of bounds: what is out of range must not reach them."""
     generator = torch.Generator().manual_seed(9)
     bad = torch.rand(60, 6, generator=generator) < 0.3

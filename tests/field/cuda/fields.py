@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 
+from biresnerf.field.cuda.check_batch import random_field, random_marching, random_rays
 from biresnerf.field.cuda.field import CudaField
 from biresnerf.field.grid_levels import grid_levels
-from biresnerf.field.radiance_field import FieldRates, FieldShape, Marching, PositionGradient, Rays
+from biresnerf.field.radiance_field import FieldRates, FieldShape, Marching, Rays
 
 HAS_GPU = torch.cuda.is_available()
 DEVICE = torch.device("cuda" if HAS_GPU else "cpu")
@@ -20,15 +23,7 @@ SHAPES = {
 
 
 def make(kind, unbounded: bool = False, reconstructing: bool = True, **more):
-    """A field with features that matter, the same for every kind."""
-    field = kind(SHAPES[unbounded], 3, DEVICE, **more)
-    generator = torch.Generator().manual_seed(5)
-    with torch.no_grad():
-        for tensor in (field.pose_table, field.reconstruction_table, field.reconstruction_columns):
-            tensor.copy_(torch.rand(tensor.shape, generator=generator) - 0.5)
-    if reconstructing:
-        field.start_reconstruction()
-    return field
+    return random_field(partial(kind, **more), SHAPES[unbounded], DEVICE, reconstructing=reconstructing)
 
 
 def make_fast(unbounded: bool = False, reconstructing: bool = True, samples: int = 4096) -> CudaField:
@@ -36,32 +31,11 @@ def make_fast(unbounded: bool = False, reconstructing: bool = True, samples: int
 
 
 def make_rays(count: int, trained: int | None = None, unbounded: bool = False, seed: int = 7) -> Rays:
-    generator = torch.Generator().manual_seed(seed)
-    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
-    aim = (torch.rand(count, 3, generator=generator) - 0.5) * 0.8
-    origin = aim - direction * (1.7 if unbounded else 2.6)
-    background, jitter = torch.rand(count, 3, generator=generator), torch.rand(count, generator=generator)
-    return Rays(
-        origin.to(DEVICE).requires_grad_(),
-        direction.to(DEVICE).requires_grad_(),
-        background.to(DEVICE),
-        jitter.to(DEVICE),
-        count if trained is None else trained,
-    )
+    return random_rays(count, count if trained is None else trained, DEVICE, unbounded=unbounded, seed=seed)
 
 
-def make_marching(step: float = 0.1, share: float = 0.4, most: int = 128, far: float = 12.0) -> Marching:
-    occupied = torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)) < share
-    return Marching(step, 0.1, far, most, occupied.to(torch.uint8).to(DEVICE))
-
-
-def learn(field, rays: Rays, marching: Marching, gradient: PositionGradient):
-    """Render, a loss of colour and opacity, backward."""
-    rendering = field.render(rays, marching, gradient)
-    target = torch.linspace(0, 1, 3 * len(rays.origin), device=DEVICE).reshape(-1, 3)
-    loss = ((rendering.colour - target) ** 2).mean() + 0.1 * (rendering.opacity**2).mean()
-    loss.backward()
-    return rendering
+def make_marching(step: float = 0.1, **more) -> Marching:
+    return random_marching(DEVICE, step=step, **more)
 
 
 def close(a, b, tolerance=TOLERANCE):

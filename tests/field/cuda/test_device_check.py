@@ -1,4 +1,4 @@
-"""The check of a GPU's kernels: right ones pass, wrong ones are named, and each machine is asked once."""
+"""The check of a GPU's kernels: right ones pass, wrong ones are named, and each machine is checked once."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class WrongTables(ReferenceField):
         self.moments[name][0].mul_(1.1)
 
 
-class NoNumber(ReferenceField):
+class NaNDepth(ReferenceField):
     def render(self, rays, marching, gradient):
         rendering = super().render(rays, marching, gradient)
         return replace(rendering, depth=rendering.depth * float("nan"))
@@ -46,32 +46,54 @@ class NoNumber(ReferenceField):
 
 @pytest.mark.parametrize(
     ("kind", "named"),
-    [(WrongDensity, "density"), (WrongTables, "gradient by tables"), (NoNumber, "depth")],
+    [(WrongDensity, "density"), (WrongTables, "gradient by tables"), (NaNDepth, "depth")],
 )
-def test_what_is_computed_otherwise_is_named(kind, named):
+def test_a_wrong_result_is_named(kind, named):
     found = device_check.faults(kind, torch.device("cpu"))
     assert len(found) == 4  # in either stage, of either kind of scene
     assert all(fault.startswith(named) for fault in found)
 
 
+def test_wrong_viewing_directions_are_named(monkeypatch):
+    turned = lambda *pixels: directions_in_cam(*pixels) + 1e-4  # noqa: E731
+    monkeypatch.setattr(device_check, "on_device", turned)
+    assert device_check.faults(ReferenceField, torch.device("cpu")) == ("viewing directions differ",)
+
+
 def test_each_gpu_is_checked_once(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    asked = []
-    monkeypatch.setattr(device_check, "_asked", lambda: asked.append(1) or ("colour differs",))
+    checked = []
+    monkeypatch.setattr(
+        device_check, "_check_in_own_process", lambda: checked.append(1) or ["colour differs"]
+    )
     for name, expected in (("one GPU", 1), ("one GPU", 1), ("another GPU", 2)):
         monkeypatch.setattr(device_check, "_installation", lambda name=name: name)
         device_check.remembered_faults.cache_clear()
         assert device_check.remembered_faults() == ("colour differs",)
-        assert len(asked) == expected
+        assert len(checked) == expected
     assert set(json.loads((tmp_path / "biresnerf/gpu-checks.json").read_text())) == {"one GPU", "another GPU"}
     device_check.remembered_faults.cache_clear()
 
 
-def test_a_check_that_fails_is_a_fault(monkeypatch):
+def test_a_check_that_did_not_end_is_run_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(device_check, "_installation", lambda: "a busy GPU")
+    for answer, expected in (
+        ("the check failed: out of memory", ("the check failed: out of memory",)),
+        ([], ()),
+    ):
+        monkeypatch.setattr(device_check, "_check_in_own_process", lambda answer=answer: answer)
+        device_check.remembered_faults.cache_clear()
+        assert device_check.remembered_faults() == expected
+    device_check.remembered_faults.cache_clear()
+
+
+def test_a_check_that_cannot_run_is_a_fault(monkeypatch):
     if torch.cuda.is_available():
         pytest.skip("there is a GPU, on which the check does not fail")
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
-    (fault,) = device_check._asked()
+    fault = device_check._check_in_own_process()
+    assert fault.startswith("the check failed")
     assert "CUDA" in fault or "NVIDIA" in fault
 
 

@@ -15,6 +15,7 @@ pytest.importorskip("triton", reason="the CUDA backend's kernels need Triton, wh
 from biresnerf.errors import InputError
 from biresnerf.field.cuda import field as cuda_field
 from biresnerf.field.cuda import plans
+from biresnerf.field.cuda.check_batch import learn
 from biresnerf.field.cuda.field import CudaField
 from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.field.reference import operations as reference
@@ -27,7 +28,6 @@ from tests.field.cuda.fields import (
     TOLERANCE,
     close,
     close_but_for_cell_faces,
-    learn,
     make,
     make_fast,
     make_marching,
@@ -91,6 +91,14 @@ def test_a_level_with_rate_zero_is_left_alone_and_its_gradient_forgotten():
     assert field._workspace is not None
     for table in field._workspace.tables.values():
         assert not table["gradient"].any()
+
+
+def test_a_step_whose_samples_were_overwritten_is_refused():
+    field = make_fast()
+    learn(field, make_rays(5), make_marching(), PositionGradient(1.0, 1.0, 1.0))
+    field.density(torch.rand(10, 3, device=DEVICE))
+    with pytest.raises(RuntimeError, match="between backward and step"):
+        field.step(RATES)
 
 
 @pytest.mark.parametrize("unbounded", [False, True])

@@ -1,5 +1,7 @@
 """Cameras that are fixed, and cameras that move as one: adjusted, and how exactly they are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,16 @@ def test_cameras_return_to_the_truth_in_the_frame_that_bodies_leave(rng, bodies)
     for group in bodies.shared:
         apart = [rigid_inverse(poses[group[0]]) @ poses[group[1]] for poses in (found, start)]
         np.testing.assert_allclose(*apart, atol=1e-9)
+
+
+def test_a_camera_that_is_known_exactly_fixes_its_body(rng):
+    truth, evidence = scene(rng)
+    start = moved_bodies(truth, FIXED_PAIRS, rng)
+    free = PosePrior.equal(start, 0.1, 0.4, PAIRS)
+    exact = np.where(np.arange(CAMERAS) == 2, 0.0, free.rotation)
+    found = adjust_poses(start, evidence, replace(free, rotation=exact)).world_from_cam
+    np.testing.assert_allclose(found[2:4], start[2:4], atol=1e-15)
+    assert camera_errors(found, truth).rotation_deg.max() < 1e-3
 
 
 def test_the_columns_of_bodies_are_the_derivative_of_their_rigid_motion(rng):

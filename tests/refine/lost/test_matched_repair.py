@@ -55,12 +55,20 @@ def test_a_camera_that_its_matches_contradict_is_placed_by_them(scene):
     assert MatchedRepair(optimiser, own).place() == []
 
 
-def test_fixed_cameras_stay_and_nothing_happens_without_matches(scene):
-    optimiser, own = begun(scene)
-    truth = optimiser.poses.poses().numpy()
-    optimiser.replace_pose(LOST, away(truth[LOST]))
+def test_nothing_happens_without_matches(scene):
+    optimiser, _ = begun(scene)
+    optimiser.replace_pose(LOST, away(optimiser.poses.poses().numpy()[LOST]))
     assert MatchedRepair(optimiser, None).place() == []
-    optimiser.bodies.fixed[LOST] = True
+
+
+@pytest.mark.parametrize("tied", ["fixed", "of a rig"])
+def test_cameras_that_cannot_move_alone_stay(scene, tied):
+    optimiser, own = begun(scene)
+    optimiser.replace_pose(LOST, away(optimiser.poses.poses().numpy()[LOST]))
+    if tied == "fixed":
+        optimiser.bodies.fixed[LOST] = True
+    else:
+        optimiser.bodies.of[LOST:] -= 1  # one body with the camera before it
     assert MatchedRepair(optimiser, own).place() == []
 
 

@@ -134,7 +134,7 @@ def test_the_fraction_waits_where_an_early_switch_makes_the_rest_dearer_than_tho
     assert later.fraction == early.fraction
 
 
-def test_a_loss_that_is_no_number_ends_the_run_with_a_reason(scene, tmp_path):
+def test_a_loss_that_is_nan_ends_the_run_with_a_reason(scene, tmp_path):
     stages = start(scene, tmp_path, tiny_options())
     with torch.no_grad():
         stages.optimiser.field.networks[4][:] = float("nan")
@@ -145,7 +145,7 @@ def test_a_loss_that_is_no_number_ends_the_run_with_a_reason(scene, tmp_path):
 
 
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
-def test_a_pose_that_is_no_number_ends_the_run_with_a_reason(scene, tmp_path, wrong):
+def test_a_pose_that_is_not_finite_ends_the_run_with_a_reason(scene, tmp_path, wrong):
     stages = start(scene, tmp_path, tiny_options())
     with torch.no_grad():
         stages.optimiser.poses.translation[0, 1] = wrong

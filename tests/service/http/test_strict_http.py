@@ -75,7 +75,7 @@ MALFORMED = {
     "two transfer codings": b"POST /v1/datasets HTTP/1.1\r\n"
     + HOST
     + b"Transfer-Encoding: gzip, chunked\r\n\r\n0\r\n\r\n",
-    "a chunk size that is no number": b"POST /v1/datasets HTTP/1.1\r\n"
+    "a chunk size that is not a number": b"POST /v1/datasets HTTP/1.1\r\n"
     + HOST
     + b"Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n{}\r\n0\r\n\r\n",
     "space before the colon": GET + HOST + b"X-A : b\r\n\r\n",

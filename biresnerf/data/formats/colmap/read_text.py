@@ -51,7 +51,7 @@ class _Words:
 
 
 def floats(words: list[str], where: str, what: str) -> NDArray[np.float64]:
-    """The words as float64 [n], NaN and infinity among them. Raises InputError where one is no number."""
+    """The words as float64 [n], NaN and infinity among them. Raises InputError where one is not a number."""
     try:
         return np.array([float(word) for word in words], dtype=np.float64)
     except ValueError:
@@ -149,7 +149,7 @@ def parse_points(text: str, file: str) -> colmap.ColmapPoints:
             values.append([float(word) for word in words[1:8]])
             elements += [int(word) for word in words[8:]]
         except ValueError:
-            raise checks.broken(where, "holds a word that is no number, or no whole one") from None
+            raise checks.broken(where, "holds a word that is not a number, or not a whole one") from None
         lengths.append(len(words) // 2 - 4)
     if not ids:
         return colmap.no_points()

@@ -49,7 +49,7 @@ class Prior:
             free = np.concatenate([free, lenses.free.reshape(-1)])
         usable = np.isfinite(deviation) & (deviation > 0)
         weight = np.where(usable, 1 / np.where(usable, deviation, 1.0) ** 2, 0.0)
-        return cls(Cameras.of(prior.world_from_cam, lenses), weight, free, prior.bodies)
+        return cls(Cameras.of(prior.world_from_cam, lenses), weight, free, prior.fixed_bodies)
 
     def cost(self, cameras: Cameras) -> float:
         return float((self.weight * cameras.apart(self.mean) ** 2).sum())
