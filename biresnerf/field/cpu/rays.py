@@ -98,7 +98,7 @@ def pack(origin, direction, t_buffer, dt_buffer, count, offset, unbounded, x, t,
 
 
 def bring_inside(x):
-    """Replaces positions [3 n] that are not finite by the grid's edge, in place: tables are read without a check of bounds.
+    """Replaces positions [3 n] that are not finite by the grid's edge, in place: tables are read without bounds checks.
 
     As unsigned numbers, positive floats are ordered as they are, and what is negative or not finite is larger.
     """

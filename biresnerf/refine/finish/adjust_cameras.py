@@ -17,7 +17,7 @@ from biresnerf.geometry.similarity import align_robust
 from biresnerf.refine.adjustment.adjustment import NOTHING_FITS, Adjustment, Halves, adjust_poses, misfit
 from biresnerf.refine.adjustment.choice import Candidate, Choice, choose
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
-from biresnerf.refine.finish.gather_evidence import SplitEvidence, gather_evidence
+from biresnerf.refine.finish.gather_evidence import gather_evidence
 from biresnerf.refine.finish.given_poses import GivenPoses, input_accuracy
 from biresnerf.refine.finish.lens_evidence import (
     contradicted_focals,
