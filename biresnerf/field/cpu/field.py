@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from biresnerf.field.cpu import encoding, network
-from biresnerf.field.cpu import rays as ray_kernels
+from biresnerf.field.cpu import marching as march_kernels
 from biresnerf.field.cpu.harmonics import add_harmonics_gradient, harmonics
 from biresnerf.field.cpu.matrix_blocks import CHANNELS, from_tiles
+from biresnerf.field.cpu.ray_gradients import ray_gradients
 from biresnerf.field.cpu.samples import Composited, Samples, segments
 from biresnerf.field.cpu.segments import render_segments
 from biresnerf.field.cpu.segments_backward import render_segments_backward
@@ -54,6 +55,7 @@ class CpuField(GridField):
         largest = int(np.concatenate([np.diff(grid.offset) for grid in self.grids.values()]).max())
         self._scratch = np.zeros((workers, 2 * largest), f4)
         self._pending: tuple[Samples, np.ndarray] | None = None
+        self._clearances: tuple[Tensor | None, int, np.ndarray] = (None, 0, np.empty(0))
 
     def _width(self) -> int:
         width = sum(self.grids[name].width for name in self.modules)
@@ -115,19 +117,28 @@ class CpuField(GridField):
         t_buffer = take("march t", rays, marching.most)
         dt_buffer = take("march dt", rays, marching.most)
         count = take("count", rays, dtype=np.int32)
-        ray_kernels.march(
+        march_kernels.march(
             origin, direction, jitter, marching.occupied.numpy().reshape(-1), marching.occupied.shape[0],
-            f4(marching.step), f4(marching.near), f4(marching.far), self.shape.unbounded, t_buffer, dt_buffer, count,
+            self._clearance(marching.occupied), f4(marching.step), f4(marching.near), f4(marching.far),
+            self.shape.unbounded, t_buffer, dt_buffer, count,
         )  # fmt: skip
         offset = np.zeros(rays + 1, np.int64)
         np.cumsum(count, out=offset[1:])
         n = int(offset[-1])
         x, t, dt, ray = take("x", 3 * n), take("t", n), take("dt", n), take("ray", n, dtype=np.int32)
-        ray_kernels.pack(
+        march_kernels.pack(
             origin, direction, t_buffer, dt_buffer, count, offset, self.shape.unbounded, x, t, dt, ray
         )
-        ray_kernels.bring_inside(x)
+        march_kernels.bring_inside(x)
         return offset, x, t, dt, ray
+
+    def _clearance(self, occupied: Tensor) -> np.ndarray:
+        """`march_kernels.clearances`, kept until the grid changes."""
+        known, version, clearance = self._clearances
+        if known is not occupied or version != occupied._version:
+            clearance = march_kernels.clearances(occupied.numpy())
+            self._clearances = (occupied, occupied._version, clearance)
+        return clearance
 
     def render_forward(self, origin: np.ndarray, direction: np.ndarray, view: np.ndarray, rays: Rays,
                        marching: Marching, gradient: PositionGradient | None,
@@ -244,8 +255,6 @@ class _RenderRays(torch.autograd.Function):
         if gradient is None:
             return (None,) * 7
         g_origin, g_direction = np.empty_like(o), np.empty_like(d)
-        ray_kernels.ray_gradients(
-            o, d, samples.offset, samples.t, dx, field.shape.unbounded, g_origin, g_direction
-        )
+        ray_gradients(o, d, samples.offset, samples.t, dx, field.shape.unbounded, g_origin, g_direction)
         add_harmonics_gradient(d, g_view, g_direction)
         return torch.from_numpy(g_origin), torch.from_numpy(g_direction), *(None,) * 5

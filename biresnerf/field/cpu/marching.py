@@ -1,4 +1,4 @@
-"""Ray marching through the occupancy grid and gradients to rays, in Numba.
+"""Ray marching through the occupancy grid, in Numba.
 
 The definitions are in `field.reference.operations`. Rays live in the unit frame; the encoding sees positions in
 [0, 1]: (x + 1) / 2 when the scene is bounded, (contract(x) + 2) / 4 when it is not.
@@ -14,6 +14,9 @@ from biresnerf.field.reference import operations
 
 f4, i4 = np.float32, np.int32
 ONE, TWO = f4(1), f4(2)
+BLOCK = 4  # cells a side that are passed at once where all are empty
+FARTHEST = 8  # blocks
+SAFETY = f4(1e-2)  # intervals: a midpoint that rounding puts beyond a face is looked at
 EDGE = f4(operations.EDGE)  # keeps grid positions strictly inside [0, 1)
 _LARGEST_BITS = np.array(ONE - EDGE, f4).view(np.uint32)
 
@@ -33,25 +36,72 @@ def _inside(v):
     return min(max(v, EDGE), ONE - EDGE)
 
 
+def clearances(occupied):
+    """How many blocks away from each the nearest one is that is not empty: uint8 [b, b, b] for cells [side] * 3.
+
+    Distances count diagonal neighbours, and end at `FARTHEST`. A block has `BLOCK` cells a side, one if they do not
+    divide the grid.
+    """
+    side = occupied.shape[0]
+    block = BLOCK if side % BLOCK == 0 else 1
+    blocks = side // block
+    near = occupied.reshape(blocks, block, blocks, block, blocks, block).any(axis=(1, 3, 5))
+    distance = np.where(near, 0, FARTHEST).astype(np.uint8)
+    for away in range(1, FARTHEST):
+        for axis in range(3):
+            before = np.moveaxis(near, axis, 0)
+            wider = before.copy()
+            wider[1:] |= before[:-1]
+            wider[:-1] |= before[1:]
+            near = np.moveaxis(wider, 0, axis)
+        np.minimum(distance, away, out=distance, where=near & (distance > away))
+    return distance
+
+
+@njit(inline="always", fastmath=True)
+def _entering(o, inverse):
+    """Where a ray enters the slab -1..1 along one axis."""
+    return (-ONE - o) * inverse if inverse > f4(0) else (ONE - o) * inverse
+
+
+@njit(inline="always", fastmath=True)
+def _leaving(o, inverse, low, high):
+    """Where a ray leaves the slab low..high along one axis."""
+    return (high - o) * inverse if inverse > f4(0) else (low - o) * inverse
+
+
+@njit(inline="always", fastmath=True)
+def _leaving_blocks(o, inverse, b, empty, middle, size):
+    """Where a ray leaves block b and its `empty` - 1 neighbours on either side, along one axis."""
+    return _leaving(o, inverse, (f4(b - empty + 1) - middle) * size, (f4(b + empty) - middle) * size)
+
+
+@njit(inline="always", fastmath=True)
+def _inverse(d):
+    return ONE / d if abs(d) >= f4(1e-9) else f4(1e9)
+
+
 @njit(**PARALLEL_KERNEL)
-def march(origin, direction, jitter, occupied, side, step, near, far, unbounded, t_buffer, dt_buffer, count):
+def march(
+    origin, direction, jitter, occupied, side, clearance, step, near, far, unbounded, t_buffer, dt_buffer, count
+):  # fmt: skip
     """Start and length of the live intervals of each ray: t_buffer, dt_buffer [rays, most], count [rays].
 
     Intervals are `step` long, growing as m^2 outside the inner box (even in contracted space, along rays from its
-    centre); one is live if the cell of its midpoint is.
+    centre); one is live if the cell of its midpoint is. Within the inner box, where rays are straight and intervals
+    even, those in empty blocks are passed at once (`clearances`).
     """
-    most = t_buffer.shape[1]
+    most, blocks = t_buffer.shape[1], clearance.shape[0]
+    block, centre, size = side // blocks, f4(0.5) * f4(blocks), (f4(4) if unbounded else TWO) / f4(blocks)
     for r in prange(origin.shape[0]):
         ox, oy, oz = origin[r, 0], origin[r, 1], origin[r, 2]
         dx, dy, dz = direction[r, 0], direction[r, 1], direction[r, 2]
+        vx, vy, vz = _inverse(dx), _inverse(dy), _inverse(dz)
+        leaving = min(_leaving(ox, vx, -ONE, ONE), _leaving(oy, vy, -ONE, ONE), _leaving(oz, vz, -ONE, ONE))
         t, t_end = near, far
         if not unbounded:
-            for axis in range(3):
-                d = direction[r, axis]
-                if abs(d) < f4(1e-9):
-                    d = f4(1e-9)
-                ta, tb = (-ONE - origin[r, axis]) / d, (ONE - origin[r, axis]) / d
-                t, t_end = max(t, min(ta, tb)), min(t_end, max(ta, tb))
+            entering = max(_entering(ox, vx), _entering(oy, vy), _entering(oz, vz))
+            t, t_end = max(t, entering), min(t_end, leaving)
         n = 0
         first = True
         while t < t_end and n < most:
@@ -74,7 +124,20 @@ def march(origin, direction, jitter, occupied, side, step, near, far, unbounded,
                 t_buffer[r, n] = t
                 dt_buffer[r, n] = dt
                 n += 1
-            t += dt
+                t += dt
+                continue
+            bx, by, bz = ix // block, iy // block, iz // block
+            empty = i4(clearance[bz, by, bx])
+            if empty == 0 or (unbounded and m > ONE):
+                t += dt
+                continue
+            until = min(
+                min(leaving, t_end),
+                _leaving_blocks(ox, vx, bx, empty, centre, size),
+                _leaving_blocks(oy, vy, by, empty, centre, size),
+                _leaving_blocks(oz, vz, bz, empty, centre, size),
+            )
+            t += dt * f4(max(i4((until - middle) / step - SAFETY) + 1, 1))
         count[r] = n
 
 
@@ -104,39 +167,3 @@ def bring_inside(x):
     """
     bits = x.view(np.uint32)
     np.minimum(bits, _LARGEST_BITS, out=bits)
-
-
-@njit(**PARALLEL_KERNEL)
-def ray_gradients(origin, direction, offset, t, dx, unbounded, g_origin, g_direction):
-    """Sum the samples' gradients dx [3, n] to grid positions into their rays."""
-    scale = f4(0.25) if unbounded else f4(0.5)
-    for r in prange(g_origin.shape[0]):
-        a0 = a1 = a2 = b0 = b1 = b2 = f4(0)
-        for i in range(offset[r], offset[r + 1]):
-            u, v, w = dx[0, i], dx[1, i], dx[2, i]
-            if unbounded:
-                px = origin[r, 0] + t[i] * direction[r, 0]
-                py = origin[r, 1] + t[i] * direction[r, 1]
-                pz = origin[r, 2] + t[i] * direction[r, 2]
-                m = max(abs(px), max(abs(py), abs(pz)))
-                if m > ONE:
-                    # y = f(m) x with f = (2 - 1/m)/m: J^T g = f g + f'(m) sign(x_k) (x . g) e_k, k the largest axis
-                    inverse = ONE / m
-                    factor = (TWO - inverse) * inverse
-                    slope = (TWO * inverse - TWO) * inverse * inverse
-                    along = slope * (px * u + py * v + pz * w)
-                    u, v, w = factor * u, factor * v, factor * w
-                    if abs(px) == m:
-                        u += along if px > f4(0) else -along
-                    elif abs(py) == m:
-                        v += along if py > f4(0) else -along
-                    else:
-                        w += along if pz > f4(0) else -along
-            a0 += u
-            a1 += v
-            a2 += w
-            b0 += t[i] * u
-            b1 += t[i] * v
-            b2 += t[i] * w
-        g_origin[r, 0], g_origin[r, 1], g_origin[r, 2] = scale * a0, scale * a1, scale * a2
-        g_direction[r, 0], g_direction[r, 1], g_direction[r, 2] = scale * b0, scale * b1, scale * b2
