@@ -22,9 +22,11 @@ from biresnerf.field.backends import resolve_here, use_threads
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import KERNELS_FROM, START_KNOWN, Monitor, OnProgress, Progress
 from biresnerf.refine.finish.rounds import run_stage_2
+from biresnerf.refine.finish.work_ahead import work_ahead
 from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.checkpoint import SEEDING, TRACKS, Checkpoint, RunOrigin
+from biresnerf.refine.stages.timing import Forecast
 from biresnerf.refine.stages.two_stages import Observer, TwoStages
 from biresnerf.refine.start.choose_start import find_start
 from biresnerf.refine.start.first_step import first_step, stage_lengths
@@ -179,7 +181,8 @@ def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observ
     )
     observer = replace(observer or Observer(), write_preview=partial(write_preview, setup.folder))
     optimiser = first_step(scene, options, setup.device, setup.threads)
-    stages = TwoStages(optimiser, scene, setup.folder.path, origin, setup.monitor, observer)
+    forecast = Forecast(work_ahead(scene, optimiser))
+    stages = TwoStages(optimiser, scene, setup.folder.path, origin, setup.monitor, observer, forecast)
     if setup.earlier is not None:
         stages.restore(setup.earlier)
         logger.info("continuing from step %d", optimiser.step_index)

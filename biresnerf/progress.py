@@ -14,7 +14,7 @@ from biresnerf.stages import ReusableStage, Stage
 
 # Where the parts of a run begin, as fractions of the whole.
 KERNELS_FROM, SEEDING_FROM, TRYING_FROM, START_KNOWN = 0.005, 0.01, 0.016, 0.02
-STAGES_FROM, EVALUATING_FROM, JUDGING_FROM, EXPORTING_FROM = 0.03, 0.88, 0.95, 0.99
+STAGES_FROM, EXPORTING_FROM = 0.03, 0.99
 
 
 class Progress(FrozenModel):

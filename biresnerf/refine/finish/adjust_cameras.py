@@ -102,7 +102,7 @@ def adjust_cameras(stages: TwoStages) -> Finish:
     if not adjusts_cameras(stages.scene.dataset, optimiser.method):
         return Finish()
     certainty = optimiser.lenses.certainty
-    with stages.record.timed("adjusting"):
+    with stages.timed("adjusting"):
         stages.repair.place_by_matches()
         found = _choice(stages.scene, optimiser, partial(_announce, stages))
     if found is None:

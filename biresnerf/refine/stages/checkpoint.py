@@ -6,9 +6,6 @@ The tensors are the file's tensors; all else is the JSON of `Checkpoint` in its 
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -64,13 +61,6 @@ class RunRecord(FrozenModel, arbitrary_types_allowed=True):
     switch_reason: SwitchReason | None = None
     adjusted: bool = False
     seconds: dict[str, float] = Field(default_factory=lambda: {"coarse": 0.0, "fine": 0.0})
-
-    @contextmanager
-    def timed(self, part: str) -> Iterator[None]:
-        """Record the seconds of a block, if it ends without an error."""
-        started = time.monotonic()
-        yield
-        self.seconds[part] = self.seconds.get(part, 0.0) + time.monotonic() - started
 
 
 class Checkpoint(FrozenModel, arbitrary_types_allowed=True):

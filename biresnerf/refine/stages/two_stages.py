@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +33,7 @@ from biresnerf.refine.stages.checkpoint import (
 )
 from biresnerf.refine.stages.history import History, HistoryLine
 from biresnerf.refine.stages.stability import StabilityDetector
-from biresnerf.refine.stages.timing import Estimate, PreviewTimer, StageName
+from biresnerf.refine.stages.timing import Forecast, Part, PreviewTimer, StageName
 from biresnerf.stages import ReusableStage
 
 logger = logging.getLogger(__name__)
@@ -61,6 +62,7 @@ class TwoStages:
     Args:
         folder: where checkpoints and the history go.
         origin: what the run was started with; goes into every checkpoint.
+        forecast: of the time that the whole run takes; of the stages alone where it is not given.
     """
 
     def __init__(
@@ -71,6 +73,7 @@ class TwoStages:
         origin: RunOrigin = RunOrigin(),
         monitor: Monitor = Monitor(),
         observer: Observer = Observer(),
+        forecast: Forecast | None = None,
     ) -> None:
         self.optimiser, self.scene, self.folder, self.origin = optimiser, scene, folder, origin
         self.monitor, self.observer = monitor, observer
@@ -82,7 +85,7 @@ class TwoStages:
             options.coarse_steps_max,
             guarded=optimiser.method.robust_extensions,
         )
-        self.estimate, self._previews = Estimate(), PreviewTimer(options.checkpoint_every_s)
+        self.forecast, self._previews = forecast or Forecast(), PreviewTimer(options.checkpoint_every_s)
         self._reported = self._saved = 0.0
         self._errors: list[float] = []
         self._losses: list[float] = []
@@ -126,6 +129,30 @@ class TwoStages:
         """Report what is done between steps."""
         self.monitor.report(self._progress(None).model_copy(update={"message": message}))
 
+    @contextmanager
+    def timed(self, part: Part) -> Iterator[None]:
+        """Around a part of the run besides its steps: its seconds are recorded if it ends without an error."""
+        started = time.monotonic()
+        with self.forecast.within(part):
+            yield
+        self.record.seconds[part] = self.record.seconds.get(part, 0.0) + time.monotonic() - started
+
+    def report_evaluation(self, share: float, step: int = 0, steps_total: int = 0, message: str = "") -> None:
+        """Report how much is done of the part that the run is in, after the stages."""
+        self.forecast.done_of_part = share
+        fraction, eta_s = self._time()
+        done = Progress(stage="evaluating", step=step, steps_total=steps_total, message=message)
+        self.monitor.report(done.model_copy(update={"fraction": fraction, "eta_s": eta_s}))
+
+    def _time(self) -> tuple[float, float]:
+        """Fraction of the run that is done, and seconds left."""
+        optimiser, record = self.optimiser, self.record
+        steps = optimiser.schedule.steps
+        if not record.adjusted:
+            steps = max(optimiser.step_index, round(self.forecast.ahead.share * steps))
+        switch = self.detector.cap if optimiser.switch is None else optimiser.switch
+        return self.forecast.at(optimiser.step_index, min(switch, steps), steps, record.seconds)
+
     def _step(self) -> None:
         """One step, and what is due after it: a check, a checkpoint, a preview, a report."""
         optimiser, options = self.optimiser, self.optimiser.options
@@ -136,7 +163,7 @@ class TwoStages:
         started, stage = time.monotonic(), self.stage
         result = optimiser.step()
         # Without the check: the time of a repair within it says nothing about the steps to come.
-        self.estimate.stepped(stage, time.monotonic() - started)
+        self.forecast.stepped(stage, time.monotonic() - started)
         if not math.isfinite(result.loss):
             raise RefinementError("diverged", f"The loss is not a number at step {optimiser.step_index}.")
         self._errors.append(result.mean_squared_error)
@@ -221,21 +248,17 @@ class TwoStages:
         )
 
     def _progress(self, checkpoint: str | None, preview: tuple[str, ...] = ()) -> Progress:
-        optimiser = self.optimiser
-        step, steps = optimiser.step_index, optimiser.schedule.steps
-        switch = self.detector.cap if optimiser.switch is None else optimiser.switch
-        fraction, eta_s = self.estimate.at(step, switch, steps, sum(self.record.seconds.values()))
+        fraction, eta_s = self._time()
         losses, self._losses = self._losses, []
         reusable, self._reusable = self._reusable, {}
         metrics = {"moved_deg": self._moved_deg, **self._signal}
-        if losses:
-            metrics["loss"] = float(np.mean(losses))
+        metrics |= {"loss": float(np.mean(losses))} if losses else {}
         if self._errors:
             metrics["psnr"] = -10 * math.log10(max(float(np.mean(self._errors)), 1e-12))
         return Progress(
             stage=self.stage,
-            step=step,
-            steps_total=steps,
+            step=self.optimiser.step_index,
+            steps_total=self.optimiser.schedule.steps,
             fraction=fraction,
             eta_s=eta_s,
             metrics=metrics,

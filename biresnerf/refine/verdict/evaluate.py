@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from biresnerf.data.show.view_file import ShownView
 from biresnerf.geometry.similarity import Similarity
-from biresnerf.progress import EVALUATING_FROM, JUDGING_FROM, Progress
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.views.evaluation import ViewScore, fit_held_out_poses, render_orbit, score_views
 from biresnerf.refine.views.shown_views import Points, spread_views, surface_of
@@ -60,32 +59,22 @@ def evaluate(stages: TwoStages, pictures: Pictures) -> Evaluation:
     Raises:
         Interrupted: stopped; a continued run evaluates again.
     """
-    with stages.record.timed("evaluating"):
+    with stages.timed("evaluating"):
         return _evaluate(stages, pictures)
 
 
 def _evaluate(stages: TwoStages, pictures: Pictures) -> Evaluation:
     optimiser, scene, monitor = stages.optimiser, stages.scene, stages.monitor
-    monitor.report(Progress(stage="evaluating", fraction=EVALUATING_FROM))
+    stages.report_evaluation(0.0)
     fit_held_out_poses(optimiser, scene.excluded_from_training)
     first = scene.held_out or list(range(min(SHOWN_WITHOUT_HELD_OUT, len(scene.dataset))))
     frames, more = optimiser.options.orbit_frames, optimiser.options.shown_views
     further = spread_views(scene.dataset.world_from_cam, first, more)
     work = len(first) + len(further) + frames
-    started = time.monotonic()
 
     def report(done: int) -> None:
         monitor.raise_if_stopped("stopped while the result was measured; run again to go on")
-        share, spent = done / max(1, work), time.monotonic() - started
-        monitor.report(
-            Progress(
-                stage="evaluating",
-                step=done,
-                steps_total=work,
-                fraction=EVALUATING_FROM + (JUDGING_FROM - EVALUATING_FROM) * share,
-                eta_s=spent * (1 - share) / share if share else None,
-            )
-        )
+        stages.report_evaluation(done / max(1, work), done, work)
 
     report(0)
     evaluation = Evaluation()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,7 +14,6 @@ from biresnerf.data.model.dataset import GUESSES, Dataset
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.progress import EXPORTING_FROM, JUDGING_FROM, Monitor, Progress
 from biresnerf.refine.lost.own_matches import contradicted
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
@@ -66,20 +66,27 @@ def judge(stages: TwoStages) -> Judgement | None:
     """
     if not stages.optimiser.options.verdict:
         return None
-    with stages.record.timed("judging"):
-        judgement = judge_poses(stages.scene, stages.optimiser, stages.monitor)
+    message = "comparing the refined poses with the input's"
+    with stages.timed("judging"):
+        judgement = judge_poses(
+            stages.scene, stages.optimiser, stages.monitor.should_stop,
+            lambda share: stages.report_evaluation(share, message=message),
+        )  # fmt: skip
     logger.info("verdict: %s", judgement.verdict.verdict)
     return judgement
 
 
-def judge_poses(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Judgement:
-    """Compare the optimised poses with the dataset's own. Raises `Interrupted` where `monitor` stops it."""
+def judge_poses(
+    scene: Scene,
+    optimiser: JointOptimiser,
+    should_stop: Callable[[], bool] = lambda: False,
+    report: Callable[[float], None] = lambda _share: None,
+) -> Judgement:
+    """Compare the optimised poses with the dataset's own; `report` is called with the share of work done.
 
-    def report(share: float) -> None:
-        fraction = JUDGING_FROM + (EXPORTING_FROM - JUDGING_FROM) * share
-        message = "comparing the refined poses with the input's"
-        monitor.report(Progress(stage="evaluating", fraction=fraction, message=message))
-
+    Raises:
+        Interrupted: ``should_stop`` returned true.
+    """
     report(0.0)
     dataset, images = scene.dataset, scene.images
     refined = optimiser.lenses.refined(dataset)
@@ -104,7 +111,7 @@ def judge_poses(scene: Scene, optimiser: JointOptimiser, monitor: Monitor) -> Ju
         if moved >= MEASURABLE_PX:
             heldout = compare_placed(
                 before, after, scene, optimiser, placed | (not grounded),
-                monitor.should_stop, lambda share: report(0.9 * share),
+                should_stop, report,
             )  # fmt: skip
     verdict = decide(
         Findings(

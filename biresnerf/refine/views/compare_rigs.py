@@ -76,7 +76,7 @@ def compare_on_unseen_views(
         Interrupted: ``should_stop`` returned true.
     """
     steps = options.trial_steps
-    rounds = unseen_rounds(len(images), held_out, most=16)[:rounds_most]
+    rounds = unseen_rounds(len(images), held_out)[:rounds_most]
     if steps == 0 or not rounds[0]:
         return None
     rigs = [rig.world_from_cam for rig in pair]

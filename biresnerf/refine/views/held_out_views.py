@@ -12,6 +12,7 @@ LEAST_VIEWS = 5  # unseen, where the set is large enough to spare them
 SPARED_OF = 3  # and one in so many at most
 # Fewer unseen views leave too wide an interval: trainings are repeated with others left out.
 ENOUGH_VIEWS, ROUNDS_MOST = 8, 3
+MOST_UNSEEN = 16  # of a round
 
 
 def evenly_spread(views: Sequence[int], count: int) -> list[int]:
@@ -44,7 +45,7 @@ def unseen_views(count: int, held_out: Sequence[int], most: int) -> list[int]:
     return sorted({*held_out, *evenly_spread(others, more)})
 
 
-def unseen_rounds(count: int, held_out: Sequence[int], most: int) -> list[list[int]]:
+def unseen_rounds(count: int, held_out: Sequence[int], most: int = MOST_UNSEEN) -> list[list[int]]:
     """The views that each pair of trainings leaves out: one round, or in small sets others as well, none twice."""
     rounds = [unseen_views(count, held_out, most)]
     while rounds[0] and len(rounds) < ROUNDS_MOST and sum(map(len, rounds)) < ENOUGH_VIEWS:

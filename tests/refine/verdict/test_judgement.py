@@ -11,7 +11,6 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
-from biresnerf.progress import Monitor
 from biresnerf.refine.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refine.verdict.judgement import Judgement, judge_poses
 from biresnerf.refine.verdict.pose_evidence import compare_on_matches, moved_px
@@ -67,7 +66,7 @@ def judged(
     dataset, images = scene
     optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3])
     run = replace(given_scene(with_poses(dataset, given), images, [3]), tracks=tracks)
-    return judge_poses(run, optimiser, Monitor())
+    return judge_poses(run, optimiser)
 
 
 def test_true_poses_in_place_of_noisy_ones_are_an_improvement(scene, noisy):
@@ -124,9 +123,7 @@ def test_images_whose_poses_were_guessed_have_no_part_in_the_trials(scene, noisy
         frames = list(with_poses(dataset, given).frames)
         frames[1] = replace(frames[1], pose_source="nearest-view")
         run = given_scene(replace(dataset, frames=tuple(frames)), images, [3])
-        return judge_poses(
-            run, tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3]), Monitor()
-        )
+        return judge_poses(run, tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3]))
 
     found = judged_with_a_guess(truth[0])
     assert found.verdict.verdict == "improved"

@@ -73,7 +73,7 @@ def test_without_evidence_nothing_is_said_to_be_known(tmp_path, rng):
 def test_a_pose_that_its_own_matches_contradict_is_not_known(tmp_path, rng):
     run, _ = stages(tmp_path, rng)
     finish = adjust_cameras(run)
-    judgement = judge_poses(run.scene, run.optimiser, run.monitor)
+    judgement = judge_poses(run.scene, run.optimiser)
     errors = judgement.epipolar_px.copy()
     errors[:, 3] = 20 * np.nanmedian(errors)
     known = pose_uncertainty(run, finish, replace(judgement, epipolar_px=errors))

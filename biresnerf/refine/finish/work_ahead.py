@@ -1,0 +1,32 @@
+"""What a run will do besides its steps, and how long that takes: foretold for its progress bar."""
+
+from __future__ import annotations
+
+from biresnerf.refine.finish.photo_trial import TIMES
+from biresnerf.refine.finish.rounds import FIRST_ROUND, LEARNING
+from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.scene.scene import Scene
+from biresnerf.refine.stages.timing import Part, WorkAhead
+from biresnerf.refine.start.first_step import adjusts_cameras
+from biresnerf.refine.views.held_out_views import unseen_rounds
+
+# In steps of stage 2, as measured over the sets of docs/estimator.md; single runs differ by a half.
+ADJUSTING, ADJUSTING_TRACKS, EVALUATING = 130.0, 200.0, 100.0
+TRAINING = 0.8  # a step of a trial, whose poses stand still
+
+
+def work_ahead(scene: Scene, optimiser: JointOptimiser) -> WorkAhead:
+    """What follows from the set and the options."""
+    options = optimiser.options
+    parts: dict[Part, float] = {}
+    share = 1.0
+    trial = 2 * TRAINING * options.trial_steps
+    if adjusts_cameras(scene.dataset, optimiser.method):
+        parts["adjusting"] = ADJUSTING
+        if scene.tracks is not None:  # mostly, these move the cameras, which then stand still
+            parts["adjusting"] += ADJUSTING_TRACKS + TIMES * trial
+            share = FIRST_ROUND + LEARNING
+    parts["evaluating"] = EVALUATING
+    if options.verdict:
+        parts["judging"] = trial * len(unseen_rounds(len(scene.dataset), scene.held_out))
+    return WorkAhead(parts, share)
