@@ -9,10 +9,11 @@ from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.timing import Part, WorkAhead
 from biresnerf.refine.start.first_step import adjusts_cameras
 from biresnerf.refine.views.held_out_views import unseen_rounds
+from biresnerf.refine.views.pose_trials import OPEN_STEPS
 
 # In steps of stage 2, as measured over the sets of docs/estimator.md; single runs differ by a half.
-ADJUSTING, ADJUSTING_TRACKS, EVALUATING = 130.0, 200.0, 100.0
-TRAINING = 0.8  # a step of a trial, whose poses stand still
+ADJUSTING, ADJUSTING_TRACKS, EVALUATING = 130.0, 100.0, 100.0
+TRAINING = 0.45  # a step of a trial: stage 1, half of the samples, poses that stand still
 
 
 def work_ahead(scene: Scene, optimiser: JointOptimiser) -> WorkAhead:
@@ -20,7 +21,7 @@ def work_ahead(scene: Scene, optimiser: JointOptimiser) -> WorkAhead:
     options = optimiser.options
     parts: dict[Part, float] = {}
     share = 1.0
-    trial = 2 * TRAINING * options.trial_steps
+    trial = 2 * TRAINING * options.trial_steps * (OPEN_STEPS if optimiser.frame.unbounded else 1)
     if adjusts_cameras(scene.dataset, optimiser.method):
         parts["adjusting"] = ADJUSTING
         if scene.tracks is not None:  # mostly, these move the cameras, which then stand still
@@ -28,5 +29,6 @@ def work_ahead(scene: Scene, optimiser: JointOptimiser) -> WorkAhead:
             share = FIRST_ROUND + LEARNING
     parts["evaluating"] = EVALUATING
     if options.verdict:
-        parts["judging"] = trial * len(unseen_rounds(len(scene.dataset), scene.held_out))
+        rounds = len(unseen_rounds(len(scene.dataset), scene.held_out))
+        parts["judging"] = trial * (1 + rounds) / 2  # the first may decide
     return WorkAhead(parts, share)

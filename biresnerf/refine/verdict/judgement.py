@@ -24,6 +24,7 @@ from biresnerf.refine.verdict.pose_evidence import (
     EpipolarComparison,
     compare_on_matches,
     moved_px,
+    working_share,
 )
 from biresnerf.refine.verdict.verdict import MEASURABLE_PX, Findings, decide, failed_checks, frame_doubt
 from biresnerf.refine.views.compare_rigs import HeldOutComparison, Rig, compare_placed
@@ -121,6 +122,7 @@ def judge_poses(
             epipolar=epipolar.evidence if epipolar else None,
             compared_with=_source_of_poses(dataset),
             grounded=grounded,
+            working_share=working_share(before, images),
             out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
         )
     )

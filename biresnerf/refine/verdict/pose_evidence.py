@@ -80,6 +80,12 @@ def _known(errors: tuple[Array, Array], counted: NDArray[np.bool_]) -> NDArray[n
     return np.isfinite(errors[0]) & np.isfinite(errors[1]) & counted
 
 
+def working_share(rig: Rig, images: ImageSet) -> float:
+    """The photos' long sides at working size over those at full size: the median."""
+    full = np.array([max(camera.width, camera.height) for camera in rig.cameras])
+    return float(np.median(np.maximum(images.widths, images.heights) / full))
+
+
 def moved_px(before: Rig, after: Rig, images: ImageSet) -> float:
     """How far the scene moves in the image (px, working size) between two rigs in one frame: median over cameras.
 

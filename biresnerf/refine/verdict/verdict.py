@@ -26,6 +26,9 @@ EPIPOLAR_MATTERS = 0.1  # log2, a difference that matters: 7 % of the error
 MEASURABLE_PX = 0.1  # at working size: less motion cannot be seen in photos of that size
 # Feature matches that miss by more than this share of the image fit no scene: neither set of poses can be trusted.
 FITS_BELOW = 0.02
+# Matches speak for poses only if the error that they lose is so large a share of the motion, but for one px of it:
+# poses that fitted well need not move far to fit a little better (docs/verdict.md).
+EXPLAINED, UNEXPLAINED_PX = 0.1, 1.0
 MOSTLY = 0.5  # share of cameras; if more fail a check, the whole set fails it
 FAR_DEG, FAR_SHARE = 60.0, 0.5  # median residuals; beyond, the result is only roughly in the input's frame
 VIEWS, MATCHES = "unseen views", "feature matches"
@@ -37,6 +40,8 @@ class Findings:
 
     Attributes:
         failed: sentences on what is inconsistent; empty where all is well.
+        moved_px: how far the image moved, at working size.
+        working_share: working size over the full size that `epipolar` is measured at.
         out_of_frame: a sentence if the refined poses fit the input's frame only roughly, else empty.
         compared_with: where the input's poses come from.
         grounded: whether the input's poses are given ones or come from matches, and are not mere guesses.
@@ -49,6 +54,16 @@ class Findings:
     compared_with: Literal["given", "seeded", "mixed"]
     grounded: bool
     out_of_frame: str = ""
+    working_share: float = 1.0
+
+    @property
+    def explained(self) -> bool:
+        """Whether the matches' error fell by enough to show that such a motion is right."""
+        if self.epipolar is None:
+            return False
+        error = self.epipolar.error_px
+        lost_px = (error.before - error.after) * self.working_share
+        return EXPLAINED * (self.moved_px - UNEXPLAINED_PX) < lost_px
 
 
 def failed_checks(refined: Array, lost: int) -> tuple[str, ...]:
@@ -116,6 +131,12 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
         return "improved", " ".join(
             filter(None, (f"The refined poses are better by {_named(speaks_for)}.", f.out_of_frame))
         )
+    if _matches_are_better(f):
+        return (
+            "inconclusive",
+            "Feature matches fit the refined poses better, but by too little for poses that moved by "
+            f"{f.moved_px:.3g} px.",
+        )
     findings = [item.finding for item in _counted(f)]
     if findings and all(finding == "same" for finding in findings):
         return "kept_input", "The refined poses are no better than the input's by any measure."
@@ -135,9 +156,13 @@ def _for(f: Findings) -> list[str]:
     names = []
     if f.heldout is not None and f.heldout.psnr.finding == "better":
         names.append(VIEWS)
-    if f.epipolar is not None and f.epipolar.independent and f.epipolar.error_px.finding == "better":
+    if _matches_are_better(f) and f.explained:
         names.append(MATCHES)
     return names
+
+
+def _matches_are_better(f: Findings) -> bool:
+    return f.epipolar is not None and f.epipolar.independent and f.epipolar.error_px.finding == "better"
 
 
 def _against(f: Findings) -> list[str]:

@@ -70,7 +70,7 @@ def compare_on_unseen_views(
     Args:
         held_out: views that the refinement never trained on; others join them where these are few.
         report: called with the share of work done.
-        rounds_most: small sets are trained so often, with other views left out.
+        rounds_most: small sets are trained so often, with other views left out, unless the first ones decide.
 
     Raises:
         Interrupted: ``should_stop`` returned true.
@@ -81,20 +81,33 @@ def compare_on_unseen_views(
         return None
     rigs = [rig.world_from_cam for rig in pair]
     scores: tuple[list[TrialScores], list[TrialScores]] = ([], [])
+    seen: list[int] = []
     for views in rounds:
         trials = PoseTrials(images, views, rigs, options, steps, device, threads, should_stop)
         for side, rig in zip(scores, pair, strict=True):
             side.append(trials.score(rig.world_from_cam, rig.lenses(images)))
             report(sum(map(len, scores)) / (2 * len(rounds)))
-    old, new = (joined(side) for side in scores)
-    seen = [view for views in rounds for view in views]
-    evidence = HeldOutEvidence(
-        steps=trials.steps,
-        strictly=len(set(seen) & set(held_out)),
-        psnr=paired(old.psnr, new.psnr, PSNR_MATTERS),
-        ssim=paired(old.ssim, new.ssim, SSIM_MATTERS),
-    )
+        seen += views
+        old, new = (joined(side) for side in scores)
+        evidence = HeldOutEvidence(
+            steps=trials.steps,
+            strictly=len(set(seen) & set(held_out)),
+            psnr=paired(old.psnr, new.psnr, PSNR_MATTERS),
+            ssim=paired(old.ssim, new.ssim, SSIM_MATTERS),
+        )
+        if _decided(evidence):
+            break
     return HeldOutComparison(seen, old, new, evidence)
+
+
+def _decided(evidence: HeldOutEvidence) -> bool:
+    """Whether both intervals lie beyond what matters, on the same side: other views would hardly change that."""
+    psnr, ssim = evidence.psnr, evidence.ssim
+    if psnr.low is None or psnr.high is None or ssim.low is None or ssim.high is None:
+        return False
+    better = psnr.low > PSNR_MATTERS and ssim.low > SSIM_MATTERS
+    worse = psnr.high < -PSNR_MATTERS and ssim.high < -SSIM_MATTERS
+    return better or worse
 
 
 def compare_placed(

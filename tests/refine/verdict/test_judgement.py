@@ -76,6 +76,15 @@ def test_true_poses_in_place_of_noisy_ones_are_an_improvement(scene, noisy):
     assert verdict.heldout.strictly == 1
 
 
+def test_other_views_are_left_out_only_until_they_decide(scene):
+    truth = scene[0].world_from_cam
+    first, second = unseen_rounds(VIEWS, [3])
+    far, near = (judged(scene, perturb_poses(truth, noise, seed=1), truth).verdict for noise in (0.3, 0.02))
+    assert far.heldout.psnr.count == len(first)
+    assert near.heldout.psnr.count == len(first) + len(second)
+    assert far.heldout.psnr.low > 0.5
+
+
 def test_poses_that_a_broken_refinement_spoilt_are_not_returned(scene, noisy):
     verdict = judged(scene, scene[0].world_from_cam, noisy).verdict
     assert (verdict.verdict, verdict.returned) == ("kept_input", "input")

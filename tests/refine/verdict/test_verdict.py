@@ -96,6 +96,17 @@ def test_matches_that_made_the_start_speak_against_refined_poses_but_not_for_the
     assert decide(findings(epipolar=matched(-1.0, independent=False))).verdict == "kept_input"
 
 
+def test_matches_that_gain_little_do_not_speak_for_poses_that_moved_far():
+    """They lose 1 px: a tenth of 11 px, but for one that is free."""
+    moved_far, fairly, a_little = ({"moved_px": moved} for moved in (11.5, 10.5, 0.9))
+    assert decide(findings(held_out(0.05), matched(1.0), **moved_far)).verdict == "inconclusive"
+    assert decide(findings(held_out(0.05), matched(1.0), **fairly)).verdict == "improved"
+    assert decide(findings(held_out(4.0), matched(1.0), **moved_far)).verdict == "improved"
+    assert decide(findings(held_out(0.05), matched(0.11), **a_little)).verdict == "improved"
+    # At half the size a px of the matches is half a px of the motion.
+    assert decide(findings(epipolar=matched(1.0), working_share=0.5, **fairly)).verdict == "inconclusive"
+
+
 def test_without_evidence_refined_poses_stand_only_against_a_guess():
     assert decide(findings(grounded=False)).returned == "refined"
     assert decide(findings(held_out(-4.0), grounded=False)).returned == "input"
