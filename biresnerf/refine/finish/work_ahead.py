@@ -8,7 +8,6 @@ from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.timing import Part, WorkAhead
 from biresnerf.refine.start.first_step import adjusts_cameras
-from biresnerf.refine.views.held_out_views import unseen_rounds
 from biresnerf.refine.views.pose_trials import OPEN_STEPS
 
 # In steps of stage 2, as measured over the sets of docs/estimator.md; single runs differ by a half.
@@ -29,6 +28,5 @@ def work_ahead(scene: Scene, optimiser: JointOptimiser) -> WorkAhead:
             share = FIRST_ROUND + LEARNING
     parts["evaluating"] = EVALUATING
     if options.verdict:
-        rounds = len(unseen_rounds(len(scene.dataset), scene.held_out))
-        parts["judging"] = trial * (1 + rounds) / 2  # the first may decide
+        parts["judging"] = trial  # of several rounds the first decides mostly
     return WorkAhead(parts, share)

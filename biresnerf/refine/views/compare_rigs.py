@@ -69,7 +69,7 @@ def compare_on_unseen_views(
 
     Args:
         held_out: views that the refinement never trained on; others join them where these are few.
-        report: called with the share of work done.
+        report: called with the share of work done, if the present round decides.
         rounds_most: small sets are trained so often, with other views left out, unless the first ones decide.
 
     Raises:
@@ -82,11 +82,11 @@ def compare_on_unseen_views(
     rigs = [rig.world_from_cam for rig in pair]
     scores: tuple[list[TrialScores], list[TrialScores]] = ([], [])
     seen: list[int] = []
-    for views in rounds:
+    for done, views in enumerate(rounds):
         trials = PoseTrials(images, views, rigs, options, steps, device, threads, should_stop)
         for side, rig in zip(scores, pair, strict=True):
             side.append(trials.score(rig.world_from_cam, rig.lenses(images)))
-            report(sum(map(len, scores)) / (2 * len(rounds)))
+            report(sum(map(len, scores)) / (2 * (done + 1)))
         seen += views
         old, new = (joined(side) for side in scores)
         evidence = HeldOutEvidence(
