@@ -106,7 +106,7 @@ def directions_for(device: torch.device) -> Directions:
 def make_field(shape: FieldShape, seed: int, device: torch.device, threads: int) -> RadianceField:
     """The fastest backend for the device: Numba kernels on the CPU, Triton kernels on CUDA.
 
-    Plain torch replaces kernels that give wrong results on this GPU.
+    Plain torch replaces kernels that did not pass their check on this GPU.
     """
     field: RadianceField
     if device.type == "cpu":
@@ -116,7 +116,9 @@ def make_field(shape: FieldShape, seed: int, device: torch.device, threads: int)
     elif faults := gpu_faults(device):
         from biresnerf.field.reference.field import ReferenceField
 
-        logger.warning("using plain torch: the CUDA kernels give wrong results on this GPU (%s)", faults[0])
+        logger.warning(
+            "using plain torch: the CUDA kernels did not pass their check on this GPU (%s)", faults[0]
+        )
         field = ReferenceField(shape, seed, device)
     else:
         from biresnerf.field.cuda.field import CudaField

@@ -111,8 +111,8 @@ def gpu_warnings(device: torch.device) -> tuple[str, ...]:
     if not faults:
         return ()
     return (
-        f"The CUDA kernels give wrong results on this GPU ({faults[0]}). Plain torch was used instead, which is many "
-        "times slower. docs/cuda.md says what to send.",
+        f"The CUDA kernels did not pass their check on this GPU ({faults[0]}). Plain torch was used instead, which is "
+        "many times slower. docs/cuda.md says what to send.",
     )
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.photos.images import ImageSet
+from biresnerf.data.photos.images import ImageSet, load_images
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.refine.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refine.verdict.judgement import Judgement, judge_poses
-from biresnerf.refine.verdict.pose_evidence import compare_on_matches, moved_px
+from biresnerf.refine.verdict.pose_evidence import compare_on_matches, moved_px, working_share
 from biresnerf.refine.views import pose_trials
 from biresnerf.refine.views.compare_rigs import Rig
 from biresnerf.refine.views.held_out_views import held_out_views, unseen_rounds, unseen_views
@@ -95,6 +95,13 @@ def test_poses_that_stayed_are_unchanged(scene):
     poses = scene[0].world_from_cam
     verdict = judged(scene, poses, perturb_poses(poses, 1e-5, seed=2)).verdict
     assert (verdict.verdict, verdict.returned) == ("unchanged", "input")
+
+
+def test_the_working_share_is_of_the_long_sides(scene):
+    dataset = scene[0]
+    rig = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in range(VIEWS)))
+    assert working_share(rig, scene[1]) == 1
+    assert working_share(rig, load_images(dataset, 12)) == 0.5
 
 
 def test_matches_alone_tell_good_poses_from_bad_ones(scene, noisy, monkeypatch):
