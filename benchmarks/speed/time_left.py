@@ -1,8 +1,8 @@
-"""Whether the time left is told rightly: ``python -m benchmarks.speed.time_left SET... [--preset fast]``.
+"""How accurate the predicted time left is: ``python -m benchmarks.speed.time_left SET... [--preset fast]``.
 
-Each SET holds true poses, which get BARF's noise (0.15). Prints for each what a run took, and what it had told at 10,
-25, 50, 75 and 90 % of that time as its seconds to the end, divided by those that it really had. Before the first step
-nothing is told (``-``).
+Each SET holds true poses, which get BARF's noise (0.15). Prints how long each run took, and at 10, 25, 50,
+75 and 90 % of that time the predicted seconds to the end over the actual ones. Before the first step nothing is
+predicted (``-``).
 """
 
 from __future__ import annotations

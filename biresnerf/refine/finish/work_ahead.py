@@ -1,4 +1,4 @@
-"""What a run will do besides its steps, and how long that takes: foretold for its progress bar."""
+"""Predicts how long the parts of a run besides its steps will take, for the progress bar."""
 
 from __future__ import annotations
 

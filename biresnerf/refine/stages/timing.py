@@ -98,7 +98,7 @@ class Forecast:
         left_s += sum(self._left_s(part, cost * fine, spent) for part, cost in self.ahead.parts.items())
         spent_s = sum(spent.values()) + self._running_s
         share = spent_s / max(spent_s + left_s, 1e-9)
-        # What was unforeseen makes the rest longer; the fraction never falls all the same.
+        # The prediction may grow; the fraction never falls all the same.
         self._fraction = max(self._fraction, STAGES_FROM + (EXPORTING_FROM - STAGES_FROM) * share)
         return self._fraction, left_s
 

@@ -22,7 +22,7 @@ def left_at(found: Forecast, step: int, **spent: float) -> float:
     return found.at(step, SWITCH, STEPS, {"coarse": 4.0, "fine": 0.0, **spent})[1]
 
 
-def test_the_steps_and_what_follows_them_are_foretold():
+def test_the_steps_and_what_follows_them_are_predicted():
     assert left_at(forecast(), 0) == pytest.approx(400 * COARSE_S + 600 * FINE_S + AFTER_S)
     assert left_at(forecast(), 700) == pytest.approx(300 * FINE_S + AFTER_S)
     assert left_at(forecast({}), STEPS) == 0
@@ -40,7 +40,7 @@ def test_a_part_that_is_over_has_nothing_left_whatever_it_took():
         assert left_at(found, STEPS) == pytest.approx(300 * FINE_S, abs=0.1)
 
 
-def test_a_part_on_its_way_is_foretold_by_what_it_has_taken():
+def test_a_part_on_its_way_is_predicted_by_what_it_has_taken():
     found = forecast({"judging": 10.0})  # 0.2 s are expected
     with found.within("judging"):
         time.sleep(0.4)
