@@ -32,7 +32,7 @@ from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.adjustment.adjustment import adjust_poses
 from biresnerf.refine.adjustment.evidence import PosePrior
-from biresnerf.refine.finish.adjust_cameras import PRIOR
+from biresnerf.refine.finish.candidates import PRIOR
 from biresnerf.studies.scenes import with_poses
 
 Array = NDArray[np.float64]

@@ -32,7 +32,7 @@ from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.adjustment.adjustment import adjust_poses
 from biresnerf.refine.adjustment.evidence import PosePrior
 from biresnerf.refine.finish import given_poses as room
-from biresnerf.refine.finish.adjust_cameras import PRIOR
+from biresnerf.refine.finish.candidates import PRIOR
 from biresnerf.refine.finish.gather_evidence import MOST_OBSERVATIONS
 
 Array = NDArray[np.float64]

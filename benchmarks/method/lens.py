@@ -28,7 +28,7 @@ from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refine.adjustment.adjustment import adjust_poses
 from biresnerf.refine.adjustment.evidence import PosePrior
 from biresnerf.refine.adjustment.lens.corrected_camera import corrected_camera
-from biresnerf.refine.finish.adjust_cameras import PRIOR
+from biresnerf.refine.finish.candidates import PRIOR
 from biresnerf.refine.finish.lens_evidence import lenses_before
 
 DISTURBED = 0.01  # rad, and shares of the cameras' distance

@@ -44,7 +44,11 @@ class Choice:
     reports: tuple[CandidateReport, ...]
 
 
-def choose(candidates: Sequence[Candidate], misfits: Mapping[str, Array]) -> Choice:
+def choose(
+    candidates: Sequence[Candidate],
+    misfits: Mapping[str, Array],
+    alike: Mapping[str, NDArray[np.bool_]] | None = None,
+) -> Choice:
     """The candidate that evidence left out speaks for.
 
     A candidate is beaten by one that fits some kind of evidence better and none worse, beyond chance over cameras. The
@@ -54,6 +58,7 @@ def choose(candidates: Sequence[Candidate], misfits: Mapping[str, Array]) -> Cho
         candidates: in the order in which they are kept on a tie.
         misfits: of each kind of evidence (``tracks``, ``patches``), [candidates, n]: each camera's mean robust square
             in noise levels; NaN where it does not know the camera.
+        alike: bool [candidates] by kind: candidates that such evidence does not tell from each other, whatever it fits.
     """
     reports = tuple(
         CandidateReport(
@@ -64,7 +69,7 @@ def choose(candidates: Sequence[Candidate], misfits: Mapping[str, Array]) -> Cho
         for i, candidate in enumerate(candidates)
     )
     count = range(len(candidates))
-    beats = np.array([[_beats(misfits, i, j) for j in count] for i in count])
+    beats = np.array([[_beats(misfits, alike or {}, i, j) for j in count] for i in count])
     best = int((beats[:, 0] & ~beats.any(0)).argmax())
     logger.info(
         "poses: %s of %s", candidates[best].name,
@@ -74,9 +79,14 @@ def choose(candidates: Sequence[Candidate], misfits: Mapping[str, Array]) -> Cho
     return Choice(candidates[best], reports)
 
 
-def _beats(misfits: Mapping[str, Array], one: int, other: int) -> bool:
+def _beats(
+    misfits: Mapping[str, Array], alike: Mapping[str, NDArray[np.bool_]], one: int, other: int
+) -> bool:
     """Whether a candidate fits some kind of evidence better than another one, and none worse."""
-    signs = [_sign(gains) for gains in (_gains(kind, one, other) for kind in misfits.values())]
+    signs = [
+        0 if kind in alike and alike[kind][[one, other]].all() else _sign(_gains(misfit, one, other))
+        for kind, misfit in misfits.items()
+    ]
     return 1 in signs and -1 not in signs
 
 

@@ -52,6 +52,21 @@ class ExpectedErrors:
         """Mean squares of the errors [n, 6, 6]."""
         return np.asarray(self.covariance + self.away[:, :, None] * self.away[:, None, :])
 
+    @property
+    def deviations(self) -> float:
+        """How far the poses are from the preferred ones: the median camera's, in standard deviations of its pose.
+
+        Infinite where that of most cameras is not known: the evidence does not say, or they are too far away.
+        """
+        deviation = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        fixed = (deviation == 0).all(1)
+        squares = np.full(len(self.away), np.inf)
+        for i in np.flatnonzero(self.known & ~fixed):
+            away, scale = self.away[i] / deviation[i], np.outer(deviation[i], deviation[i])
+            squares[i] = away @ np.linalg.pinv(self.covariance[i] / scale, hermitian=True) @ away / len(away)
+        told = (self.by_tracks | self.by_patches) & ~fixed
+        return float(np.sqrt(np.median(squares[told]))) if told.any() else np.inf
+
     def bounds_90(self) -> tuple[Array, Array]:
         """What nine in ten errors are within: of the rotation (rad) and the position, [n] each."""
         turned, shifted = (

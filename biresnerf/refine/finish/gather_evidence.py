@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,10 @@ class SplitEvidence:
     fitted: Evidence
     left_out: Evidence
     placed: NDArray[np.bool_]
+
+    def without_tracks(self) -> SplitEvidence:
+        fitted, left_out = (replace(each, tracks=None) for each in (self.fitted, self.left_out))
+        return SplitEvidence(fitted, left_out, self.placed)
 
 
 def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from biresnerf.refine.finish.adjust_cameras import Finish, adjust_cameras
+from biresnerf.refine.finish.adjust_cameras import adjust_cameras
+from biresnerf.refine.finish.outcome import Finish
 from biresnerf.refine.stages.two_stages import TwoStages
 
 # Shares of all steps: where cameras are adjusted first, and how long the field then learns at their poses. The first is

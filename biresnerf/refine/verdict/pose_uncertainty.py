@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from biresnerf.geometry.focus import focus_point, rms_spread
-from biresnerf.refine.finish.adjust_cameras import Finish
 from biresnerf.refine.finish.expected_errors import ExpectedErrors, expected_errors
+from biresnerf.refine.finish.outcome import Finish
 from biresnerf.refine.lost.own_matches import contradicted
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.first_step import poses_in_input_frame

@@ -11,8 +11,8 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.named_images import few_names
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.field.backends import gpu_faults
-from biresnerf.refine.finish.adjust_cameras import Finish
 from biresnerf.refine.finish.given_poses import accuracy_report, accuracy_warnings
+from biresnerf.refine.finish.outcome import Finish
 from biresnerf.refine.lost.own_matches import LEAST_PAIRS
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene

@@ -48,6 +48,24 @@ def test_nothing_is_taken_that_one_kind_of_evidence_speaks_against():
     assert chosen(tracks=(2.5, 1.0, 0.9, 2.5), patches=(2.5, 1.0, 1.6, 2.5)) == "refined"
 
 
+def test_evidence_does_not_choose_between_candidates_that_are_alike_to_it():
+    rng = np.random.default_rng(0)
+    poses = [Candidate(name, np.zeros((CAMERAS, 4, 4))) for name in NAMES]
+
+    def taken(alike, **kinds):
+        misfits = {
+            kind: np.array(errors)[:, None] ** 2 * np.exp(rng.normal(0, 0.05, (4, CAMERAS)))
+            for kind, errors in kinds.items()
+        }
+        return choose(poses, misfits, {"tracks": np.array(alike)}).chosen.name
+
+    tracks = (3.0, 1.3, 1.0, 1.0)
+    assert taken((False,) * 4, tracks=tracks) == "adjusted"
+    assert taken((False, True, True, True), tracks=tracks) == "refined"
+    assert taken((True, True, True, True), tracks=tracks) == "input"
+    assert taken((False, True, True, True), tracks=tracks, patches=(3.0, 1.3, 1.0, 1.3)) == "adjusted"
+
+
 def test_evidence_that_knows_no_camera_says_nothing():
     poses = [Candidate(name, np.zeros((CAMERAS, 4, 4))) for name in NAMES[:2]]
     none = choose(poses, {"tracks": np.full((2, CAMERAS), np.nan)})

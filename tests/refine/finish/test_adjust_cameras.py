@@ -12,6 +12,7 @@ from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refine.adjustment.lens.corrected_camera import corrected_camera
 from biresnerf.refine.finish import adjust_cameras as module
+from biresnerf.refine.finish import choose_poses
 from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.finish.given_poses import accuracy_report
 from biresnerf.refine.finish.photo_evidence import photo_patches
@@ -237,13 +238,28 @@ def test_tracks_that_agree_on_other_poses_than_the_photos_are_not_believed(tmp_p
     assert errors_deg(run, truth).mean() < 2 * before.mean() + 0.5
 
 
+@pytest.mark.parametrize(("refined", "name"), [(0.0002, "refined"), (0.04, "adjusted-tracks")])
+def test_tracks_that_share_their_errors_move_no_camera_within_their_accuracy(tmp_path, rng, refined, name):
+    """All features of a photo lie half a noise level beside where they belong, also those left out."""
+    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3), refined=refined)
+    tracks = observed(truth, rng.uniform(-0.5, 0.5, (400, 3)), lenses(run.scene.dataset), rng, 0.3)
+    beside = rng.normal(0, 0.15, (VIEWS, 2))
+    run.scene = replace(run.scene, tracks=replace(tracks, xy=tracks.xy + beside[tracks.image]))
+    before = errors_deg(run, truth)
+    candidates = {each.name: each for each in adjust_cameras(run).candidates}
+    assert candidates["adjusted-tracks"].track_misfit < 0.9 * candidates["refined"].track_misfit
+    assert [each.name for each in candidates.values() if each.chosen] == [name]
+    if name == "refined":
+        assert np.array_equal(errors_deg(run, truth), before)
+
+
 @pytest.mark.parametrize("name", ["adjusted", "adjusted-tracks"])
 def test_fields_are_trained_only_where_patches_of_the_photos_have_not_spoken(
     tmp_path, rng, monkeypatch, name
 ):
     run, _ = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
-    adjusted, asked = module._adjusted, []
-    monkeypatch.setattr(module, "_adjusted", lambda *given: {name: next(iter(adjusted(*given).values()))})
+    adjust, asked = choose_poses.adjust, []
+    monkeypatch.setattr(choose_poses, "adjust", lambda *given: {name: next(iter(adjust(*given).values()))})
     monkeypatch.setattr(module, "photos_object", lambda *_: bool(asked.append(name)))
     (chosen,) = (each.name for each in adjust_cameras(run).candidates if each.chosen)
     assert chosen == name

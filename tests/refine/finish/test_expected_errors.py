@@ -47,6 +47,25 @@ def test_nine_in_ten_errors_of_adjusted_poses_are_within_the_bounds(rng):
     assert np.mean(inside, axis=(0, 2)) == pytest.approx([0.9, 0.9], abs=0.05)
 
 
+def test_true_poses_are_within_what_is_expected_of_adjusted_ones_and_others_are_not(rng):
+    truth = ring(CAMERAS, rng)
+    points, intrinsics = rng.uniform(-0.8, 0.8, (120, 3)), pinholes(CAMERAS)
+    away = []
+    for seed in range(20):
+        tracks = observed(truth, points, intrinsics, np.random.default_rng(seed), 0.5)
+        evidence = Evidence(intrinsics, tracks)
+        poses = adjust_poses(truth, evidence, PosePrior.equal(truth, np.inf, np.inf)).world_from_cam
+        # The noise is all that is wrong here.
+        away.append(TRACK_MODEL_ERROR * expected_errors(truth, poses, evidence).deviations)
+    assert np.mean(np.square(away)) == pytest.approx(
+        1.0, abs=0.25
+    )  # a median of squares of six degrees of freedom
+    turned = disturbed(truth, rng, 0.02, 0.0)
+    assert expected_errors(turned, poses, evidence).deviations > 5
+    assert expected_errors(disturbed(truth, rng, 0.3, 0.0), poses, evidence).deviations == np.inf
+    assert expected_errors(truth, truth, Evidence(intrinsics)).deviations == np.inf
+
+
 def test_a_focal_length_that_is_not_known_widens_the_bounds(rng):
     truth = ring(CAMERAS, rng)
     tracks = observed(truth, rng.uniform(-0.8, 0.8, (120, 3)), pinholes(CAMERAS), rng, 0.5)

@@ -15,7 +15,7 @@ from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.progress import Monitor
-from biresnerf.refine.finish.adjust_cameras import Finish
+from biresnerf.refine.finish.outcome import Finish
 from biresnerf.refine.lost import lost_cameras
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.parameters.pose_parameters import PoseParameters

@@ -8,8 +8,9 @@ import pytest
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.geometry.similarity import Similarity, align_by_spread
 from biresnerf.refine.adjustment.cameras import Cameras
-from biresnerf.refine.finish.adjust_cameras import Finish, adjust_cameras
+from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.finish.expected_errors import TRACK_MODEL_ERROR
+from biresnerf.refine.finish.outcome import Finish
 from biresnerf.refine.start.first_step import poses_in_input_frame
 from biresnerf.refine.verdict.judgement import judge_poses
 from biresnerf.refine.verdict.pose_uncertainty import CONTRADICTED, NO_EVIDENCE, pose_uncertainty
