@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 # Of tracks, in px or in shares of the photos' size. Sets have 0.1 to 0.5 px.
 MOST_NOISE_PX, MOST_NOISE = 2.0, 0.002
 # Poses nearer than this to those that tracks prefer, in standard deviations of a camera's pose, may be the true ones.
-TOLD_APART = 1.5
+TOLD_APART = 2.0
 
 
 def choose_poses(
