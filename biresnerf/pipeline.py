@@ -22,12 +22,14 @@ from biresnerf.field.backends import resolve_here, use_threads
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import KERNELS_FROM, START_KNOWN, Monitor, OnProgress, Progress
 from biresnerf.refine.finish.rounds import run_stage_2
+from biresnerf.refine.finish.time_budget import keep_to_budget
 from biresnerf.refine.finish.work_ahead import work_ahead
 from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.checkpoint import SEEDING, TRACKS, Checkpoint, RunOrigin
+from biresnerf.refine.stages.observer import Observer
 from biresnerf.refine.stages.timing import Forecast
-from biresnerf.refine.stages.two_stages import Observer, TwoStages
+from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.choose_start import find_start
 from biresnerf.refine.start.first_step import first_step, stage_lengths
 from biresnerf.refine.verdict.evaluate import Evaluation, evaluate
@@ -80,6 +82,7 @@ def refine_poses(
     dataset = input if isinstance(input, Dataset) else read_dataset(Path(input))
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
+    keep_to_budget(stages, started, setup.options.steps)
     stages.record.seconds["preparing"] = time.monotonic() - started
 
     evaluation, judgement = Evaluation(), None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
 ComputeDevice = Literal["cpu", "cuda"]
@@ -94,10 +95,12 @@ def preset_values(
         values |= METHOD_PAPER_VALUES[method]
     elif device == "cuda":
         values |= {key: values[key] * factor for key, factor in CUDA_SCALE.items()}
-    if steps is not None:
-        ratio = steps / values["steps"]
-        for key in SCALED_BY_STEPS:
-            values[key] = max(10, round(values[key] * ratio))
-        # In proportion, trials would be too short to distinguish good poses from better ones.
-        values["trial_steps"] = max(10, min(values["trial_steps"], steps // 4))
-    return values
+    return values if steps is None else values | in_proportion(values, steps)
+
+
+def in_proportion(values: Mapping[str, Any], steps: int) -> dict[str, int]:
+    """What follows from so many steps in place of those that the values have."""
+    ratio = steps / values["steps"]
+    # In proportion, trials would be too short to distinguish good poses from better ones.
+    trial = {"trial_steps": min(values["trial_steps"], max(10, steps // 4))}
+    return {key: max(10, round(values[key] * ratio)) for key in SCALED_BY_STEPS} | trial

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from biresnerf.errors import InputError
 from biresnerf.options.formats import ExportName
 from biresnerf.options.option import Option, divided, lowered
-from biresnerf.options.presets import ComputeDevice, MethodName, PresetName, preset_values
+from biresnerf.options.presets import ComputeDevice, MethodName, PresetName, in_proportion, preset_values
 from biresnerf.stages import STAGES
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -108,6 +108,12 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     )
     steps: Annotated[int | Open, Option("coarse", level="usual")] = Field(
         OPEN, ge=20, le=1_000_000, description="Optimisation steps of both stages together."
+    )
+    time_budget_s: Annotated[float, Option("coarse", level="usual")] = Field(
+        0.0,
+        ge=0,
+        le=1e6,
+        description="Seconds that the run may take, with all it does: fewer steps, as many as fit; 0: all steps.",
     )
     coarse_steps_min: Annotated[int | Open, Option("coarse")] = Field(
         OPEN, ge=10, description="Shortest stage 1, steps."
@@ -236,6 +242,10 @@ class ResolvedOptions(_Options[Never, ComputeDevice]):
     model_config = ConfigDict(
         title="Resolved options", validate_default=True, json_schema_extra=_all_required
     )
+
+    def with_steps(self, steps: int) -> ResolvedOptions:
+        """The same with so many steps; what keeps its proportion to them does."""
+        return self.model_copy(update={"steps": steps, **in_proportion(self.model_dump(), steps)})
 
 
 class RefineOptions(_Options[None, Device]):

@@ -8,7 +8,7 @@ import math
 import pytest
 
 from biresnerf.commands.answers import print_json, table, with_code
-from biresnerf.commands.settings_option import parse_settings
+from biresnerf.commands.settings_option import parse_duration, parse_settings
 from biresnerf.errors import InputError
 from biresnerf.wire.results import ArtifactView
 
@@ -48,3 +48,17 @@ def test_a_setting_that_is_none_or_is_there_twice_is_refused(texts: tuple[str, .
     with pytest.raises(InputError) as caught:
         parse_settings(texts)
     assert (caught.value.code, caught.value.where) == ("invalid_options", "--set")
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("90", 90), ("90s", 90), ("2m", 120), ("1.5m", 90), ("1h30m", 5400), ("1m5", 65)]
+)
+def test_a_time_has_hours_minutes_and_seconds(text: str, seconds: float) -> None:
+    assert parse_duration(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "soon", "-5", "0", "2 m", "1.2.3s", "5d"])
+def test_what_is_no_time_is_refused(text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_duration(text)
+    assert (caught.value.code, caught.value.where) == ("invalid_options", "--budget")

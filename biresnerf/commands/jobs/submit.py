@@ -15,7 +15,7 @@ from biresnerf.commands.empty_folder import require_empty
 from biresnerf.commands.jobs.follow_job import follow_options, see_through
 from biresnerf.commands.jobs.job_progress import SendingView
 from biresnerf.commands.jobs.service_options import service_at, service_options
-from biresnerf.commands.settings_option import settings_option
+from biresnerf.commands.settings_option import budget_option, settings_option
 
 if TYPE_CHECKING:
     from biresnerf.client import Client, Sending
@@ -46,6 +46,7 @@ label_option = click.option(
 @click.command("submit")
 @click.argument("path", type=click.Path(path_type=Path))
 @click.option("--preset", help="fast, balanced, quality or paper.")
+@budget_option
 @settings_option
 @follow_options
 @click.option(
@@ -59,6 +60,7 @@ label_option = click.option(
 def submit_command(
     path: Path,
     preset: str | None,
+    time_budget_s: float | None,
     settings: dict[str, Any],
     wait: bool,
     timeout_s: float | None,
@@ -75,7 +77,8 @@ def submit_command(
     """
     from biresnerf.options.refine_options import parse_options
 
-    options = parse_options({**settings, **({"preset": preset} if preset else {})})
+    named = {"preset": preset, "time_budget_s": time_budget_s}
+    options = parse_options({**settings, **{key: value for key, value in named.items() if value}})
     if output is not None:
         require_empty(output)
     with service_at(url, api_key) as client:

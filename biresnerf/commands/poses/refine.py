@@ -16,7 +16,7 @@ from rich.progress import Progress as ProgressBar
 
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option, show
-from biresnerf.commands.settings_option import settings_option
+from biresnerf.commands.settings_option import budget_option, settings_option
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.errors import Interrupted
 from biresnerf.options.presets import PRESETS
@@ -103,6 +103,7 @@ def describe(progress: Progress) -> str:
 @click.option("--preset", type=click.Choice(list(PRESETS)), default=None, help="Default: balanced.")
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default=None, help="Default: auto.")
 @click.option("--seed", type=int, default=None, help="Default: 0.")
+@budget_option
 @settings_option
 @click.option("--verbose", "-v", is_flag=True, help="Print log messages.")
 @json_option
@@ -112,6 +113,7 @@ def refine_command(
     preset: str | None,
     device: str | None,
     seed: int | None,
+    time_budget_s: float | None,
     settings: dict[str, Any],
     verbose: bool,
     as_json: bool,
@@ -121,7 +123,7 @@ def refine_command(
     Results go to OUT: transforms.json and colmap/sparse/0 in the input's own frame and scale, report.json,
     renders/ and config.json. --json prints report.json. Run the same command again to resume.
     """
-    named = {"preset": preset, "device": device, "seed": seed}
+    named = {"preset": preset, "device": device, "seed": seed, "time_budget_s": time_budget_s}
     options = parse_options({**settings, **{key: value for key, value in named.items() if value is not None}})
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING,

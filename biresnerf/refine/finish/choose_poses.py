@@ -110,7 +110,7 @@ def _within(
         expected_errors(each.world_from_cam, by_tracks.world_from_cam, evidence, bodies=bodies)
         for each in candidates
     )
-    return np.array([each.known.any() and each.deviations < TOLD_APART for each in found])
+    return np.array([each.deviations < TOLD_APART for each in found])
 
 
 def _misfit(candidate: Candidate, evidence: Evidence, noise: NoiseLevels) -> Array:

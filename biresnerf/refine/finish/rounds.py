@@ -31,6 +31,7 @@ def run_stage_2(stages: TwoStages) -> Finish:
         if stages.optimiser.poses_held:
             stages.optimiser.end_after(LEARNING)
         stages.record = stages.record.model_copy(update={"adjusted": True})
+        stages.replan()
     stages.run_stage_2()
     held = stages.optimiser.poses_held
     if first is not None and held and first.heeds_photos:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.finish.photo_trial import TIMES
 from biresnerf.refine.finish.rounds import FIRST_ROUND, LEARNING
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
@@ -15,9 +16,9 @@ ADJUSTING, ADJUSTING_TRACKS, EVALUATING = 130.0, 100.0, 100.0
 TRAINING = 0.45  # a step of a trial: stage 1, half of the samples, poses that stand still
 
 
-def work_ahead(scene: Scene, optimiser: JointOptimiser) -> WorkAhead:
-    """What follows from the set and the options."""
-    options = optimiser.options
+def work_ahead(scene: Scene, optimiser: JointOptimiser, options: ResolvedOptions | None = None) -> WorkAhead:
+    """What follows from the set and the options, the optimiser's where none are given."""
+    options = options or optimiser.options
     parts: dict[Part, float] = {}
     share = 1.0
     trial = 2 * TRAINING * options.trial_steps * (OPEN_STEPS if optimiser.frame.unbounded else 1)

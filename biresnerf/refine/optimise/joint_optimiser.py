@@ -222,6 +222,17 @@ class JointOptimiser:
         """The run ends after so large a share of the steps that it was asked for, if not sooner."""
         self._end_at(min(self.step_index + round(share * self.options.steps), self.schedule.steps))
 
+    def set_steps(self, steps: int) -> None:
+        """The run takes so many steps in all: what is left of its schedule is compressed or stretched."""
+        if self.switch is None:
+            self._plan(steps)
+        else:
+            self._end_at(steps)
+
+    def _plan(self, steps: int) -> None:
+        self.options = self.options.with_steps(steps)
+        self.schedule = replace(self.schedule, options=self.options)
+
     def _end_at(self, steps: int) -> None:
         options = self.schedule.options.model_copy(update={"steps": steps})
         self.schedule = replace(self.schedule, options=options)
@@ -271,6 +282,7 @@ class JointOptimiser:
             switch=self.switch,
             rays=self.rays,
             poses_held=self.poses_held,
+            planned_steps=self.options.steps,
             steps=self.schedule.steps,
         )
 
@@ -280,6 +292,8 @@ class JointOptimiser:
         load_state_of(self._parts(), tensors)
         self.step_index, self.switch, self.rays = numbers.step_index, numbers.switch, numbers.rays
         self.poses_held = numbers.poses_held
+        if numbers.planned_steps != self.options.steps:
+            self._plan(numbers.planned_steps)
         self._end_at(numbers.steps)
         if self.draws is not self.generator:
             self.draws.manual_seed(self.options.seed + self.step_index)  # its state is not kept

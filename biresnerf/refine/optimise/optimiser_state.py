@@ -16,6 +16,7 @@ class StepState(FrozenModel):
         switch: the step that stage 2 began at, None before.
         rays: of the next step.
         poses_held: whether poses stand still.
+        planned_steps: that the lengths of the run follow from: fewer than asked for where time is short.
         steps: where the run ends.
     """
 
@@ -23,6 +24,7 @@ class StepState(FrozenModel):
     switch: int | None
     rays: int
     poses_held: bool
+    planned_steps: int
     steps: int
 
 

@@ -28,7 +28,7 @@ CHECKPOINT = Path("checkpoint") / "latest.safetensors"
 SEEDING = CHECKPOINT.with_name("seeding.json")  # COLMAP's result; every checkpoint carries a copy
 TRACKS = CHECKPOINT.with_name(KEPT)  # through feature matches; every checkpoint carries them, too
 COARSE = CHECKPOINT.with_name("coarse.safetensors")  # the state at the end of stage 1, for runs that share it
-FORMAT = "8"
+FORMAT = "9"
 TRACKED = "tracks."  # before the names of tensors
 OTHER_FOLDER = "Choose another output folder, or remove this one."
 

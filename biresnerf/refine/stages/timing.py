@@ -92,15 +92,26 @@ class Forecast:
             steps: of both stages.
             spent: seconds in each part of the run so far, without the one that it is in.
         """
-        coarse = self.step_seconds["coarse"] or self.step_seconds["fine"] / FINE_COST
-        fine = self.step_seconds["fine"] or coarse * FINE_COST
-        left_s = max(0, switch - step) * coarse + max(0, steps - max(step, switch)) * fine
-        left_s += sum(self._left_s(part, cost * fine, spent) for part, cost in self.ahead.parts.items())
+        left_s = self.left_s(step, switch, steps, spent, self.ahead)
         spent_s = sum(spent.values()) + self._running_s
         share = spent_s / max(spent_s + left_s, 1e-9)
         # The prediction may grow; the fraction never falls all the same.
         self._fraction = max(self._fraction, STAGES_FROM + (EXPORTING_FROM - STAGES_FROM) * share)
         return self._fraction, left_s
+
+    def left_s(
+        self, step: int, switch: int, steps: int, spent: Mapping[str, float], ahead: WorkAhead
+    ) -> float:
+        """Seconds to the end of a run of so many steps with this work besides; see `at`."""
+        coarse = self.step_seconds["coarse"] or self.step_seconds["fine"] / FINE_COST
+        fine = self.fine_step_s
+        left_s = max(0, switch - step) * coarse + max(0, steps - max(step, switch)) * fine
+        return left_s + sum(self._left_s(part, cost * fine, spent) for part, cost in ahead.parts.items())
+
+    @property
+    def fine_step_s(self) -> float:
+        """Seconds of a step of stage 2."""
+        return self.step_seconds["fine"] or self.step_seconds["coarse"] * FINE_COST
 
     @property
     def _running_s(self) -> float:

@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +31,7 @@ from biresnerf.refine.stages.checkpoint import (
     track_tensors,
 )
 from biresnerf.refine.stages.history import History, HistoryLine
+from biresnerf.refine.stages.observer import Observer
 from biresnerf.refine.stages.stability import StabilityDetector
 from biresnerf.refine.stages.timing import Forecast, Part, PreviewTimer, StageName
 from biresnerf.stages import ReusableStage
@@ -39,21 +39,7 @@ from biresnerf.stages import ReusableStage
 logger = logging.getLogger(__name__)
 
 REPORT_PERIOD_S = 0.5
-
-
-@dataclass(frozen=True)
-class Observer:
-    """Looks into a run on its way; the run does not depend on what it sees.
-
-    Attributes:
-        at_check: what it returns at each check joins that check's line of the history.
-        at_end: called once, when the poses are final.
-        write_preview: shows the state of the run in files, and returns these relative to the output folder.
-    """
-
-    at_check: Callable[[JointOptimiser], dict[str, float]] = lambda _optimiser: {}
-    at_end: Callable[[TwoStages], None] = lambda _stages: None
-    write_preview: Callable[[TwoStages], tuple[str, ...]] = lambda _stages: ()
+MEASURED_STEPS = 20  # of a stage, after which it is known how long they take
 
 
 class TwoStages:
@@ -63,6 +49,11 @@ class TwoStages:
         folder: where checkpoints and the history go.
         origin: what the run was started with; goes into every checkpoint.
         forecast: of the time that the whole run takes; of the stages alone where it is not given.
+
+    Attributes:
+        plan: called when it is known how long the steps of a stage take, and after cameras were adjusted; it may
+            shorten the run.
+        ends: of `time.monotonic`, when the run is to end.
     """
 
     def __init__(
@@ -77,15 +68,14 @@ class TwoStages:
     ) -> None:
         self.optimiser, self.scene, self.folder, self.origin = optimiser, scene, folder, origin
         self.monitor, self.observer = monitor, observer
+        self.plan: Callable[[TwoStages], None] = lambda _stages: None
+        self.ends = math.inf
         self.record, self.history = RunRecord(), History(folder)
         self.repair = LostCameraRepair(optimiser, OwnMatches.of(scene))
-        options = optimiser.options
-        self.detector = StabilityDetector(
-            options.coarse_steps_min,
-            options.coarse_steps_max,
-            guarded=optimiser.method.robust_extensions,
-        )
-        self.forecast, self._previews = forecast or Forecast(), PreviewTimer(options.checkpoint_every_s)
+        self.detector = StabilityDetector(0, 0, guarded=optimiser.method.robust_extensions)
+        self._take_lengths()
+        self.forecast = forecast or Forecast()
+        self._previews = PreviewTimer(optimiser.options.checkpoint_every_s)
         self._reported = self._saved = 0.0
         self._errors: list[float] = []
         self._losses: list[float] = []
@@ -113,12 +103,20 @@ class TwoStages:
 
     def run_stage_2(self, share: float = 1.0) -> None:
         """Step until this share of all steps is taken, and write a checkpoint. Raises as `run_stage_1`."""
-        until = round(share * self.optimiser.schedule.steps)
-        while self.optimiser.step_index < until:
+        while self.optimiser.step_index < round(share * self.optimiser.schedule.steps):
             self._step()
         self._save()
         # What follows may take long: meanwhile a preview shows the poses, and a stop loses nothing.
         self.monitor.report(self._progress(CHECKPOINT.as_posix(), self._preview()))
+
+    def replan(self) -> None:
+        """The rest of the run may be shortened: how long it takes has been measured."""
+        self.plan(self)
+        self._take_lengths()
+
+    def _take_lengths(self) -> None:
+        options = self.optimiser.options
+        self.detector.floor, self.detector.cap = options.coarse_steps_min, options.coarse_steps_max
 
     def place(self, unit_from_cam: NDArray[np.float64]) -> None:
         """Move all cameras to other poses [n, 4, 4]; that does not count as motion within the block."""
@@ -166,6 +164,8 @@ class TwoStages:
         self.forecast.stepped(stage, time.monotonic() - started)
         if not math.isfinite(result.loss):
             raise RefinementError("diverged", f"The loss is not a number at step {optimiser.step_index}.")
+        if optimiser.step_index - (optimiser.switch or 0) == MEASURED_STEPS:
+            self.replan()
         self._errors.append(result.mean_squared_error)
         self._losses.append(result.loss)
         # At the cap, too, where the period does not divide it: stage 2 must not wait for the next check.
@@ -289,6 +289,7 @@ class TwoStages:
         if checkpoint.ends_stage_1:  # it holds nothing of the reconstruction module
             tensors = {**optimiser.state(), **tensors}
         optimiser.load_state(tensors, checkpoint.optimiser)
+        self._take_lengths()
         self._poses_at_check, self._errors = tensors["poses_at_check"], list(checkpoint.block_errors)
         self.repair.load_state(checkpoint.repair)
         self.record = checkpoint.record

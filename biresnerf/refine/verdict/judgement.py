@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -28,6 +29,7 @@ from biresnerf.refine.verdict.pose_evidence import (
 )
 from biresnerf.refine.verdict.verdict import MEASURABLE_PX, Findings, decide, failed_checks, frame_doubt
 from biresnerf.refine.views.compare_rigs import HeldOutComparison, Rig, compare_placed
+from biresnerf.refine.views.held_out_views import ROUNDS_MOST
 from biresnerf.report import Verdict
 
 logger = logging.getLogger(__name__)
@@ -71,10 +73,18 @@ def judge(stages: TwoStages) -> Judgement | None:
     with stages.timed("judging"):
         judgement = judge_poses(
             stages.scene, stages.optimiser, stages.monitor.should_stop,
-            lambda share: stages.report_evaluation(share, message=message),
+            lambda share: stages.report_evaluation(share, message=message), _rounds(stages),
         )  # fmt: skip
     logger.info("verdict: %s", judgement.verdict.verdict)
     return judgement
+
+
+def _rounds(stages: TwoStages) -> int:
+    """How many rounds of trainings there is time for; one in any case."""
+    forecast = stages.forecast
+    each_s = forecast.ahead.parts.get("judging", 0.0) * forecast.fine_step_s
+    in_time = (stages.ends - time.monotonic()) / max(each_s, 1e-9)
+    return int(min(max(in_time, 1), ROUNDS_MOST))
 
 
 def judge_poses(
@@ -82,8 +92,11 @@ def judge_poses(
     optimiser: JointOptimiser,
     should_stop: Callable[[], bool] = lambda: False,
     report: Callable[[float], None] = lambda _share: None,
+    rounds_most: int = ROUNDS_MOST,
 ) -> Judgement:
     """Compare the optimised poses with the dataset's own; `report` is called with the share of work done.
+
+    Fields are trained in ``rounds_most`` rounds at most.
 
     Raises:
         Interrupted: ``should_stop`` returned true.
@@ -112,7 +125,7 @@ def judge_poses(
         if moved >= MEASURABLE_PX:
             heldout = compare_placed(
                 before, after, scene, optimiser, placed | (not grounded),
-                should_stop, report,
+                should_stop, report, rounds_most=rounds_most,
             )  # fmt: skip
     verdict = decide(
         Findings(

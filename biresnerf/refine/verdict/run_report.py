@@ -13,6 +13,7 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.field.backends import gpu_faults
 from biresnerf.refine.finish.given_poses import accuracy_report, accuracy_warnings
 from biresnerf.refine.finish.outcome import Finish
+from biresnerf.refine.finish.time_budget import budget_warnings
 from biresnerf.refine.lost.own_matches import LEAST_PAIRS
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
@@ -77,6 +78,7 @@ def run_report(
         + accuracy_warnings(finish.given, optimiser.options)
         + unmatched_warnings(scene)
         + gpu_warnings(optimiser.device)
+        + budget_warnings(stages)
         + _unknown_warnings(dataset, uncertainty),
     )
 

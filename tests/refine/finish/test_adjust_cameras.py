@@ -16,11 +16,9 @@ from biresnerf.refine.finish import choose_poses
 from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.finish.given_poses import accuracy_report
 from biresnerf.refine.finish.photo_evidence import photo_patches
-from biresnerf.refine.finish.rounds import FIRST_ROUND, LEARNING, run_stage_2
 from biresnerf.refine.lost.lost_cameras import LostCameraRepair
 from biresnerf.refine.lost.own_matches import OwnMatches
 from biresnerf.refine.parameters.intrinsics_parameters import lenses_of
-from biresnerf.refine.stages.checkpoint import load_checkpoint
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.verdict.camera_reports import camera_reports, focal_warnings
 from tests.refine.adjustment.rig import disturbed, observed, rotation_errors_deg
@@ -198,46 +196,6 @@ def wild(rng):
     return lambda poses: disturbed(poses, rng, 0.1, 0.3)
 
 
-def test_the_field_learns_at_adjusted_poses_that_stand_still(tmp_path, rng):
-    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
-    run.run_stage_1()
-    before = errors_deg(run, truth)
-    ends = []
-    step = run.optimiser.step
-
-    def watched():
-        ends.append(run.optimiser.poses.poses())
-        return step()
-
-    run.optimiser.step = watched
-    finish = run_stage_2(run)
-    assert [each.name for each in finish.candidates if each.chosen] == ["adjusted-tracks"]
-    steps = run.optimiser.options.steps
-    assert run.optimiser.step_index == (FIRST_ROUND + LEARNING) * steps
-    assert all(torch.equal(ends[-1], poses) for poses in ends[-round(LEARNING * steps) :])
-    assert errors_deg(run, truth).mean() < 0.2 * before.mean()
-
-
-def test_tracks_that_agree_on_other_poses_than_the_photos_are_not_believed(tmp_path, rng):
-    """As of a symmetric thing: all tracks fit poses that are far from the truth."""
-    run, truth = stages(tmp_path, rng, refined=0.003)
-    run.run_stage_1()
-    folded = disturbed(truth, rng, 0.1, 0.3)
-    tracks = observed(folded, rng.uniform(-0.5, 0.5, (120, 3)), lenses(run.scene.dataset), rng, 0.02)
-    run.scene = replace(run.scene, tracks=tracks)
-    run.repair = LostCameraRepair(run.optimiser, None)
-    # So many as tell poses apart in photos of that size.
-    run.optimiser.options = run.optimiser.options.model_copy(update={"trial_steps": 60})
-    before = errors_deg(run, truth)
-    finish = run_stage_2(run)
-    assert [each.name for each in finish.candidates if each.chosen] == ["refined"]
-    assert run.optimiser.step_index == run.optimiser.options.steps
-    assert not run.optimiser.poses_held
-    assert run.optimiser.lenses.certainty == (None,)
-    assert finish.fit is None
-    assert errors_deg(run, truth).mean() < 2 * before.mean() + 0.5
-
-
 @pytest.mark.parametrize(("refined", "name"), [(0.0002, "refined"), (0.04, "adjusted-tracks")])
 def test_tracks_that_share_their_errors_move_no_camera_within_their_accuracy(tmp_path, rng, refined, name):
     """All features of a photo lie half a noise level beside where they belong, also those left out."""
@@ -264,28 +222,6 @@ def test_fields_are_trained_only_where_patches_of_the_photos_have_not_spoken(
     (chosen,) = (each.name for each in adjust_cameras(run).candidates if each.chosen)
     assert chosen == name
     assert asked == (["adjusted-tracks"] if name == "adjusted-tracks" else [])
-
-
-def test_poses_go_on_with_the_field_to_the_last_step_where_no_evidence_tells(tmp_path, rng):
-    run, _ = stages(tmp_path, rng)
-    run.scene = replace(run.scene, tracks=None)
-    run.run_stage_1()
-    assert run_stage_2(run).candidates == ()
-    assert run.optimiser.step_index == run.optimiser.options.steps
-    assert not run.optimiser.poses_held
-
-
-def test_a_run_resumed_after_the_first_adjustment_ends_at_the_same_poses(tmp_path, rng):
-    run, _ = stages(tmp_path / "once", rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
-    run.run_stage_1()
-    run_stage_2(run)
-    again = TwoStages(
-        tiny_optimiser(run.scene.dataset, run.scene.images, tiny_options()), run.scene, run.folder
-    )
-    again.restore(load_checkpoint(run.folder))
-    assert again.optimiser.schedule.steps == run.optimiser.step_index
-    run_stage_2(again)
-    torch.testing.assert_close(again.optimiser.poses.poses(), run.optimiser.poses.poses())
 
 
 def test_the_accuracy_of_the_input_is_measured_where_poses_were_given(tmp_path, rng):
