@@ -141,7 +141,7 @@ def map_incrementally(
 
     known = [number for number, c in zip(numbers, request["cameras"], strict=True) if c["known"]]
     options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed, options.num_threads = request["seed"], request["matching_threads"]
+    options.random_seed, options.num_threads = request["seed"], request["mapping_threads"]
     options.min_model_size, options.min_num_matches = 3, 10
     options.ba_refine_focal_length = options.ba_refine_extra_params = len(known) < len(numbers)
     options.constant_cameras = set(known)
@@ -163,8 +163,8 @@ def map_globally(
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
-    options.random_seed, options.num_threads = request["seed"], request["matching_threads"]
-    options.mapper.random_seed, options.mapper.num_threads = request["seed"], request["matching_threads"]
+    options.random_seed, options.num_threads = request["seed"], request["mapping_threads"]
+    options.mapper.random_seed, options.mapper.num_threads = request["seed"], request["mapping_threads"]
     fixed = all(camera["known"] for camera in request["cameras"])
     adjustment = options.mapper.bundle_adjustment
     adjustment.refine_focal_length = adjustment.refine_extra_params = not fixed

@@ -15,7 +15,7 @@ def match_features(request: dict[str, Any], database: Path, work: Path) -> None:
     import pycolmap
 
     matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = request["matching_threads"]
+    matching.num_threads = request["threads"]
     verification = pycolmap.TwoViewGeometryOptions()
     verification.compute_relative_pose = True
     verification.min_num_inliers = LEAST_MATCHES

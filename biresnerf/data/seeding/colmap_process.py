@@ -50,7 +50,7 @@ def run_colmap(
     request_path.write_text(json.dumps(request), "utf-8")
     command = [sys.executable, "-P", str(CHILD), str(request_path)]
     # Sums over threads come out in another order each time; a guided mapping promises the same poses again.
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"} if request["matching_threads"] == 1 else None
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"} if request["mapping_threads"] == 1 else None
     with log_path.open("wb") as log, log_path.open("rb") as said:
         child = subprocess.Popen(
             command,

@@ -102,9 +102,9 @@ def ask_colmap(
 ) -> dict[str, Any]:
     """What COLMAP finds, as plain data for `read_mapping`. Poses that the set has guide it.
 
-    Beside the log in ``log_folder`` the tracks are left, for `Tracks.load`. One thread matches and
-    maps where all poses are given: more would make the answer differ from run to run. Where little is asked, one also
-    looks for features: each takes memory.
+    Beside the log in ``log_folder`` the tracks are left, for `Tracks.load`. One thread maps where all poses are
+    given: more would make the answer differ from run to run. Where little is asked, one also looks for features and
+    matches: each takes memory.
 
     Raises:
         InputError: ``seed_timeout``, or a code of `open_image`.
@@ -118,7 +118,7 @@ def ask_colmap(
             "answer": str(Path(work, "answer.json")),
             "seed": seed,
             "threads": 1 if low else -1,
-            "matching_threads": 1 if low or dataset.posed.all() else -1,
+            "mapping_threads": 1 if low or dataset.posed.all() else -1,
         }
         request |= thoroughness(dataset, effort, request["pairs"])
         watch = SeedingWatch(Path(work, DATABASE), on_progress)

@@ -48,17 +48,19 @@ def choose(
     candidates: Sequence[Candidate],
     misfits: Mapping[str, Array],
     alike: Mapping[str, NDArray[np.bool_]] | None = None,
+    first: int = 0,
 ) -> Choice:
     """The candidate that evidence left out speaks for.
 
     A candidate is beaten by one that fits some kind of evidence better and none worse, beyond chance over cameras. The
-    first is kept unless something beats it: then the next one that beats it, and that nothing beats, is taken.
+    first is kept unless something beats it: then the first one that beats it, and that nothing beats, is taken.
 
     Args:
         candidates: in the order in which they are kept on a tie.
         misfits: of each kind of evidence (``tracks``, ``patches``), [candidates, n]: each camera's mean robust square
             in noise levels; NaN where it does not know the camera.
         alike: bool [candidates] by kind: candidates that such evidence does not tell from each other, whatever it fits.
+        first: index of the candidate that is kept on a tie.
     """
     reports = tuple(
         CandidateReport(
@@ -70,7 +72,8 @@ def choose(
     )
     count = range(len(candidates))
     beats = np.array([[_beats(misfits, alike or {}, i, j) for j in count] for i in count])
-    best = int((beats[:, 0] & ~beats.any(0)).argmax())
+    better = np.flatnonzero(beats[:, first] & ~beats.any(0))
+    best = int(better[0]) if len(better) else first
     logger.info(
         "poses: %s of %s", candidates[best].name,
         ", ".join(f"{r.name} ({r.track_misfit}, {r.patch_misfit})" for r in reports),

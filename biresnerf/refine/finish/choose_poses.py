@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -66,7 +66,7 @@ def choose_poses(
         return None
     by_tracks = results.get("adjusted-tracks")
     alike = {} if by_tracks is None else {"tracks": _within(candidates, by_tracks, split, optimiser.bodies)}
-    choice = choose(candidates, misfits, alike)
+    choice = choose(candidates, misfits, alike, _kept_on_a_tie(candidates, set(misfits), alike))
     announce()
     best = results.get(choice.chosen.name) or next(iter(results.values()), None)
     kept = given_focals(scene.dataset, optimiser.options.refine_intrinsics)
@@ -74,6 +74,16 @@ def choose_poses(
         best, split.fitted, contradicted_focals(refined, split.fitted, split.left_out, prior, noise, kept)
     )
     return choice.chosen, Finish(choice.reports, fit_of(candidates, results, split.fitted), given)
+
+
+def _kept_on_a_tie(
+    candidates: Sequence[Candidate], kinds: set[str], alike: Mapping[str, NDArray[np.bool_]]
+) -> int:
+    """The input's poses; the refined ones where no kind of evidence tells these apart: the verdict will, by photos."""
+    names = [candidate.name for candidate in candidates]
+    both = [names.index("input"), names.index("refined")] if "input" in names else [0, 0]
+    told_apart = any(kind not in alike or not alike[kind][both].all() for kind in kinds)
+    return both[0] if told_apart else both[1]
 
 
 def _misfits(

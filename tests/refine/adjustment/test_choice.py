@@ -66,6 +66,14 @@ def test_evidence_does_not_choose_between_candidates_that_are_alike_to_it():
     assert taken((False, True, True, True), tracks=tracks, patches=(3.0, 1.3, 1.0, 1.3)) == "adjusted"
 
 
+def test_another_candidate_may_be_the_one_that_is_kept_on_a_tie():
+    poses = [Candidate(name, np.zeros((CAMERAS, 4, 4))) for name in NAMES[:3]]
+    same = {"tracks": np.ones((3, CAMERAS))}
+    assert choose(poses, same, first=1).chosen.name == "refined"
+    better = {"tracks": np.array([[0.5], [1.0], [2.0]]) * np.ones((3, CAMERAS))}
+    assert choose(poses, better, first=1).chosen.name == "input"
+
+
 def test_evidence_that_knows_no_camera_says_nothing():
     poses = [Candidate(name, np.zeros((CAMERAS, 4, 4))) for name in NAMES[:2]]
     none = choose(poses, {"tracks": np.full((2, CAMERAS), np.nan)})

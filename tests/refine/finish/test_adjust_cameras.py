@@ -211,6 +211,19 @@ def test_tracks_that_share_their_errors_move_no_camera_within_their_accuracy(tmp
         assert np.array_equal(errors_deg(run, truth), before)
 
 
+def test_refined_poses_go_on_where_tracks_do_not_tell_them_from_the_input(tmp_path, rng):
+    """The input fits them better, but the difference is within their accuracy: photos will tell."""
+    run, truth = stages(
+        tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.0002, 0.0004), refined=0.002, noise_px=0.3
+    )
+    before = errors_deg(run, truth)
+    candidates = {each.name: each for each in adjust_cameras(run).candidates}
+    assert candidates["input"].track_misfit < candidates["refined"].track_misfit
+    assert [each.name for each in candidates.values() if each.chosen] == ["refined"]
+    assert np.array_equal(errors_deg(run, truth), before)
+    assert not run.optimiser.poses_held
+
+
 @pytest.mark.parametrize("name", ["adjusted", "adjusted-tracks"])
 def test_fields_are_trained_only_where_patches_of_the_photos_have_not_spoken(
     tmp_path, rng, monkeypatch, name

@@ -46,7 +46,9 @@ def checkpoint(tensors: dict[str, torch.Tensor], step: int = 3) -> Checkpoint:
             (TrialReport(source="given", placed=0, psnr=0.1),),
         ),
         record=RunRecord(seconds={"coarse": 0.1 + 0.2}),
-        optimiser=StepState(step_index=step, switch=None, rays=7, poses_held=True, planned_steps=40, steps=40),
+        optimiser=StepState(
+            step_index=step, switch=None, rays=7, poses_held=True, planned_steps=40, steps=40
+        ),
         detector=DetectorState(decibels=(1 / 3, float("inf")), confirmed=1),
         repair=RepairState(repaired=(1, 2), times=1, spent=1e9 / 7),
         block_errors=(2 / 3, float("nan")),

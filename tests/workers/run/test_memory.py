@@ -54,7 +54,7 @@ def test_a_second_try_reaches_colmap(photos: Path, asked: list[dict[str, Any]], 
     assert after["most_features"] <= before["most_features"] / 4
     same = {
         "threads",
-        "matching_threads",
+        "mapping_threads",
         "thorough",
         "widest_image",
         "most_features",
