@@ -11,10 +11,17 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.geometry.rigid_bodies import RigidBodies
-from biresnerf.refine.adjustment.adjustment import NOTHING_FITS, Adjustment, misfit
+from biresnerf.refine.adjustment.adjustment import NOTHING_FITS, Adjustment, adjust_poses, misfit
 from biresnerf.refine.adjustment.choice import Candidate, choose
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
-from biresnerf.refine.finish.candidates import ORDER, PRIOR, adjust, as_candidate, without_adjustment
+from biresnerf.refine.finish.candidates import (
+    BY_TRACKS,
+    ORDER,
+    PRIOR,
+    adjust,
+    as_candidate,
+    without_adjustment,
+)
 from biresnerf.refine.finish.expected_errors import expected_errors
 from biresnerf.refine.finish.gather_evidence import SplitEvidence, gather_evidence
 from biresnerf.refine.finish.given_poses import input_accuracy
@@ -68,12 +75,18 @@ def choose_poses(
     alike = {} if by_tracks is None else {"tracks": _within(candidates, by_tracks, split, optimiser.bodies)}
     choice = choose(candidates, misfits, alike, _kept_on_a_tie(candidates, set(misfits), alike))
     announce()
-    best = results.get(choice.chosen.name) or next(iter(results.values()), None)
+    chosen, evidence = choice.chosen, dict.fromkeys(results, split.fitted)
+    if chosen.name in BY_TRACKS:  # nothing has to be judged any more
+        heeded_now = evidence[chosen.name] = replace(split.fitted, tracks=split.tracks)
+        result = adjust_poses(refined, heeded_now, prior, results[chosen.name].halves)
+        results[chosen.name] = result
+        chosen = as_candidate(chosen.name, result, heeded_now, cameras) or chosen
+    best = results.get(chosen.name) or next(iter(results.values()), None)
     kept = given_focals(scene.dataset, optimiser.options.refine_intrinsics)
     optimiser.lenses.certainty = focal_certainty(
         best, split.fitted, contradicted_focals(refined, split.fitted, split.left_out, prior, noise, kept)
     )
-    return choice.chosen, Finish(choice.reports, fit_of(candidates, results, split.fitted), given)
+    return chosen, Finish(choice.reports, fit_of(candidates, results, evidence), given)
 
 
 def _kept_on_a_tie(

@@ -16,7 +16,8 @@ from biresnerf.refine.finish.photo_evidence import photo_patches
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
 
-MOST_OBSERVATIONS = 40_000  # of tracks that are adjusted to
+# Of tracks: in candidates, and in what is returned. On scarf 21,000 of 133,000 leave 0.090 deg, all of them 0.048.
+MOST_OBSERVATIONS, MOST_IN_THE_END = 40_000, 200_000
 LEFT_OUT_ONE_IN = 5  # patches
 
 
@@ -25,17 +26,19 @@ class SplitEvidence:
     """Evidence in two parts.
 
     Attributes:
-        fitted, left_out: what is adjusted to, and what is judged by.
+        fitted, left_out: what candidates are adjusted to, and what they are judged by.
+        tracks: those of both parts, and those that were too many; what is returned is adjusted to them.
         placed: bool [n], cameras that are not at a guess still; the evidence is of their photos alone.
     """
 
     fitted: Evidence
     left_out: Evidence
+    tracks: Tracks | None
     placed: NDArray[np.bool_]
 
     def without_tracks(self) -> SplitEvidence:
         fitted, left_out = (replace(each, tracks=None) for each in (self.fitted, self.left_out))
-        return SplitEvidence(fitted, left_out, self.placed)
+        return SplitEvidence(fitted, left_out, None, self.placed)
 
 
 def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
@@ -53,14 +56,17 @@ def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
     judging: Tracks | None = None
     tracks = scene.tracks and scene.tracks.where(placed[scene.tracks.image])
     if tracks is not None:
-        fitted, judging = straight_tracks(tracks, intrinsics, ideal).split()
+        tracks = straight_tracks(tracks, intrinsics, ideal)
+        fitted, judging = tracks.split()
+        tracks = tracks.thinned(MOST_IN_THE_END, len(dataset))
         fitted = fitted and fitted.thinned(MOST_OBSERVATIONS, len(dataset))
     patches = photo_patches(scene, optimiser, intrinsics, ideal, placed)
     if patches is None:
-        return SplitEvidence(Evidence(ideal, fitted, None, lenses), Evidence(ideal, judging), placed)
+        return SplitEvidence(Evidence(ideal, fitted, None, lenses), Evidence(ideal, judging), tracks, placed)
     spared = np.arange(len(patches)) % LEFT_OUT_ONE_IN == 0
     return SplitEvidence(
         Evidence(ideal, fitted, patches.of(~spared), lenses),
         Evidence(ideal, judging, patches.of(spared)),
+        tracks,
         placed,
     )

@@ -76,11 +76,13 @@ def heeded(name: CandidateName, found: Adjustment, evidence: Evidence) -> Eviden
 
 
 def fit_of(
-    candidates: Sequence[Candidate], results: Mapping[CandidateName, Adjustment], evidence: Evidence
+    candidates: Sequence[Candidate],
+    results: Mapping[CandidateName, Adjustment],
+    evidence: Mapping[CandidateName, Evidence],
 ) -> Fit | None:
-    """The adjusted poses that heed most; None where none was to be believed."""
+    """The adjusted poses that heed most, and what each was adjusted to; None where none was to be believed."""
     name = next((each.name for each in candidates if each.name in results), None)
     if name is None:
         return None
-    found, to = results[name], heeded(name, results[name], evidence)
+    found, to = results[name], heeded(name, results[name], evidence[name])
     return Fit(found.world_from_cam, to, found.patch_noise if to.patches else 1.0)
