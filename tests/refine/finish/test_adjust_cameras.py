@@ -211,6 +211,16 @@ def test_tracks_that_share_their_errors_move_no_camera_within_their_accuracy(tmp
         assert np.array_equal(errors_deg(run, truth), before)
 
 
+def test_tracks_that_judged_place_cameras_as_well_once_poses_are_chosen(tmp_path, rng):
+    """The last camera sees none of the points that candidates are adjusted to."""
+    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    tracks, last = run.scene.tracks, VIEWS - 1
+    run.scene = replace(run.scene, tracks=tracks.where(tracks.left_out()[tracks.point] | (tracks.image != last)))
+    before = errors_deg(run, truth)
+    assert [each.name for each in adjust_cameras(run).candidates if each.chosen] == ["adjusted-tracks"]
+    assert errors_deg(run, truth)[last] < 0.2 * before.mean()
+
+
 def test_refined_poses_go_on_where_tracks_do_not_tell_them_from_the_input(tmp_path, rng):
     """The input fits them better, but the difference is within their accuracy: photos will tell."""
     run, truth = stages(
