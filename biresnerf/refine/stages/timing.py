@@ -65,15 +65,17 @@ class Forecast:
     def __init__(self, ahead: WorkAhead = WorkAhead()) -> None:
         self.ahead = ahead
         self.step_seconds: dict[StageName, float] = {"coarse": 0.0, "fine": 0.0}
+        self._steps: dict[StageName, int] = {"coarse": 0, "fine": 0}
         self.done_of_part = 0.0
         self._part: Part | None = None
         self._began = 0.0
         self._fraction = STAGES_FROM
 
     def stepped(self, stage: StageName, seconds: float) -> None:
-        """Add the time of one step."""
-        mean = self.step_seconds[stage]
-        self.step_seconds[stage] = seconds if mean == 0 else MEMORY * mean + (1 - MEMORY) * seconds
+        """Add the time of one step. The first of a stage is slower: it counts only until there is another."""
+        self._steps[stage] += 1
+        share = max(1 / max(1, self._steps[stage] - 1), 1 - MEMORY)
+        self.step_seconds[stage] += share * (seconds - self.step_seconds[stage])
 
     @contextmanager
     def within(self, part: Part) -> Iterator[None]:

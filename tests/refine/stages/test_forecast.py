@@ -56,3 +56,12 @@ def test_the_fraction_is_the_time_spent_over_the_whole_and_never_falls():
     assert early == pytest.approx(0.03 + 0.96 * 20 / (20 + 6 + AFTER_S))
     found.step_seconds["fine"] *= 10
     assert found.at(700, SWITCH, STEPS, {"coarse": 4.0, "fine": 6.0})[0] == early
+
+
+def test_the_first_step_counts_only_until_there_is_another_and_later_ones_alike():
+    found = Forecast()
+    found.stepped("coarse", 5.0)
+    assert found.step_seconds["coarse"] == 5.0
+    for seconds in (0.1, 0.2, 0.3):
+        found.stepped("coarse", seconds)
+    assert found.step_seconds == {"coarse": pytest.approx(0.2), "fine": 0.0}
