@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from biresnerf.geometry.rigid_bodies import RigidBodies
@@ -137,13 +138,13 @@ def _damped(system: Array, right: Array, free: NDArray[np.bool_] | None, damping
     free = (np.diagonal(system) > 0) & (True if free is None else free)
     if not free.any():
         return None
-    part = system[np.ix_(free, free)]
-    part = part + np.diag(damping * np.diagonal(part))
-    step = np.zeros(len(right))
-    try:
-        step[free] = -np.linalg.solve(part, right[free])
-    except np.linalg.LinAlgError:
+    part = torch.from_numpy(system if free.all() else system[np.ix_(free, free)]).clone()
+    part.diagonal().mul_(1 + damping)
+    factor, failed = torch.linalg.cholesky_ex(part)
+    if failed:  # not positive definite: damped more, it will be
         return None
+    step = np.zeros(len(right))
+    step[free] = -torch.cholesky_solve(torch.from_numpy(right[free])[:, None], factor)[:, 0].numpy()
     return step if np.isfinite(step).all() else None
 
 
