@@ -18,7 +18,7 @@ from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.scene.scene_depth import matched_depth
 from biresnerf.refine.scene.scene_frame import scene_frame
 
-# Cameras. Their system is dense: 1,000 take four minutes of one core and 1.8 GB.
+# Cameras. Their system is dense: 1,000 take five minutes of one core and 1.9 GB.
 LEAST_ADJUSTED, MOST_ADJUSTED = 3, 1000
 # Where matches placed most cameras, stage 1 has only to form the field: its lengths shrink to this share.
 MATCHED_COARSE_SHARE = 2 / 3
