@@ -26,12 +26,21 @@ def goes_round(grey: NDArray[np.float32]) -> bool:
     """Whether photos, shrunk, in grey and in order [n, h, w], resemble their neighbours and the last one the first."""
     if len(grey) < LEAST_PHOTOS:
         return False
-    flat = grey.reshape(len(grey), -1)
-    apart = np.sqrt(((flat[:, None] - flat[None]) ** 2).mean(2))
+    apart = _apart(grey)
     steps = np.diagonal(apart, offset=1)
     typical = float(np.median(steps))
     any_two = float(np.median(apart[np.triu_indices(len(apart), 1)]))
     return typical < NEIGHBOUR_SHARE * any_two and float(apart[-1, 0]) < (typical + any_two) / 2
+
+
+def _apart(grey: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Root mean squared difference [n, n] of photos [n, h, w]."""
+    flat = grey.reshape(len(grey), -1).astype(np.float64)
+    own = (flat**2).sum(1)
+    # By products: the differences themselves would take gigabytes for a thousand photos.
+    squared = own[:, None] + own[None] - 2 * flat @ flat.T
+    np.fill_diagonal(squared, 0.0)
+    return np.sqrt(np.maximum(squared, 0.0) / flat.shape[1])
 
 
 def still_surroundings(grey: NDArray[np.float32]) -> bool:

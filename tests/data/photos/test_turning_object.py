@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 
 from biresnerf.data.photos.turning_object import goes_round, still_surroundings
@@ -36,3 +38,14 @@ def test_only_a_background_with_texture_that_stays_is_in_the_way():
     assert still_surroundings(before)
     moving = before + np.linspace(0, 0.4, 30, dtype=np.float32)[:, None, None]
     assert not still_surroundings(moving)
+
+
+def test_a_thousand_photos_are_compared_without_an_array_of_all_their_differences():
+    photos = turning(1000)
+    tracemalloc.start()
+    try:
+        assert goes_round(photos)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 100e6  # the differences take 2.3 GB
