@@ -54,12 +54,7 @@ class OwnMatches:
         a, b = self.tracks.image[one], self.tracks.image[other]
         angles = epipolar_angles(world_from_cam, a, b, self.rays[one], self.rays[other])
         errors = angles * (self.focal_px[a] + self.focal_px[b]) / 2
-        medians = np.full(len(self.focal_px), np.nan)
-        for image in range(len(medians)):
-            own = errors[((a == image) | (b == image)) & np.isfinite(errors)]
-            if len(own) >= LEAST_PAIRS:
-                medians[image] = np.median(own)
-        return medians
+        return _medians(np.concatenate([a, b]), np.tile(errors, 2), len(self.focal_px))
 
     def placed(self, camera: int, world_from_cam: Array, trusted: NDArray[np.bool_]) -> Array | None:
         """The camera's pose [4, 4] by points that trusted cameras [n] see, at poses [n, 4, 4]; none of those left out.
@@ -91,6 +86,19 @@ class OwnMatches:
         poses = world_from_cam.copy()
         poses[camera] = found.world_from_cam
         return found.world_from_cam if better(camera, before, self.errors_px(poses)) else None
+
+
+def _medians(image: NDArray[np.int64], errors: Array, count: int) -> Array:
+    """Median of the finite errors [m] of each of `count` images; NaN where there are too few."""
+    finite = np.isfinite(errors)
+    image, errors = image[finite], errors[finite]
+    ordered = errors[np.lexsort((errors, image))]
+    known = np.bincount(image, minlength=count)
+    first, enough = np.cumsum(known) - known, known >= LEAST_PAIRS
+    medians = np.full(count, np.nan)
+    low, high = (first + (known - 1) // 2)[enough], (first + known // 2)[enough]
+    medians[enough] = (ordered[low] + ordered[high]) / 2
+    return medians
 
 
 def contradicted(errors_px: Array) -> NDArray[np.bool_]:

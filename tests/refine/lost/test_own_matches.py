@@ -8,9 +8,10 @@ import pytest
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points
+from biresnerf.geometry.epipolar import epipolar_angles
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.refine.lost.own_matches import OwnMatches, contradicted
+from biresnerf.refine.lost.own_matches import LEAST_PAIRS, OwnMatches, contradicted
 from tests.data.formats.random_sets import random_poses
 
 CAMERA = Camera("SIMPLE_RADIAL", 640, 480, (600.0, 320.0, 240.0, 0.02))
@@ -76,3 +77,15 @@ def test_too_few_matches_or_wrong_ones_or_no_trusted_cameras_place_nothing():
     together = np.repeat(poses[:1], 12, axis=0)  # no parallax
     assert own.placed(0, together, np.ones(12, bool)) is None
     assert not contradicted(own.errors_px(together)).any()
+
+
+def test_each_cameras_error_is_the_median_over_its_own_pairs():
+    poses, own = rig(10, cameras=9, points=31, wrong=0.3)
+    one, other = own.tracks.pairs()
+    a, b = own.tracks.image[one], own.tracks.image[other]
+    errors = epipolar_angles(poses, a, b, own.rays[one], own.rays[other])
+    errors *= (own.focal_px[a] + own.focal_px[b]) / 2
+    found = own.errors_px(poses)
+    for camera in range(9):
+        mine = errors[(a == camera) | (b == camera)]
+        assert found[camera] == np.median(mine) if len(mine) >= LEAST_PAIRS else np.isnan(found[camera])
