@@ -7,6 +7,8 @@ camera whose view no other shares is suspect, however small its error.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -21,6 +23,7 @@ WITNESSED = 0.8
 # Distances tried, as shares of the cameras' distance. Noisy poses share less: beyond 0.5 scenes may begin.
 NEAREST, FARTHEST, SPACING = 0.1, 0.5, 0.05
 SEERS, SIDE = 24, 5  # cameras tried, and pixels of each along either side
+ASKED_AT_ONCE = 64  # cameras, which settle most points where the set is large
 
 
 def nearest_shared(unit_from_cam: NDArray[np.float64], intrinsics: Intrinsics, distance: float) -> float:
@@ -65,9 +68,8 @@ def shared_shares(points: Tensor, seer: Tensor, unit_from_cam: Tensor, intrinsic
     cameras = torch.arange(len(unit_from_cam), device=points.device)
     shares = []
     for own, camera in zip(points, seer.tolist(), strict=True):
-        seen = _seen_by(cameras, own, unit_from_cam, intrinsics)
-        seen[camera] = False
-        shares.append((seen.sum(0) >= WITNESSES).float().mean())
+        others = cameras[cameras != camera]
+        shares.append(_witnessed(own, others.split(ASKED_AT_ONCE), unit_from_cam, intrinsics).float().mean())
     return torch.stack(shares)
 
 
@@ -78,11 +80,21 @@ def witnessed(points: Tensor, cameras: Tensor, unit_from_cam: Tensor, intrinsics
         unit_from_cam: [n, 3, 4], in the frame of the points.
         intrinsics: of the n cameras.
     """
+    # One by one, as points are many and a few cameras settle most of them.
+    return _witnessed(points, cameras.split(1), unit_from_cam, intrinsics)
+
+
+def _witnessed(
+    points: Tensor, cameras: Iterable[Tensor], unit_from_cam: Tensor, intrinsics: Intrinsics
+) -> Tensor:
+    """`witnessed`, asking some cameras after the others, and these only about points that are still in doubt."""
     count = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     doubtful = torch.arange(len(points), device=points.device)
-    for camera in cameras:  # one by one, as points are many and a few cameras settle most of them
-        count[doubtful] += _seen_by(camera[None], points[doubtful], unit_from_cam, intrinsics)[0]
+    for some in cameras:
+        count[doubtful] += _seen_by(some, points[doubtful], unit_from_cam, intrinsics).sum(0)
         doubtful = doubtful[count[doubtful] < WITNESSES]
+        if len(doubtful) == 0:
+            break
     return count >= WITNESSES
 
 

@@ -12,7 +12,14 @@ from biresnerf.data.synthetic.scene import synthetic_cameras
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refine.scene.scene_frame import scene_frame
-from biresnerf.refine.scene.shared_views import FARTHEST, NEAREST, SPACING, nearest_shared, shared_shares
+from biresnerf.refine.scene.shared_views import (
+    ASKED_AT_ONCE,
+    FARTHEST,
+    NEAREST,
+    SPACING,
+    nearest_shared,
+    shared_shares,
+)
 from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set
 
 LENS = Camera("SIMPLE_PINHOLE", 20, 20, (20.0, 10.0, 10.0))  # half a unit to each side at a distance of one
@@ -44,6 +51,19 @@ def test_a_point_counts_once_two_others_have_it_in_view():
 def test_shares_are_of_each_seers_own_points():
     points = torch.tensor([[[1.0, 0, 10], [1, 0, 1]], [[1, 0, 10], [1, 0, 12]], [[1, 0, 1], [1, 0, -3]]])
     assert shares(side_by_side(4), points, [0, 2, 2]) == [0.5, 1, 0]
+
+
+def test_many_cameras_asked_some_at_a_time_say_what_all_would():
+    poses = synthetic_cameras(3 * ASKED_AT_ONCE + 5, seed=2)
+    points = torch.from_numpy(np.random.default_rng(0).normal(0, 4, (1, 200, 3))).float()
+    last = len(poses) - 1
+    others = np.delete(np.arange(len(poses)), last)
+    in_cam = np.einsum("cji,cmj->cmi", poses[:, :3, :3], points.numpy() - poses[:, None, :3, 3])[others]
+    xy = in_cam[..., :2] / in_cam[..., 2:]
+    seen = (in_cam[..., 2] > 0) & (np.abs(xy) < 0.5).all(-1)
+    expected = (seen.sum(0) >= 2).mean()
+    assert 0.1 < expected < 0.9
+    assert shares(poses, points, [last]) == [pytest.approx(expected)]
 
 
 def test_a_camera_turned_away_shares_nothing_and_those_about_a_scene_all():
