@@ -69,4 +69,4 @@ def _eight_bit(image: Image.Image, name: str) -> NDArray[np.uint8]:
         )
     if image.mode in _ALPHA_MODES or "transparency" in image.info:
         return np.asarray(image.convert("RGBA"))
-    return np.asarray(image.convert("RGB"))
+    return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))  # which would copy it

@@ -21,10 +21,9 @@ from biresnerf.options.refine_options import Background
 
 T = TypeVar("T", bound=np.generic)
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
-# More threads hold more full-size pictures at once than they save time.
-_DECODERS = 4
-_DECODING_BYTES = 2**30  # for all threads together
-_DECODING_BYTES_PER_PX = 24  # RGBA as bytes and as floats, and the float copy being shrunk
+# Every core decodes, as far as all full-size pictures held at once fit into this.
+_DECODING_BYTES = 2**30
+_DECODING_BYTES_PER_PX = 16  # RGBA, and the three copies that Pillow makes on the way to an array
 # A set of opaque images shows its scene before plain black or white:
 BLACK_BELOW = 24  # of 255: sensors and JPEG leave some light in black
 WHITE_ABOVE = 250  # of 255: bright walls and skies stay below it or vary
@@ -134,7 +133,7 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
 
     largest = max(camera.width * camera.height for camera in dataset.cameras)
     fitting = _DECODING_BYTES // (largest * _DECODING_BYTES_PER_PX)
-    threads = max(1, min(_DECODERS, os.cpu_count() or 1, len(dataset), fitting))
+    threads = max(1, min(_cores(), len(dataset), fitting))
     with quiet_pillow(), ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
         pending = [pool.submit(fill, index) for index in range(len(dataset))]
         try:
@@ -149,6 +148,11 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
         pixels, None if opaque else alpha, offsets, widths, heights, cameras, None, counts if masked else None
     )
     return _with_background(images, background, behind)
+
+
+def _cores() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _with_background(images: ImageSet, background: Background, behind: tuple[float, ...]) -> ImageSet:
@@ -206,12 +210,16 @@ def _shrink(
             return picture[..., :3], opaque
         return _bytes(area_resize(picture[..., :3], width, height)), opaque
     # Averages of colours weigh by opacity, else hidden colours bleed into the edges.
-    premultiplied = picture.astype(np.float32)
-    premultiplied[..., :3] *= premultiplied[..., 3:] / 255.0
-    small = area_resize(premultiplied, width, height)
+    small = area_resize(picture, width, height, _premultiplied)
     opacity = small[..., 3:] / 255.0
     colour = small[..., :3] + (1.0 - opacity) * (255.0 * np.asarray(behind, dtype=np.float32))
     return _bytes(colour), _bytes(small[..., 3])
+
+
+def _premultiplied(rows: NDArray[np.uint8]) -> NDArray[np.float32]:
+    weighed = rows.astype(np.float32)
+    weighed[..., :3] *= weighed[..., 3:] / 255.0
+    return weighed
 
 
 def _bytes(values: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -51,6 +51,20 @@ def test_a_ramp_stays_a_ramp_so_nothing_is_shifted(source, size):
     assert shift.max() <= 0.25 * size / source + 1e-4
 
 
+def test_halves_are_the_same_in_one_piece_as_row_by_row(monkeypatch):
+    picture = np.random.default_rng(0).integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    in_one_piece = area_resize(picture, 8, 6)
+    assert np.array_equal(in_one_piece, picture.reshape(6, 2, 8, 2, 3).mean((1, 3)))
+    monkeypatch.setattr("biresnerf.data.photos.area_resize._AT_ONCE", 0)
+    assert np.array_equal(area_resize(picture, 8, 6), in_one_piece)
+
+
+def test_values_of_rows_are_averaged_in_place_of_the_picture():
+    picture = np.random.default_rng(1).integers(0, 256, (9, 8, 4), dtype=np.uint8)
+    doubled = area_resize(picture, 4, 3, lambda rows: 2 * rows.astype(np.float32))
+    np.testing.assert_allclose(doubled, 2 * area_resize(picture, 4, 3), rtol=1e-6)
+
+
 def test_enlarging_is_refused():
     with pytest.raises(ValueError, match="cannot average"):
         area_resize(np.zeros((4, 4, 3), np.uint8), 5, 4)

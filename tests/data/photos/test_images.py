@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+import time
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.images import load_images, uniform_background, working_size
 from biresnerf.errors import InputError
 from tests.data.scenes import (
@@ -211,3 +215,28 @@ def test_masked_borders_have_no_say_about_the_background():
     counts[:, :20] = False
     assert _background(images, [counts] * 10) == [0, 0, 0]
     assert _background(images, [np.zeros((40, 50), dtype=bool)] * 10) is None
+
+
+def test_no_more_large_pictures_are_decoded_at_once_than_fit_into_memory(tmp_path, monkeypatch):
+    dataset = png_scene(tmp_path, [noise(index, HEIGHT, WIDTH, 4) for index in range(8)])
+    lock, now, most = threading.Lock(), [0], [0]
+
+    def counted(frame, camera):
+        with lock:
+            now[0] += 1
+            most[0] = max(most[0], now[0])
+        time.sleep(0.02)
+        try:
+            return decode(frame, camera)
+        finally:
+            with lock:
+                now[0] -= 1
+
+    monkeypatch.setattr("biresnerf.data.photos.images.decode", counted)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _pid: set(range(16)), raising=False)
+    load_images(dataset)
+    assert most[0] > 3
+    most[0] = 0
+    monkeypatch.setattr("biresnerf.data.photos.images._DECODING_BYTES", 3 * 16 * HEIGHT * WIDTH)
+    load_images(dataset)
+    assert most[0] == 3
