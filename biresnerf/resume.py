@@ -45,9 +45,9 @@ def run_origin(folder: Path, dataset: Dataset, images: ImageSet, options: Resolv
     Args:
         dataset: as it was given, before poses were found.
     """
-    photos = hashlib.sha256(images.pixels.tobytes())
+    photos = hashlib.sha256(images.pixels.data)
     if images.counts is not None:
-        photos.update(images.counts.tobytes())
+        photos.update(images.counts.data)
     given = [None if f.world_from_cam is None else f.world_from_cam.tolist() for f in dataset.frames]
 
     def fingerprint(names: frozenset[str]) -> str:

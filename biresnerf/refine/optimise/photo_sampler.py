@@ -44,10 +44,12 @@ class PhotoSampler:
 
     def __init__(self, images: ImageSet, held_out: list[int], device: torch.device) -> None:
         count = len(images)
-        training = [i for i in range(count) if i not in set(held_out)]
+        unseen = set(held_out)
+        training = [i for i in range(count) if i not in unseen]
         self.order = torch.tensor(training + sorted(held_out), device=device)
         self.training, self.device = len(training), device
-        levels, offsets, sizes, base = [], [], [], 0
+        offsets, sizes, base = [], [], 0
+        pixels = np.empty((_pyramid_pixels(images), 3), dtype=np.uint8)
         current = [images.image(i) for i in range(count)]
         masks, shares = _masks(images), []
         for level in range(PYRAMID_LEVELS):
@@ -55,13 +57,13 @@ class PhotoSampler:
                 halves = [_half(image, mask) for image, mask in zip(current, masks, strict=True)]
                 current, masks = [image for image, _ in halves], [mask for _, mask in halves]
             shares += [mask.reshape(-1) for mask in masks if mask is not None]
-            offsets.append(
-                [base + n for n in np.cumsum([0, *(im.shape[0] * im.shape[1] for im in current)])[:-1]]
-            )
+            begin = base + np.cumsum([0, *(im.shape[0] * im.shape[1] for im in current)])
+            offsets.append(begin[:-1].tolist())
             sizes.append([(im.shape[1], im.shape[0]) for im in current])
-            levels.append(np.concatenate([im.reshape(-1, 3) for im in current]))
-            base += len(levels[-1])
-        self.pixels = torch.from_numpy(np.concatenate(levels)).to(device)
+            for image, first, end in zip(current, begin[:-1], begin[1:], strict=True):
+                pixels[first:end] = image.reshape(-1, 3)
+            base = int(begin[-1])
+        self.pixels = torch.from_numpy(pixels).to(device)
         self.shares = torch.from_numpy(np.concatenate(shares)).to(device) if shares else None
         self._counted = self._counted_pixels(images) if shares else None
         self.offsets = torch.tensor(offsets, device=device)
@@ -177,6 +179,13 @@ class PhotoSampler:
         if self.shares is not None:
             total = total / weight.clamp(min=1e-6)
         return total / 255
+
+
+def _pyramid_pixels(images: ImageSet) -> int:
+    """Of all photos on all levels."""
+    widths = (np.maximum(1, images.widths.astype(np.int64) >> k) for k in range(PYRAMID_LEVELS))
+    heights = (np.maximum(1, images.heights.astype(np.int64) >> k) for k in range(PYRAMID_LEVELS))
+    return int(sum((w * h).sum() for w, h in zip(widths, heights, strict=True)))
 
 
 def _masks(images: ImageSet) -> list[NDArray[np.uint8] | None]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import torch
@@ -113,3 +115,15 @@ def test_targets_are_blurred_between_not_at_all_and_as_much_as_asked():
     ]
     assert min(changed) == 0.0
     assert max(changed) > 0.05
+
+
+def test_the_pyramid_of_all_photos_is_laid_out_without_a_second_copy():
+    photos = [np.full((240, 320, 3), i, np.uint8) for i in range(100)]
+    images = photos_set(photos)
+    tracemalloc.start()
+    try:
+        sampler = PhotoSampler(images, [], CPU)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 1.5 * sampler.pixels.numel()
