@@ -215,7 +215,9 @@ def test_tracks_that_judged_place_cameras_as_well_once_poses_are_chosen(tmp_path
     """The last camera sees none of the points that candidates are adjusted to."""
     run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
     tracks, last = run.scene.tracks, VIEWS - 1
-    run.scene = replace(run.scene, tracks=tracks.where(tracks.left_out()[tracks.point] | (tracks.image != last)))
+    run.scene = replace(
+        run.scene, tracks=tracks.where(tracks.left_out()[tracks.point] | (tracks.image != last))
+    )
     before = errors_deg(run, truth)
     assert [each.name for each in adjust_cameras(run).candidates if each.chosen] == ["adjusted-tracks"]
     assert errors_deg(run, truth)[last] < 0.2 * before.mean()
