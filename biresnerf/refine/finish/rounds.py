@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.finish.outcome import Finish
+from biresnerf.refine.stages.timing import Part
 from biresnerf.refine.stages.two_stages import TwoStages
 
 # Shares of all steps: where cameras are adjusted first, and how long the field then learns at their poses. The first is
 # soon enough: on the demo scene cameras adjusted after half of the steps end as exact as after all (docs/estimator.md).
 FIRST_ROUND, LEARNING = 0.5, 0.25
+AFTER: tuple[Part, ...] = ("evaluating", "judging")  # parts of the run that follow
 
 
 def run_stage_2(stages: TwoStages) -> Finish:
@@ -18,7 +21,7 @@ def run_stage_2(stages: TwoStages) -> Finish:
 
     Where the first adjustment finds better poses than the field's, they stand still from then on, and the field learns
     at them for a while. It would only bend them. They are adjusted again only if patches of the photos had no say yet:
-    the surface of a young field may have been too rough for them.
+    the surface of a young field may have been too rough for them; and if the run's time allows.
 
     Raises:
         Interrupted: stopped; a continued run goes on from there.
@@ -34,8 +37,14 @@ def run_stage_2(stages: TwoStages) -> Finish:
         stages.replan()
     stages.run_stage_2()
     held = stages.optimiser.poses_held
-    if first is not None and held and first.heeds_photos:
+    if first is not None and ((held and first.heeds_photos) or not _time_to_adjust_again(stages)):
         return first
     last = adjust_cameras(stages)
     # The poses that are held are what the first adjustment made of the field's.
     return replace(last, candidates=first.candidates) if first is not None and held and last.kept else last
+
+
+def _time_to_adjust_again(stages: TwoStages) -> bool:
+    """Whether a second adjustment, as long as the first, leaves time for what follows it."""
+    after_s = sum(stages.forecast.expected_s(part) for part in AFTER)
+    return time.monotonic() + stages.record.seconds.get("adjusting", 0.0) + after_s < stages.ends

@@ -110,6 +110,10 @@ class Forecast:
         left_s = max(0, switch - step) * coarse + max(0, steps - max(step, switch)) * fine
         return left_s + sum(self._left_s(part, cost * fine, spent) for part, cost in ahead.parts.items())
 
+    def expected_s(self, part: Part) -> float:
+        """Seconds that a part is expected to take; none if it is not to be."""
+        return self.ahead.parts.get(part, 0.0) * self.fine_step_s
+
     @property
     def fine_step_s(self) -> float:
         """Seconds of a step of stage 2."""

@@ -81,8 +81,7 @@ def judge(stages: TwoStages) -> Judgement | None:
 
 def _rounds(stages: TwoStages) -> int:
     """How many rounds of trainings there is time for; one in any case."""
-    forecast = stages.forecast
-    each_s = forecast.ahead.parts.get("judging", 0.0) * forecast.fine_step_s
+    each_s = stages.forecast.expected_s("judging")
     in_time = (stages.ends - time.monotonic()) / max(each_s, 1e-9)
     return int(min(max(in_time, 1), ROUNDS_MOST))
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from biresnerf.refine.finish import rounds
+from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.finish.rounds import FIRST_ROUND, LEARNING, run_stage_2
 from biresnerf.refine.lost.lost_cameras import LostCameraRepair
 from biresnerf.refine.stages.checkpoint import load_checkpoint
@@ -82,3 +84,15 @@ def test_a_run_resumed_after_the_first_adjustment_ends_at_the_same_poses(tmp_pat
     assert again.optimiser.schedule.steps == run.optimiser.step_index
     run_stage_2(again)
     torch.testing.assert_close(again.optimiser.poses.poses(), run.optimiser.poses.poses())
+
+
+@pytest.mark.parametrize(("ends", "adjusted"), [(np.inf, 2), (0.0, 1)])
+def test_cameras_are_adjusted_again_only_where_there_is_time(tmp_path, rng, monkeypatch, ends, adjusted):
+    """The first adjustment finds nothing better, so that the field's poses would be adjusted once more."""
+    run, _ = stages(tmp_path, rng, refined=0.0, noise_px=0.3)
+    run.run_stage_1()
+    run.ends, calls = ends, []
+    monkeypatch.setattr(rounds, "adjust_cameras", lambda run: calls.append(run) or adjust_cameras(run))
+    run_stage_2(run)
+    assert run.optimiser.step_index == run.optimiser.options.steps
+    assert len(calls) == adjusted
