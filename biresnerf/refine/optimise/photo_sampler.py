@@ -117,24 +117,24 @@ class PhotoSampler:
         """Places in `order`, evenly spread and in turn, and how many are of training views."""
         views = len(self.order)
         if held_out_only:
-            return self._spread(rays, self.training, views, generator), 0
+            return self.training + self._spread(rays, views - self.training, generator), 0
         if generator.device.type == "cpu":
-            position = self._spread(rays, 0, views, generator)
+            position = self._spread(rays, views, generator)
             return position, int((position < self.training).sum())
         # On a GPU the host would have to wait for that sum, so it fixes the number, equal to within a ray.
         trained = round(rays * self.training / views)
         parts = (
-            self._spread(trained, 0, self.training, generator),
-            self._spread(rays - trained, self.training, views, generator),
+            turned(self._spread(trained, self.training, generator), self.training, generator),
+            self.training + self._spread(rays - trained, views - self.training, generator),
         )
         return torch.cat(parts), trained
 
-    def _spread(self, rays: int, first: int, end: int, generator: torch.Generator) -> Tensor:
-        """`rays` places in [first, end): one at random in each of as many equal parts."""
+    def _spread(self, rays: int, count: int, generator: torch.Generator) -> Tensor:
+        """`rays` places in [0, count): one at random in each of as many equal parts."""
         at = generator.device
         where = torch.arange(rays, device=at) + torch.rand(rays, generator=generator, device=at)
-        where = where * ((end - first) / max(1, rays))
-        return first + where.long().clamp(max=end - first - 1).to(self.device)
+        where = where * (count / max(1, rays))
+        return where.long().clamp(max=count - 1).to(self.device)
 
     def _share(self, generator: torch.Generator) -> float:
         """A random number in [0, 1); on a GPU from a generator of the host, which then need not wait."""
@@ -179,6 +179,12 @@ class PhotoSampler:
         if self.shares is not None:
             total = total / weight.clamp(min=1e-6)
         return total / 255
+
+
+def turned(places: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Places in [0, count), in order, so that they begin anywhere: rays that find no room are not always the same's."""
+    by = torch.randint(count, (1,), generator=generator, device=generator.device).to(places.device)
+    return (places + by) % count
 
 
 def _pyramid_pixels(images: ImageSet) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.refine.optimise.photo_sampler import PhotoSampler
+from biresnerf.refine.optimise.photo_sampler import PhotoSampler, turned
 from tests.refine.tiny_scene import CPU, photos_set
 
 
@@ -127,3 +127,16 @@ def test_the_pyramid_of_all_photos_is_laid_out_without_a_second_copy():
     finally:
         tracemalloc.stop()
     assert most < 1.5 * sampler.pixels.numel()
+
+
+def test_turned_places_stay_evenly_spread_and_each_is_last_as_often():
+    """Rays that buffers have no room for are the last ones."""
+    count, rays, draws = 5, 12, 4000
+    places, random = (torch.arange(rays) * count) // rays, generator()
+    last = torch.zeros(count)
+    for _ in range(draws):
+        found = turned(places, count, random)
+        each = torch.bincount(found, minlength=count)
+        assert each.max() - each.min() <= 1
+        last[found[-1]] += 1
+    assert (last / draws - 1 / count).abs().max() < 5 * (1 / count / draws) ** 0.5
