@@ -10,7 +10,8 @@ import re
 import subprocess
 import sys
 import tempfile
-from itertools import chain
+from dataclasses import dataclass
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -27,60 +28,90 @@ from biresnerf.field.radiance_field import FieldShape
 from biresnerf.field.reference.field import ReferenceField
 
 POINTERS = {torch.float32: "*fp32", torch.int32: "*i32", torch.int64: "*i64", torch.uint8: "*u8"}
+ALIGNED = 16
 CUOBJDUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
 
 
-def _launches() -> dict[tuple[Any, ...], Launch]:
-    """Every kernel with every set of constants it is launched with, at the paper's encodings."""
-    found = {}
-    for unbounded in (False, True):
+# Rays, samples, samples of a ray, cells along a side of the occupancy grid: round, and as they come.
+CAPACITIES = (Capacity(256, 1024, 768, 8), Capacity(250, 1003, 77, 1))
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What a compiled kernel takes: shared memory (bytes); registers and stack (bytes) of a thread."""
+
+    shared: int
+    registers: int
+    stack: int
+
+
+def kernels() -> dict[str, Launch]:
+    """Every kernel, by its name, constants and specialised arguments, at the paper's encodings."""
+    found: dict[str, Launch] = {}
+    for unbounded, reconstructing, capacity in product((False, True), (False, True), CAPACITIES):
         shape = FieldShape(grid_levels(3, 16, 72, 22), grid_levels(16, 128, 4096, 10), unbounded)
         field = ReferenceField(shape, 0, torch.device("cpu"))
-        for reconstructing in (False, True):
-            field.reconstructing = reconstructing
-            workspace = Workspace(field, Capacity(256, 1024, 768, 8))
-            made = [plan(workspace) for plan in (plans.forward, plans.viewing, plans.backward, plans.density)]
-            made += [plans.update(workspace, name) for name in workspace.modules]
-            for launch in chain.from_iterable(made):
-                if isinstance(launch, Launch):
-                    constants = [launch.arguments[p.name] for p in launch.kernel.params if p.is_constexpr]
-                    found.setdefault((launch.kernel.fn.__name__, *constants), launch)
+        field.reconstructing = reconstructing
+        workspace = Workspace(field, capacity)
+        made = [plan(workspace) for plan in (plans.forward, plans.viewing, plans.backward, plans.density)]
+        made += [plans.update(workspace, name) for name in workspace.modules]
+        for launch in chain.from_iterable(made):
+            if isinstance(launch, Launch):
+                constants, _, attributes = _specialised(launch)
+                told = [launch.kernel.fn.__name__, *map(str, constants.values())]
+                told.append("".join("a" if (i,) in attributes else "-" for i in range(len(launch.arguments))))
+                found.setdefault(" ".join(told), launch)
     return found
 
 
-def _compile(launch: Launch, capability: int) -> str:
-    constants, signature, attributes = {}, {}, {}
+def _specialised(launch: Launch) -> tuple[dict[str, Any], dict[str, str], dict[tuple[int], Any]]:
+    """Constants, types and what is known of the arguments, as a launch would tell the compiler.
+
+    Triton does so by the values: a pointer or number that 16 divides, and the number one.
+    """
+    constants: dict[str, Any] = {}
+    signature: dict[str, str] = {}
+    attributes: dict[tuple[int], Any] = {}
     for i, parameter in enumerate(launch.kernel.params):
         value = launch.arguments[parameter.name]
-        if parameter.is_constexpr:
+        if parameter.is_constexpr or (isinstance(value, int) and value == 1):
             constants[parameter.name], signature[parameter.name] = value, "constexpr"
-        elif isinstance(value, torch.Tensor):
-            signature[parameter.name] = POINTERS[value.dtype]
-            attributes[(i,)] = [["tt.divisibility", 16]]
-        else:
-            signature[parameter.name] = "i32"
-    compiled = triton.compile(
+            continue
+        tensor = isinstance(value, torch.Tensor)
+        signature[parameter.name] = POINTERS[value.dtype] if tensor else "i32"
+        # The allocator aligns what it gives; a slice begins where it begins.
+        begins = value.storage_offset() * value.element_size() if tensor else value
+        if begins % ALIGNED == 0:
+            attributes[(i,)] = [["tt.divisibility", ALIGNED]]
+    return constants, signature, attributes
+
+
+def compiled(launch: Launch, capability: int) -> Usage:
+    """What a kernel takes, compiled for a compute capability."""
+    constants, signature, attributes = _specialised(launch)
+    found = triton.compile(
         ASTSource(launch.kernel, signature=signature, constexprs=constants, attrs=attributes),
         target=GPUTarget("cuda", capability, 32),
         options={"num_warps": launch.warps, "num_stages": 1},
     )
     with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
-        file.write(compiled.asm["cubin"])
+        file.write(found.asm["cubin"])
         file.flush()
         usage = subprocess.run(
             [CUOBJDUMP, "--dump-resource-usage", file.name], capture_output=True, text=True, check=True
         )
-    registers, stack = re.search(r"REG:(\d+) STACK:(\d+)", usage.stdout).groups()
-    return f"{compiled.metadata.shared:>8}{registers:>11}{stack:>8}"
+    taken = re.search(r"REG:(\d+) STACK:(\d+)", usage.stdout)
+    assert taken is not None, usage.stdout
+    return Usage(int(found.metadata.shared), int(taken[1]), int(taken[2]))
 
 
 def main() -> None:
-    launches = _launches()
+    """Print the table."""
     for capability in [int(argument) for argument in sys.argv[1:]] or [80, 90]:
-        print(f"{f'capability {capability}':48}{'shared':>8}{'registers':>11}{'stack':>8}")
-        for (name, *constants), launch in launches.items():
-            told = f"{name} {' '.join(str(c) for c in constants)}"
-            print(f"{told[:47]:48}{_compile(launch, capability)}", flush=True)
+        print(f"{f'capability {capability}':60}{'shared':>8}{'registers':>11}{'stack':>8}")
+        for told, launch in kernels().items():
+            usage = compiled(launch, capability)
+            print(f"{told[:59]:60}{usage.shared:>8}{usage.registers:>11}{usage.stack:>8}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,76 @@
+"""Memory of the CUDA kernels: what a buffer held before has no say, and nothing is written beside it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+pytest.importorskip("triton", reason="the CUDA backend's kernels need Triton, which exists for Linux only")
+
+from biresnerf.field.cuda import workspace
+from biresnerf.field.cuda.check_batch import learn
+from biresnerf.field.radiance_field import PositionGradient
+from tests.field.cuda.fields import DEVICE, RATES, make_fast, make_marching, make_rays
+
+pytestmark = pytest.mark.slow
+
+GUARD = 64  # values at either end of a buffer
+POISON = {torch.float32: float("nan"), torch.int32: -(2**30), torch.uint8: 171}
+
+
+class GuardedMemory:
+    """Makes buffers in the middle of larger ones; all of it holds poison, but for what is to be zero."""
+
+    def __init__(self) -> None:
+        self.guards: list[torch.Tensor] = []
+
+    def empty(self, shape, dtype=torch.float32, device=None):
+        shape = shape if isinstance(shape, tuple) else (shape,)
+        size = torch.Size(shape).numel()
+        whole = torch.full((GUARD + size + GUARD,), POISON[dtype], dtype=dtype, device=device)
+        self.guards += [whole[:GUARD], whole[GUARD + size :]]
+        return whole[GUARD : GUARD + size].view(shape)
+
+    def zeros(self, *shape, dtype=torch.float32, device=None):
+        return self.empty(shape, dtype, device).zero_()
+
+    def untouched(self) -> bool:
+        return all(
+            bool(guard.isnan().all() if guard.is_floating_point() else (guard == POISON[guard.dtype]).all())
+            for guard in self.guards
+        )
+
+
+def two_steps(unbounded: bool, reconstructing: bool) -> list[torch.Tensor]:
+    """Everything that comes of two steps, of a view and of densities: the second step takes fewer rays."""
+    field = make_fast(unbounded, reconstructing)
+    found = []
+    for count in (33, 20):
+        rays = make_rays(count, count // 2, unbounded)
+        rendering = learn(field, rays, make_marching(), PositionGradient(1.0, 0.5, 0.7))
+        found += [rendering.colour, rendering.opacity, rendering.depth, rays.origin.grad, rays.direction.grad]
+        field.step(RATES)
+    with torch.no_grad():
+        found.append(field.render(make_rays(9, 0, unbounded), make_marching(), PositionGradient()).colour)
+    found.append(field.density(torch.rand(50, 3, generator=torch.Generator().manual_seed(1)).to(DEVICE)))
+    tables = [field.pose_table, *([field.reconstruction_table] if reconstructing else [])]
+    return [each.detach().clone() for each in (*found, *tables, *field.networks)]
+
+
+@pytest.mark.parametrize(("unbounded", "reconstructing"), [(False, True), (True, True), (False, False)])
+def test_results_do_not_depend_on_what_buffers_held_and_nothing_else_is_written(
+    unbounded, reconstructing, monkeypatch
+):
+    expected = two_steps(unbounded, reconstructing)
+    memory = GuardedMemory()
+    names = {name: getattr(torch, name) for name in dir(torch)}
+    guarded = SimpleNamespace(**{**names, "empty": memory.empty, "zeros": memory.zeros})
+    monkeypatch.setattr(workspace, "torch", guarded)
+    found = two_steps(unbounded, reconstructing)
+    assert len(memory.guards) > 2 * 30
+    assert memory.untouched()
+    for one, other in zip(found, expected, strict=True):
+        assert torch.isfinite(one).all()
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-7)
