@@ -105,7 +105,7 @@ def test_the_working_share_is_of_the_long_sides(scene):
 
 
 def test_matches_alone_tell_good_poses_from_bad_ones(scene, noisy, monkeypatch):
-    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_: None)
+    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_, **__: None)
     truth, matches = scene[0].world_from_cam, true_matches(scene[0])
     better, worse = judged(scene, noisy, truth, matches), judged(scene, truth, noisy, matches)
     assert (better.verdict.verdict, worse.verdict.verdict) == ("improved", "kept_input")
@@ -243,7 +243,7 @@ def test_matches_of_points_left_out_judge_and_photos_placed_by_a_guess_do_not(sc
 
 
 def test_a_camera_that_its_own_matches_contradict_is_named(scene, monkeypatch):
-    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_: None)
+    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_, **__: None)
     truth, refined = scene[0].world_from_cam, scene[0].world_from_cam.copy()
     refined[5] = refined[6]
     found = judged(scene, truth, refined, true_matches(scene[0]))
