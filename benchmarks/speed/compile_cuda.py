@@ -53,7 +53,8 @@ def kernels() -> dict[str, Launch]:
         field = ReferenceField(shape, 0, torch.device("cpu"))
         field.reconstructing = reconstructing
         workspace = Workspace(field, capacity)
-        made = [plan(workspace) for plan in (plans.forward, plans.viewing, plans.backward, plans.density)]
+        made = [plan(workspace, merged=True) for plan in (plans.forward, plans.viewing)]
+        made += [plan(workspace) for plan in (plans.backward, plans.density)]
         made += [plans.update(workspace, name) for name in workspace.modules]
         for launch in chain.from_iterable(made):
             if isinstance(launch, Launch):

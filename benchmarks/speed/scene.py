@@ -1,26 +1,36 @@
-"""A scene made up for measuring: random photos from cameras around a shell that alone holds anything."""
+"""A made scene for measuring, and its optimisation in the middle of either stage."""
 
 from __future__ import annotations
+
+from functools import cache
 
 import numpy as np
 import torch
 
 from biresnerf.data.photos.images import ImageSet
+from biresnerf.data.synthetic.scene import render_synthetic, synthetic_cameras, synthetic_focal
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refine.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
 from biresnerf.refine.scene.scene_frame import scene_frame
 
 CPU = torch.device("cpu")
-DISTANCE, FOCAL = 4.0, 1.4  # of the cameras; in widths of the photo
+VIEWS, SEED = 25, 1  # that differ; of more photos, some are the same
+STEPS = 400  # until the middle of stage 1; as many in stage 2
+
+
+@cache
+def _views(size: int) -> np.ndarray:
+    """uint8 [VIEWS, size, size, 3]."""
+    poses = synthetic_cameras(VIEWS, SEED)
+    return np.stack([render_synthetic(pose, size, SEED)[0][..., :3] for pose in poses])
 
 
 def photos(count: int, size: int) -> ImageSet:
-    """Random uint8 photos of `size` px a side."""
-    rng = np.random.default_rng(count)
-    camera = Camera("SIMPLE_PINHOLE", size, size, (FOCAL * size, size / 2, size / 2))
+    """Photos of `size` px a side."""
+    camera = Camera("SIMPLE_PINHOLE", size, size, (synthetic_focal(size), size / 2, size / 2))
     return ImageSet(
-        pixels=rng.integers(0, 256, (count * size * size, 3), dtype=np.uint8),
+        pixels=_views(size)[np.arange(count) % VIEWS].reshape(-1, 3),
         alpha=None,
         offsets=np.arange(count + 1) * size * size,
         widths=np.full(count, size, np.int32),
@@ -30,43 +40,39 @@ def photos(count: int, size: int) -> ImageSet:
     )
 
 
-def cameras_around(count: int) -> np.ndarray:
-    """world_from_cam [count, 4, 4] spread evenly over a sphere, looking at its centre."""
-    height = 1 - (2 * np.arange(count) + 1) / count
-    turn = np.pi * (1 + 5**0.5) * np.arange(count)
-    ring = np.sqrt(1 - height**2)
-    centre = DISTANCE * np.stack([ring * np.cos(turn), ring * np.sin(turn), height], 1)
-    forward = -centre / DISTANCE
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], 2)
-    poses[:, :3, 3] = centre
-    return poses
+def _new(images: int, threads: int, size: int, preset: str) -> JointOptimiser:
+    """From true poses; as many steps of either stage as are trained here, and as many to come."""
+    options = RefineOptions(preset=preset, device="cpu", max_image_size=size, steps=4 * STEPS)
+    options = options.model_copy(update={"coarse_steps_max": 2 * STEPS}).resolved("cpu")
+    photo_set, poses = photos(images, size), synthetic_cameras(VIEWS, SEED)[np.arange(images) % VIEWS]
+    frame = scene_frame(poses, photo_set)
+    start = frame.unit_from_world.apply_to_poses(poses)
+    return JointOptimiser(photo_set, frame, start, options, [], CPU, threads)
 
 
-def shell(side: int) -> torch.Tensor:
-    """An occupancy grid that is live in a spherical shell: some 40 samples a ray, as after pruning."""
-    centre = (torch.arange(side) + 0.5) / side - 0.5
-    z, y, x = torch.meshgrid(centre, centre, centre, indexing="ij")
-    radius = (x * x + y * y + z * z).sqrt()
-    return ((radius - 0.33).abs() < 0.02).to(torch.uint8)
+@cache
+def _trained(stage: str, threads: int, size: int, preset: str) -> JointOptimiser:
+    made = _new(VIEWS, threads, size, preset)
+    for _ in range(STEPS):
+        made.step()
+    if stage == "fine":
+        made.start_reconstruction()
+        for _ in range(STEPS):
+            made.step()
+    return made
 
 
 def optimiser(
     stage: str, images: int, threads: int, rays: int, size: int = 200, preset: str = "paper"
 ) -> JointOptimiser:
-    """An optimiser of the given preset in the middle of a stage, with the shell as its occupancy."""
-    options = RefineOptions(preset=preset, device="cpu", max_image_size=size).resolved("cpu")
-    photo_set, poses = photos(images, size), cameras_around(images)
-    frame = scene_frame(poses, photo_set)
-    start = frame.unit_from_world.apply_to_poses(poses)
-    made = JointOptimiser(photo_set, frame, start, options, [], CPU, threads)
-    made.occupancy.occupied = shell(made.occupancy.side)
-    made.step_index = options.coarse_steps_max - 1
+    """An optimiser of the given preset's encodings in the middle of a stage."""
+    trained, made = _trained(stage, threads, size, preset), _new(images, threads, size, preset)
     if stage == "fine":
         made.start_reconstruction()
-        made.step_index += 3 * options.warmup_steps + 1
+        made.switch = trained.switch
+    made.step_index = trained.step_index
+    made.field.load_state(trained.field.state())
+    made.occupancy.load_state(trained.occupancy.state())
     made.rays = rays
     return made
 
@@ -74,9 +80,10 @@ def optimiser(
 def step(joint: JointOptimiser, rays: int) -> int:
     """One step of the whole training without the occupancy update, at the same place of the schedule each time.
 
-    Returns its samples.
+    Returns its samples before any were merged.
     """
     index = joint.step_index
+    joint.step_index += index % OCCUPANCY_PERIOD == 0
     result = joint.step()
     joint.step_index, joint.rays = index, rays
     return result.samples

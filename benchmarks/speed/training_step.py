@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from biresnerf.refine.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOpt
 from biresnerf.refine.optimise.photo_sampler import PhotoSampler
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
 
+FORWARD, BACKWARD = "networks forward, composite", "composite and networks back, position gradient"
 OPERATIONS = [
     (PhotoSampler, "draw", "draw pixels"),
     (PoseParameters, "matrices", "pose matrices"),
@@ -24,9 +26,11 @@ OPERATIONS = [
     (cpu_field, "harmonics", "view harmonics"),
     (cpu_field.march_kernels, "march", "march"),
     (cpu_field.march_kernels, "pack", "pack samples"),
-    (cpu_field.CpuField, "_encode", "encode, both modules"),
-    (cpu_field, "render_segments", "networks forward, composite"),
-    (cpu_field, "render_segments_backward", "composite and networks back, position gradient"),
+    (cpu_field.CpuField, "_density", "estimate of densities"),
+    (cpu_field, "merge", "merge intervals"),
+    (cpu_field.CpuField, "_encode", "encode"),
+    (cpu_field, "render_segments", FORWARD),
+    (cpu_field, "render_segments_backward", BACKWARD),
     (cpu_field, "ray_gradients", "sum into rays"),
     (cpu_field.encoding, "update_table", "table gradient and Adam"),
     (PoseParameters, "step", "Adam on poses"),
@@ -41,16 +45,22 @@ def _flops(width: int) -> float:
     return 2.0 * (forward + again + 2 * forward)
 
 
-def _alternatives(ours: JointOptimiser, stage: str, definition: bool) -> dict[str, JointOptimiser]:
-    """The same optimisation on other fields; photos and poses are shared."""
+def _every_interval(ours: JointOptimiser) -> JointOptimiser:
+    """The same optimisation with a sample in every live interval; photos, poses and field are shared."""
+    rival = copy.copy(ours)
+    rival.method = replace(ours.method, merging=None)
+    return rival
+
+
+def _alternatives(ours: JointOptimiser, definition: bool) -> dict[str, JointOptimiser]:
+    """The same on other fields, which are trained as far."""
     kinds: dict[str, Any] = {"unrolled": UnrolledField, "vectorised": VectorisedField}
     if definition:
         kinds["definition"] = ReferenceField
     made = {}
     for name, kind in kinds.items():
-        rival, field = copy.copy(ours), kind(ours.field.shape, 0, scene.CPU)
-        if stage == "fine":
-            field.start_reconstruction()
+        rival, field = _every_interval(ours), kind(ours.field.shape, 0, scene.CPU)
+        field.load_state(ours.field.state())
         rival.field = field
         made[name] = rival
     return made
@@ -70,8 +80,9 @@ def run(
             scene.step(rival, rays)
             torch.set_num_threads(1)
 
-        rivals = _alternatives(ours, stage, definition)
+        rivals, unmerged = _alternatives(ours, definition), _every_interval(ours)
         competitors = {"kernels": lambda ours=ours: scene.step(ours, rays)}
+        competitors["every interval"] = lambda rival=unmerged: scene.step(rival, rays)
         competitors |= {name: lambda r=rival: torch_step(r) for name, rival in rivals.items()}
         seconds = interleave(competitors, rounds, clock)
         with peak_memory() as slow_memory:
@@ -94,7 +105,7 @@ def run(
         width = ours.field.shape.pose_grid.width + (
             ours.field.shape.reconstruction_grid.width if stage == "fine" else 0
         )
-        network_s = 1e-3 * (medians[OPERATIONS[7][2]] + medians[OPERATIONS[8][2]])
+        network_s = 1e-3 * (medians[FORWARD] + medians[BACKWARD])
         rows.append({
             "stage": stage, "rays": rays, "samples": samples, "kernels": summary(seconds["kernels"]),
             "ns_per_sample": 1e9 * fast / samples, "samples_per_s": samples / fast, "rays_per_s": rays / fast,

@@ -41,10 +41,22 @@ class Rays:
 
 
 @dataclass(frozen=True)
+class Merging:
+    """Neighbouring intervals of a ray become one where they give little light: see `reference.merge`.
+
+    Those that are merged give at most the share `light` of the ray's light, and are at most `most`.
+    """
+
+    light: float
+    most: int
+
+
+@dataclass(frozen=True)
 class Marching:
     """Where samples are taken: interval `step`, from `near` to `far` (unit lengths), at most `most` per ray.
 
-    `occupied` is the occupancy grid, uint8 [side, side, side] over (z, y, x) of the grid position.
+    `occupied` is the occupancy grid, uint8 [side, side, side] over (z, y, x) of the grid position. Every interval is a
+    sample where `merging` is None.
     """
 
     step: float
@@ -52,6 +64,7 @@ class Marching:
     far: float
     most: int
     occupied: Tensor
+    merging: Merging | None = None
 
 
 @dataclass(frozen=True)
@@ -78,7 +91,10 @@ class FieldRates:
 
 @dataclass(frozen=True)
 class Rendering:
-    """Colour [rays, 3], opacity [rays], depth [rays] (unit lengths along the ray) and the samples it took."""
+    """Colour [rays, 3], opacity [rays] and depth [rays] (unit lengths along the ray).
+
+    `samples` is how many there were before any were merged.
+    """
 
     colour: Tensor
     opacity: Tensor

@@ -12,11 +12,12 @@ from biresnerf.field.cpu import encoding, network
 from biresnerf.field.cpu import marching as march_kernels
 from biresnerf.field.cpu.harmonics import add_harmonics_gradient, harmonics
 from biresnerf.field.cpu.matrix_blocks import CHANNELS, from_tiles
+from biresnerf.field.cpu.merging import merge
 from biresnerf.field.cpu.ray_gradients import ray_gradients
 from biresnerf.field.cpu.samples import Composited, Samples, segments
 from biresnerf.field.cpu.segments import render_segments
 from biresnerf.field.cpu.segments_backward import render_segments_backward
-from biresnerf.field.grid_field import BETA1, BETA2, EPSILON, HIDDEN, OUTPUTS, GridField
+from biresnerf.field.grid_field import BETA1, BETA2, EPSILON, HIDDEN, MODULES, OUTPUTS, GridField
 from biresnerf.field.radiance_field import FieldShape, Marching, PositionGradient, Rays, Rendering
 from biresnerf.field.spherical_harmonics import VIEW_FEATURES
 
@@ -57,32 +58,36 @@ class CpuField(GridField):
         self._pending: tuple[Samples, np.ndarray] | None = None
         self._clearances: tuple[Tensor | None, int, np.ndarray] = (None, 0, np.empty(0))
 
-    def _width(self) -> int:
-        width = sum(self.grids[name].width for name in self.modules)
+    def _width(self, modules: tuple[str, ...]) -> int:
+        width = sum(self.grids[name].width for name in modules)
         return -CHANNELS * (-width // CHANNELS)  # whole register tiles
+
+    def _first_layer(self, modules: tuple[str, ...]) -> np.ndarray:
+        """The columns of these modules, padded to whole tiles."""
+        first = np.zeros((HIDDEN, self._width(modules)), f4)
+        low = self.shape.pose_grid.width
+        first[:, :low] = self.networks[0].detach().numpy()
+        if len(modules) > 1:
+            high = self.shape.reconstruction_grid.width
+            first[:, low : low + high] = self.reconstruction_columns.detach().numpy()
+        return first
 
     def _weights(self) -> list[np.ndarray]:
         """The five layers as contiguous arrays; input columns padded to whole tiles, colour rows to 4."""
-        first = np.zeros((HIDDEN, self._width()), f4)
-        low = self.shape.pose_grid.width
-        first[:, :low] = self.networks[0].detach().numpy()
-        if self.reconstructing:
-            high = self.shape.reconstruction_grid.width
-            first[:, low : low + high] = self.reconstruction_columns.detach().numpy()
         last = np.zeros((4, HIDDEN), f4)
         last[:3] = self.networks[4].detach().numpy()
-        return [first, *(w.detach().numpy() for w in self.networks[1:4]), last]
+        return [self._first_layer(self.modules), *(w.detach().numpy() for w in self.networks[1:4]), last]
 
     def _encode(
-        self, x: np.ndarray, gradient: PositionGradient | None, role: str
+        self, x: np.ndarray, gradient: PositionGradient | None, role: str, modules: tuple[str, ...]
     ) -> tuple[np.ndarray, list[np.ndarray]]:
         """Features [width, n] and each module's Jacobian, [levels, 0, n] where no gradient is asked for."""
-        n, width = len(x) // 3, self._width()
+        n, width = len(x) // 3, self._width(modules)
         derivatives, gradient = (0, PositionGradient()) if gradient is None else (6, gradient)
         features = self._buffers.take(f"{role} features", width, n)
         jacobians, row = [], 0
         smoothings = (gradient.pose_smoothing, gradient.reconstruction_smoothing)
-        for name, smoothing in zip(self.modules, smoothings, strict=False):
+        for name, smoothing in zip(modules, smoothings, strict=False):
             grid, words = self.grids[name], self.tables[name].numpy().reshape(-1).view(np.uint64)
             jacobian = self._buffers.take(f"{role} jacobian {name}", grid.levels, derivatives, n)
             encoding.encode(
@@ -101,18 +106,24 @@ class CpuField(GridField):
         return Rendering(colour, opacity, depth, int(count))
 
     def density(self, position: Tensor) -> Tensor:
-        x = position.contiguous().numpy().reshape(-1)
-        features, _ = self._encode(x, None, "density")
         result = np.empty(len(position), f4)
-        w1, w2 = (w.reshape(-1) for w in self._weights()[:2])
-        network.network_density(
-            features.reshape(-1), features.shape[0], w1, w2, result, tasks(), self.workers
-        )
+        self._density(position.contiguous().numpy().reshape(-1), self.modules, result)
         return torch.from_numpy(result)
+
+    def _density(self, x: np.ndarray, modules: tuple[str, ...], density: np.ndarray) -> None:
+        """Fill `density` [n] with that which these modules give at x [3 n]."""
+        features, _ = self._encode(x, None, "density", modules)
+        w1, w2 = self._first_layer(modules).reshape(-1), self.networks[1].detach().numpy().reshape(-1)
+        network.network_density(
+            features.reshape(-1), features.shape[0], w1, w2, density, tasks(), self.workers
+        )
 
     def march(self, origin: np.ndarray, direction: np.ndarray, jitter: np.ndarray, marching: Marching,
               ) -> tuple[np.ndarray, ...]:  # fmt: skip
-        """Where the live intervals of rays are: offset [rays + 1], grid positions x [3 n], t, dt, ray [n]."""
+        """Where the samples of rays are: offset [rays + 1], grid positions x [3 n], t, dt, ray [n].
+
+        And how many there were before any were merged.
+        """
         rays, take = len(origin), self._buffers.take
         t_buffer = take("march t", rays, marching.most)
         dt_buffer = take("march dt", rays, marching.most)
@@ -122,7 +133,18 @@ class CpuField(GridField):
             self._clearance(marching.occupied), f4(marching.step), f4(marching.near), f4(marching.far),
             self.shape.unbounded, t_buffer, dt_buffer, count,
         )  # fmt: skip
-        offset = np.zeros(rays + 1, np.int64)
+        packed = self._pack(origin, direction, t_buffer, dt_buffer, count)
+        marched, merging = len(packed[2]), marching.merging
+        if merging is not None:
+            density = take("estimate", marched)
+            self._density(packed[1], MODULES[:1], density)
+            merge(density, packed[0], jitter, f4(merging.light), merging.most, t_buffer, dt_buffer, count)
+            packed = self._pack(origin, direction, t_buffer, dt_buffer, count)
+        return (*packed, marched)
+
+    def _pack(self, origin: np.ndarray, direction: np.ndarray, t_buffer: np.ndarray, dt_buffer: np.ndarray,
+              count: np.ndarray) -> tuple[np.ndarray, ...]:  # fmt: skip
+        take, offset = self._buffers.take, np.zeros(len(count) + 1, np.int64)
         np.cumsum(count, out=offset[1:])
         n = int(offset[-1])
         x, t, dt, ray = take("x", 3 * n), take("t", n), take("dt", n), take("ray", n, dtype=np.int32)
@@ -143,17 +165,17 @@ class CpuField(GridField):
     def render_forward(self, origin: np.ndarray, direction: np.ndarray, view: np.ndarray, rays: Rays,
                        marching: Marching, gradient: PositionGradient | None,
                        ) -> tuple[Samples, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-        """March, evaluate the field at every live sample and composite: colour [rays, 3], opacity, depth [rays].
+        """March, evaluate the field at every sample and composite: colour [rays, 3], opacity, depth [rays].
 
         `gradient` is None where positions need none.
         """
         take, count = self._buffers.take, len(origin)
-        offset, x, t, dt, ray = self.march(origin, direction, rays.jitter.numpy(), marching)
+        offset, x, t, dt, ray, marched = self.march(origin, direction, rays.jitter.numpy(), marching)
         n = len(t)
-        features, jacobians = self._encode(x, gradient, "render")
+        features, jacobians = self._encode(x, gradient, "render", self.modules)
         segment, learning = segments(offset, rays.trained)
         samples = Samples(
-            segment, learning, offset, x, t, dt, ray, features, jacobians,
+            segment, learning, marched, offset, x, t, dt, ray, features, jacobians,
             Composited(
                 take("outputs", OUTPUTS * n), take("density", n), take("alpha", n), take("kept", n, dtype=np.int32),
                 take("kept begin", count, dtype=np.int64), take("kept end", count, dtype=np.int64),
@@ -241,9 +263,9 @@ class _RenderRays(torch.autograd.Function):
         samples, colour, opacity, depth = field.render_forward(o, d, view, rays, marching, gradient)
         ctx.kept = (field, samples, o, d, view, colour, opacity, gradient)
         tensors = (torch.from_numpy(colour), torch.from_numpy(opacity), torch.from_numpy(depth))
-        samples_taken = torch.tensor(len(samples.t))
-        ctx.mark_non_differentiable(tensors[2], samples_taken)
-        return (*tensors, samples_taken)
+        marched = torch.tensor(samples.marched)
+        ctx.mark_non_differentiable(tensors[2], marched)
+        return (*tensors, marched)
 
     @staticmethod
     def backward(ctx, g_colour, g_opacity, _g_depth, _g_count):

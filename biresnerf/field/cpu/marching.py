@@ -85,7 +85,7 @@ def _inverse(d):
 def march(
     origin, direction, jitter, occupied, side, clearance, step, near, far, unbounded, t_buffer, dt_buffer, count
 ):  # fmt: skip
-    """Start and length of the live intervals of each ray: t_buffer, dt_buffer [rays, most], count [rays].
+    """Middle and length of the live intervals of each ray: t_buffer, dt_buffer [rays, most], count [rays].
 
     Intervals are `step` long, growing as m^2 outside the inner box (even in contracted space, along rays from its
     centre); one is live if the cell of its midpoint is. Within the inner box, where rays are straight and intervals
@@ -121,7 +121,7 @@ def march(
             iy = min(max(i4(gy * side), 0), side - 1)
             iz = min(max(i4(gz * side), 0), side - 1)
             if occupied[(iz * side + iy) * side + ix]:
-                t_buffer[r, n] = t
+                t_buffer[r, n] = middle
                 dt_buffer[r, n] = dt
                 n += 1
                 t += dt
@@ -143,21 +143,20 @@ def march(
 
 @njit(**PARALLEL_KERNEL)
 def pack(origin, direction, t_buffer, dt_buffer, count, offset, unbounded, x, t, dt, ray):
-    """The live intervals of all rays one after another: x [3 n] grid positions of midpoints, t, dt, ray [n]."""
+    """The intervals of all rays one after another: x [3 n] grid positions of samples, t, dt, ray [n]."""
     for r in prange(origin.shape[0]):
         base = offset[r]
         for k in range(count[r]):
             i = base + k
-            length = dt_buffer[r, k]
-            middle = t_buffer[r, k] + f4(0.5) * length
+            at = t_buffer[r, k]
             gx, gy, gz, _ = _grid_position(
-                origin[r, 0] + middle * direction[r, 0],
-                origin[r, 1] + middle * direction[r, 1],
-                origin[r, 2] + middle * direction[r, 2],
+                origin[r, 0] + at * direction[r, 0],
+                origin[r, 1] + at * direction[r, 1],
+                origin[r, 2] + at * direction[r, 2],
                 unbounded,
             )
             x[3 * i], x[3 * i + 1], x[3 * i + 2] = _inside(gx), _inside(gy), _inside(gz)
-            t[i], dt[i], ray[i] = middle, length, r
+            t[i], dt[i], ray[i] = at, dt_buffer[r, k], r
 
 
 def bring_inside(x):

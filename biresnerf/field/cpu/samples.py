@@ -27,11 +27,13 @@ class Samples:
     """What the forward pass leaves for the backward pass; arrays are views of `Buffers`.
 
     Rays segment[s]:segment[s + 1] form segment s; `learning` segments give gradients to the field. Of the samples of
-    ray r, offset[r]:offset[r + 1], light reaches those with indices kept[kept_begin[r]:kept_end[r]].
+    ray r, offset[r]:offset[r + 1], light reaches those with indices kept[kept_begin[r]:kept_end[r]]. There were
+    `marched` samples before any were merged.
     """
 
     segment: np.ndarray
     learning: int
+    marched: int
     offset: np.ndarray
     x: np.ndarray
     t: np.ndarray

@@ -8,7 +8,7 @@ from typing import TypeVar
 import torch
 
 from biresnerf.field.grid_field import GridField
-from biresnerf.field.radiance_field import FieldShape, Marching, PositionGradient, Rays, Rendering
+from biresnerf.field.radiance_field import FieldShape, Marching, Merging, PositionGradient, Rays, Rendering
 
 Field = TypeVar("Field", bound=GridField)
 MakeField = Callable[[FieldShape, int, torch.device], GridField]
@@ -49,11 +49,17 @@ def random_rays(count: int, trained: int, device: torch.device, *, unbounded: bo
 
 
 def random_marching(
-    device: torch.device, *, step: float = 0.1, share: float = 0.4, most: int = 128, far: float = 12.0
+    device: torch.device,
+    *,
+    step: float = 0.1,
+    share: float = 0.4,
+    most: int = 128,
+    far: float = 12.0,
+    merging: Merging | None = None,
 ) -> Marching:
     """A march through a grid of 8 x 8 x 8 cells, of which a share is occupied."""
     occupied = torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)) < share
-    return Marching(step, 0.1, far, most, occupied.to(torch.uint8).to(device))
+    return Marching(step, 0.1, far, most, occupied.to(torch.uint8).to(device), merging)
 
 
 def learn(field: GridField, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:

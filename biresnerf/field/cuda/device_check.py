@@ -22,7 +22,7 @@ from torch import Tensor
 from biresnerf.field.cuda.check_batch import MakeField, learn, random_field, random_marching, random_rays
 from biresnerf.field.cuda.lens import directions_in_cam as on_device
 from biresnerf.field.grid_levels import grid_levels
-from biresnerf.field.radiance_field import FieldRates, FieldShape, PositionGradient
+from biresnerf.field.radiance_field import FieldRates, FieldShape, Merging, PositionGradient
 from biresnerf.field.reference.field import ReferenceField
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.camera.camera_models import Camera
@@ -31,10 +31,12 @@ logger = logging.getLogger(__name__)
 
 LIMIT_S = 600.0  # the first run compiles all kernels
 TOLERANCE = 0.02  # products of the networks keep 10 bits of mantissa
-# Of the rays, how many may have other gradients: these jump where rounding moves a sample to the next cell.
+# Of the rays, how many may have other gradients: these jump where rounding moves a sample to the next cell. The same
+# holds for what is rendered of merged intervals, where rounding ends a run of them elsewhere.
 JUMPING_SHARE = 1 / 16
 RAYS = 16
-_JUMPING = ("gradient by origins", "gradient by directions", "gradient by tables")
+_MERGED = "colour of merged intervals"
+_JUMPING = ("gradient by origins", "gradient by directions", "gradient by tables", _MERGED)
 _RATES = FieldRates(0.01, 0.005, (0.01, 0.02, 0.01), 0.003)
 _GRADIENT = PositionGradient(1.0, 0.5, 0.7)
 
@@ -145,11 +147,13 @@ def _computed(make: MakeField, device: torch.device, *, unbounded: bool) -> dict
     found: dict[str, Tensor] = {}
     shape = FieldShape(grid_levels(3, 8, 20, 14), grid_levels(3, 16, 60, 10), unbounded)
     rays = random_rays(RAYS, RAYS, device, unbounded=unbounded)
-    marching = random_marching(device)
+    marching, merging = random_marching(device), random_marching(device, step=0.05, merging=Merging(0.05, 4))
     probes = torch.rand(100, 3, generator=torch.Generator().manual_seed(9)).to(device)
     for stage in ("coarse", "fine"):
         field = random_field(make, shape, device, reconstructing=stage == "fine")
         found[f"density, {stage}"] = field.density(probes)
+        with torch.no_grad():
+            found[f"{_MERGED}, {stage}"] = field.render(rays, merging, _GRADIENT).colour
         for _ in range(2):  # the first time kernels are launched one by one, then recorded and replayed
             field.discard_gradients()
             rays.origin.grad = rays.direction.grad = None

@@ -19,7 +19,7 @@ from biresnerf.field.cuda.launches import interpreted
 from biresnerf.field.cuda.sample_count import SampleCount
 from biresnerf.field.cuda.workspace import Capacity, Workspace
 from biresnerf.field.grid_field import BETA1, BETA2, GridField
-from biresnerf.field.radiance_field import FieldShape, Marching, PositionGradient, Rays, Rendering
+from biresnerf.field.radiance_field import FieldShape, Marching, Merging, PositionGradient, Rays, Rendering
 
 logger = logging.getLogger(__name__)
 
@@ -103,10 +103,10 @@ class CudaField(GridField):
             w = self._reserve(len(part.origin), 1, marching.most, side)
             self._write(w, part, marching, gradient)
             w.record()
-            w.plan(plans.viewing).run()
+            w.plan(plans.viewing, marching.merging is not None).run()
             n = len(part.origin)
             parts.append([w.buffers[name][:n].clone() for name in RESULTS])
-            total += w.buffers["ray_offset"][-1:]
+            total += w.buffers["marched"]
         colour, opacity, depth = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
         return Rendering(colour, opacity, depth, int(total))
 
@@ -127,14 +127,14 @@ class CudaField(GridField):
             # No count is known, or far more samples are expected: only here the host waits for the device.
             self._write(w, rays, marching, gradient)
             w.plan(plans.marching).run()
-            samples = int(w.buffers["ray_offset"][-1])
+            samples = int(w.buffers["marched"])
             if samples * MARGIN > w.capacity.samples:
                 del w  # frees its memory before the larger one takes its own
                 w = self._reserve(count, int(samples * GROWTH), marching.most, side)
         self._write(w, rays, marching, gradient)
         w.record()
-        w.plan(plans.forward).run()
-        self._sample_count.note(w.buffers["ray_offset"][-1:], count, interval)
+        w.plan(plans.forward, marching.merging is not None).run()
+        self._sample_count.note(w.buffers["marched"], count, interval)
         colour, opacity, depth = (w.buffers[name][:count].clone() for name in RESULTS)
         return colour, opacity, depth, samples, self._forward_number
 
@@ -199,12 +199,14 @@ class CudaField(GridField):
         for name in ("origin", "direction", "background", "jitter"):
             w.buffers[name][:count].copy_(getattr(rays, name).detach())
         w.buffers["occupied"].copy_(marching.occupied)
+        merging = marching.merging or Merging(0.0, 0)
         values = {
             "ray_count": count, "trained_rays": rays.trained,
             "interval": marching.step, "near": marching.near, "far": marching.far,
             "pose_smoothing": gradient.pose_smoothing, "pose_share": 1.0,
             "reconstruction_smoothing": gradient.reconstruction_smoothing,
             "reconstruction_share": gradient.reconstruction_share,
+            "merged_light": merging.light, "merged_most": merging.most,
         }  # fmt: skip
         w.write_controls(values)
 

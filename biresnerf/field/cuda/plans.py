@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 
-from biresnerf.field.cuda import encoding, harmonics, network, rays
+from biresnerf.field.cuda import encoding, harmonics, merging, network, rays
 from biresnerf.field.cuda.launches import Launch, bind, block
 from biresnerf.field.cuda.workspace import Workspace
 from biresnerf.field.grid_field import BETA1, BETA2, EPSILON
@@ -26,18 +27,19 @@ def marching(w: Workspace) -> list[Any]:
         _per_ray_block(
             rays.march, w, side=w.capacity.side, most=w.capacity.most, ray_capacity=w.capacity.rays
         ),
-        lambda: torch.cumsum(b["count"], 0, dtype=torch.int32, out=b["ray_offset"][1:]),
+        _offsets(w),
+        lambda: b["marched"].copy_(b["ray_offset"][-1:]),
     ]
 
 
-def viewing(w: Workspace) -> list[Any]:
+def viewing(w: Workspace, merged: bool) -> list[Any]:
     """Colour, opacity and depth of rays."""
-    return _rendering(w, with_jacobian=False)
+    return _rendering(w, merged, with_jacobian=False)
 
 
-def forward(w: Workspace) -> list[Any]:
+def forward(w: Workspace, merged: bool) -> list[Any]:
     """The same, leaving what the backward pass needs."""
-    return _rendering(w, with_jacobian=True)
+    return _rendering(w, merged, with_jacobian=True)
 
 
 def backward(w: Workspace) -> list[Any]:
@@ -65,7 +67,10 @@ def backward(w: Workspace) -> list[Any]:
 
 def density(w: Workspace) -> list[Any]:
     """Density of the points that are given as samples."""
-    return [*_encoding(w, with_jacobian=False), _per_tile(network.network_forward, w, WITH_COLOUR=False)]
+    return [
+        *_encoding(w, w.modules, with_jacobian=False),
+        _per_tile(network.network_forward, w, WITH_COLOUR=False),
+    ]
 
 
 def update(w: Workspace, name: str) -> list[Any]:
@@ -81,25 +86,51 @@ def update(w: Workspace, name: str) -> list[Any]:
     ]  # fmt: skip
 
 
-def _rendering(w: Workspace, with_jacobian: bool) -> list[Any]:
+def _rendering(w: Workspace, merged: bool, with_jacobian: bool) -> list[Any]:
     return [
         *marching(w),
-        w.buffers["taken"].zero_,
-        _per_ray(rays.pack, w, most=w.capacity.most),
+        *_packing(w),
+        *(_merging(w) if merged else []),
         _per_ray_block(harmonics.view_harmonics, w),
-        *_encoding(w, with_jacobian),
+        *_encoding(w, w.modules, with_jacobian),
         _per_tile(network.network_forward, w, WITH_COLOUR=True),
         _per_ray(rays.composite, w),
     ]
 
 
-def _encoding(w: Workspace, with_jacobian: bool) -> list[Launch]:
+def _packing(w: Workspace) -> list[Any]:
+    return [w.buffers["taken"].zero_, _per_ray(rays.pack, w, most=w.capacity.most)]
+
+
+def _merging(w: Workspace) -> list[Any]:
+    """Merge intervals by the densities of the pose-estimation module, and pack them again."""
+    return [
+        *_encoding(w, w.modules[:1], with_jacobian=False),
+        _per_tile(network.network_forward, w, WITH_COLOUR=False, HIGH=0),
+        _per_ray_block(
+            merging.merge,
+            w,
+            most=w.capacity.most,
+            capacity=w.capacity.samples,
+            ray_capacity=w.capacity.rays,
+        ),
+        _offsets(w),
+        *_packing(w),
+    ]
+
+
+def _offsets(w: Workspace) -> Callable[[], Any]:
+    b = w.buffers
+    return lambda: torch.cumsum(b["count"], 0, dtype=torch.int32, out=b["ray_offset"][1:])
+
+
+def _encoding(w: Workspace, modules: tuple[str, ...], with_jacobian: bool) -> list[Launch]:
     return [
         _per_sample(
             encoding.encode, w, name, per_level=True,
             smoothing=w.buffers[f"{name}_smoothing"], WITH_JACOBIAN=with_jacobian,
         )
-        for name in w.modules
+        for name in modules
     ]  # fmt: skip
 
 

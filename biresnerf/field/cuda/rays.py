@@ -55,10 +55,10 @@ def _axis(o, d, t, t_end):
 
 @triton.jit
 def march(
-    origin, direction, jitter, occupied, ray_count, interval, near, far, start, count, side, most, ray_capacity,
-    UNBOUNDED: tl.constexpr, BLOCK: tl.constexpr,
+    origin, direction, jitter, occupied, ray_count, interval, near, far, middle, length, count, side, most,
+    ray_capacity, UNBOUNDED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Start of every live interval, start [rays, most], and how many a ray has, count [rays]; a thread per ray."""
+    """Live intervals, middle and length [rays, most], and how many a ray has, count [rays]; a thread per ray."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = r < tl.load(ray_count).to(tl.int32)
     ox, oy, oz = load_vector(origin + 3 * r, 1, here)
@@ -79,15 +79,16 @@ def march(
     row = r.to(tl.int64) * most
     while tl.max(active.to(tl.int32), 0) > 0:
         dt = _length(ox + t * dx, oy + t * dy, oz + t * dz, step, UNBOUNDED)
-        middle = t + 0.5 * dt
-        px, py, pz = ox + middle * dx, oy + middle * dy, oz + middle * dz
+        at = t + 0.5 * dt
+        px, py, pz = ox + at * dx, oy + at * dy, oz + at * dz
         factor, _m = _contraction(px, py, pz, UNBOUNDED)
         ix = _cell(px * factor + 0.5, side)
         iy = _cell(py * factor + 0.5, side)
         iz = _cell(pz * factor + 0.5, side)
-        active = active & (middle < t_end)
+        active = active & (at < t_end)
         live = tl.load(occupied + (iz * side + iy) * side + ix, mask=active, other=0) != 0
-        tl.store(start + row + n, t, mask=live)
+        tl.store(middle + row + n, at, mask=live)
+        tl.store(length + row + n, dt, mask=live)
         n += live.to(tl.int32)
         t = tl.where(active, t + dt, t)
         active = active & (t < t_end) & (n < most)
@@ -103,10 +104,10 @@ def _span(ray_offset, r, capacity):
 
 @triton.jit
 def pack(
-    origin, direction, start, ray_offset, ray_count, interval, taken, x, t, dt, ray, most, capacity,
+    origin, direction, middle, length, ray_offset, ray_count, taken, x, t, dt, ray, most, capacity,
     UNBOUNDED: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
-    """The live intervals one after another: x [3, capacity] grid positions of midpoints, t, dt, ray; one ray each.
+    """The intervals one after another: x [3, capacity] grid positions of their samples, t, dt, ray; one ray each.
 
     Whichever ray is the last that fits writes how many samples there are, `taken` [1] (zero before).
     """
@@ -117,19 +118,16 @@ def pack(
     begin, end = _span(ray_offset, r, capacity)
     ox, oy, oz = load_vector(origin + 3 * r, 1, True)
     dx, dy, dz = load_vector(direction + 3 * r, 1, True)
-    step = tl.load(interval)
     row = r.to(tl.int64) * most
     for first in range(begin, end, CHUNK):
         i = first + tl.arange(0, CHUNK)
         here = i < end
-        s = tl.load(start + row + (i - begin), mask=here, other=0.0)
-        length = _length(ox + s * dx, oy + s * dy, oz + s * dz, step, UNBOUNDED)
-        middle = s + 0.5 * length
-        px, py, pz = ox + middle * dx, oy + middle * dy, oz + middle * dz
+        at = tl.load(middle + row + (i - begin), mask=here, other=0.0)
+        px, py, pz = ox + at * dx, oy + at * dy, oz + at * dz
         factor, _m = _contraction(px, py, pz, UNBOUNDED)
         store_vector(x + i, capacity, _inside(px * factor), _inside(py * factor), _inside(pz * factor), here)
-        tl.store(t + i, middle, mask=here)
-        tl.store(dt + i, length, mask=here)
+        tl.store(t + i, at, mask=here)
+        tl.store(dt + i, tl.load(length + row + (i - begin), mask=here, other=0.0), mask=here)
         tl.store(ray + i, r, mask=here)
     full = tl.load(ray_offset + r + 1) > capacity
     next_full = tl.load(ray_offset + r + 2, mask=r + 1 < rays, other=capacity + 1) > capacity

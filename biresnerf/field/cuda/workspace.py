@@ -17,6 +17,7 @@ from biresnerf.field.spherical_harmonics import VIEW_FEATURES
 CONTROLS = (
     "ray_count", "trained_rays", "interval", "near", "far",
     "pose_smoothing", "reconstruction_smoothing", "pose_share", "reconstruction_share",
+    "merged_light", "merged_most",
 )  # fmt: skip
 PROGRAMS_ELSEWHERE = 3
 
@@ -65,7 +66,7 @@ class Workspace:
         }
         self._plans: dict[tuple[Any, ...], Plan] = {}
 
-    def plan(self, launches: Callable[..., list[Any]], *arguments: str) -> Plan:
+    def plan(self, launches: Callable[..., list[Any]], *arguments: str | bool) -> Plan:
         """The plan that `launches` makes for this workspace and these arguments, made once."""
         key = (launches, *arguments)
         if key not in self._plans:
@@ -97,7 +98,7 @@ class Workspace:
         n = self.capacity.rays
         shapes = {
             "origin": (n, 3), "direction": (n, 3), "background": (n, 3), "jitter": (n,),
-            "start": (n, self.capacity.most), "view": (n, VIEW_FEATURES),
+            "middle": (n, self.capacity.most), "length": (n, self.capacity.most), "view": (n, VIEW_FEATURES),
             "ray_colour": (n, 3), "opacity": (n,), "depth": (n,), "g_ray_colour": (n, 3), "g_opacity": (n,),
             "g_origin": (n, 3), "g_direction": (n, 3), "g_harmonics": (n, VIEW_FEATURES),
         }  # fmt: skip
@@ -107,6 +108,7 @@ class Workspace:
             "count": torch.zeros(n, dtype=torch.int32, device=self.device),
             "ray_offset": torch.zeros(n + 1, dtype=torch.int32, device=self.device),
             "taken": torch.zeros(1, dtype=torch.int32, device=self.device),
+            "marched": torch.zeros(1, dtype=torch.int32, device=self.device),
             "occupied": torch.zeros(side, side, side, dtype=torch.uint8, device=self.device),
         }
 

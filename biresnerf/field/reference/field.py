@@ -42,8 +42,11 @@ class ReferenceField(GridField):
                 rays.origin, rays.direction, rays.jitter, marching.occupied,
                 marching.step, marching.near, marching.far, self.shape.unbounded, marching.most,
             )  # fmt: skip
-        point = rays.origin[ray] + t[:, None] * rays.direction[ray]
-        x = reference.grid_position(point, self.shape.unbounded)
+            samples = len(ray)
+            if marching.merging is not None:
+                estimate = self._pose_density(self._positions(rays, t, ray))
+                t, dt, ray = reference.merge(estimate, t, dt, ray, rays.jitter, marching.merging)
+        x = self._positions(rays, t, ray)
         view = spherical_harmonics(rays.direction)[ray]
         split = int((ray < rays.trained).sum())
         density, colour = self._sample(x[:split], view[:split], gradient, trained=True)
@@ -51,7 +54,10 @@ class ReferenceField(GridField):
             rest = self._sample(x[split:], view[split:], gradient, trained=False)
             density, colour = torch.cat([density, rest[0]]), torch.cat([colour, rest[1]])
         rgb, opacity, depth = reference.composite(density, colour, t, dt, ray, rays.background)
-        return Rendering(rgb, opacity, depth.detach(), len(ray))
+        return Rendering(rgb, opacity, depth.detach(), samples)
+
+    def _positions(self, rays: Rays, t: Tensor, ray: Tensor) -> Tensor:
+        return reference.grid_position(rays.origin[ray] + t[:, None] * rays.direction[ray], self.unbounded)
 
     def _sample(
         self, x: Tensor, view: Tensor, gradient: PositionGradient, trained: bool
@@ -69,6 +75,12 @@ class ReferenceField(GridField):
     def density(self, position: Tensor) -> Tensor:
         features, weights = self._features(position, PositionGradient())
         return reference.density_of((torch.relu(features @ weights[0].T) @ weights[1].T)[:, 0])
+
+    @torch.no_grad()
+    def _pose_density(self, position: Tensor) -> Tensor:
+        """The density [n] that the pose-estimation module alone gives."""
+        features = reference.encode(position, self.pose_table, self.shape.pose_grid)
+        return reference.density_of((torch.relu(features @ self.networks[0].T) @ self.networks[1].T)[:, 0])
 
     @torch.no_grad()
     def _update_table(self, name: str, rates: np.ndarray) -> None:

@@ -127,7 +127,7 @@ class JointOptimiser:
         near = self.schedule.near(self.step_index, self.switch)
         near = self.frame.distance * (max(near, self.frame.near) if self.method.robust_extensions else near)
         far = self.schedule.far(self.frame.far)
-        return Marching(interval, near, far, MOST_SAMPLES, self.occupancy.occupied)
+        return Marching(interval, near, far, MOST_SAMPLES, self.occupancy.occupied, self.method.merging)
 
     def cast(
         self, matrix: Tensor, image: Tensor, xy: Tensor, intrinsics: Intrinsics | None = None

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from biresnerf.field.backends import make_field
 from biresnerf.field.grid_levels import GridLevels, grid_levels
-from biresnerf.field.radiance_field import FieldShape, RadianceField
+from biresnerf.field.radiance_field import FieldShape, Merging, RadianceField
 from biresnerf.options.presets import MethodName
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.optimise.schedule import Schedule
@@ -44,6 +44,7 @@ class Method:
             squares of camera centres alone.
         large_network: the field is one large network, whose samples cost tens of times those of a grid.
         pruned: whether the occupancy grid is updated; otherwise every cell counts as occupied.
+        merging: how intervals that give little light are merged, if they are.
         rays_least: fewest rays a step.
     """
 
@@ -57,6 +58,7 @@ class Method:
     robust_frame: bool = False
     large_network: bool = False
     pruned: bool = True
+    merging: Merging | None = None
     rays_least: int = 256
 
 
@@ -105,6 +107,7 @@ BIRESNERF = Method(
     pose_betas=(0.9, 0.99),
     robust_extensions=True,
     robust_frame=True,
+    merging=Merging(light=0.03, most=8),
 )
 
 # The baselines belong to the studies, which this package must not import. `find_method` loads theirs by name when a run

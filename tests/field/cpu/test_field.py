@@ -8,7 +8,14 @@ import torch
 
 from biresnerf.field.cpu.field import CpuField
 from biresnerf.field.grid_levels import grid_levels
-from biresnerf.field.radiance_field import FieldRates, FieldShape, Marching, PositionGradient, Rays
+from biresnerf.field.radiance_field import (
+    FieldRates,
+    FieldShape,
+    Marching,
+    Merging,
+    PositionGradient,
+    Rays,
+)
 from biresnerf.field.reference.field import ReferenceField
 
 CPU = torch.device("cpu")
@@ -44,9 +51,9 @@ def _rays(count: int, trained: int, unbounded: bool, moving: bool = True):
     )
 
 
-def _marching(seed=1):
+def _marching(seed=1, merging=None):
     occupied = (torch.rand(16, 16, 16, generator=torch.Generator().manual_seed(seed)) < 0.4).to(torch.uint8)
-    return Marching(step=0.05, near=0.1, far=12.0, most=256, occupied=occupied)
+    return Marching(step=0.05, near=0.1, far=12.0, most=256, occupied=occupied, merging=merging)
 
 
 def _close(a, b, tolerance=2e-3):
@@ -61,20 +68,21 @@ def _close_but_for_cell_faces(a, b):
     assert int(off.sum()) <= max(1, len(a) // 60)
 
 
+@pytest.mark.parametrize("merging", [None, Merging(0.05, 4)])
 @pytest.mark.parametrize("unbounded", [False, True])
 @pytest.mark.parametrize("reconstructing", [False, True])
 @pytest.mark.parametrize(
     ("count", "trained", "moving"), [(257, 257, True), (257, 257, False), (130, 77, True), (5, 0, True)]
 )
 def test_fast_field_equals_reference_in_values_and_all_gradients(
-    unbounded, reconstructing, count, trained, moving
+    unbounded, reconstructing, count, trained, moving, merging
 ):
     slow, fast = _pair(unbounded, reconstructing)
     gradient = PositionGradient(1.0, 0.5, 0.7)
     results = []
     for field in (slow, fast):
         rays = _rays(count, trained, unbounded, moving)
-        rendering = field.render(rays, _marching(), gradient)
+        rendering = field.render(rays, _marching(merging=merging), gradient)
         target = torch.linspace(0, 1, count * 3).reshape(count, 3)
         loss = ((rendering.colour - target) ** 2).mean() + 0.1 * (rendering.opacity**2).mean()
         loss.backward()

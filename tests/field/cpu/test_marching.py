@@ -26,18 +26,18 @@ def test_no_live_interval_is_passed_over(unbounded, side, share):
     origin, direction, jitter = rays(count, unbounded, draws)
     occupied = (torch.rand(side, side, side, generator=draws) < share).to(torch.uint8)
     middle, _, ray = reference.march(origin, direction, jitter, occupied, STEP, NEAR, FAR, unbounded, MOST)
-    start, length = np.zeros((2, count, MOST), np.float32)
+    middles, length = np.zeros((2, count, MOST), np.float32)
     found = np.zeros(count, np.int32)
     march(
         origin.numpy(), direction.numpy(), jitter.numpy(), occupied.numpy().reshape(-1), side,
         clearances(occupied.numpy()), np.float32(STEP), np.float32(NEAR), np.float32(FAR), unbounded,
-        start, length, found,
+        middles, length, found,
     )  # fmt: skip
     expected = torch.bincount(ray, minlength=count).numpy()
     same = expected == found  # a midpoint on a cell face may fall to either side
     assert same.mean() > 0.99
     assert abs(expected - found).max() <= 1
-    middles = (start + length / 2)[(np.arange(MOST) < found[:, None]) & same[:, None]]
+    middles = middles[(np.arange(MOST) < found[:, None]) & same[:, None]]
     np.testing.assert_allclose(middles, middle.numpy()[same[ray.numpy()]], atol=1e-3 if unbounded else 1e-5)
 
 

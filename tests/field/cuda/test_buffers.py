@@ -11,7 +11,7 @@ pytest.importorskip("triton", reason="the CUDA backend's kernels need Triton, wh
 
 from biresnerf.field.cuda import workspace
 from biresnerf.field.cuda.check_batch import learn
-from biresnerf.field.radiance_field import PositionGradient
+from biresnerf.field.radiance_field import Merging, PositionGradient
 from tests.field.cuda.fields import DEVICE, RATES, make_fast, make_marching, make_rays
 
 pytestmark = pytest.mark.slow
@@ -47,9 +47,9 @@ def two_steps(unbounded: bool, reconstructing: bool) -> list[torch.Tensor]:
     """Everything that comes of two steps, of a view and of densities: the second step takes fewer rays."""
     field = make_fast(unbounded, reconstructing)
     found = []
-    for count in (33, 20):
-        rays = make_rays(count, count // 2, unbounded)
-        rendering = learn(field, rays, make_marching(), PositionGradient(1.0, 0.5, 0.7))
+    for count, merging in ((33, None), (20, Merging(0.05, 4))):
+        rays, marching = make_rays(count, count // 2, unbounded), make_marching(merging=merging)
+        rendering = learn(field, rays, marching, PositionGradient(1.0, 0.5, 0.7))
         found += [rendering.colour, rendering.opacity, rendering.depth, rays.origin.grad, rays.direction.grad]
         field.step(RATES)
     with torch.no_grad():

@@ -17,7 +17,7 @@ from biresnerf.field.cuda import field as cuda_field
 from biresnerf.field.cuda import plans
 from biresnerf.field.cuda.check_batch import learn
 from biresnerf.field.cuda.field import CudaField
-from biresnerf.field.radiance_field import PositionGradient
+from biresnerf.field.radiance_field import Merging, PositionGradient
 from biresnerf.field.reference import operations as reference
 from biresnerf.field.reference.field import ReferenceField
 from tests.field.cuda.fields import (
@@ -39,17 +39,26 @@ pytestmark = pytest.mark.slow
 needs_gpu = pytest.mark.skipif(not HAS_GPU, reason="CUDA graphs and late counts need a GPU; torch finds none")
 
 
+MERGING = Merging(light=0.05, most=4)
+
+
 @pytest.mark.parametrize(
-    ("unbounded", "reconstructing", "count", "trained"),
-    [(False, True, 33, 20), (True, True, 33, 33), (False, False, 5, 5), (True, False, 9, 0)],
+    ("unbounded", "reconstructing", "count", "trained", "merging"),
+    [
+        (False, True, 33, 20, None),
+        (True, True, 33, 33, MERGING),
+        (False, True, 40, 25, MERGING),
+        (False, False, 5, 5, MERGING),
+        (True, False, 9, 0, None),
+    ],
 )
-def test_values_and_all_gradients_equal_the_reference(unbounded, reconstructing, count, trained):
+def test_values_and_all_gradients_equal_the_reference(unbounded, reconstructing, count, trained, merging):
     gradient = PositionGradient(1.0, 0.5, 0.7)
     fields = make(ReferenceField, unbounded, reconstructing), make_fast(unbounded, reconstructing)
     results = []
     for field in fields:
         rays = make_rays(count, trained, unbounded)
-        rendering = learn(field, rays, make_marching(), gradient)
+        rendering = learn(field, rays, make_marching(merging=merging), gradient)
         weights = [*field.networks, *([field.reconstruction_columns] if reconstructing else [])]
         results.append((rendering, rays, [None if w.grad is None else w.grad.clone() for w in weights]))
     (a, rays_a, weights_a), (b, rays_b, weights_b) = results
@@ -68,7 +77,7 @@ def test_values_and_all_gradients_equal_the_reference(unbounded, reconstructing,
     slow, fast = fields
     for field in fields:
         field.step(RATES)
-        learn(field, make_rays(count, trained, unbounded), make_marching(), gradient)
+        learn(field, make_rays(count, trained, unbounded), make_marching(merging=merging), gradient)
         field.step(RATES)  # with moments from the first step
     for name in ("pose", "reconstruction") if reconstructing else ("pose",):
         expected, table = (getattr(field, f"{name}_table").detach() for field in fields)
@@ -252,8 +261,8 @@ def test_a_replayed_graph_equals_its_launches():
         close(b.origin.grad, a.origin.grad, 0.05)
         for field in (launched, replayed):
             field.step(RATES)
-    assert replayed._workspace.plan(plans.forward)._graph is not None
-    assert launched._workspace.plan(plans.forward)._graph is None
+    assert replayed._workspace.plan(plans.forward, False)._graph is not None
+    assert launched._workspace.plan(plans.forward, False)._graph is None
 
 
 @needs_gpu
