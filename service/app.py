@@ -79,7 +79,7 @@ def create_app(settings: Settings) -> FastAPI:
             if swept:
                 logger.info("removed %d unfinished uploads", swept)
             service.keep_running(_repeat(_finish_checks, service))
-            service.keep_running(_repeat(_finish_uploads, service))
+            service.keep_running(_repeat(finish_uploads, service))
             await log_access(service)
             try:
                 yield
@@ -139,10 +139,13 @@ async def _finish_checks(service: Service) -> None:
             await service.stores.datasets.check(dataset_id)
 
 
-async def _finish_uploads(service: Service) -> None:
+async def finish_uploads(service: Service) -> None:
     """Finishes uploads that another process received but did not store; deletes those that expired."""
     for upload_id in await service.stores.uploads.not_imported():
-        await import_upload(service, upload_id)
+        try:
+            await import_upload(service, upload_id)
+        except (FaultError, OSError) as error:  # of this one; others may do well
+            logger.warning("upload %s is received but not stored yet: %s", upload_id, error)
     await service.stores.uploads.expire()
 
 

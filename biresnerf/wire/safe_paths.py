@@ -7,8 +7,10 @@ import unicodedata
 
 from biresnerf.errors import InputError
 
-PART_BYTES_MAX = 255
-PATH_BYTES_MAX = 1024
+# File systems allow 255, and stores append to a name while they write it. Of the 1 024 bytes that a key may have in a
+# bucket, some are the folder's.
+PART_BYTES_MAX = 240
+PATH_BYTES_MAX = 900
 DEPTH_MAX = 16
 _DRIVE = re.compile(r"^[A-Za-z]:")
 _HINT = "Use relative names with forward slashes, such as images/0001.png."
@@ -24,7 +26,7 @@ def checked_path(name: str) -> str:
     """`name` as a safe relative POSIX path (a leading `./` dropped); raises `InputError` ``unsafe_path``.
 
     Refuses `..`, absolute names, drive letters, backslashes, NUL and control characters, undecodable
-    bytes, bidirectional controls, device names, empty parts, parts longer than 255 bytes and nesting
+    bytes, bidirectional controls, device names, empty parts, parts longer than 240 bytes and nesting
     deeper than 16.
     """
     kept = "/".join(part for part in name.split("/") if part != ".")

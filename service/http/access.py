@@ -165,19 +165,7 @@ async def identify(service: Service, request: Request) -> Identity:
 
 async def _anonymous(service: Service, request: Request) -> Identity:
     """The identity of a request without a key, where none is required."""
-    mode = service.settings.auth
-    if mode == "auto":
-        if not on_loopback(service.settings.host) or await service.stores.keys.any_made():
-            mode = "required"
-        elif _is_public_name(request.url.hostname or ""):
-            # DNS rebinding: a page's own host name may resolve to this machine, and would then be of the same site.
-            raise ProblemError(
-                "cross_site",
-                "Without an API key only requests to this machine by its own name are accepted.",
-                where="Host",
-                hint="Use http://127.0.0.1 or localhost, or make a key: biresnerf keys create.",
-            )
-    if mode == "required":
+    if await _needs_key(service):
         raise ProblemError(
             "missing_credentials",
             "This service requires an API key.",
@@ -185,7 +173,21 @@ async def _anonymous(service: Service, request: Request) -> Identity:
             hint="Send the header `Authorization: Bearer brn_…`; `biresnerf keys create` makes a key.",
             headers={"WWW-Authenticate": _CHALLENGE},
         )
+    if service.settings.auth == "auto" and _is_public_name(request.url.hostname or ""):
+        # DNS rebinding: a page's own host name may resolve to this machine, and would then be of the same site.
+        raise ProblemError(
+            "cross_site",
+            "Without an API key only requests to this machine by its own name are accepted.",
+            where="Host",
+            hint="Use http://127.0.0.1 or localhost, or make a key: biresnerf keys create.",
+        )
     return Identity(LOCAL_TENANT, ALL_SCOPES)
+
+
+async def _needs_key(service: Service) -> bool:
+    if service.settings.auth == "auto":
+        return not on_loopback(service.settings.host) or await service.stores.keys.any_made()
+    return service.settings.auth == "required"
 
 
 def _is_public_name(host: str) -> bool:
@@ -216,23 +218,33 @@ def on_loopback(host: str) -> bool:
         return False
 
 
-async def may_scrape(service: Service, authorization: str) -> bool:
-    """Whether the client may read /metrics: with the token or an ``admin`` key; on loopback, also if no token is set.
+async def may_scrape(service: Service, request: Request) -> bool:
+    """Whether the client may read /metrics: with the token or an ``admin`` key, or where neither is needed.
 
     The database is asked only if nothing else allows it.
     """
     token = service.settings.metrics_token
-    if token is None and on_loopback(service.settings.host):
-        return True
+    authorization = request.headers.get("authorization")
+    if authorization is None:
+        return (
+            token is None
+            and on_loopback(service.settings.host)
+            and "admin" in await _scopes(service, request)
+        )
     bearer = _BEARER.fullmatch(authorization)
     if bearer is None:
         return False
     if token is not None and hmac.compare_digest(token.get_secret_value().encode(), bearer[1].encode()):
         return True
+    return "admin" in await _scopes(service, request)
+
+
+async def _scopes(service: Service, request: Request) -> frozenset[KeyScope]:
+    """Those of the request; none where it would be refused."""
     try:
-        return "admin" in (await service.stores.keys.recognise(bearer[1])).scopes
-    except KeyRefused:
-        return False
+        return (await identify(service, request)).scopes
+    except ProblemError:
+        return frozenset()
 
 
 def _unknown(detail: str) -> ProblemError:

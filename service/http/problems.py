@@ -30,7 +30,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "invalid_api_key": (401, "The API key is not valid"),
     "scope_required": (403, "The API key lacks the scope"),
     "priority_not_allowed": (403, "The priority is higher than the tenant's limit"),
-    "cross_site": (403, "The request comes from another web site"),
+    "cross_site": (403, "The request comes from another web page"),
     "not_found": (404, "Not found"),
     "method_not_allowed": (405, "The method is not allowed here"),
     "head_timeout": (408, "The request headers did not arrive in time"),

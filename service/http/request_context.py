@@ -7,7 +7,7 @@ import errno
 import logging
 import re
 import uuid
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
@@ -29,6 +29,7 @@ _SECURITY_HEADERS = {
     "Referrer-Policy": "no-referrer",
 }
 _ID = re.compile(r"^[\w.:-]{1,128}$", re.ASCII)
+_HOST = re.compile(r"^([\w.-]+|\[[0-9a-fA-F:.]+\])(:[0-9]{1,5})?$", re.ASCII)
 
 
 def request_id(request: Request) -> str:
@@ -77,7 +78,7 @@ class RequestContext:
 
         try:
             _refuse_ambiguous(request)
-            _refuse_other_sites(request)
+            _refuse_other_pages(request)
             with log_context(request_id=request_id(request)):
                 await self._app(scope, receive, send_with_headers)
             return
@@ -103,6 +104,12 @@ def _refuse_ambiguous(request: Request) -> None:
     if "content-length" in request.headers and "transfer-encoding" in request.headers:
         detail = "Content-Length and Transfer-Encoding exclude each other."
         raise ProblemError("malformed_request", detail, headers=close)
+    # Where it cannot be parsed, the framework takes the server's own address for it.
+    host = request.headers.get("host")
+    if host is not None and not _HOST.match(host):
+        raise ProblemError(
+            "malformed_request", "The Host header is no host name.", where="Host", headers=close
+        )
     # The parser limits only headers that arrive in pieces; those that arrive at once are measured here.
     head = [request.scope["raw_path"], request.scope["query_string"], *sum(request.scope["headers"], ())]
     if sum(map(len, head)) > HEAD_BYTES_MAX:
@@ -110,10 +117,20 @@ def _refuse_ambiguous(request: Request) -> None:
         raise ProblemError("headers_too_large", detail, headers=close)
 
 
-def _refuse_other_sites(request: Request) -> None:
-    """Refuse requests of other sites' pages: a browser would send their forms to a service on this machine."""
-    if request.method not in _SAFE and request.headers.get("sec-fetch-site") == "cross-site":
-        raise ProblemError("cross_site", "Requests from pages of other sites are refused.")
+def _refuse_other_pages(request: Request) -> None:
+    """Refuse what pages of other origins send: a browser would send their forms to a service on this machine.
+
+    Browsers say so in Sec-Fetch-Site; those that do not, or not over plain HTTP, say where a page is from. Another port
+    of the same machine is another origin.
+    """
+    if request.method in _SAFE:
+        return
+    site, origin = request.headers.get("sec-fetch-site"), request.headers.get("origin")
+    ours = site in {"same-origin", "none"}
+    if site is None:
+        ours = origin is None or urlsplit(origin).netloc == request.headers.get("host")
+    if not ours:
+        raise ProblemError("cross_site", "Requests from pages of other origins are refused.", where="Origin")
 
 
 def _stopping(request: Request) -> bool:

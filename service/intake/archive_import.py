@@ -120,9 +120,10 @@ async def import_upload(service: Service, upload_id: str) -> None:
         await _add_to_dataset(service, await uploads.get(upload_id))
     except NotFound:
         return  # deleted meanwhile
-    except FaultError as error:
-        failure = _client_error(error)
+    except Exception as error:
+        failure = _client_error(error) if isinstance(error, FaultError) else None
         if failure is None:
+            await retry_while_unavailable(lambda: uploads.postpone(upload_id, token))
             raise
     finally:
         renewing.cancel()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Header
+from fastapi import APIRouter, Header, Request
 from fastapi.responses import PlainTextResponse, Response
 
 from biresnerf.wire.problems import FieldProblem
@@ -68,14 +68,16 @@ async def _require_everything(service: Service) -> None:
     },
 )
 async def get_metrics(
+    request: Request,
     service: CurrentService,
     accept: Annotated[str, Header()] = "",
-    authorization: Annotated[
-        str, Header(description="`Bearer` and BIRESNERF_METRICS_TOKEN, or an admin key.")
+    _authorization: Annotated[
+        str,
+        Header(alias="authorization", description="`Bearer` and BIRESNERF_METRICS_TOKEN, or an admin key."),
     ] = "",
 ) -> Response:
     """Metrics of this process and of the installation; without the database only of this process."""
-    if not await may_scrape(service, authorization):
+    if not await may_scrape(service, request):
         # Metrics reveal what the service does, so not everyone who can reach the port may read them.
         raise ProblemError(
             "metrics_token_required",

@@ -94,9 +94,8 @@ class Database:
                 "database_unavailable", f"The database did not answer within {self._answer_s:g} s."
             ) from error
         except AWAY as error:
-            raise Unavailable(
-                "database_unavailable", f"The database does not answer: {first_line(error)}"
-            ) from error
+            log.warning("the database does not answer: %s", first_line(error))
+            raise Unavailable("database_unavailable", "The database does not answer.") from error
 
     async def run(
         self, work: Callable[Concatenate[Connection, P], Awaitable[T]], *given: P.args, **named: P.kwargs

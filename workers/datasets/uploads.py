@@ -31,6 +31,12 @@ PIECE_MAX_BYTES = 4 * 2**20
 PIECE_MIN_BYTES = 2**18
 EXPIRE_BATCH = 100
 
+_NEVER_STORED = JobError(
+    code="storage_unavailable",
+    detail="The upload arrived whole, but storing its content failed again and again.",
+    hint="Send it again; the operator's log says what was wrong.",
+    retryable=True,
+)
 _UPLOAD = "SELECT uploads.* FROM uploads JOIN datasets ON datasets.id = uploads.dataset_id"
 
 
@@ -177,10 +183,22 @@ class UploadStore(OwnedStore):
         rows = await self._database.fetch(
             "UPDATE uploads SET take_token = %s, take_until = clock_timestamp() + make_interval(secs => %s)"
             " WHERE id = %s AND state = 'received'"
-            " AND (take_token = %s OR take_until IS NULL OR take_until < clock_timestamp()) RETURNING id",
+            " AND (take_token = %s OR take_token IS NULL OR take_until < clock_timestamp()) RETURNING id",
             *(token, 2 * self._settings.beat_s, upload_id, token),
         )
         return bool(rows)
+
+    async def postpone(self, upload_id: str, token: uuid.UUID) -> None:
+        """Give the lease back after a failure: `not_imported` names the upload again after half of its age.
+
+        At the latest after a quarter of an hour; who asks for it may take it at once.
+        """
+        await self._database.fetch(
+            "UPDATE uploads SET take_token = NULL, take_until = clock_timestamp() + least(interval '15 min', greatest("
+            "interval '10 s', (clock_timestamp() - expires_at + make_interval(secs => %s)) / 2))"
+            " WHERE id = %s AND state = 'received' AND take_token = %s",
+            *(self._settings.upload_expiry_s, upload_id, token),
+        )
 
     async def conclude(self, upload_id: str, token: uuid.UUID, error: JobError | None) -> None:
         """``received`` becomes ``stored``, or ``rejected`` with the error; the pieces go to the trash."""
@@ -226,7 +244,11 @@ class UploadStore(OwnedStore):
             )
 
     async def expire(self) -> int:
-        """Delete uploads that received nothing for ``upload_expiry_s``; returns how many."""
+        """Delete uploads that received nothing for ``upload_expiry_s``; returns how many.
+
+        One that is received whole but could not be stored in that time is rejected first, so that its owner sees why.
+        """
+        await self._give_up()
         rows = await self._database.fetch(
             "WITH gone AS (DELETE FROM uploads WHERE id IN (SELECT id FROM uploads"
             " WHERE expires_at < clock_timestamp() AND state <> 'received' ORDER BY expires_at LIMIT %s"
@@ -235,6 +257,17 @@ class UploadStore(OwnedStore):
             EXPIRE_BATCH,
         )
         return len(rows)
+
+    async def _give_up(self) -> None:
+        await self._database.fetch(
+            "WITH given_up AS (UPDATE uploads SET state = 'rejected', error = %s, take_token = NULL, take_until = NULL,"
+            " expires_at = clock_timestamp() + make_interval(secs => %s) WHERE id IN (SELECT id FROM uploads"
+            " WHERE expires_at < clock_timestamp() AND state = 'received'"
+            " AND (take_token IS NULL OR take_until < clock_timestamp()) LIMIT %s FOR UPDATE SKIP LOCKED)"
+            " RETURNING id, folder), pieces AS (DELETE FROM upload_pieces USING given_up WHERE upload_id = given_up.id)"
+            " INSERT INTO trash (prefix) SELECT folder FROM given_up",
+            *(Jsonb(_NEVER_STORED.model_dump()), self._settings.upload_expiry_s, EXPIRE_BATCH),
+        )
 
     async def _required(self, connection: Connection, upload_id: str) -> Upload:
         sql = _UPLOAD + f" WHERE uploads.id = %s AND {MINE}"

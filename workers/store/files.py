@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import logging
 from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path, PurePosixPath
@@ -27,13 +28,16 @@ from workers.store.file_places import Bucket, BucketPlace, LocalPlace, Method, P
 if TYPE_CHECKING:
     from obstore import ObjectMeta
 
+logger = logging.getLogger(__name__)
+
 CHUNK_BYTES = 2**20
 PART_BYTES = 8 * 2**20
 # Up to this size a file goes to the store in one request, from memory.
 SINGLE_BYTES = 4 * 2**20
 HEALTH_S = 5.0
-# How the operating system's "no space left on device" reads once it came through the store.
+# How the operating system's "no space left on device" and "file name too long" read once they came through the store.
 _FULL = "(os error 28)"
+_TOO_LONG = "(os error 36)"
 
 
 class StoredFile(Record):
@@ -50,7 +54,8 @@ class FileStore:
     """Files by key. Writes are atomic: a reader sees the old file, the new one or none, never a part.
 
     Keys are relative paths with ``/``; a key with an empty, ``.`` or ``..`` part is refused (`ValueError`).
-    Every method raises `Unavailable` (``storage_unavailable``) where the store does not answer.
+    Every method raises `Unavailable` (``storage_unavailable``) where the store does not answer, and `InputError`
+    (``unsafe_path``) for a key that is too long for it.
     """
 
     def __init__(self, place: Place) -> None:
@@ -278,13 +283,20 @@ class _Measured:
 
 @contextlib.contextmanager
 def _told(what: str) -> Iterator[None]:
-    """The store's own errors in the engine's words."""
+    """The store's own errors in the engine's words; theirs, which name paths and hosts, are for the log alone."""
     try:
         yield
     except BaseError as error:
         if _FULL in str(error):
             raise LimitReached("storage_full", f"{what}: the disk is full.") from error
-        raise Unavailable("storage_unavailable", f"{what}: {str(error).splitlines()[0]}") from error
+        logger.warning("%s: %s", what, str(error).splitlines()[0])
+        if _TOO_LONG in str(error):
+            raise InputError(
+                "unsafe_path", f"{what}: the name is too long.", hint="Use a shorter name."
+            ) from error
+        raise Unavailable(
+            "storage_unavailable", f"{what}: the store does not answer as it should."
+        ) from error
 
 
 def _stored(key: str, meta: ObjectMeta) -> StoredFile:

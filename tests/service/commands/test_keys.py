@@ -123,6 +123,17 @@ def test_without_any_key_the_loopback_is_open_but_not_to_names_that_point_at_it(
         problem(http.get("/v1/jobs", headers={"Authorization": "Bearer brn_x"}), 401, "invalid_api_key")
 
 
+def test_metrics_are_open_only_where_everything_is(service: Running, closed: Running):
+    with client_with(service, None) as http:
+        assert http.get("/metrics").status_code == 200
+        problem(http.get("/metrics", headers={"Host": "evil.example"}), 401, "metrics_token_required")
+    admin = operator(closed.data_dir, "keys", "create", "figures", "--scope", "admin")["key"]
+    reader = operator(closed.data_dir, "keys", "create", "reader", "--scope", "read")["key"]
+    for key, status in ((None, 401), (reader, 401), (admin, 200)):
+        with client_with(closed, key) as http:
+            assert http.get("/metrics").status_code == status
+
+
 def test_a_bucket_lets_its_burst_through_and_then_its_rate() -> None:
     now = 0.0
     buckets = Buckets("key", 2.0, 3, clock=lambda: now)

@@ -96,6 +96,40 @@ def test_a_page_of_another_site_cannot_use_the_service(http: httpx.Client) -> No
     assert own.status_code == 201
 
 
+def test_a_page_of_another_port_of_this_machine_is_another_origin(http: httpx.Client) -> None:
+    host = http.base_url.netloc.decode()
+    for headers in (
+        {"Sec-Fetch-Site": "same-site", "Origin": "http://127.0.0.1:1"},
+        {"Origin": "http://127.0.0.1:1"},
+        {"Origin": f"http://{host}.evil.example"},
+        {"Origin": "null"},
+    ):
+        refused = problem(http.post("/v1/datasets", json={}, headers=headers), 403, "cross_site")
+        assert refused["where"] == "Origin"
+    for headers in ({"Origin": f"http://{host}"}, {"Origin": f"https://{host}"}, {}):
+        assert http.post("/v1/datasets", json={}, headers=headers).status_code == 201
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "evil.example#127.0.0.1",
+        "localhost:1@evil.example",
+        "127.0.0.1, evil.example",
+        "[::1",
+        "",
+        "127.0.0.1/../x",
+    ],
+)
+def test_a_host_that_cannot_be_parsed_is_refused(http: httpx.Client, host: str) -> None:
+    problem(http.get("/v1/jobs", headers={"Host": host}), 400, "malformed_request")
+
+
+def test_text_that_the_database_cannot_hold_is_refused(http: httpx.Client) -> None:
+    for body in ({"dataset_id": "\0"}, {"dataset_id": "ds_1", "labels": {"a\0": "b"}}):
+        problem(http.post("/v1/jobs", json=body), 400, "malformed_json")
+
+
 def test_the_docs_page_works_without_any_other_host(http: httpx.Client) -> None:
     page = http.get("/docs")
     assert page.status_code == 200

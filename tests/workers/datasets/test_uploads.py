@@ -106,8 +106,8 @@ async def test_what_does_not_go_on_is_given_up(settings: Settings, tmp_path: Pat
         assert await stores.uploads.expire() == 1
         with pytest.raises(NotFound):
             await stores.uploads.get(old.id)
-        for upload in (received, young):
-            assert (await stores.uploads.get(upload.id)).id == upload.id
+        assert (await stores.uploads.get(received.id)).state == "rejected"
+        assert (await stores.uploads.get(young.id)).state == "receiving"
         await stores.datasets.delete(young.dataset_id)
         with pytest.raises(NotFound):
             await stores.uploads.get(young.id)
@@ -162,3 +162,30 @@ async def test_what_an_archive_unpacks_to_is_counted_and_the_archive_only_until_
     assert (await stored(stores), (await stores.datasets.get(dataset.id)).files) == (1000, 1)
     await taken(stores, upload, {"a.png": bytes(400), "b.png": bytes(1100)})
     assert await stored(stores) == 1500
+
+
+async def test_what_could_not_be_stored_waits_longer_each_time_and_is_rejected_in_the_end(
+    settings: Settings,
+):
+    hasty = quick_settings(settings.data_dir, database_url=settings.database_url, upload_expiry_s=0.5)
+    async with open_stores(hasty) as stores:
+        upload = await begin(stores, 3)
+        await stores.uploads.append(upload.id, 0, stream(b"abc"))
+        token = uuid.uuid4()
+        assert await stores.uploads.take(upload.id, token)
+        await stores.uploads.postpone(upload.id, token)
+        assert await stores.uploads.not_imported() == ()
+        again = uuid.uuid4()
+        assert await stores.uploads.take(upload.id, again), "who asks for it need not wait"
+        await asyncio.sleep(0.6)
+        assert await stores.uploads.take(upload.id, again)
+        await stores.uploads.expire()
+        assert (await stores.uploads.get(upload.id)).state == "received", "somebody is at it"
+        await stores.uploads.postpone(upload.id, again)
+        await stores.uploads.expire()
+        given_up = await stores.uploads.get(upload.id)
+        assert given_up.state == "rejected"
+        assert given_up.error.code == "storage_unavailable"
+        assert await content_of(stores, given_up) == b""
+        await asyncio.sleep(0.6)
+        assert await stores.uploads.expire() == 1

@@ -10,7 +10,9 @@ import httpx
 import pytest
 
 from biresnerf.errors import InputError
+from biresnerf.wire.safe_paths import PART_BYTES_MAX, PATH_BYTES_MAX, checked_path
 from tests.workers.buckets import by_boto, fresh_bucket, moto_server, s3rver_server
+from workers.datasets.dataset_rows import file_key
 from workers.settings.errors import LimitReached, NotFound, SetupError, Unavailable
 from workers.store import file_places
 from workers.store.file_places import Bucket, BucketPlace, LocalPlace
@@ -235,3 +237,24 @@ def test_a_folder_or_address_that_cannot_be_used_is_a_setup_error(tmp_path: Path
         with pytest.raises(SetupError, match="BIRESNERF_STORAGE_URL"):
             Bucket.at(url)
     assert Bucket.at("s3://photos.of-us/a/b/") == Bucket("photos.of-us", "a/b")
+
+
+async def test_the_longest_names_that_clients_may_send_can_be_stored(files: FileStore):
+    part = "é" * (PART_BYTES_MAX // 2)
+    path = f"{part}/{part}/{part}/" + "x" * (PATH_BYTES_MAX - 3 * PART_BYTES_MAX - 3)
+    assert checked_path(path) == path
+    key = file_key("datasets/ds_01J9ZQ4R7V0000000000000000/files", path)
+    await put(files, key, b"x")
+    assert await content_of(files, key) == b"x"
+
+
+async def test_a_name_that_the_store_cannot_hold_is_the_clients_fault_and_tells_no_path(tmp_path: Path):
+    files = FileStore(LocalPlace(tmp_path / "store"))
+    with pytest.raises(InputError) as caught:
+        await put(files, "a/" + "x" * 254, b"x")
+    assert caught.value.code == "unsafe_path"
+    assert str(tmp_path) not in str(caught.value)
+    (tmp_path / "store/folder").mkdir()
+    with pytest.raises(Unavailable) as refused:
+        await put(files, "folder", b"x")
+    assert str(tmp_path) not in str(refused.value)
