@@ -24,6 +24,7 @@ from biresnerf.wire.base import Record
 from workers.settings.errors import EngineError, LimitReached, NotFound, Unavailable
 from workers.settings.settings import Settings
 from workers.store.file_places import Bucket, BucketPlace, LocalPlace, Method, Place
+from workers.store.measured_stream import MeasuredStream
 
 if TYPE_CHECKING:
     from obstore import ObjectMeta
@@ -76,7 +77,7 @@ class FileStore:
         (``digest_mismatch``) at the end; then nothing is stored, and what was there before stays.
         """
         _checked(key)
-        incoming = _Measured(key, chunks, limit_bytes, expected_sha256)
+        incoming = MeasuredStream(key, chunks, limit_bytes, expected_sha256)
         head = await incoming.first(SINGLE_BYTES)
         content = head if incoming.ended else incoming.all_with(head)
         attributes = self._place.attributes(media_type)
@@ -222,63 +223,6 @@ def open_files(settings: Settings, *, patience_s: float = 15.0) -> FileStore:
         secret_access_key=settings.storage_secret_access_key,
     )
     return FileStore(BucketPlace(bucket, patience_s))
-
-
-class _Measured:
-    """A stream that is counted and hashed as it passes. ``failure`` is what it ended with, if not well."""
-
-    def __init__(self, key: str, chunks: AsyncIterable[bytes], limit: int, expected: str | None) -> None:
-        self._key, self._limit, self._expected = key, limit, expected
-        self._digest, self._size = hashlib.sha256(), 0
-        self._chunks = aiter(chunks)
-        self.ended = False
-        self.failure: BaseException | None = None
-
-    @property
-    def sha256(self) -> str:
-        return self._digest.hexdigest()
-
-    async def first(self, size: int) -> bytes:
-        """Up to about ``size`` bytes from the start; then `ended` says whether that was all."""
-        head = bytearray()
-        while len(head) <= size:
-            chunk = await self._next()
-            if chunk is None:
-                break
-            head += chunk
-        return bytes(head)
-
-    async def all_with(self, head: bytes) -> AsyncIterator[bytes]:
-        """``head`` and what follows it."""
-        yield head
-        try:
-            while (chunk := await self._next()) is not None:
-                yield chunk
-        except BaseException as error:
-            self.failure = error
-            raise
-
-    async def _next(self) -> bytes | None:
-        try:
-            chunk = bytes(await anext(self._chunks))
-        except StopAsyncIteration:
-            self.ended = True
-            self._check_digest()
-            return None
-        self._size += len(chunk)
-        if self._size > self._limit:
-            raise LimitReached("body_too_large", f"{self._key} has more than {self._limit} bytes.")
-        self._digest.update(chunk)
-        return chunk
-
-    def _check_digest(self) -> None:
-        if self._expected is not None and self.sha256 != self._expected:
-            raise InputError(
-                "digest_mismatch",
-                f"What arrived has SHA-256 {self.sha256}, announced was {self._expected}.",
-                where=self._key.rpartition("/")[2],
-                hint="Send the file again.",
-            )
 
 
 @contextlib.contextmanager
