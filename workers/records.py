@@ -18,6 +18,7 @@ PRIORITIES: dict[PriorityName, int] = {"low": -1, "normal": 0, "high": 1}
 
 # Files of a result that the engine knows.
 LOG_NAME, POSES_NAME, REPORT_NAME = "log.txt", "poses.json", "report.json"
+CRASH_NAME = "crash.txt"  # beside the log, for the operator alone
 THUMBNAIL_NAME = "thumbnail.jpg"
 PREVIEW_FOLDER = "preview"  # of files that show how far a job is
 

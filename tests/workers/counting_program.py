@@ -87,7 +87,9 @@ for step in range(start + 1, plan["steps"] + 1):
     tell(step)
     if step % plan.get("checkpoint_every", 5) == 0:
         save(step)
-    if plan.get("die_at") == step:
+    if step == 7 and "no_room" in plan and Path(plan["no_room"]).exists():
+        sys.exit(5)  # as `workers.run.job_process` says that the disk is full
+    if plan.get("die_at") == step or step - start == plan.get("die_every"):
         sys.stderr.write("dying now\n")
         sys.stderr.flush()
         if "oom_counter" in plan:

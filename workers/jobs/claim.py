@@ -8,9 +8,9 @@ from typing import Any
 
 from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import JobKind
-from biresnerf.wire.problems import JobError
 from workers.database.database import Database
 from workers.jobs.job_states import finish, finish_cancelled, start_attempt
+from workers.jobs.setbacks import crashed_too_often, used_up
 from workers.process.waiting import retry_while_unavailable
 from workers.settings.errors import NotFound
 
@@ -65,8 +65,8 @@ async def _claim(database: Database, job_id: str, max_attempts: int, token: uuid
         if row["cancel_requested"]:
             await finish_cancelled(connection, job_id)
             return None
-        if row["attempt"] >= max_attempts:
-            await finish(connection, job_id, "failed", crashed_too_often(row["attempt"]))
+        if used_up(row["attempt"], row["crashes"], max_attempts):
+            await finish(connection, job_id, "failed", crashed_too_often(row["attempt"], row["setback"]))
             return None
         return _claimed(await start_attempt(connection, job_id, token), token)
 
@@ -79,16 +79,6 @@ def _claimed(row: dict[str, Any], token: uuid.UUID) -> Claim:
         token=token,
         forked_stage=row["forked_stage"],
         **{name: row[name] for name in (*same, *also)},
-    )
-
-
-def crashed_too_often(attempts: int, log_tail: str = "") -> JobError:
-    """The error of a job of which every attempt died."""
-    return JobError(
-        code="too_many_crashes",
-        detail=f"The job's process died in each of {attempts} attempts.",
-        hint="Try smaller options (preset fast, a smaller max_image_size) or a machine with more memory.",
-        log_tail=log_tail,
     )
 
 

@@ -18,6 +18,7 @@ from biresnerf.wire.jobs import EventType
 from biresnerf.wire.problems import JobError
 from workers.database import job_queue
 from workers.database.database import Connection
+from workers.jobs.setbacks import SETBACKS, Cause
 from workers.records import LOG_NAME, POSES_NAME, PREVIEW_FOLDER, REPORT_NAME, Artifact
 from workers.settings.traces import traceparent
 from workers.store.trash import discard
@@ -73,29 +74,46 @@ class Requeue:
     """Why a job goes back to the queue, as an event, and with what changes.
 
     Attributes:
+        setback: what ended the attempt; None where nothing went wrong, and then the attempt does not count.
         fence: drop the token, so that the attempt that ran it can write no more.
-        uncounted: the attempt does not count.
         forget_checkpoint: start over.
         smaller: options that later attempts use in the place of those asked for.
     """
 
     event: EventType
     data: Mapping[str, Any]
+    setback: Cause | None = None
     fence: bool = False
-    uncounted: bool = False
     forget_checkpoint: bool = False
     smaller: Mapping[str, Any] = field(default_factory=dict)
 
 
 async def requeue(connection: Connection, job_id: str, how: Requeue) -> None:
     """Set the job back to queued. The caller puts its queue entry back."""
+    setback = None if how.setback is None else SETBACKS[how.setback]
     await connection.execute(
-        "UPDATE jobs SET state = 'queued', attempt = attempt - %s, eta_s = NULL,"
-        " run_token = CASE WHEN %s THEN NULL ELSE run_token END,"
+        "UPDATE jobs SET state = 'queued', attempt = attempt - %s, crashes = crashes + %s, setback = %s,"
+        " message = %s, eta_s = NULL, run_token = CASE WHEN %s THEN NULL ELSE run_token END,"
         " checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END, smaller = smaller || %s WHERE id = %s",
-        (int(how.uncounted), how.fence, how.forget_checkpoint, Jsonb(dict(how.smaller)), job_id),
+        (
+            *(int(setback is None), int(setback is not None and setback.counts), how.setback),
+            *(setback.message if setback else "", how.fence, how.forget_checkpoint),
+            *(Jsonb(dict(how.smaller)), job_id),
+        ),
     )
     await add_event(connection, job_id, how.event, how.data)
+
+
+async def say_what_it_waits_for(connection: Connection, job_id: str, cause: Cause) -> None:
+    """Tell the owner of a queued job, once, why it does not start."""
+    message = SETBACKS[cause].message
+    changed = await connection.execute(
+        "UPDATE jobs SET message = %s, revision = revision + 1, updated_at = clock_timestamp()"
+        " WHERE id = %s AND state = 'queued' AND message <> %s",
+        (message, job_id, message),
+    )
+    if changed.rowcount:
+        await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job_id,))
 
 
 async def take_back(connection: Connection, entry_id: int) -> None:
@@ -120,7 +138,9 @@ async def take_back(connection: Connection, entry_id: int) -> None:
         await finish_cancelled(connection, job["id"])
         await job_queue.abort(connection, entry_id)
         return
-    await requeue(connection, job["id"], Requeue("requeued", {"why": "worker_lost"}, fence=True))
+    await requeue(
+        connection, job["id"], Requeue("requeued", {"why": "worker_lost"}, "worker_lost", fence=True)
+    )
     await job_queue.put_back(connection, entry_id)
 
 
@@ -136,7 +156,7 @@ async def requeue_lost(connection: Connection, silent_s: float) -> None:
     ):
         log.warning("job %s was lost by the queue; queueing it again", job["id"])
         await _enqueue(connection, job)
-        await requeue(connection, job["id"], Requeue("requeued", {"why": "lost"}, fence=True))
+        await requeue(connection, job["id"], Requeue("requeued", {"why": "lost"}, "worker_lost", fence=True))
 
 
 async def offer_held_jobs(connection: Connection) -> None:

@@ -28,7 +28,8 @@ from workers.store.trash import discard
 PREVIEW_KEPT_S = 60.0  # after another one took its place: it may be on its way to somebody
 LOG_LINES_MAX = 20_000  # of one job
 _LOCKED = """
-    SELECT id, run_token, state, stage, cancel_requested, keep_partial, log_lines, checkpoint, reusable, previews
+    SELECT id, run_token, state, stage, cancel_requested, keep_partial, log_lines, checkpoint, reusable, previews,
+    crashes
     FROM jobs WHERE id = %s FOR UPDATE"""
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -98,6 +99,7 @@ class Ledger:
         """Point the job at a new checkpoint and have the one before deleted."""
         await _discard_replaced(connection, job["checkpoint"], prefix)
         await _set(connection, job, "checkpoint", {"prefix": prefix, "files": list(files)})
+        await connection.execute("UPDATE jobs SET crashes = 0 WHERE id = %s", (job["id"],))
         await add_event(connection, job["id"], "checkpoint", {"step": step})
 
     @_fenced(None)
@@ -145,6 +147,11 @@ class Ledger:
         await connection.execute(
             "UPDATE jobs SET log_lines = log_lines + %s WHERE id = %s", (len(kept), job["id"])
         )
+
+    @_fenced(0)
+    async def crashes(self, _: Connection, job: DictRow) -> int:
+        """How often attempts crashed since the job's last checkpoint, this one not counted."""
+        return int(job["crashes"])
 
     @_fenced(False)
     async def wants_partial(self, _: Connection, job: DictRow) -> bool:

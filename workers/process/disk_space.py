@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,6 +38,11 @@ def upload_disk_budget(settings: Settings) -> DiskBudget:
 def job_disk_budget(settings: Settings) -> DiskBudget:
     """Where jobs have their working copies."""
     return DiskBudget([settings.scratch_dir], settings.disk_reserve_bytes)
+
+
+def is_disk_full(error: BaseException) -> bool:
+    """Whether the operating system refused to write for want of room."""
+    return isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}
 
 
 def _existing(folder: Path) -> Path:

@@ -24,6 +24,7 @@ from workers.database.job_queue import Entry
 from workers.database.notifications import Listener
 from workers.database.statistics import announce_slot
 from workers.jobs.claim import Claim, Fenced, cancel_requested, claim_job, input_bytes
+from workers.jobs.job_states import say_what_it_waits_for
 from workers.process.disk_space import job_disk_budget
 from workers.process.waiting import first_done, retry_while_unavailable
 from workers.process.watchdog import run_process
@@ -157,6 +158,8 @@ class Slot:
     async def _run_job(self, database: Database, listener: Listener, entry: Entry) -> float | None:
         """In how many seconds the queue offers the job again; none where it is over."""
         if not await self._fits_on_disk(database, entry.job_id):
+            say = partial(say_what_it_waits_for, job_id=entry.job_id, cause="disk_full")
+            await retry_while_unavailable(lambda: database.run(say))
             return self._settings.stall_s / 4
         claim = await claim_job(database, entry.job_id, self._settings.max_attempts)
         if claim is None:
@@ -166,7 +169,7 @@ class Slot:
         attempt = Attempt(database, self._files, self._settings, claim, folder, self._variables())
         watching = asyncio.create_task(self._stop_when_asked(database, listener, entry, attempt))
         try:
-            return 0.0 if await self._traced(attempt, claim) else None
+            return await self._traced(attempt, claim)
         finally:
             watching.cancel()
 
@@ -196,7 +199,7 @@ class Slot:
             return False
         return True
 
-    async def _traced(self, attempt: Attempt, claim: Claim) -> bool:
+    async def _traced(self, attempt: Attempt, claim: Claim) -> float | None:
         """Run the attempt, as part of the trace of its submission."""
         if self._settings.traces == "off":
             return await attempt.run()

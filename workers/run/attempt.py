@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import shutil
@@ -18,16 +19,19 @@ from biresnerf.progress import Progress
 from biresnerf.report import Verdict, VerdictName
 from biresnerf.wire.problems import JobError
 from workers.database.database import Database
-from workers.jobs.claim import Claim, Fenced, crashed_too_often
+from workers.jobs.claim import Claim, Fenced
 from workers.jobs.job_states import Requeue
 from workers.jobs.ledger import Ledger
+from workers.jobs.setbacks import Cause, crashed_too_often, used_up
+from workers.process.disk_space import is_disk_full
 from workers.process.waiting import first_done, retry_while_unavailable
-from workers.records import LOG_NAME, Artifact
+from workers.records import CRASH_NAME, LOG_NAME, Artifact
 from workers.run.child import Child, log_tail
 from workers.run.courier import Courier
 from workers.run.memory import OomKills, out_of_memory, smaller_options
 from workers.run.results import store_result
 from workers.run.staging import stage_job
+from workers.settings.errors import LimitReached, Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
 
@@ -36,6 +40,7 @@ log = logging.getLogger(__name__)
 StopReason = Literal["cancel", "shutdown"]
 EXIT_ERRORS = {2: "InputError", 3: "RefinementError"}  # deterministic: another attempt would end the same
 EXIT_MEMORY = 4
+EXIT_DISK = 5
 # Of a process that the kernel may have killed for want of memory; the second where it was a process of its own.
 KILLED, CHILD_KILLED = -signal.SIGKILL, "seeding_crashed"
 # Ours to fix, not the user's: a checkpoint of an older version, for example. The job starts over.
@@ -72,10 +77,10 @@ class Attempt:
             self._stop_reason = reason
         self._stop.set()
 
-    async def run(self) -> bool:
-        """Run to the end; True where the job goes back to the queue. Raises `Fenced`.
+    async def run(self) -> float | None:
+        """Run to the end; in how many seconds to offer the job again, None where it is over. Raises `Fenced`.
 
-        Whatever goes wrong on our side counts as a crash of the attempt.
+        What goes wrong on our side counts as a crash of the attempt, unless disk or store are to blame.
         """
         try:
             return await self._run()
@@ -86,12 +91,25 @@ class Attempt:
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
 
-    async def _run(self) -> bool:
+    async def _run(self) -> float | None:
         try:
             return await self._conclude(await self._run_process())
+        except Unavailable:
+            return await self._wait("store_away")
         except Exception as error:
+            full = isinstance(error, LimitReached) and error.code == "storage_full"
+            if full or is_disk_full(error):
+                return await self._wait("disk_full")
             log.exception("attempt %s of %s failed on our side", self._claim.name, self._claim.job_id)
-            return await self._crashed(f"{type(error).__name__}: {error}")
+            return await self._crashed("error", "an error on the worker's side")
+
+    async def _give_back(self, how: Requeue, again_in_s: float = 0.0) -> float | None:
+        return again_in_s if await self._ledger.give_back(how) else None
+
+    async def _wait(self, cause: Cause) -> float | None:
+        """Back to the queue until there is room, or the store answers."""
+        log.warning("job %s goes back to the queue: %s", self._claim.job_id, cause)
+        return await self._give_back(Requeue("requeued", {"why": cause}, cause), self._settings.stall_s / 4)
 
     @property
     def _result_prefix(self) -> str:
@@ -154,26 +172,29 @@ class Attempt:
                 with self._log.open("ab") as file:  # a library printed something
                     file.write(line)
 
-    async def _conclude(self, status: int | None) -> bool:
+    async def _conclude(self, status: int | None) -> float | None:
         if status == 0:
             artifacts = await self._store(enough=lambda: self._stop_reason == "cancel")
             if not await self._ledger.publish(artifacts, self._verdict()):
                 await self._ledger.cancelled(artifacts)
-            return False
+            return None
+        self._log_crash()
         if status == EXIT_MEMORY or (status in (KILLED, *EXIT_ERRORS) and self._killed_for_memory(status)):
             return await self._ran_out_of_memory()
         if status in EXIT_ERRORS:
             error = self._reported_error()
             if error.code in STALE_CHECKPOINT and self._claim.checkpoint is not None:
-                return await self._crashed(error.detail, forget_checkpoint=True)
+                return await self._crashed("error", error.detail, forget_checkpoint=True)
             await self._ledger.fail(error, await self._store(log_only=True))
-            return False
+            return None
         if self._stop_reason == "cancel":
             unwanted = not await self._ledger.wants_partial()
             await self._ledger.cancelled(await self._store(log_only=unwanted))
-            return False
+            return None
         if self._stop_reason == "shutdown":
-            return await self._ledger.give_back(Requeue("requeued", {"why": "shutdown"}, uncounted=True))
+            return await self._give_back(Requeue("requeued", {"why": "shutdown"}))
+        if status == EXIT_DISK:
+            return await self._wait("disk_full")
         if self._timed_out:
             error = JobError(
                 code="timeout",
@@ -182,20 +203,29 @@ class Attempt:
                 log_tail=log_tail(self._log),
             )
             await self._ledger.fail(error, await self._store())
-            return False
-        return await self._crashed(f"exit status {status}")
+            return None
+        return await self._crashed("killed" if status == KILLED else "error", f"exit status {status}")
 
-    async def _crashed(self, how: str, *, forget_checkpoint: bool = False) -> bool:
+    async def _crashed(self, cause: Cause, how: str, *, forget_checkpoint: bool = False) -> float | None:
         tail = log_tail(self._log)
-        if self._claim.attempt < self._settings.max_attempts:
+        if await self._may_try_again():
             data = {"how": how, "log_tail": tail}
-            return await self._ledger.give_back(
-                Requeue("attempt_crashed", data, forget_checkpoint=forget_checkpoint)
+            return await self._give_back(
+                Requeue("attempt_crashed", data, cause, forget_checkpoint=forget_checkpoint)
             )
-        error = crashed_too_often(self._claim.attempt, tail)
-        error = error.model_copy(update={"detail": f"{error.detail} The last time: {how}."})
+        error = crashed_too_often(self._claim.attempt, cause, tail)
         await self._ledger.fail(error, await self._store(log_only=True))
-        return False
+        return None
+
+    async def _may_try_again(self) -> bool:
+        crashes = await self._ledger.crashes() + 1
+        return not used_up(self._claim.attempt, crashes, self._settings.max_attempts)
+
+    def _log_crash(self) -> None:
+        """What the process says for the operator alone."""
+        with contextlib.suppress(OSError):
+            text = (self._folder / CRASH_NAME).read_text(errors="replace")
+            log.error("the process of job %s failed:\n%s", self._claim.job_id, text)
 
     def _killed_for_memory(self, status: int) -> bool:
         """Whether the kernel killed a process meanwhile, and this one's end looks like it."""
@@ -206,20 +236,20 @@ class Attempt:
         now = self._oom_kills.count()
         return now is not None and now > (self._oom_kills_before or 0)
 
-    async def _ran_out_of_memory(self) -> bool:
+    async def _ran_out_of_memory(self) -> float | None:
         """Once more with less, from the start: a checkpoint is of the sizes that were too large."""
         tail = log_tail(self._log)
         smaller: dict[str, Any] = {}
         if self._claim.kind == "refine":
             # Until the process reports its options, assume a CPU, which takes less than a GPU.
             smaller = smaller_options(self._resolved or parse_options(self._claim.options).resolved("cpu"))
-        if smaller and not self._claim.smaller and self._claim.attempt < self._settings.max_attempts:
+        if smaller and not self._claim.smaller and await self._may_try_again():
             data = {"why": "out_of_memory", "options": smaller, "log_tail": tail}
-            return await self._ledger.give_back(
-                Requeue("retried_smaller", data, forget_checkpoint=True, smaller=smaller)
+            return await self._give_back(
+                Requeue("retried_smaller", data, "killed", forget_checkpoint=True, smaller=smaller)
             )
         await self._ledger.fail(out_of_memory(self._claim.smaller, tail), await self._store(log_only=True))
-        return False
+        return None
 
     def _verdict(self) -> VerdictName | None:
         """What the report says of the result; None where it passes no verdict."""

@@ -2,14 +2,17 @@
 
 Reads ``job.json``, writes one line of JSON per report to standard output, everything else to standard error.
 Exit status: 0 done; 2 the user's mistake, 3 the refinement failed (both described in ``error.json``); 4 out of
-memory; 143 stopped by SIGTERM after writing a checkpoint, if there was anything to keep; 1 anything else.
+memory; 5 the disk is full; 143 stopped by SIGTERM after writing a checkpoint, if there was anything to keep; 1 anything
+else, described for the operator in ``crash.txt``.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -26,11 +29,15 @@ from biresnerf.options.formats import ExportName
 from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.progress import Progress
 from biresnerf.stages import Stage
+from workers.process.disk_space import is_disk_full
+from workers.records import CRASH_NAME
 
 EXIT_BUG = 1
 EXIT_INPUT = 2
 EXIT_REFINEMENT = 3
 EXIT_MEMORY = 4
+EXIT_DISK = 5
+_ROOM_BYTES = 2**20  # a disk with less is full: libraries do not always say why they could not write
 EXIT_STOPPED = 128 + signal.SIGTERM
 
 
@@ -54,6 +61,13 @@ def main(folder: Path) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         os.chdir(folder)
+        return _run(protocol, stop)
+    except Exception as error:  # noqa: BLE001 - the last line of defence: a bug ends in a file and in the status
+        return _unexpected(error)
+
+
+def _run(protocol: TextIO, stop: _Stop) -> int:
+    try:
         order = Order.model_validate_json(Path("job.json").read_bytes())
         if order.task == "export":
             _export(order, stop)
@@ -62,13 +76,25 @@ def main(folder: Path) -> int:
     except Interrupted:
         return EXIT_STOPPED
     except (InputError, RefinementError) as error:
+        if _disk_is_full(error):
+            return EXIT_DISK
         Path("error.json").write_text(error.fault.model_dump_json())
         sys.stderr.write(f"{error}\n")
         return EXIT_INPUT if isinstance(error, InputError) else EXIT_REFINEMENT
-    except Exception as error:  # noqa: BLE001 - the last line of defence: a bug ends in the log and in the status
-        traceback.print_exc()
-        return EXIT_MEMORY if is_out_of_memory(error) else EXIT_BUG
     return 0
+
+
+def _unexpected(error: Exception) -> int:
+    if _disk_is_full(error):
+        return EXIT_DISK
+    with contextlib.suppress(OSError):
+        Path(CRASH_NAME).write_text(traceback.format_exc())
+    sys.stderr.write(f"The program failed ({type(error).__name__}).\n")
+    return EXIT_MEMORY if is_out_of_memory(error) else EXIT_BUG
+
+
+def _disk_is_full(error: Exception) -> bool:
+    return is_disk_full(error) or shutil.disk_usage(".").free < _ROOM_BYTES
 
 
 class _Stop:

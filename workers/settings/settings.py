@@ -101,7 +101,9 @@ class Settings(BaseSettings):
     )
     job_timeout_s: float = Field(2 * 3600, gt=0, description="Longest run of one attempt.")
     check_timeout_s: float = Field(900, gt=0, description="Longest validation of one dataset.")
-    max_attempts: int = Field(3, ge=1, description="Attempts of a job that crashes.")
+    max_attempts: int = Field(
+        3, ge=1, description="Crashes after which a job fails, if it stores no checkpoint between them."
+    )
     max_queued: int = Field(1000, ge=1, description="Jobs that may wait, of all tenants together.")
     tenant_max_running: int = Field(2, ge=0, description="Jobs of one tenant at the same time; 0: no limit.")
     tenant_max_queued: int = Field(100, ge=0, description="Jobs of one tenant that may wait; 0: no limit.")

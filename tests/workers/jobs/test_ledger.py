@@ -147,6 +147,7 @@ async def test_nothing_is_written_once_another_attempt_owns_the_job(database: Da
         ledger.reusable("coarse", "jobs/x/1", ["a"]),
         ledger.log(["one"]),
         ledger.wants_partial(),
+        ledger.crashes(),
         ledger.publish([FILE], None),
         ledger.fail(ERROR, []),
         ledger.cancelled([]),
@@ -171,13 +172,13 @@ async def test_a_job_given_back_starts_from_its_checkpoint_unless_that_is_forgot
     database: Database, ledger: Ledger
 ):
     await ledger.checkpoint("jobs/x/1", ["a"], 10)
-    assert await ledger.give_back(Requeue("requeued", {"why": "shutdown"}, uncounted=True))
+    assert await ledger.give_back(Requeue("requeued", {"why": "shutdown"}))
     again = await claim_job(database, ledger.claim.job_id, max_attempts=3)
     assert again is not None
     assert (again.attempt, again.checkpoint) == (1, {"prefix": "jobs/x/1", "files": ["a"]})
     smaller = {"max_image_size": 100}
     await Ledger(database, again, STALL_S).give_back(
-        Requeue("retried_smaller", {}, forget_checkpoint=True, smaller=smaller)
+        Requeue("retried_smaller", {}, "killed", forget_checkpoint=True, smaller=smaller)
     )
     last = await claim_job(database, ledger.claim.job_id, max_attempts=3)
     assert last is not None

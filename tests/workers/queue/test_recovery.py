@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+from pathlib import Path
 
 import psutil
 import pytest
 
-from tests.workers.conftest import Counting, Slots, died
+from tests.workers.conftest import SHORT_STALL, Counting, Slots, died
 from workers.engine import Stores
 from workers.settings.settings import Settings
 
@@ -103,8 +104,47 @@ async def test_a_job_that_always_dies_fails_after_its_attempts(
     assert job.error is not None
     assert job.error.code == "too_many_crashes"
     assert "dying now" in job.error.log_tail
+    assert "want of memory" in job.error.detail
     assert [item.name for item in await counting.stores.jobs.artifacts(counting.id)] == ["log.txt"]
     assert len(counting.starts()) == settings.max_attempts
+
+
+async def test_crashes_count_only_until_the_next_checkpoint(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    slots.start(settings.model_copy(update={"max_attempts": 2}), "a")
+    await counting.submit(40, 0.01, die_every=7)
+    job = await counting.until_final()
+    assert (job.state, job.attempt) == ("succeeded", 8)
+    await assert_one_result(counting, 40)
+
+
+async def test_a_full_disk_costs_no_attempt_and_the_owner_sees_what_the_job_waits_for(
+    counting: Counting, settings: Settings, slots: Slots, tmp_path: Path
+):
+    full = tmp_path / "full"
+    full.touch()
+    slots.start(settings.model_copy(update={"max_attempts": 1, **SHORT_STALL}), "a")
+    await counting.submit(20, 0.01, no_room=str(full))
+    waiting = await counting.until(lambda job: "disk is full" in job.message)
+    assert waiting.state == "queued"
+    full.unlink()
+    job = await counting.until_final()
+    assert (job.state, job.message) == ("succeeded", "")
+    assert counting.starts()[-1]["from"] == 5, "and it went on from its checkpoint"
+
+
+async def test_a_job_that_does_not_fit_on_the_disk_says_so(
+    counting: Counting, settings: Settings, slots: Slots
+):
+    first = slots.start(settings.model_copy(update={"disk_reserve_bytes": 2**60, **SHORT_STALL}), "a")
+    await counting.submit(20, 0.01)
+    waiting = await counting.until(lambda job: "disk is full" in job.message)
+    assert (waiting.state, waiting.attempt) == ("queued", 0)
+    first.terminate()
+    first.wait()
+    slots.start(settings, "a")
+    assert (await counting.until_final()).state == "succeeded"
 
 
 async def test_a_job_that_kills_its_worker_each_time_fails_too(
@@ -120,6 +160,7 @@ async def test_a_job_that_kills_its_worker_each_time_fails_too(
     job = await counting.until_final()
     assert job.error is not None
     assert (job.state, job.error.code) == ("failed", "too_many_crashes")
+    assert "the worker was lost" in job.error.detail
 
 
 async def test_a_mistake_of_the_user_is_not_tried_again(counting: Counting, settings: Settings, slots: Slots):

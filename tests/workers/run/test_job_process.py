@@ -19,7 +19,7 @@ from biresnerf.options.refine_options import RefineOptions
 from biresnerf.progress import Progress
 from tests.workers.conftest import ROOT, Counting, Slots, quick_settings, ready_dataset
 from workers.engine import open_stores
-from workers.run.job_process import is_out_of_memory
+from workers.run.job_process import EXIT_DISK, is_out_of_memory
 
 pytestmark = pytest.mark.server
 
@@ -190,3 +190,30 @@ def only_child(slots: Slots) -> int:
 
     (child,) = psutil.Process(slots.processes[0].pid).children()
     return child.pid
+
+
+def run_with_site(folder: Path, site: str) -> subprocess.CompletedProcess[str]:
+    """The job program, with `site` run first."""
+    (folder / "sitecustomize.py").write_text(site)
+    variables = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    command = [sys.executable, "-m", "workers.run.job_process", str(folder)]
+    return subprocess.run(command, env=variables, capture_output=True, text=True, check=False, timeout=120)
+
+
+def test_a_disk_that_is_full_is_an_end_of_its_own(tmp_path: Path, scene: Path):
+    folder = job_folder(tmp_path, scene, {"preset": "fast"})
+    (folder / "error.json").symlink_to("/dev/full")
+    (folder / "input").unlink()
+    (folder / "input").mkdir()  # without photos, which is to be written to error.json
+    done = run_with_site(folder, "")
+    assert done.returncode == EXIT_DISK, done.stderr
+
+
+def test_a_traceback_is_for_the_operator_alone(tmp_path: Path, scene: Path):
+    folder = job_folder(tmp_path, scene, {"preset": "fast"})
+    done = run_with_site(folder, "import sys\nsys.modules['biresnerf.pipeline'] = None\n")
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert str(ROOT) not in done.stderr
+    assert "The program failed (ModuleNotFoundError)" in done.stderr
+    assert "Traceback" in (folder / "crash.txt").read_text()

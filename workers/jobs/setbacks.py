@@ -1,0 +1,78 @@
+"""Why an attempt ended though its job is not over, and what that means for the job."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from biresnerf.wire.problems import JobError
+
+Cause = Literal["worker_lost", "killed", "error", "disk_full", "store_away"]
+# Attempts of a job at most, in crashes that it may have one after the other: each of them may store a checkpoint first.
+ATTEMPTS_PER_CRASH = 10
+
+
+@dataclass(frozen=True)
+class Setback:
+    """One way for an attempt to end too early.
+
+    Attributes:
+        counts: whether it is a crash, of which a job may have so many without a new checkpoint between them.
+        what: what happened, after "The last time ".
+        hint: what to do where it happened too often.
+        message: what the job's owner reads while the job waits.
+    """
+
+    counts: bool
+    what: str
+    hint: str
+    message: str = ""
+
+
+SETBACKS: Mapping[Cause, Setback] = {
+    "worker_lost": Setback(
+        True,
+        "the worker was lost: it was killed, or its machine stopped",
+        "Submit the job again; tell the operator if that does not help.",
+    ),
+    "killed": Setback(
+        True,
+        "its process was killed, mostly for want of memory",
+        "Try smaller options (preset fast, a smaller max_image_size) or a machine with more memory.",
+    ),
+    "error": Setback(
+        True,
+        "the program failed",
+        "This is a fault of the program. Tell the operator the job's id: the worker's log has the details.",
+    ),
+    "disk_full": Setback(
+        False,
+        "the worker's disk was full",
+        "Ask the operator for more room, or try a smaller max_image_size.",
+        "Waiting: the worker's disk is full.",
+    ),
+    "store_away": Setback(
+        False,
+        "the file storage did not answer",
+        "Tell the operator, and submit the job again later.",
+        "Waiting: the file storage does not answer.",
+    ),
+}
+
+
+def used_up(attempts: int, crashes: int, max_attempts: int) -> bool:
+    """Whether a job may not be tried again, after so many attempts and crashes since its last checkpoint."""
+    return crashes >= max_attempts or attempts >= ATTEMPTS_PER_CRASH * max_attempts
+
+
+def crashed_too_often(attempts: int, cause: Cause | None, log_tail: str = "") -> JobError:
+    """The error of a job that may not be tried again; ``cause`` of the last attempt's end."""
+    last = SETBACKS[cause or "error"]
+    times = "once" if attempts == 1 else f"{attempts} times"
+    return JobError(
+        code="too_many_crashes",
+        detail=f"The job was started {times} and did not end. The last time {last.what}.",
+        hint=last.hint,
+        log_tail=log_tail,
+    )
