@@ -66,6 +66,17 @@ def _alternatives(ours: JointOptimiser, definition: bool) -> dict[str, JointOpti
     return made
 
 
+def _parts_ms(joint: JointOptimiser, rays: int, steps: int, clock: Clock) -> dict[str, float]:
+    """Medians of what the parts of a step take."""
+    parts: dict[str, list[float]] = {}
+    for _ in range(steps):
+        with timed(OPERATIONS, clock) as spent:
+            scene.step(joint, rays)
+        for label, value in spent.items():
+            parts.setdefault(label, []).append(value)
+    return {label: 1e3 * float(np.median(values)) for label, values in parts.items()}
+
+
 def run(
     rays: int, rounds: int, threads: int, clock: Clock, limit: dict[str, float], definition: bool
 ) -> list[dict]:
@@ -87,25 +98,20 @@ def run(
         seconds = interleave(competitors, rounds, clock)
         with peak_memory() as slow_memory:
             torch_step(rivals["unrolled"])
-        parts: dict[str, list[float]] = {}
         with peak_memory() as memory:
-            for _ in range(3 * rounds):
-                with timed(OPERATIONS, clock) as spent:
-                    scene.step(ours, rays)
-                for label, value in spent.items():
-                    parts.setdefault(label, []).append(value)
+            medians = _parts_ms(ours, rays, 3 * rounds, clock)
+        networks = _parts_ms(unmerged, rays, rounds, clock)
         started = clock()
         kept = ours.occupancy.occupied
         ours._update_occupancy(ours.step_index)
         occupancy = (clock() - started) / OCCUPANCY_PERIOD
         ours.occupancy.occupied = kept
-        medians = {label: 1e3 * float(np.median(values)) for label, values in parts.items()}
         medians["occupancy update, per step"] = 1e3 * occupancy
         fast = float(np.median(seconds["kernels"])) + occupancy
         width = ours.field.shape.pose_grid.width + (
             ours.field.shape.reconstruction_grid.width if stage == "fine" else 0
         )
-        network_s = 1e-3 * (medians[FORWARD] + medians[BACKWARD])
+        network_s = 1e-3 * (networks[FORWARD] + networks[BACKWARD])
         rows.append({
             "stage": stage, "rays": rays, "samples": samples, "kernels": summary(seconds["kernels"]),
             "ns_per_sample": 1e9 * fast / samples, "samples_per_s": samples / fast, "rays_per_s": rays / fast,

@@ -192,6 +192,17 @@ class Counting:
         self.id = job.id
         return job.id
 
+    async def assert_one_result(self, steps: int) -> None:
+        """Published once, from one attempt, complete."""
+        events = await self.events()
+        assert events.count("succeeded") == 1
+        assert (await self.result())["steps"] == steps
+        artifacts = await self.stores.jobs.artifacts(self.id)
+        assert {item.name for item in artifacts} == {"log.txt", "renders/one.png", "report.json"}
+        assert len({item.key.split("/")[3] for item in artifacts}) == 1
+        sequence = [event.seq for event in await self.stores.jobs.events(self.id)]
+        assert sequence == list(range(1, len(sequence) + 1))
+
     async def until(self, holds: Callable[[JobView], bool], timeout_s: float = PATIENCE_S) -> JobView:
         """The job once ``holds``; fails the test after the timeout. A client tries again after a 503."""
         end = time.monotonic() + timeout_s

@@ -11,9 +11,9 @@ from biresnerf.refine.stages.timing import Part, WorkAhead
 from biresnerf.refine.start.first_step import adjusts_cameras
 from biresnerf.refine.views.pose_trials import OPEN_STEPS
 
-# In steps of stage 2, as measured over the sets of docs/estimator.md; single runs differ by a half.
-ADJUSTING, ADJUSTING_TRACKS, EVALUATING = 130.0, 100.0, 100.0
-TRAINING = 0.45  # a step of a trial: stage 1, half of the samples, poses that stand still
+# In steps of stage 2, as measured on lego, temple, fox and fountain-P11; sets differ by a factor of two.
+ADJUSTING, ADJUSTING_TRACKS, EVALUATING = 180.0, 800.0, 180.0
+TRAINING = 0.55  # a step of a trial: stage 1, half of the samples, poses that stand still
 
 
 def work_ahead(scene: Scene, optimiser: JointOptimiser, options: ResolvedOptions | None = None) -> WorkAhead:

@@ -17,18 +17,6 @@ from workers.settings.settings import Settings
 pytestmark = pytest.mark.anyio
 
 
-async def assert_one_result(counting: Counting, steps: int) -> None:
-    """Published once, from one attempt, complete."""
-    events = await counting.events()
-    assert events.count("succeeded") == 1
-    assert (await counting.result())["steps"] == steps
-    artifacts = await counting.stores.jobs.artifacts(counting.id)
-    assert {item.name for item in artifacts} == {"log.txt", "renders/one.png", "report.json"}
-    assert len({item.key.split("/")[3] for item in artifacts}) == 1
-    sequence = [event.seq for event in await counting.stores.jobs.events(counting.id)]
-    assert sequence == list(range(1, len(sequence) + 1))
-
-
 async def test_a_job_runs_reports_and_publishes(counting: Counting, settings: Settings, slots: Slots):
     slots.start(settings, "a")
     await counting.submit(12, 0.02)
@@ -42,7 +30,7 @@ async def test_a_job_runs_reports_and_publishes(counting: Counting, settings: Se
     assert events[-1] == "succeeded"
     assert {"stage", "checkpoint"} <= set(events)
     assert counting.starts()[0]["database"] is False, "the job must not see the database's address"
-    await assert_one_result(counting, 12)
+    await counting.assert_one_result(12)
 
 
 async def test_kill_9_of_the_worker_moves_the_job_to_another_one(
@@ -61,7 +49,7 @@ async def test_kill_9_of_the_worker_moves_the_job_to_another_one(
     assert len(starts) == 2
     assert starts[1]["from"] >= 10, "resumed from the checkpoint"
     assert "requeued" in await counting.events()
-    await assert_one_result(counting, 100)
+    await counting.assert_one_result(100)
 
 
 async def test_a_worker_started_again_under_the_same_name_takes_its_job_back_at_once(
@@ -91,7 +79,7 @@ async def test_kill_9_of_the_job_process_resumes_from_the_checkpoint(
     (crash,) = [e for e in await counting.stores.jobs.events(counting.id) if e.type == "attempt_crashed"]
     assert crash.data["how"] == "exit status -9"
     assert "counting from 0" in crash.data["log_tail"]
-    await assert_one_result(counting, 60)
+    await counting.assert_one_result(60)
 
 
 async def test_a_job_that_always_dies_fails_after_its_attempts(
@@ -116,7 +104,7 @@ async def test_crashes_count_only_until_the_next_checkpoint(
     await counting.submit(40, 0.01, die_every=7)
     job = await counting.until_final()
     assert (job.state, job.attempt) == ("succeeded", 8)
-    await assert_one_result(counting, 40)
+    await counting.assert_one_result(40)
 
 
 async def test_a_full_disk_costs_no_attempt_and_the_owner_sees_what_the_job_waits_for(
@@ -210,7 +198,7 @@ async def test_sigterm_gives_the_job_back_without_counting_the_attempt(
     job = await counting.until_final()
     assert (job.state, job.attempt) == ("succeeded", 1)
     assert counting.starts()[1]["from"] >= 10, "the checkpoint written at SIGTERM was kept"
-    await assert_one_result(counting, 60)
+    await counting.assert_one_result(60)
 
 
 @pytest.mark.parametrize("within_transaction", [False, True])
@@ -228,7 +216,7 @@ async def test_a_frozen_worker_that_wakes_up_is_fenced_and_one_result_is_publish
     assert await asyncio.to_thread(first.wait, 15) == 75
     job = await counting.until_final()
     assert (job.state, job.attempt) == ("succeeded", 2)
-    await assert_one_result(counting, 80)
+    await counting.assert_one_result(80)
     await _trash_is_empty(counting.stores)
     left = {
         file.key.split("/")[3] for file in await counting.stores.files.list(f"jobs/{counting.id}/results")
@@ -260,62 +248,6 @@ async def _trash_is_empty(stores: Stores) -> None:
     raise AssertionError("the trash was not taken out")
 
 
-async def test_a_running_job_is_cancelled(counting: Counting, settings: Settings, slots: Slots):
-    slots.start(settings, "a")
-    await counting.submit(1000, 0.05)
-    await counting.until(lambda job: job.progress.step >= 5)
-    asked = await counting.stores.jobs.cancel(counting.id)
-    assert asked.cancel_requested
-    job = await counting.until_final(timeout_s=5)
-    assert job.state == "cancelled"
-    assert (await counting.events())[-2:] in (["cancel_requested", "cancelled"], ["checkpoint", "cancelled"])
-    assert not psutil.pid_exists(int(counting.starts()[0]["pid"]))
-    await counting.submit(3, 0.01)
-    assert (await counting.until_final()).state == "succeeded", "the slot is free again"
-
-
-async def test_a_deaf_job_is_killed_when_cancelled(counting: Counting, settings: Settings, slots: Slots):
-    slots.start(settings.model_copy(update={"stop_grace_s": 0.5}), "a")
-    await counting.submit(1000, 0.05, deaf=True)
-    await counting.until(lambda job: job.progress.step >= 5)
-    await counting.stores.jobs.cancel(counting.id)
-    assert (await counting.until_final(timeout_s=5)).state == "cancelled"
-
-
-async def test_cancelling_at_the_finish_line_leaves_one_consistent_end(
-    counting: Counting, settings: Settings, slots: Slots
-):
-    slots.start(settings, "a")
-    ends = set()
-    for tenth in range(6):
-        await counting.submit(6, 0.02)
-        await counting.until(lambda job: job.progress.step >= 1)
-        await asyncio.sleep(0.03 * tenth)
-        await counting.stores.jobs.cancel(counting.id)
-        job = await counting.until_final()
-        events = await counting.events()
-        ends.add(job.state)
-        assert events[-1] == job.state
-        assert sum(event in ("succeeded", "failed", "cancelled") for event in events) == 1
-        if job.state == "succeeded":
-            await assert_one_result(counting, 6)
-    assert ends <= {"succeeded", "cancelled"}
-
-
-async def test_a_cancelled_job_of_a_dead_worker_ends_cancelled(
-    counting: Counting, settings: Settings, slots: Slots
-):
-    first = slots.start(settings, "a")
-    await counting.submit(1000, 0.05)
-    await counting.until(lambda job: job.progress.step >= 1)
-    first.kill()
-    first.wait()
-    await counting.stores.jobs.cancel(counting.id)
-    slots.start(settings, "b")
-    assert (await counting.until_final()).state == "cancelled"
-    assert len(counting.starts()) == 1
-
-
 async def test_a_store_that_is_away_at_the_end_costs_no_attempt(
     counting: Counting, settings: Settings, slots: Slots
 ):
@@ -334,4 +266,4 @@ async def test_a_store_that_is_away_at_the_end_costs_no_attempt(
     away.rename(settings.files_dir)
     job = await counting.until_final()
     assert (job.state, job.attempt, len(counting.starts())) == ("succeeded", 1, 1)
-    await assert_one_result(counting, 40)
+    await counting.assert_one_result(40)
