@@ -80,6 +80,8 @@ def create_app(settings: Settings) -> FastAPI:
                 logger.info("removed %d unfinished uploads", swept)
             service.keep_running(_repeat(_finish_checks, service))
             service.keep_running(_repeat(finish_uploads, service))
+            # Workers do the same; without any, trash and tallies would pile up.
+            service.keep_running(stores.janitor.run())
             await log_access(service)
             try:
                 yield

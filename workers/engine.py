@@ -13,6 +13,7 @@ from workers.datasets.datasets import DatasetStore
 from workers.datasets.uploads import UploadStore
 from workers.jobs.job_updates import JobListener
 from workers.jobs.jobs import JobStore
+from workers.queue.janitor import Janitor
 from workers.settings.settings import Settings
 from workers.store.files import FileStore, open_files
 from workers.store.store_identity import require_same_store
@@ -37,6 +38,7 @@ class Stores:
     tenants: TenantStore
     monitor: Monitor
     webhooks: WebhookStore
+    janitor: Janitor  # not yet at work
     share_key: bytes  # signs links to results
 
 
@@ -64,7 +66,8 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
             datasets = DatasetStore(database, files, settings)
             webhooks = WebhookStore(database, settings)
             keys = KeyStore(database)
-            yield Stores(jobs, datasets, files, uploads, keys, tenants, monitor, webhooks, share_key)
+            janitor = Janitor(database, files, settings)
+            yield Stores(jobs, datasets, files, uploads, keys, tenants, monitor, webhooks, janitor, share_key)
         finally:
             listening.cancel()
 

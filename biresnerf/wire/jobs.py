@@ -174,7 +174,7 @@ class NewJob(JobTexts):
         }
     )
 
-    dataset_id: str = Field(max_length=100)
+    dataset_id: str = Field(max_length=100, pattern=r"^[^\x00-\x1f]*$")
 
 
 class CancelJob(Record):

@@ -58,7 +58,11 @@ class NewShare(Record):
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"name": "transforms.json", "valid_s": 3600}]})
 
-    name: str = Field(max_length=1000, description="The name of the file in the list of artifacts.")
+    name: str = Field(
+        max_length=1000,
+        pattern=r"^[^\x00-\x1f]*$",
+        description="The name of the file in the list of artifacts.",
+    )
     valid_s: int = Field(3600, ge=1, le=30 * 86_400, description="How long the link is valid.")
 
 

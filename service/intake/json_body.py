@@ -1,4 +1,4 @@
-"""JSON bodies, read strictly: of limited size, no NaN, NUL or repeated keys, a pointer to every wrong field."""
+"""JSON bodies, read strictly: of limited size, no NaN, no repeated keys, a pointer to every wrong field."""
 
 from __future__ import annotations
 
@@ -70,25 +70,11 @@ async def read_json(request: Request, limit: int = JSON_BYTES_MAX) -> Any:
 def load_json(text: bytes | str) -> Any:
     """JSON text as values; raises `ProblemError` ``malformed_json``."""
     try:
-        values = json.loads(text, parse_constant=_no_constant, object_pairs_hook=_no_repeats)
-        _refuse_nul(values)
-        return values
+        return json.loads(text, parse_constant=_no_constant, object_pairs_hook=_no_repeats)
     except RecursionError:
         raise ProblemError("malformed_json", "The JSON is nested too deeply.") from None
     except ValueError as error:
         raise ProblemError("malformed_json", f"{error}.") from None
-
-
-def _refuse_nul(values: Any) -> None:
-    """No text of a client may hold NUL, which the database cannot store."""
-    if isinstance(values, str) and "\0" in values:
-        raise ValueError("A string holds a NUL character")
-    if isinstance(values, dict):
-        for pair in values.items():
-            _refuse_nul(list(pair))
-    elif isinstance(values, list):
-        for value in values:
-            _refuse_nul(value)
 
 
 def validate(values: Any, model: type[Model]) -> Model:

@@ -124,10 +124,10 @@ class JointOptimiser:
         self.mobility[:, self.poses.members(camera)] = 1.0
 
     def marching(self, interval: float) -> Marching:
-        near = self.schedule.near(self.step_index, self.switch)
+        near, far = self.schedule.near(self.step_index, self.switch), self.schedule.far(self.frame.far)
         near = self.frame.distance * (max(near, self.frame.near) if self.method.robust_extensions else near)
-        far = self.schedule.far(self.frame.far)
-        return Marching(interval, near, far, MOST_SAMPLES, self.occupancy.occupied, self.method.merging)
+        merging = self.method.merging if self.switch is not None else None  # stage 1 needs every sample
+        return Marching(interval, near, far, MOST_SAMPLES, self.occupancy.occupied, merging)
 
     def cast(
         self, matrix: Tensor, image: Tensor, xy: Tensor, intrinsics: Intrinsics | None = None

@@ -15,7 +15,7 @@ Part = Literal["adjusting", "evaluating", "judging"]
 
 FIRST_PREVIEW_S, PREVIEW_PERIOD_S = 3.0, 20.0
 PREVIEW_SHARE = 0.05  # of the run's time, at most
-FINE_COST = 1.6  # a step of stage 2 against one of stage 1, until measured
+FINE_COST = 1.1  # a step of stage 2 against one of stage 1, until measured
 MEMORY = 0.98  # of the running mean of a step's time
 
 

@@ -36,7 +36,7 @@ def left_s(stages):
     return stages.forecast.left_s(optimiser.step_index, switch, steps, spent, stages.forecast.ahead)
 
 
-@pytest.mark.parametrize("seconds", [600.0, 800.0, 1000.0])
+@pytest.mark.parametrize("seconds", [850.0, 1000.0, 1200.0])
 def test_as_many_steps_are_taken_as_there_is_time_for(scene, tmp_path, seconds):
     stages = with_step_of(stages_of(scene, tmp_path), 1.0)
     stages.ends = time.monotonic() + seconds

@@ -127,7 +127,7 @@ def test_a_host_that_cannot_be_parsed_is_refused(http: httpx.Client, host: str) 
 
 def test_text_that_the_database_cannot_hold_is_refused(http: httpx.Client) -> None:
     for body in ({"dataset_id": "\0"}, {"dataset_id": "ds_1", "labels": {"a\0": "b"}}):
-        problem(http.post("/v1/jobs", json=body), 400, "malformed_json")
+        problem(http.post("/v1/jobs", json=body), 422, "invalid_request")
 
 
 def test_the_docs_page_works_without_any_other_host(http: httpx.Client) -> None:

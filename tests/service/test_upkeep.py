@@ -1,0 +1,28 @@
+"""What workers keep in order is kept in order where only the web process runs."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from service.http.dependencies import Service
+from tests.service.in_process import serving
+from tests.workers.conftest import anyio_backend, database_url, quick_settings, server
+
+__all__ = ["anyio_backend", "database_url", "server"]
+pytestmark = [pytest.mark.server, pytest.mark.anyio]
+
+
+async def test_trash_and_tallies_do_not_pile_up_without_workers(database_url: str, tmp_path: Path):
+    async with serving(quick_settings(tmp_path / "data", database_url=database_url)) as http:
+        dataset = (await http.post("/v1/datasets", json={})).json()["id"]
+        assert (await http.put(f"/v1/datasets/{dataset}/files/a.png", content=b"x")).status_code == 201
+        assert (await http.delete(f"/v1/datasets/{dataset}")).status_code == 204
+        service: Service = http._transport.app.state.service
+        rows = "SELECT (SELECT count(*) FROM trash) + (SELECT count(*) FROM tally_log) AS left_over"
+        async with asyncio.timeout(60):
+            while (await service.stores.jobs._database.fetch(rows))[0]["left_over"]:
+                await asyncio.sleep(0.2)
+        assert not list((tmp_path / "data" / "files").rglob("a.png"))
