@@ -30,8 +30,9 @@ def look(optimiser) -> torch.Tensor:
     return torch.cat([r.colour, r.opacity[:, None], r.depth[:, None]], 1)
 
 
-def test_the_switch_leaves_every_render_as_it_was(scene):
+def test_the_switch_leaves_every_render_as_it_was_but_for_merged_intervals(scene):
     optimiser = tiny_optimiser(*scene, tiny_options())
+    merging, optimiser.method = optimiser.method, replace(optimiser.method, merging=None)
     for _ in range(20):
         optimiser.step()
     with torch.no_grad():  # only the zero columns may keep the module out, not its tiny features
@@ -40,6 +41,8 @@ def test_the_switch_leaves_every_render_as_it_was(scene):
     assert float(before[:, :3].std()) > 0.01  # there is something to see
     optimiser.start_reconstruction()
     assert float((look(optimiser) - before).abs().max()) < 1e-5
+    optimiser.method = merging
+    assert 0 < float((look(optimiser) - before).abs().max()) < 0.02
     optimiser.step()
     optimiser.step()
     assert float((look(optimiser) - before).abs().max()) > 1e-5  # from now on it takes part
