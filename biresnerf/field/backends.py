@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import logging
-import os
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
+from biresnerf.cores import usable_cores
 from biresnerf.errors import InputError
 from biresnerf.field.occupancy import DeviceOccupancyGrid, OccupancyGrid
 from biresnerf.field.radiance_field import FieldShape, RadianceField
@@ -73,8 +73,7 @@ def use_threads(threads: int) -> int:
     """
     import numba
 
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    taken = min(threads or available, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    taken = min(threads or usable_cores(), numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     numba.set_num_threads(taken)
     torch.set_num_threads(1)
     return taken

@@ -38,6 +38,7 @@ class Links(Record):
         return cls(self=path, **others, **{part: f"{path}/{part}" for part in parts})
 
 
+NO_CONTROLS = r"^[^\x00-\x1f]*$"  # the database stores no NUL in text
 LABELS_MOST, LABEL_LENGTH = 20, 100
-Label = Annotated[str, StringConstraints(min_length=1, max_length=LABEL_LENGTH, pattern=r"^[^\x00-\x1f]*$")]
+Label = Annotated[str, StringConstraints(min_length=1, max_length=LABEL_LENGTH, pattern=NO_CONTROLS)]
 Labels = Annotated[dict[Label, Label], Field(max_length=LABELS_MOST)]

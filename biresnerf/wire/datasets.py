@@ -9,7 +9,7 @@ from urllib.parse import quote
 from pydantic import ConfigDict, Field, StringConstraints
 
 from biresnerf.report import IntrinsicsSource
-from biresnerf.wire.base import Links, Page, Record
+from biresnerf.wire.base import NO_CONTROLS, Links, Page, Record
 from biresnerf.wire.problems import JobError
 
 DatasetState = Literal["open", "finalizing", "ready", "rejected", "expired"]
@@ -84,9 +84,7 @@ class NewDataset(Record):
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"name": "kitchen"}]})
 
-    name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f]*$")] = (
-        "dataset"
-    )
+    name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=NO_CONTROLS)] = "dataset"
     manifest: list[ManifestEntry] = Field(
         default=[],
         max_length=100_000,

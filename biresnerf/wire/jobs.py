@@ -12,7 +12,7 @@ from biresnerf.options.formats import ExportName
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.report import VerdictName
 from biresnerf.stages import ReusableStage, Stage
-from biresnerf.wire.base import Labels, Links, Page, Record
+from biresnerf.wire.base import NO_CONTROLS, Labels, Links, Page, Record
 from biresnerf.wire.datasets import dataset_url
 from biresnerf.wire.problems import JobError
 from biresnerf.wire.webhooks import JobWebhook
@@ -174,7 +174,7 @@ class NewJob(JobTexts):
         }
     )
 
-    dataset_id: str = Field(max_length=100, pattern=r"^[^\x00-\x1f]*$")
+    dataset_id: str = Field(max_length=100, pattern=NO_CONTROLS)
 
 
 class CancelJob(Record):

@@ -7,7 +7,7 @@ from datetime import datetime
 from pydantic import ConfigDict, Field
 
 from biresnerf.report import ImageReport
-from biresnerf.wire.base import Record
+from biresnerf.wire.base import NO_CONTROLS, Record
 
 
 class ResultFile(Record):
@@ -60,7 +60,7 @@ class NewShare(Record):
 
     name: str = Field(
         max_length=1000,
-        pattern=r"^[^\x00-\x1f]*$",
+        pattern=NO_CONTROLS,
         description="The name of the file in the list of artifacts.",
     )
     valid_s: int = Field(3600, ge=1, le=30 * 86_400, description="How long the link is valid.")

@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from pydantic import AfterValidator, ConfigDict, Field, StringConstraints
 
-from biresnerf.wire.base import Links, Page, Record
+from biresnerf.wire.base import NO_CONTROLS, Links, Page, Record
 
 WebhookEvent = Literal[
     "job.queued", "job.started", "job.succeeded", "job.failed", "job.cancelled", "dataset.validated"
@@ -21,7 +21,7 @@ DeliveryState = Literal["pending", "delivered", "failed"]
 SECRET_PREFIX = "whsec_"
 SECRET_BYTES = (24, 64)
 Events = Annotated[list[WebhookEvent], Field(min_length=1, max_length=len(ALL_EVENTS))]
-Description = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00-\x1f]*$")]
+Description = Annotated[str, StringConstraints(max_length=200, pattern=NO_CONTROLS)]
 Url = Annotated[str, Field(max_length=2000, examples=["https://hooks.example.org/biresnerf"])]
 
 

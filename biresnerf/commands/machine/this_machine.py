@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import platform
 
 from biresnerf import __version__
+from biresnerf.cores import usable_cores
 
 
 def describe_machine() -> str:
     """Cores, architecture and versions, in one line."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return (
-        f"{cores} cores ({platform.machine()}), Python {platform.python_version()}, BiResNeRF {__version__}"
-    )
+    return f"{usable_cores()} cores ({platform.machine()}), Python {platform.python_version()}, BiResNeRF {__version__}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -11,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.cores import usable_cores
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.decode import decode
@@ -133,7 +133,7 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
 
     largest = max(camera.width * camera.height for camera in dataset.cameras)
     fitting = _DECODING_BYTES // (largest * _DECODING_BYTES_PER_PX)
-    threads = max(1, min(_cores(), len(dataset), fitting))
+    threads = max(1, min(usable_cores(), len(dataset), fitting))
     with quiet_pillow(), ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
         pending = [pool.submit(fill, index) for index in range(len(dataset))]
         try:
@@ -148,11 +148,6 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
         pixels, None if opaque else alpha, offsets, widths, heights, cameras, None, counts if masked else None
     )
     return _with_background(images, background, behind)
-
-
-def _cores() -> int:
-    """How many this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _with_background(images: ImageSet, background: Background, behind: tuple[float, ...]) -> ImageSet:

@@ -73,14 +73,13 @@ class ReferenceField(GridField):
 
     @torch.no_grad()
     def density(self, position: Tensor) -> Tensor:
-        features, weights = self._features(position, PositionGradient())
-        return reference.density_of((torch.relu(features @ weights[0].T) @ weights[1].T)[:, 0])
+        return reference.density(*self._features(position, PositionGradient()))
 
     @torch.no_grad()
     def _pose_density(self, position: Tensor) -> Tensor:
         """The density [n] that the pose-estimation module alone gives."""
         features = reference.encode(position, self.pose_table, self.shape.pose_grid)
-        return reference.density_of((torch.relu(features @ self.networks[0].T) @ self.networks[1].T)[:, 0])
+        return reference.density(features, self.networks)
 
     @torch.no_grad()
     def _update_table(self, name: str, rates: np.ndarray) -> None:

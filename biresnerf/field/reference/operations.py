@@ -66,6 +66,11 @@ def network(features: Tensor, view: Tensor, weights: list[Tensor]) -> tuple[Tens
     return density_of(outputs[:, 0]), torch.sigmoid(colour)
 
 
+def density(features: Tensor, weights: list[Tensor]) -> Tensor:
+    """The density [n] of `network` alone."""
+    return density_of((torch.relu(features @ weights[0].T) @ weights[1].T)[:, 0])
+
+
 def density_of(logit: Tensor) -> Tensor:
     """Density of the first network's first output: a shifted exponential, capped."""
     return torch.exp((logit - DENSITY_SHIFT).clamp(max=DENSITY_CAP))
