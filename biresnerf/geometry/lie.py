@@ -1,18 +1,19 @@
 """Exponential and logarithm of rotations and rigid motions on torch tensors, finite everywhere with gradient.
 
 A rotation vector is axis times angle (rad). Rotation and translation are always two arguments, never packed.
-Closed forms are used for angles above one radian and Taylor series below; the argument of the form not taken
-is guarded too, since ``where`` passes NaN gradients of the branch it discards.
+The exponential takes its coefficients and their derivatives from the Stumpff functions, see `_Stumpff`.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from math import factorial
+from typing import Any
 
 import torch
 from torch import Tensor
 
-# Terms of the series in the squared angle: below one radian the first one left out is under 1e-17.
+# Terms of the Stumpff functions' series: below one radian the first one left out is under 1e-17.
 _SERIES_TERMS = 9
 # Squared tangent of the half angle below which the logarithm takes its series (8 terms: under 1e-16).
 _LOG_SERIES_BELOW = 1e-2
@@ -22,10 +23,7 @@ _LOG_SERIES_TERMS = 8
 def hat(vector: Tensor) -> Tensor:
     """The matrix [..., 3, 3] with ``hat(v) @ x == cross(v, x)``, of vectors [..., 3]."""
     _require(vector, (3,), "vector")
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    flat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
-    return flat.reshape(*flat.shape[:-1], 3, 3)
+    return (vector @ _generators(vector.dtype, vector.device)).unflatten(-1, (3, 3))
 
 
 def so3_exp(rotvec: Tensor) -> Tensor:
@@ -114,22 +112,70 @@ def _unit_quaternion(rotation: Tensor) -> tuple[Tensor, Tensor]:
 
 def _exp_coefficients(rotvec: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 of the angles a = |rotvec|, each [..., 1, 1]."""
-    angle_squared = (rotvec * rotvec).sum(-1)[..., None, None]
-    small = angle_squared < 1.0
-    low = torch.where(small, angle_squared, torch.zeros_like(angle_squared))
-    high = torch.where(small, torch.ones_like(angle_squared), angle_squared)
-    angle = high.sqrt()
-    sine_closed = angle.sin() / angle
-    # Half-angle form: no cancellation near whole turns.
-    cosine_closed = 2.0 * ((0.5 * angle).sin() / angle) ** 2
-    cubic_closed = (1.0 - sine_closed) / high
-    closed = (sine_closed, cosine_closed, cubic_closed)
-    series = [
-        _horner(low, [(-1.0) ** k / factorial(2 * k + first) for k in range(_SERIES_TERMS)])
-        for first in (1, 2, 3)
-    ]
-    sine, cosine, cubic = (torch.where(small, s, c) for s, c in zip(series, closed, strict=True))
+    found: Tensor = _Stumpff.apply((rotvec * rotvec).sum(-1))
+    sine, cosine, cubic = found[..., None, None, :].unbind(-1)
     return sine, cosine, cubic
+
+
+class _Stumpff(torch.autograd.Function):
+    """The first three Stumpff functions c_k(s) = sum_j (-s)^j / (k + 2j)! of squared angles [...], as [..., 3].
+
+    Below one radian they are the series, above it closed forms. The derivative of c_k is (k c_(k+2) - c_(k+1)) / 2,
+    finite everywhere (Danby 1992, Fundamentals of Celestial Mechanics, section 6.9).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, squared: Tensor) -> Tensor:  # type: ignore[override]
+        small = squared < 1.0
+        powers = torch.where(small, squared, 0.0)[..., None] ** _exponents(squared.device)
+        series = powers @ _stumpff_series(squared.dtype, squared.device)
+        high = torch.where(small, 1.0, squared)
+        angle = high.sqrt()
+        c1 = angle.sin() / angle
+        c2 = 2.0 * ((0.5 * angle).sin() / angle) ** 2  # no cancellation near whole turns
+        c3, c4 = (1.0 - c1) / high, (0.5 - c2) / high
+        closed = torch.stack([c1, c2, c3, c4, (1 / 6 - c3) / high], -1)
+        values = torch.where(small[..., None], series, closed)
+        ctx.save_for_backward(values)
+        return values[..., :3].clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
+        (values,) = ctx.saved_tensors
+        slopes = values @ _stumpff_slopes(values.dtype, values.device)
+        return (gradient * slopes).sum(-1)
+
+
+# Made once for each device: copying a constant there would make the host wait.
+@cache
+def _generators(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Row k [9] is hat of the k-th unit vector."""
+    rows = torch.zeros(3, 3, 3, dtype=dtype)
+    for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        rows[x, z, y], rows[x, y, z] = 1, -1
+    return rows.flatten(1).to(device)
+
+
+@cache
+def _exponents(device: torch.device) -> Tensor:
+    return torch.arange(_SERIES_TERMS, device=device)
+
+
+@cache
+def _stumpff_series(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The coefficients [terms, 5] of the first five functions."""
+    rows = [[(-1.0) ** j / factorial(k + 2 * j) for k in range(1, 6)] for j in range(_SERIES_TERMS)]
+    return torch.tensor(rows, dtype=dtype, device=device)
+
+
+@cache
+def _stumpff_slopes(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The derivatives of the first three functions from the first five [5, 3]."""
+    slopes = torch.zeros(5, 3, dtype=dtype)
+    for k in (1, 2, 3):
+        slopes[k + 1, k - 1], slopes[k, k - 1] = k / 2, -1 / 2
+    return slopes.to(device)
 
 
 def _horner(x: Tensor, coefficients: list[float]) -> Tensor:

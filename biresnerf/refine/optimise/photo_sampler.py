@@ -69,7 +69,7 @@ class PhotoSampler:
         self.offsets = torch.tensor(offsets, device=device)
         self.sizes = torch.tensor(sizes, device=device)
         self.long_side = float(self.sizes[0].max())
-        self._corners = torch.tensor([[[0, 0], [0, 1]], [[1, 0], [1, 1]]], device=device)
+        self._corners = torch.tensor([[[0, 0]], [[0, 1]], [[1, 0]], [[1, 1]]], device=device)
         self._host: torch.Generator | None = None
 
     def _counted_pixels(self, images: ImageSet) -> tuple[Tensor, Tensor]:
@@ -161,24 +161,13 @@ class PhotoSampler:
         size = self.sizes[level][image]
         at = xy * (size / self.sizes[0][image]) - 0.5
         low = at.floor()
-        fraction = at - low
-        total = torch.zeros(len(image), 3, device=self.device)
-        weight = torch.zeros(len(image), 1, device=self.device)
-        for dx in (0, 1):
-            for dy in (0, 1):
-                corner = (low + self._corners[dx, dy]).long()
-                corner = torch.minimum(corner.clamp(min=0), size - 1)
-                index = self.offsets[level][image] + corner[:, 1] * size[:, 0] + corner[:, 0]
-                wx = fraction[:, 0] if dx else 1 - fraction[:, 0]
-                wy = fraction[:, 1] if dy else 1 - fraction[:, 1]
-                share = (wx * wy)[:, None]
-                if self.shares is not None:
-                    share = share * self.shares[index, None]
-                    weight += share
-                total += share * self.pixels[index].float()
-        if self.shares is not None:
-            total = total / weight.clamp(min=1e-6)
-        return total / 255
+        corner = torch.minimum((low + self._corners).long().clamp(min=0), size - 1)  # [4, rays, 2]
+        index = self.offsets[level][image] + corner[..., 1] * size[:, 0] + corner[..., 0]
+        share = (1 - self._corners - (at - low)).abs().prod(2, keepdim=True)
+        if self.shares is None:
+            return (share * self.pixels[index]).sum(0) / 255
+        share = share * self.shares[index, None]
+        return (share * self.pixels[index]).sum(0) / (share.sum(0).clamp(min=1e-6) * 255)
 
 
 def turned(places: Tensor, count: int, generator: torch.Generator) -> Tensor:
