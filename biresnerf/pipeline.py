@@ -19,16 +19,16 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.errors import Interrupted
 from biresnerf.field.backends import resolve_here, use_threads
+from biresnerf.forecast import Forecast, remember_rates, remembered_rates
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
-from biresnerf.progress import KERNELS_FROM, START_KNOWN, Monitor, OnProgress, Progress
+from biresnerf.progress import Monitor, OnProgress, Progress
 from biresnerf.refine.finish.rounds import run_stage_2
 from biresnerf.refine.finish.time_budget import keep_to_budget
-from biresnerf.refine.finish.work_ahead import work_ahead
+from biresnerf.refine.finish.work_ahead import expect_rest, expect_run
 from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.checkpoint import SEEDING, TRACKS, Checkpoint, RunOrigin
 from biresnerf.refine.stages.observer import Observer
-from biresnerf.refine.stages.timing import Forecast
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.choose_start import find_start
 from biresnerf.refine.start.first_step import first_step, stage_lengths
@@ -94,11 +94,13 @@ def refine_poses(
         judgement = judge(stages)
         known = pose_uncertainty(stages, finish, judgement)
         report = run_report(stages, evaluation.scores, judgement, "complete", finish, known)
-        return write_result(setup.folder, stages, evaluation, report)
+        report = write_result(setup.folder, stages, evaluation, report)
     except Interrupted:
         report = run_report(stages, evaluation.scores, judgement, "partial")
         write_result(setup.folder, stages, evaluation, report)
         raise
+    remember_rates(setup.device.type, setup.threads, setup.monitor.forecast.measured())
+    return report
 
 
 @dataclass(frozen=True)
@@ -129,15 +131,15 @@ def _set_up(
     keep_reusable: bool,
 ) -> _Setup:
     """Check the folder, find earlier work in it, and choose the backend, and compile the kernels."""
-    monitor = Monitor(on_progress or (lambda _progress: None), should_stop or (lambda: False))
     folder = OutputFolder(output, keep_reusable=keep_reusable)
     folder.refuse_finished()
     earlier = earlier_work(folder.path)
-    monitor.report(Progress(stage="preparing"))
     options, device = resolve_here(asked)
     threads = use_threads(options.threads)
+    forecast = Forecast(remembered_rates(device.type, threads))
+    monitor = Monitor(on_progress or (lambda _progress: None), should_stop or (lambda: False), forecast)
     message = "loading kernels (the first run compiles them)"
-    monitor.report(Progress(stage="preparing", fraction=KERNELS_FROM, message=message, options=options))
+    monitor.report(Progress(stage="preparing", message=message, options=options))
     compile_kernels(field=device.type == "cpu")
     return _Setup(folder, asked, options, device, threads, earlier, monitor)
 
@@ -146,6 +148,7 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
     """The set with initial poses for all its images: those of earlier work, else those that predict photos best."""
     options, folder, earlier, monitor = setup.options, setup.folder, setup.earlier, setup.monitor
     rigid_bodies(dataset, options)  # refuses unknown names before anything takes time
+    expect_run(monitor.forecast, dataset, options)
     with SeedingPreview(dataset, folder, monitor) as preview:
         seeding = seed_poses(
             dataset,
@@ -176,7 +179,6 @@ def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observ
     setup.monitor.report(
         Progress(
             stage="seeding" if origin.seeding is not None else "preparing",
-            fraction=START_KNOWN,
             message=f"{len(scene.dataset)} images read",
             options=options,
             reusable=reusable_seeding(setup.folder.path) if setup.earlier is None else {},
@@ -184,9 +186,9 @@ def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observ
     )
     observer = replace(observer or Observer(), write_preview=partial(write_preview, setup.folder))
     optimiser = first_step(scene, options, setup.device, setup.threads)
-    forecast = Forecast(work_ahead(scene, optimiser))
-    stages = TwoStages(optimiser, scene, setup.folder.path, origin, setup.monitor, observer, forecast)
+    stages = TwoStages(optimiser, scene, setup.folder.path, origin, setup.monitor, observer)
     if setup.earlier is not None:
         stages.restore(setup.earlier)
         logger.info("continuing from step %d", optimiser.step_index)
+    expect_rest(stages)
     return stages

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from pydantic import Field
 
 from biresnerf.errors import Interrupted
+from biresnerf.forecast import Forecast
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.stages import ReusableStage, Stage
-
-# Where the parts of a run begin, as fractions of the whole.
-KERNELS_FROM, SEEDING_FROM, TRYING_FROM, START_KNOWN = 0.005, 0.01, 0.016, 0.02
-STAGES_FROM, EXPORTING_FROM = 0.03, 0.99
 
 
 class Progress(FrozenModel):
@@ -51,12 +48,23 @@ class Monitor:
     """Whoever follows a run.
 
     Attributes:
-        report: called with each `Progress`.
+        on_progress: called with each `Progress`.
         should_stop: asked after every step, view, frame and photo; once true, the run ends with `Interrupted`.
+        forecast: says of each report how far the run is.
     """
 
-    report: OnProgress = lambda _progress: None
+    on_progress: OnProgress = lambda _progress: None
     should_stop: Callable[[], bool] = lambda: False
+    forecast: Forecast = field(default_factory=Forecast)
+
+    def report(self, progress: Progress) -> None:
+        """Tell what is done, with the fraction and the time left as they are now."""
+        fraction, eta_s = self.forecast.now()
+        self.on_progress(progress.model_copy(update={"fraction": fraction, "eta_s": eta_s}))
+
+    def report_end(self) -> None:
+        """The run is complete."""
+        self.on_progress(Progress(stage="exporting", fraction=1.0, eta_s=0.0))
 
     def raise_if_stopped(self, message: str) -> None:
         """Raise `Interrupted` with ``message`` if the run is to stop."""

@@ -1,8 +1,8 @@
 """What products in TF32, as on a GPU, do to poses: ``python -m benchmarks.method.tf32 SCENE... [--seeds 1,2]``.
 
-TF32 keeps 10 of float32's 23 bits of mantissa of both factors, and sums in float32. Here the CPU kernels of the networks
-cut their factors so, and are compiled anew for it. Each SCENE is refined as `benchmarks.method.loss` does, in float32 and
-then in TF32. Prints one JSON line per run.
+TF32 keeps 10 of float32's 23 bits of mantissa of both factors, and sums in float32. Here the CPU kernels of the
+networks cut their factors so, and are compiled anew for it. Each SCENE is refined as `benchmarks.method.loss` does, in
+float32 and then in TF32. Prints one JSON line per run.
 """
 
 from __future__ import annotations

@@ -23,7 +23,8 @@ _LOG_SERIES_TERMS = 8
 def hat(vector: Tensor) -> Tensor:
     """The matrix [..., 3, 3] with ``hat(v) @ x == cross(v, x)``, of vectors [..., 3]."""
     _require(vector, (3,), "vector")
-    return (vector @ _generators(vector.dtype, vector.device)).unflatten(-1, (3, 3))
+    flat = vector @ _generators(vector.dtype, vector.device)
+    return flat.reshape(*flat.shape[:-1], 3, 3)
 
 
 def so3_exp(rotvec: Tensor) -> Tensor:
@@ -112,7 +113,7 @@ def _unit_quaternion(rotation: Tensor) -> tuple[Tensor, Tensor]:
 
 def _exp_coefficients(rotvec: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 of the angles a = |rotvec|, each [..., 1, 1]."""
-    found: Tensor = _Stumpff.apply((rotvec * rotvec).sum(-1))
+    found: Tensor = _Stumpff.apply((rotvec * rotvec).sum(-1))  # type: ignore[no-untyped-call]
     sine, cosine, cubic = found[..., None, None, :].unbind(-1)
     return sine, cosine, cubic
 
@@ -121,11 +122,11 @@ class _Stumpff(torch.autograd.Function):
     """The first three Stumpff functions c_k(s) = sum_j (-s)^j / (k + 2j)! of squared angles [...], as [..., 3].
 
     Below one radian they are the series, above it closed forms. The derivative of c_k is (k c_(k+2) - c_(k+1)) / 2,
-    finite everywhere (Danby 1992, Fundamentals of Celestial Mechanics, section 6.9).
+    finite everywhere (Danby 1992, Fundamentals of Celestial Mechanics, chapter 6).
     """
 
     @staticmethod
-    def forward(ctx: Any, squared: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, squared: Tensor) -> Tensor:
         small = squared < 1.0
         powers = torch.where(small, squared, 0.0)[..., None] ** _exponents(squared.device)
         series = powers @ _stumpff_series(squared.dtype, squared.device)
@@ -141,10 +142,11 @@ class _Stumpff(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (values,) = ctx.saved_tensors
         slopes = values @ _stumpff_slopes(values.dtype, values.device)
-        return (gradient * slopes).sum(-1)
+        found: Tensor = (gradient * slopes).sum(-1)
+        return found
 
 
 # Made once for each device: copying a constant there would make the host wait.

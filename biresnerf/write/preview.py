@@ -15,7 +15,7 @@ from biresnerf.data.show.renders import picture_stems
 from biresnerf.data.show.view_file import THUMBNAIL
 from biresnerf.data.show.view_pictures import write_thumbnail
 from biresnerf.geometry.camera.camera import Intrinsics
-from biresnerf.progress import SEEDING_FROM, Monitor, Progress
+from biresnerf.progress import Monitor, Progress
 from biresnerf.refine.stages.history import HISTORY
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.first_step import poses_in_input_frame
@@ -84,6 +84,7 @@ class SeedingPreview:
     def __call__(self, found: SeedingProgress) -> None:
         """More is known."""
         self._found = found
+        self._forecast(found)
         given = self._dataset.posed.all()
         message = "comparing the poses with feature matches" if given else "COLMAP looks for poses"
         if found.matches:
@@ -92,6 +93,17 @@ class SeedingPreview:
             message += f": features of {len(found.features)} of {len(self._dataset)} photos found"
         poses = refined_set(self._dataset, self._dataset.world_from_cam) if given else None
         self._show(found, poses, message)
+
+    def _forecast(self, found: SeedingProgress) -> None:
+        forecast, count = self._monitor.forecast, len(self._dataset)
+        if len(found.features) < count:
+            forecast.enter("features")
+            forecast.advance(len(found.features) / count)
+        elif found.tried < found.pairs:
+            forecast.enter("matching")
+            forecast.advance(found.tried / found.pairs)
+        else:
+            forecast.enter("mapping")
 
     def show_candidate(self, seeding: Seeding) -> None:
         """Show the first candidate, if COLMAP ran; others may be tried before any pose moves."""
@@ -109,4 +121,4 @@ class SeedingPreview:
     def _show(self, found: SeedingProgress, poses: RefinedSet | None, message: str) -> None:
         paths = write_seeding_preview(self._dataset, found, self._folder.preview, poses)
         shown = tuple(f"{PREVIEW}/{path.name}" for path in paths)
-        self._monitor.report(Progress(stage="seeding", fraction=SEEDING_FROM, message=message, preview=shown))
+        self._monitor.report(Progress(stage="seeding", message=message, preview=shown))

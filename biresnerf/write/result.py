@@ -21,7 +21,7 @@ from biresnerf.data.show.renders import picture_stems, write_orbit, write_view
 from biresnerf.data.show.view_file import THUMBNAIL, ShownPictures, ShownView, ViewFile, write_view_file
 from biresnerf.data.show.view_pictures import write_contact_sheet, write_points, write_thumbnail
 from biresnerf.geometry.similarity import Similarity
-from biresnerf.progress import EXPORTING_FROM, Monitor, Progress
+from biresnerf.progress import Monitor, Progress
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.first_step import poses_in_input_frame
@@ -53,7 +53,7 @@ def write_result(folder: OutputFolder, stages: TwoStages, evaluation: Evaluation
     """
     complete = report.state == "complete"
     if complete:
-        stages.monitor.report(Progress(stage="exporting", fraction=EXPORTING_FROM))
+        stages.monitor.report(Progress(stage="exporting"))
     scene, optimiser, path = stages.scene, stages.optimiser, folder.path
     write_text(path / CONFIG, optimiser.options.model_dump_json(indent=2))
     refined, input_from_optimised = poses_in_input_frame(scene.dataset, optimiser)
@@ -79,7 +79,7 @@ def write_result(folder: OutputFolder, stages: TwoStages, evaluation: Evaluation
     write_text(path / REPORT, report.model_dump_json(indent=2))
     if complete:
         folder.clean_up()
-        stages.monitor.report(Progress(stage="exporting", fraction=1.0, eta_s=0.0))
+        stages.monitor.report_end()
     return report
 
 

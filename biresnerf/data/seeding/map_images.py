@@ -120,8 +120,9 @@ def ask_colmap(
             "threads": 1 if low else -1,
             "mapping_threads": 1 if low or dataset.posed.all() else -1,
         }
-        request |= thoroughness(dataset, effort, request["pairs"])
-        watch = SeedingWatch(Path(work, DATABASE), on_progress)
+        pairs = pair_count(dataset, request["pairs"])
+        request |= thoroughness(dataset, effort, pairs)
+        watch = SeedingWatch(Path(work, DATABASE), pairs, on_progress)
         answer = run_colmap(request, Path(work), should_stop, limit_s, log_folder, watch.look)
         if log_folder is not None:
             keep_tracks(Path(work), dataset.names, log_folder / KEPT)
@@ -180,10 +181,8 @@ def _request_images(dataset: Dataset, names: list[str]) -> dict[str, Any]:
     }
 
 
-def thoroughness(
-    dataset: Dataset, effort: SeedingEffort, pairs: list[tuple[str, str]] | None
-) -> dict[str, Any]:
-    """How large photos are and how many features are looked for where these pairs, None for all, are matched."""
+def thoroughness(dataset: Dataset, effort: SeedingEffort, count: float) -> dict[str, Any]:
+    """How large photos are and how many features are looked for where so many pairs are matched."""
     sizes = [dataset.camera_of(i) for i in range(len(dataset))]
     low, guided = effort == "low", dataset.posed.all()
     side = (PIXELS * 4 / 3 / len(dataset)) ** 0.5  # of photos of 4 to 3
@@ -192,9 +191,8 @@ def thoroughness(
         WIDEST_LOW if low else int(np.clip(side, NARROWEST_IMAGE, WIDEST_IMAGE)) if guided else WIDEST_IMAGE
     )
     widest = min(most, float(np.median([max(c.width, c.height) for c in sizes])))
-    count = len(sizes) * (len(sizes) - 1) / 2 if pairs is None else len(pairs)
     fewest = FEWEST_FEATURES if guided else FEWEST_ALONE
-    features = int(np.clip((COMPARISONS / max(1.0, count)) ** 0.5, fewest, MOST_FEATURES))
+    features = int(np.clip((COMPARISONS / max(1, count)) ** 0.5, fewest, MOST_FEATURES))
     return {
         "widest_image": most,
         "most_features": MOST_FEATURES_LOW if low else features,
@@ -203,6 +201,11 @@ def thoroughness(
         and widest < THOROUGH_BELOW
         and sum(c.width * c.height for c in sizes) <= THOROUGH_UP_TO,
     }
+
+
+def pair_count(dataset: Dataset, pairs: list[tuple[str, str]] | None) -> int:
+    """How many pairs are matched, all of them where none are named."""
+    return len(dataset) * (len(dataset) - 1) // 2 if pairs is None else len(pairs)
 
 
 def _pairs(dataset: Dataset, names: list[str]) -> list[tuple[str, str]] | None:

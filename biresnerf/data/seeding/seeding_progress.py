@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-LOOK_EVERY_S = 5.0
+LOOK_EVERY_S = 2.0
 _MOST_IMAGES = 2_147_483_647  # of a pair's number in COLMAP's database, a pair being number * most + number
 
 
@@ -20,46 +20,51 @@ class SeedingProgress:
     Attributes:
         features: how many each has, of those that were looked at.
         matches: how many features each pair has in common once that was verified; pairs with any alone.
+        tried: how many pairs were verified, of `pairs` in all.
     """
 
     features: dict[int, int] = field(default_factory=dict)
     matches: dict[tuple[int, int], int] = field(default_factory=dict)
+    tried: int = 0
+    pairs: int = 0
 
 
 OnSeeding = Callable[[SeedingProgress], None]
 
 
-def read_progress(database: Path) -> SeedingProgress | None:
-    """What the database of images called by their numbers holds now; none while it cannot be read."""
+def read_progress(database: Path, pairs: int) -> SeedingProgress | None:
+    """What the database of images called by their numbers holds now, of so many pairs; none while it cannot be read."""
     if not database.is_file():
         return None
     try:
         with closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=0.1)) as opened:
             names = dict(opened.execute("SELECT image_id, name FROM images"))
             features = opened.execute("SELECT image_id, rows FROM keypoints").fetchall()
-            pairs = opened.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0").fetchall()
+            tried = opened.execute("SELECT pair_id, rows FROM two_view_geometries").fetchall()
     except sqlite3.Error:  # it is being made, or written to
         return None
     index = {image: int(Path(name).stem) for image, name in names.items()}
     matches = {}
-    for pair, count in pairs:
+    for pair, count in tried:
+        if count == 0:
+            continue
         a, b = sorted((index[pair // _MOST_IMAGES], index[pair % _MOST_IMAGES]))
         matches[a, b] = count
-    return SeedingProgress({index[image]: count for image, count in features}, matches)
+    return SeedingProgress({index[image]: count for image, count in features}, matches, len(tried), pairs)
 
 
 class SeedingWatch:
     """Tells of news in the database, when asked to look, and never more often than every few seconds."""
 
-    def __init__(self, database: Path, tell: OnSeeding) -> None:
-        self._database, self._tell = database, tell
+    def __init__(self, database: Path, pairs: int, tell: OnSeeding) -> None:
+        self._database, self._pairs, self._tell = database, pairs, tell
         self._told, self._next = SeedingProgress(), time.monotonic() + LOOK_EVERY_S
 
     def look(self) -> None:
         """Tell if it is time and there is news."""
         if time.monotonic() < self._next:
             return
-        found = read_progress(self._database)
+        found = read_progress(self._database, self._pairs)
         if found is not None and found != self._told:
             self._told = found
             self._tell(found)

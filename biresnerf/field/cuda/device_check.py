@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import subprocess
 import sys
 from functools import cache
@@ -24,6 +23,7 @@ from biresnerf.field.cuda.lens import directions_in_cam as on_device
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldRates, FieldShape, Merging, PositionGradient
 from biresnerf.field.reference.field import ReferenceField
+from biresnerf.forecast import cache_folder
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.camera.camera_models import Camera
 
@@ -98,8 +98,7 @@ def _installation() -> str:
 
 
 def _cache_file() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(base, "biresnerf", "gpu-checks.json")
+    return cache_folder() / "gpu-checks.json"
 
 
 def faults(make_fast: MakeField, device: torch.device) -> tuple[str, ...]:

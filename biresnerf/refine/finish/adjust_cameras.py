@@ -10,6 +10,7 @@ from biresnerf.refine.finish.choose_poses import choose_poses
 from biresnerf.refine.finish.lens_evidence import corrected_cameras
 from biresnerf.refine.finish.outcome import Finish
 from biresnerf.refine.finish.photo_trial import photos_object
+from biresnerf.refine.finish.work_ahead import adjustment
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.first_step import adjusts_cameras
 
@@ -30,7 +31,7 @@ def adjust_cameras(stages: TwoStages) -> Finish:
     if not adjusts_cameras(stages.scene.dataset, optimiser.method):
         return Finish()
     certainty = optimiser.lenses.certainty
-    with stages.timed("adjusting"):
+    with stages.timed("adjusting", amount=adjustment(stages.scene)):
         stages.repair.place_by_matches()
         found = choose_poses(stages.scene, optimiser, partial(_announce, stages))
     if found is None:

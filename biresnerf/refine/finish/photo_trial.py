@@ -35,7 +35,7 @@ def photos_object(stages: TwoStages, unit_from_cam: NDArray[np.float64], cameras
     present = Rig(optimiser.poses.poses().numpy(), tuple(refined.camera_of(i) for i in range(len(refined))))
     other = Rig(unit_from_cam, tuple(cameras[frame.camera] for frame in refined.frames))
     stages.announce("checking the adjusted cameras by the photos")
-    with stages.timed("adjusting"):
+    with stages.timed("adjusting", "checking"):
         found = compare_placed(
             present, other, scene, optimiser, ~scene.start.guessed, stages.monitor.should_stop,
             times=TIMES, rounds_most=1,

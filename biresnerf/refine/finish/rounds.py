@@ -5,15 +5,13 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
+from biresnerf.forecast import Phase
 from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.finish.outcome import Finish
-from biresnerf.refine.stages.timing import Part
+from biresnerf.refine.finish.work_ahead import FIRST_ROUND, LEARNING, work_ahead
 from biresnerf.refine.stages.two_stages import TwoStages
 
-# Shares of all steps: where cameras are adjusted first, and how long the field then learns at their poses. The first is
-# soon enough: on the demo scene cameras adjusted after half of the steps end as exact as after all (docs/estimator.md).
-FIRST_ROUND, LEARNING = 0.5, 0.25
-AFTER: tuple[Part, ...] = ("evaluating", "judging")  # parts of the run that follow
+AFTER: tuple[Phase, ...] = ("evaluating", "judging")  # phases of the run that follow
 
 
 def run_stage_2(stages: TwoStages) -> Finish:
@@ -34,17 +32,25 @@ def run_stage_2(stages: TwoStages) -> Finish:
         if stages.optimiser.poses_held:
             stages.optimiser.end_after(LEARNING)
         stages.record = stages.record.model_copy(update={"adjusted": True})
+        stages.forecast.left |= work_ahead(stages)
+        if _is_over(stages, first):
+            stages.forecast.left["adjusting"] = 0.0
         stages.replan()
     stages.run_stage_2()
     held = stages.optimiser.poses_held
-    if first is not None and ((held and first.heeds_photos) or not _time_to_adjust_again(stages)):
+    if first is not None and (_is_over(stages, first) or not _time_to_adjust_again(stages)):
         return first
     last = adjust_cameras(stages)
     # The poses that are held are what the first adjustment made of the field's.
     return replace(last, candidates=first.candidates) if first is not None and held and last.kept else last
 
 
+def _is_over(stages: TwoStages, first: Finish) -> bool:
+    """Whether cameras need not be adjusted again."""
+    return stages.optimiser.poses_held and first.heeds_photos
+
+
 def _time_to_adjust_again(stages: TwoStages) -> bool:
     """Whether a second adjustment, as long as the first, leaves time for what follows it."""
-    after_s = sum(stages.forecast.expected_s(part) for part in AFTER)
+    after_s = sum(stages.forecast.seconds(phase) for phase in AFTER)
     return time.monotonic() + stages.record.seconds.get("adjusting", 0.0) + after_s < stages.ends

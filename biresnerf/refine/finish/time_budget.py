@@ -55,16 +55,10 @@ def choose_steps(stages: TwoStages, most: int) -> None:
     if low != before:
         logger.info("%d steps in place of %d: %.0f s left", low, before, left_s)
         optimiser.set_steps(low)
-        stages.forecast.ahead = work_ahead(stages.scene, optimiser)
+        stages.forecast.left |= work_ahead(stages)
 
 
 def _needed_s(stages: TwoStages, steps: int) -> float:
     optimiser = stages.optimiser
     options = optimiser.options.with_steps(steps) if optimiser.switch is None else optimiser.options
-    ahead = work_ahead(stages.scene, optimiser, options)
-    switch = options.coarse_steps_max if optimiser.switch is None else optimiser.switch
-    taken = steps if stages.record.adjusted else round(ahead.share * steps)
-    spent = stages.record.seconds
-    # Cameras that were not moved by the first adjustment are adjusted again.
-    again = 0.0 if optimiser.poses_held else spent.get("adjusting", 0.0)
-    return again + stages.forecast.left_s(optimiser.step_index, min(switch, taken), taken, spent, ahead)
+    return stages.forecast.left_s(work_ahead(stages, options.model_copy(update={"steps": steps})))

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.errors import Interrupted, RefinementError
+from biresnerf.forecast import Phase
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refine.lost.lost_cameras import LostCameraRepair
@@ -33,7 +34,7 @@ from biresnerf.refine.stages.checkpoint import (
 from biresnerf.refine.stages.history import History, HistoryLine
 from biresnerf.refine.stages.observer import Observer
 from biresnerf.refine.stages.stability import StabilityDetector
-from biresnerf.refine.stages.timing import Forecast, Part, PreviewTimer, StageName
+from biresnerf.refine.stages.timing import Part, PreviewTimer, StageName
 from biresnerf.stages import ReusableStage
 
 logger = logging.getLogger(__name__)
@@ -48,7 +49,6 @@ class TwoStages:
     Args:
         folder: where checkpoints and the history go.
         origin: what the run was started with; goes into every checkpoint.
-        forecast: of the time that the whole run takes; of the stages alone where it is not given.
 
     Attributes:
         plan: called when it is known how long the steps of a stage take, and after cameras were adjusted; it may
@@ -62,19 +62,18 @@ class TwoStages:
         scene: Scene,
         folder: Path,
         origin: RunOrigin = RunOrigin(),
-        monitor: Monitor = Monitor(),
+        monitor: Monitor | None = None,
         observer: Observer = Observer(),
-        forecast: Forecast | None = None,
     ) -> None:
         self.optimiser, self.scene, self.folder, self.origin = optimiser, scene, folder, origin
-        self.monitor, self.observer = monitor, observer
+        self.monitor, self.observer = monitor or Monitor(), observer
+        self.forecast = self.monitor.forecast
         self.plan: Callable[[TwoStages], None] = lambda _stages: None
         self.ends = math.inf
         self.record, self.history = RunRecord(), History(folder)
         self.repair = LostCameraRepair(optimiser, OwnMatches.of(scene))
         self.detector = StabilityDetector(0, 0, guarded=optimiser.method.robust_extensions)
         self._take_lengths()
-        self.forecast = forecast or Forecast()
         self._previews = PreviewTimer(optimiser.options.checkpoint_every_s)
         self._reported = self._saved = 0.0
         self._errors: list[float] = []
@@ -118,6 +117,13 @@ class TwoStages:
         options = self.optimiser.options
         self.detector.floor, self.detector.cap = options.coarse_steps_min, options.coarse_steps_max
 
+    def steps_left(self, steps: int, cap: int) -> tuple[int, int]:
+        """Of stage 1, at most, and of stage 2, in a run of so many steps whose stage 1 has at most `cap`."""
+        step, switch = self.optimiser.step_index, self.optimiser.switch
+        end = steps if self.record.adjusted else max(step, round(self.forecast.share * steps))
+        begin = min(cap if switch is None else switch, end)
+        return max(0, begin - step), max(0, end - max(step, begin))
+
     def place(self, unit_from_cam: NDArray[np.float64]) -> None:
         """Move all cameras to other poses [n, 4, 4]; that does not count as motion within the block."""
         self.optimiser.poses.place(torch.from_numpy(unit_from_cam))
@@ -128,28 +134,20 @@ class TwoStages:
         self.monitor.report(self._progress(None).model_copy(update={"message": message}))
 
     @contextmanager
-    def timed(self, part: Part) -> Iterator[None]:
-        """Around a part of the run besides its steps: its seconds are recorded if it ends without an error."""
+    def timed(self, part: Part, phase: Phase | None = None, amount: float | None = None) -> Iterator[None]:
+        """Around a part of the run besides its steps: its seconds are recorded if it ends without an error.
+
+        It is a phase of the forecast, of its own name if not given, or so much of it.
+        """
         started = time.monotonic()
-        with self.forecast.within(part):
+        with self.forecast.within(phase or part, amount):
             yield
         self.record.seconds[part] = self.record.seconds.get(part, 0.0) + time.monotonic() - started
 
     def report_evaluation(self, share: float, step: int = 0, steps_total: int = 0, message: str = "") -> None:
         """Report how much is done of the part that the run is in, after the stages."""
-        self.forecast.done_of_part = share
-        fraction, eta_s = self._time()
-        done = Progress(stage="evaluating", step=step, steps_total=steps_total, message=message)
-        self.monitor.report(done.model_copy(update={"fraction": fraction, "eta_s": eta_s}))
-
-    def _time(self) -> tuple[float, float]:
-        """Fraction of the run that is done, and seconds left."""
-        optimiser, record = self.optimiser, self.record
-        steps = optimiser.schedule.steps
-        if not record.adjusted:
-            steps = max(optimiser.step_index, round(self.forecast.ahead.share * steps))
-        switch = self.detector.cap if optimiser.switch is None else optimiser.switch
-        return self.forecast.at(optimiser.step_index, min(switch, steps), steps, record.seconds)
+        self.forecast.advance(share)
+        self.monitor.report(Progress(stage="evaluating", step=step, steps_total=steps_total, message=message))
 
     def _step(self) -> None:
         """One step, and what is due after it: a check, a checkpoint, a preview, a report."""
@@ -248,7 +246,7 @@ class TwoStages:
         )
 
     def _progress(self, checkpoint: str | None, preview: tuple[str, ...] = ()) -> Progress:
-        fraction, eta_s = self._time()
+        self.forecast.plan_steps(*self.steps_left(self.optimiser.schedule.steps, self.detector.cap))
         losses, self._losses = self._losses, []
         reusable, self._reusable = self._reusable, {}
         metrics = {"moved_deg": self._moved_deg, **self._signal}
@@ -259,8 +257,6 @@ class TwoStages:
             stage=self.stage,
             step=self.optimiser.step_index,
             steps_total=self.optimiser.schedule.steps,
-            fraction=fraction,
-            eta_s=eta_s,
             metrics=metrics,
             checkpoint=checkpoint,
             preview=preview,

@@ -15,7 +15,7 @@ import torch
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.progress import TRYING_FROM, Monitor, Progress
+from biresnerf.progress import Monitor, Progress
 from biresnerf.refine.start.forward_facing import find_forward_facing
 from biresnerf.refine.start.turntable import start_on_turntable
 from biresnerf.refine.views.pose_trials import PoseTrials, trial_views
@@ -48,7 +48,7 @@ def find_start(
     first = candidates[0]
     if first.source in ("forward-facing", "turntable"):
         message = "looking for poses without features"
-        monitor.report(Progress(stage="seeding", fraction=TRYING_FROM, message=message))
+        monitor.report(Progress(stage="seeding", message=message))
         if first.source == "turntable":
             return start_on_turntable(first, images, options, device, threads, monitor.should_stop)
         found = find_forward_facing(images, options, device, threads, monitor.should_stop)
@@ -56,8 +56,9 @@ def find_start(
     if len(candidates) == 1:
         return replace(first, matched_poses=first.world_from_cam if first.matched.any() else None)
     message = f"trying {len(candidates)} sets of poses"
-    monitor.report(Progress(stage="seeding", fraction=TRYING_FROM, message=message))
-    return choose_start(candidates, images, options, device, threads, monitor.should_stop)
+    monitor.report(Progress(stage="seeding", message=message))
+    with monitor.forecast.within("trying"):
+        return choose_start(candidates, images, options, device, threads, monitor.should_stop)
 
 
 def choose_start(

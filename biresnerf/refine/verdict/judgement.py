@@ -81,7 +81,7 @@ def judge(stages: TwoStages) -> Judgement | None:
 
 def _rounds(stages: TwoStages) -> int:
     """How many rounds of trainings there is time for; one in any case."""
-    each_s = stages.forecast.expected_s("judging")
+    each_s = stages.forecast.seconds("judging")
     in_time = (stages.ends - time.monotonic()) / max(each_s, 1e-9)
     return int(min(max(in_time, 1), ROUNDS_MOST))
 

@@ -5,7 +5,9 @@ import time
 
 import pytest
 
+from biresnerf.forecast import RATES
 from biresnerf.refine.finish.time_budget import LEAST, budget_warnings, choose_steps, keep_to_budget
+from biresnerf.refine.finish.work_ahead import step_weights, work_ahead
 from biresnerf.refine.stages.checkpoint import load_checkpoint
 from biresnerf.refine.stages.two_stages import MEASURED_STEPS, TwoStages
 from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
@@ -26,17 +28,19 @@ def stages_of(scene, folder, **changed):
 
 def with_step_of(stages, seconds):
     """As if steps of stage 1 took so long, and those of stage 2 twice as long; all else nothing."""
-    stages.forecast.step_seconds = {"coarse": seconds, "fine": 2 * seconds}
+    weights = stages.forecast.step_weights = step_weights(stages.optimiser.options, unbounded=False)
+    stages.forecast.rates = dict.fromkeys(RATES, 0.0) | {
+        "coarse step": seconds / weights["coarse"],
+        "fine step": 2 * seconds / weights["fine"],
+    }
     return stages
 
 
 def left_s(stages):
-    optimiser, spent = stages.optimiser, stages.record.seconds
-    switch, steps = optimiser.options.coarse_steps_max, optimiser.schedule.steps
-    return stages.forecast.left_s(optimiser.step_index, switch, steps, spent, stages.forecast.ahead)
+    return stages.forecast.left_s(work_ahead(stages))
 
 
-@pytest.mark.parametrize("seconds", [850.0, 1000.0, 1200.0])
+@pytest.mark.parametrize("seconds", [350.0, 450.0, 550.0])
 def test_as_many_steps_are_taken_as_there_is_time_for(scene, tmp_path, seconds):
     stages = with_step_of(stages_of(scene, tmp_path), 1.0)
     stages.ends = time.monotonic() + seconds
@@ -59,7 +63,7 @@ def test_no_more_steps_are_taken_than_were_asked_for_and_no_fewer_than_a_tenth(s
 
 def test_steps_that_were_too_few_are_added_again_where_they_turn_out_faster(scene, tmp_path):
     stages = with_step_of(stages_of(scene, tmp_path), 1.0)
-    stages.ends = time.monotonic() + 700
+    stages.ends = time.monotonic() + 400
     choose_steps(stages, STEPS)
     few = stages.optimiser.schedule.steps
     stages.optimiser.start_reconstruction()

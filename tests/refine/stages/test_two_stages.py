@@ -9,7 +9,6 @@ from biresnerf.errors import RefinementError
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refine.stages.checkpoint import CHECKPOINT, load_checkpoint
 from biresnerf.refine.stages.history import HISTORY, read_history
-from biresnerf.refine.stages.timing import Forecast, WorkAhead
 from biresnerf.refine.stages.two_stages import TwoStages
 from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
@@ -112,7 +111,7 @@ def test_a_stable_error_begins_stage_2_before_the_cap(scene, tmp_path):
 def test_fractions_never_fall_and_checkpoints_are_told_when_they_exist(scene, tmp_path):
     told: list[Progress] = []
     stages = start(scene, tmp_path, tiny_options(checkpoint_every_s=0.01), told=told)
-    stages.forecast = Forecast(WorkAhead({"judging": 100.0}))
+    stages.forecast.left["judging"] = 1e6
     assert finished(stages)
     fractions = [progress.fraction for progress in told]
     assert fractions == sorted(fractions)
@@ -124,16 +123,18 @@ def test_fractions_never_fall_and_checkpoints_are_told_when_they_exist(scene, tm
 
 
 def test_the_fraction_waits_where_an_early_switch_makes_the_rest_dearer_than_thought(scene, tmp_path):
-    stages = start(scene, tmp_path, tiny_options())
+    told: list[Progress] = []
+    stages = start(scene, tmp_path, tiny_options(), told=told)
     stages.optimiser.step_index = 12
-    stages.record.seconds["coarse"], stages.forecast.step_seconds["coarse"] = 12.0, 1.0
-    early = stages._progress(None)
-    assert 0.1 < early.fraction < 0.9
+    stages.forecast.continues(12.0)
+    stages.forecast.rates["coarse step"] = stages.forecast.rates["fine step"] = 1.0
+    stages.announce("")
+    assert 0.1 < told[0].fraction < 0.9
     stages.optimiser.start_reconstruction()
-    stages.forecast.step_seconds["fine"] = 10.0
-    later = stages._progress(None)
-    assert later.eta_s > early.eta_s
-    assert later.fraction == early.fraction
+    stages.forecast.rates["fine step"] = 10.0
+    stages.announce("")
+    assert told[1].eta_s > told[0].eta_s
+    assert told[1].fraction == told[0].fraction
 
 
 def test_a_loss_that_is_nan_ends_the_run_with_a_reason(scene, tmp_path):

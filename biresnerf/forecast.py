@@ -1,0 +1,207 @@
+"""How much of a run is done and how long the rest takes: amounts of work, and the seconds that each takes here.
+
+Rates are measured as the run goes and remembered for the next one on the same machine.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal, get_args
+
+logger = logging.getLogger(__name__)
+
+Phase = Literal[
+    "features", "matching", "mapping", "trying", "coarse", "fine", "adjusting", "checking", "evaluating", "judging"
+]  # fmt: skip
+Unit = Literal[
+    "megapixel", "comparison", "image", "trial step", "coarse step", "fine step", "adjustment", "evaluation"
+]  # fmt: skip
+UNITS: dict[Phase, Unit] = {
+    "features": "megapixel",
+    "matching": "comparison",
+    "mapping": "image",
+    "trying": "trial step",
+    "coarse": "coarse step",
+    "fine": "fine step",
+    "adjusting": "adjustment",
+    "checking": "trial step",
+    "evaluating": "evaluation",
+    "judging": "trial step",
+}
+# Seconds of one core of an AMD EPYC (Zen 4), medians over nine sets (docs/speed.md): where nothing was measured yet.
+RATES: dict[Unit, float] = {
+    "megapixel": 1.1,
+    "comparison": 4.2,  # a billion of features of one photo with those of another
+    "image": 0.2,
+    "trial step": 0.0125,
+    "coarse step": 0.015,
+    "fine step": 0.0155,
+    "adjustment": 0.13,
+    "evaluation": 2.4,
+}
+MEMORY = 0.98  # of the running mean of a step's time
+LEARNING = 0.5  # weight of a run's rates against those remembered
+LATE = 0.2  # a phase that takes longer than expected is expected to take this share of its time more
+RATES_FILE = "rates.json"
+
+
+class Forecast:
+    """The time left of a run.
+
+    Attributes:
+        rates: seconds of each unit of work.
+        left: amount of work in each phase, in its unit; phases that are over or will not be are not in it.
+        step_weights: units of work in a step of either stage.
+        share: of the steps asked for, how many will be taken.
+    """
+
+    def __init__(self, rates: Mapping[Unit, float] = RATES) -> None:
+        self.rates, self._expected = dict(rates), dict(rates)
+        self.left: dict[Phase, float] = {}
+        self.step_weights: dict[Phase, float] = {"coarse": 1.0, "fine": 1.0}
+        self.share = 1.0
+        self._slower = 1.0  # than expected, by the last steps
+        self._earlier_s, self._began = 0.0, time.monotonic()
+        self._phase: Phase | None = None
+        self._phase_began = self._done = 0.0
+        self._steps: dict[Unit, int] = {}
+        self._measured: set[Unit] = set()
+        self._fraction = 0.0
+
+    def continues(self, seconds: float) -> None:
+        """The run has taken so long before it was interrupted."""
+        self._earlier_s = seconds
+
+    @contextmanager
+    def within(self, phase: Phase, amount: float | None = None) -> Iterator[None]:
+        """Around a phase, or so much of it: all that is left, if not given. Where it ends, its rate is known."""
+        amount = self.left.get(phase, 0.0) if amount is None else amount
+        rest = max(0.0, self.left.get(phase, 0.0) - amount)
+        self.left[phase] = amount
+        self.enter(phase)
+        try:
+            yield
+            self.leave()
+            self.left[phase] = rest
+        finally:
+            self._phase = None
+
+    def enter(self, phase: Phase) -> None:
+        """A phase begins, and with it the one before ends."""
+        if phase != self._phase:
+            self.leave()
+            self._phase, self._phase_began, self._done = phase, time.monotonic(), 0.0
+
+    def leave(self) -> None:
+        """The phase is over."""
+        if self._phase is None:
+            return
+        amount = self.left.pop(self._phase, 0.0)
+        if amount > 0:
+            self.rates[UNITS[self._phase]] = (time.monotonic() - self._phase_began) / amount
+            self._measured.add(UNITS[self._phase])
+        self._phase = None
+
+    def advance(self, share: float) -> None:
+        """So much of the phase is done."""
+        self._done = min(1.0, max(0.0, share))
+
+    def stepped(self, stage: Literal["coarse", "fine"], seconds: float) -> None:
+        """Add the time of one step. The first of a stage is slower: it counts only until there is another.
+
+        What was not measured yet is expected to be as much slower than thought as the steps are.
+        """
+        unit = UNITS[stage]
+        self._steps[unit] = count = self._steps.get(unit, 0) + 1
+        share = max(1 / max(1, count - 1), 1 - MEMORY)
+        self.rates[unit] += share * (seconds / self.step_weights[stage] - self.rates[unit])
+        self._measured.add(unit)
+        self._slower = self.rates[unit] / self._expected[unit]
+
+    def plan_steps(self, coarse: int, fine: int) -> None:
+        """So many steps of either stage are left."""
+        self.left["coarse"] = coarse * self.step_weights["coarse"]
+        self.left["fine"] = fine * self.step_weights["fine"]
+
+    def seconds(self, phase: Phase) -> float:
+        """How long what is left of a phase is expected to take."""
+        amount = self.left.get(phase, 0.0)
+        expected = amount * self._rate(UNITS[phase])
+        if phase != self._phase or amount == 0:
+            return expected
+        elapsed = time.monotonic() - self._phase_began
+        if self._done == 0:
+            return max(expected - elapsed, LATE * elapsed)
+        todo = 1 - self._done  # from what was expected to what is measured
+        return todo * (elapsed + todo * expected)
+
+    def left_s(self, instead: Mapping[Phase, float] | None = None) -> float:
+        """Seconds to the end; with other amounts of work in some phases, if given."""
+        changed = instead or {}
+        return sum(self.seconds(phase) for phase in self.left if phase not in changed) + sum(
+            amount * self._rate(UNITS[phase]) for phase, amount in changed.items()
+        )
+
+    def now(self) -> tuple[float, float | None]:
+        """Fraction of the whole run that is done, which never falls, and seconds left, if any work is known."""
+        if not self.left:
+            return self._fraction, None
+        left_s = self.left_s()
+        spent_s = self._earlier_s + time.monotonic() - self._began
+        self._fraction = max(self._fraction, min(0.99, spent_s / max(spent_s + left_s, 1e-9)))
+        return self._fraction, left_s
+
+    def measured(self) -> dict[Unit, float]:
+        """The rates that this run has measured."""
+        return {unit: self.rates[unit] for unit in get_args(Unit) if unit in self._measured}
+
+    def _rate(self, unit: Unit) -> float:
+        return self.rates[unit] * (1.0 if unit in self._measured else self._slower)
+
+
+def remembered_rates(device: str, threads: int) -> dict[Unit, float]:
+    """The rates of earlier runs on a kind of device with so many threads; else the general ones."""
+    rates = {unit: rate / threads for unit, rate in RATES.items()}
+    known = _read_rates().get(f"{device} {threads}", {})
+    return rates | {unit: known[unit] for unit in rates if unit in known}
+
+
+def remember_rates(device: str, threads: int, rates: Mapping[Unit, float]) -> None:
+    """Keep what a run measured, for the next. Where nothing can be written, nothing is kept."""
+    all_rates = _read_rates()
+    known = all_rates.setdefault(f"{device} {threads}", {})
+    for unit, rate in rates.items():
+        known[unit] = rate if unit not in known else known[unit] + LEARNING * (rate - known[unit])
+    path = cache_folder() / RATES_FILE
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f"{RATES_FILE}.{os.getpid()}")
+        temporary.write_text(json.dumps(all_rates, indent=1), "utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        logger.debug("rates are not kept: %s", error)
+
+
+def cache_folder() -> Path:
+    """Where what was found out of this machine is kept."""
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(base, "biresnerf")
+
+
+def _read_rates() -> dict[str, dict[str, float]]:
+    try:
+        found = json.loads((cache_folder() / RATES_FILE).read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    machines = found if isinstance(found, dict) else {}
+    return {
+        name: {unit: rate for unit, rate in rates.items() if isinstance(rate, float) and rate > 0}
+        for name, rates in machines.items()
+        if isinstance(rates, dict)
+    }

@@ -1,0 +1,156 @@
+"""The forecast of a run: what its phases will take, as far as that is known."""
+
+import time
+
+import pytest
+
+from biresnerf.forecast import (
+    RATES,
+    RATES_FILE,
+    Forecast,
+    cache_folder,
+    remember_rates,
+    remembered_rates,
+)
+
+COARSE_S, FINE_S = 0.01, 0.02
+AFTER = {"adjusting": 50.0, "evaluating": 1.0, "judging": 400.0}
+
+
+def forecast(**left: float) -> Forecast:
+    """Of a machine on which everything else takes as long as thought."""
+    found = Forecast(RATES | {"coarse step": COARSE_S, "fine step": FINE_S})
+    found.left = dict(left)
+    return found
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path
+
+
+def test_the_steps_and_what_follows_them_are_predicted():
+    found = forecast(**AFTER)
+    found.plan_steps(400, 600)
+    after_s = 50 * RATES["adjustment"] + RATES["evaluation"] + 400 * RATES["trial step"]
+    assert found.left_s() == pytest.approx(400 * COARSE_S + 600 * FINE_S + after_s)
+    found.step_weights = {"coarse": 2.0, "fine": 3.0}
+    found.plan_steps(400, 600)
+    assert found.left_s() == pytest.approx(2 * 400 * COARSE_S + 3 * 600 * FINE_S + after_s)
+
+
+def test_other_amounts_of_work_can_be_asked_for():
+    found = forecast(**AFTER)
+    rest = found.left_s() - found.seconds("judging")
+    assert found.left_s({"judging": 100.0}) == pytest.approx(rest + 100 * RATES["trial step"])
+
+
+def test_a_machine_whose_steps_are_slower_is_thought_slower_in_all_that_was_not_measured():
+    found = forecast(judging=400.0)
+    for _ in range(2):
+        found.stepped("coarse", 3 * COARSE_S)
+    assert found.left_s() == pytest.approx(3 * 400 * RATES["trial step"])
+    with found.within("trying", 10.0):
+        time.sleep(0.1)
+    assert found.left_s() == pytest.approx(400 * 0.01, rel=0.2)
+
+
+def test_a_phase_that_is_over_has_nothing_left_and_teaches_what_the_rest_of_it_will_take():
+    found = forecast(adjusting=100.0)
+    with found.within("adjusting", 50.0):
+        time.sleep(0.2)
+    assert found.left["adjusting"] == 50.0
+    assert found.left_s() == pytest.approx(0.2, abs=0.1)
+    with found.within("adjusting", 50.0):
+        pass
+    assert found.left_s() == 0
+
+
+def test_a_phase_on_its_way_is_predicted_by_what_it_has_taken():
+    found = forecast(judging=0.2 / RATES["trial step"])
+    with found.within("judging"):
+        time.sleep(0.4)
+        found.advance(0.5)
+        assert found.left_s() == pytest.approx(0.5 * (0.4 + 0.5 * 0.2), abs=0.1)
+        found.advance(1.0)
+        assert found.left_s() == 0
+
+
+def test_a_phase_that_takes_longer_than_expected_is_not_over_yet():
+    found = forecast(evaluating=0.1 / RATES["evaluation"])
+    with found.within("evaluating"):
+        time.sleep(0.5)
+        assert found.left_s() == pytest.approx(0.1, abs=0.05)
+
+
+def test_the_phases_of_matching_follow_each_other():
+    found = forecast(features=1.0, matching=10.0, mapping=5.0)
+    found.enter("features")
+    time.sleep(0.2)
+    found.enter("matching")
+    assert "features" not in found.left
+    found.enter("matching")
+    found.advance(0.5)
+    found.enter("mapping")
+    found.leave()
+    assert found.left == {}
+    assert set(found.measured()) == {"megapixel", "comparison", "image"}
+    assert found.measured()["megapixel"] == pytest.approx(0.2, abs=0.1)
+
+
+def test_a_phase_that_ends_with_an_error_teaches_nothing():
+    found = forecast(judging=400.0)
+    with pytest.raises(RuntimeError), found.within("judging"):
+        raise RuntimeError
+    assert found.measured() == {}
+
+
+def test_the_fraction_is_the_time_spent_over_the_whole_and_never_falls():
+    found = forecast(judging=10 / RATES["trial step"])
+    found.continues(10.0)
+    early, left_s = found.now()
+    assert (early, left_s) == (pytest.approx(0.5, abs=0.05), pytest.approx(10.0))
+    found.left["judging"] *= 10
+    assert found.now() == (early, pytest.approx(100.0))
+
+
+def test_nothing_is_predicted_before_any_work_is_known():
+    assert Forecast().now() == (0.0, None)
+
+
+def test_the_first_step_counts_only_until_there_is_another_and_later_ones_alike():
+    found = Forecast()
+    found.stepped("coarse", 5.0)
+    assert found.rates["coarse step"] == 5.0
+    for seconds in (0.1, 0.2, 0.3):
+        found.stepped("coarse", seconds)
+    assert found.rates["coarse step"] == pytest.approx(0.2)
+    assert set(found.measured()) == {"coarse step"}
+
+
+def test_a_machine_remembers_what_its_runs_measured(cache):
+    assert remembered_rates("cpu", 2) == {unit: rate / 2 for unit, rate in RATES.items()}
+    remember_rates("cpu", 2, {"coarse step": 0.1})
+    remember_rates("cpu", 2, {"coarse step": 0.3, "comparison": 1.0})
+    known = remembered_rates("cpu", 2)
+    assert (known["coarse step"], known["comparison"]) == (pytest.approx(0.2), 1.0)
+    assert known["image"] == RATES["image"] / 2
+    assert remembered_rates("cuda", 2)["comparison"] == RATES["comparison"] / 2
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "[]", '{"cpu 2": 5}', '{"cpu 2": {"comparison": "slow"}}', '{"cpu 2": {"comparison": -1.0}}'],
+)
+def test_a_damaged_memory_is_none(cache, text):
+    (cache_folder() / RATES_FILE).parent.mkdir()
+    (cache_folder() / RATES_FILE).write_text(text)
+    assert remembered_rates("cpu", 2)["comparison"] == RATES["comparison"] / 2
+    remember_rates("cpu", 2, {"comparison": 1.0})
+
+
+def test_a_machine_without_room_for_a_memory_runs_all_the_same(cache, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc/none")
+    remember_rates("cpu", 2, {"comparison": 1.0})
+    assert remembered_rates("cpu", 2)["comparison"] == RATES["comparison"] / 2
