@@ -101,7 +101,7 @@ def main() -> None:
         )
         _print_steps(result["steps"])
         if torch.cuda.is_available():
-            from benchmarks.speed import cuda_step
+            from benchmarks.gpu import cuda_step
 
             result["cuda_steps"] = cuda_step.run(8 * arguments.rays, arguments.rounds)
             _print_cuda(result["cuda_steps"])

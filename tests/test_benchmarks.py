@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.gpu import gpu_report
 from benchmarks.method import peers
-from benchmarks.speed import gpu_report, scene
+from benchmarks.speed import scene
 from benchmarks.speed.torch_forms import (
     UnrolledField,
     VectorisedField,

@@ -25,7 +25,7 @@ def table():
     From a process of its own: in this one, the interpreter has taken the compiler's place.
     """
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
-    command = [sys.executable, "-m", "benchmarks.speed.compile_cuda", str(CAPABILITY)]
+    command = [sys.executable, "-m", "benchmarks.gpu.compile_cuda", str(CAPABILITY)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500, check=False)
     if "cuobjdump" in done.stderr and "No such file" in done.stderr:
         pytest.skip("this Triton has no cuobjdump, which says what kernels take")

@@ -1,4 +1,4 @@
-"""Compile every CUDA kernel for compute capabilities, without a GPU: `python -m benchmarks.speed.compile_cuda 80 90`.
+"""Compile every CUDA kernel for compute capabilities, without a GPU: `python -m benchmarks.gpu.compile_cuda 80 90`.
 
 The interpreter that runs the kernels in tests is more forgiving than the compiler. Prints what each kernel takes:
 shared memory, registers of a thread and what of them is spilt to the stack (bytes).

@@ -1,4 +1,4 @@
-"""All that a machine with a GPU can tell of the CUDA backend, in one file: ``python -m benchmarks.speed.gpu_report``.
+"""All that a machine with a GPU can tell of the CUDA backend, in one file: ``python -m benchmarks.gpu.gpu_report``.
 
 Checks the kernels, runs the tests that need a GPU, times steps and a whole job on a made scene, and writes what each
 command printed to gpu-report.txt. The kernels are compiled on the way.
