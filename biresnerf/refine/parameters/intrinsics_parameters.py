@@ -90,6 +90,9 @@ class IntrinsicsParameters:
         working: each image's camera at working size.
         held_out: images without effect here; they only move their own pose.
         dollies: whether cameras move with their focal length; not where some are fixed or belong to a rig.
+
+    Attributes:
+        moving: whether anything may be refined.
     """
 
     def __init__(
@@ -109,9 +112,9 @@ class IntrinsicsParameters:
         self.of_image = torch.tensor(of_image, dtype=torch.int64, device=device)
         self.is_training = torch.ones(len(working), 1, dtype=torch.bool, device=device)
         self.is_training[list(held_out)] = False
-        self.free = torch.stack([free_columns(c, part) for c, part in zip(cameras, parts, strict=True)]).to(
-            device
-        )
+        free = torch.stack([free_columns(c, part) for c, part in zip(cameras, parts, strict=True)])
+        self.moving = bool(free.any())
+        self.free = free.to(device)
         self.unit = torch.stack([units(camera) for camera in cameras]).to(device)
         self.precision = PRIOR_WEIGHT / torch.tensor(DEVIATIONS, dtype=torch.float64, device=device) ** 2
         self.increments = torch.zeros(len(cameras), COLUMNS, dtype=torch.float64, device=device)
@@ -124,11 +127,6 @@ class IntrinsicsParameters:
     def held(cls, working: Sequence[Camera], device: torch.device) -> IntrinsicsParameters:
         """Intrinsics that stay as they are."""
         return cls(working, range(len(working)), ["none"] * len(working), working, [], device)
-
-    @property
-    def moving(self) -> bool:
-        """Whether anything may be refined."""
-        return bool(self.free.any())
 
     @property
     def intrinsics(self) -> Intrinsics:

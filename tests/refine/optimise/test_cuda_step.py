@@ -15,7 +15,7 @@ from tests.refine.tiny_scene import tiny_options, tiny_set
 )
 def test_a_step_waits_for_nothing_and_the_error_falls(tmp_path):
     dataset, images = tiny_set(tmp_path)
-    frame = scene_frame(dataset, images)
+    frame = scene_frame(dataset.world_from_cam, images)
     start = frame.unit_from_world.apply_to_poses(dataset.world_from_cam)
     options = tiny_options(device="cuda", steps=400, coarse_steps_max=200)
     optimiser = JointOptimiser(images, frame, start, options, [1], torch.device("cuda"), threads=1)
