@@ -1,6 +1,6 @@
 """BiResNeRF: refine camera poses by optimising poses and a radiance field together.
 
-Importing the package loads neither torch nor numba; ``refine_poses`` does when it is first used.
+Importing the package loads neither numpy nor torch: what needs them does when it is first used.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from biresnerf.progress import Progress
 
 if TYPE_CHECKING:
     from biresnerf.pipeline import refine_poses
+    from biresnerf.result import Result, load
 
 __version__ = "0.1.0"
 __all__ = [
@@ -23,6 +24,8 @@ __all__ = [
     "Progress",
     "RefineOptions",
     "RefinementError",
+    "Result",
+    "load",
     "refine_poses",
 ]
 
@@ -33,4 +36,8 @@ def __getattr__(name: str) -> Any:
         from biresnerf.pipeline import refine_poses
 
         return refine_poses
+    if name in ("Result", "load"):
+        from biresnerf import result
+
+        return getattr(result, name)
     raise AttributeError(f"module 'biresnerf' has no attribute {name!r}")

@@ -94,6 +94,7 @@ class Client:
     artifacts = _blocking(AsyncClient.artifacts)
     download = _blocking(AsyncClient.download)
     download_all = _blocking(AsyncClient.download_all)
+    result = _blocking(AsyncClient.result)
     report = _blocking(AsyncClient.report)
     images = _blocking(AsyncClient.images)
     share = _blocking(AsyncClient.share)

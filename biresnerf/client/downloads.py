@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import anyio
 import httpx
@@ -21,6 +21,9 @@ from biresnerf.client.transport import Call, run_together, tell
 from biresnerf.errors import InputError
 from biresnerf.wire.results import ArtifactView
 from biresnerf.wire.safe_paths import checked_path
+
+if TYPE_CHECKING:
+    from biresnerf.result import Result
 
 _REDIRECTIONS = frozenset({301, 302, 303, 307, 308})
 
@@ -100,6 +103,17 @@ class Downloads(JobCalls):
 
         await run_together(partial(self.download, *one, on_bytes=count) for one in wanted)
         return [target for _, target in targets]
+
+    async def result(self, job_id: str, folder: Path) -> Result:
+        """Downloads the whole result of a job into ``folder`` and loads it, as `biresnerf.load` does.
+
+        Raises:
+            InputError: as `download_all` and `biresnerf.load` do.
+        """
+        from biresnerf.result import load
+
+        await self.download_all(job_id, folder)
+        return await to_thread.run_sync(load, folder)
 
 
 class _PartialFile:

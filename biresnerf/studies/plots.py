@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from biresnerf.data.model.atomic_file import whole_file
-from biresnerf.refine.stages.history import HISTORY, read_history
+from biresnerf.data.show.history import HISTORY, read_history
 from biresnerf.studies.cell import RUN, Outcome
 from biresnerf.studies.plan import Entry, Variant
 

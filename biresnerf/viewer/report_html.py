@@ -17,11 +17,12 @@ from PIL import Image
 
 from biresnerf.data.formats.simple.poses_json import POSES
 from biresnerf.data.model.atomic_file import write_text
+from biresnerf.data.show.history import HISTORY
 from biresnerf.data.show.view_file import VIEW, ViewFile, read_view_file
 from biresnerf.errors import InputError
 from biresnerf.report import Report
 
-REPORT_HTML, HISTORY = "report.html", "history.jsonl"
+REPORT_HTML = "report.html"
 BUNDLE = Path(__file__).parent / "dist"
 # Pictures, points and video before base64, for a page of 12 MB; the rest stays in the result's folder.
 MOST_BYTES = 8_000_000

@@ -6,9 +6,9 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
+from biresnerf.data.show.history import HISTORY
 from biresnerf.errors import InputError
 from biresnerf.refine.stages.checkpoint import CHECKPOINT, OTHER_FOLDER
-from biresnerf.refine.stages.history import HISTORY
 
 REPORT, PREVIEW = "report.json", "preview"
 

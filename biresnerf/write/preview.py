@@ -11,12 +11,12 @@ from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.seeding.seed_poses import Seeding
 from biresnerf.data.seeding.seeding_preview import write_seeding_preview
 from biresnerf.data.seeding.seeding_progress import SeedingProgress
+from biresnerf.data.show.history import HISTORY
 from biresnerf.data.show.renders import picture_stems
 from biresnerf.data.show.view_file import THUMBNAIL
 from biresnerf.data.show.view_pictures import write_thumbnail
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.progress import Monitor, Progress
-from biresnerf.refine.stages.history import HISTORY
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.first_step import poses_in_input_frame
 from biresnerf.refine.verdict.run_report import run_report

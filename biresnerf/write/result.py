@@ -15,7 +15,7 @@ from biresnerf.data.formats.simple.poses_json import POSES
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.model.refined_set import RefinedSet, refined_set
+from biresnerf.data.model.refined_set import REFINED, RefinedSet, refined_set
 from biresnerf.data.points.refined_points import with_points_of
 from biresnerf.data.show.renders import picture_stems, write_orbit, write_view
 from biresnerf.data.show.view_file import THUMBNAIL, ShownPictures, ShownView, ViewFile, write_view_file
@@ -36,7 +36,6 @@ logger = logging.getLogger(__name__)
 
 CONFIG = "config.json"
 RENDERS, ORBIT = "renders", "renders/orbit.mp4"
-REFINED = "refined"
 SOLID = 0.5  # opacity from which a depth means something
 
 

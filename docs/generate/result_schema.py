@@ -8,8 +8,8 @@ from pydantic.json_schema import GenerateJsonSchema, models_json_schema
 
 from biresnerf.data.formats.simple.poses_json import PosesDocument
 from biresnerf.data.seeding.seeding_preview import SeedingPreview
+from biresnerf.data.show.history import HistoryLine
 from biresnerf.data.show.view_file import ViewFile
-from biresnerf.refine.stages.history import HistoryLine
 from biresnerf.report import Report
 
 FILES = {

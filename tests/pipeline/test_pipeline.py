@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import biresnerf
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
 from biresnerf.data.synthetic.scene import synthetic_cameras, write_synthetic_scene
@@ -231,3 +232,17 @@ def test_a_finished_folder_is_not_written_to_again(run):
     with pytest.raises(InputError) as caught:
         refine_poses(run.scene, run.output, OPTIONS)
     assert caught.value.code == "output_finished"
+
+
+def test_a_loaded_result_holds_what_the_files_say(run):
+    result = biresnerf.load(run.output)
+    assert result.names == tuple(image.name for image in run.report.images)
+    assert result.report == run.report
+    np.testing.assert_allclose(result.poses, run.refined(), atol=1e-12)
+    np.testing.assert_allclose(result.poses_before, run.start, atol=1e-9)
+    np.testing.assert_allclose(result.rotated_deg, rotation_between_deg(run.start, result.poses), atol=1e-6)
+    assert result.verdict is not None
+    assert result.verdict.verdict == "improved"
+    steps = result.history["step"]
+    assert (np.diff(steps) > 0).all()
+    assert set(result.history["stage"]) == {"coarse", "fine"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from biresnerf.refine.stages.history import HISTORY
+from biresnerf.data.show.history import HISTORY
 from biresnerf.studies.cell import RUN
 from biresnerf.studies.plan import Variant
 from biresnerf.studies.plots import plot_curves, plot_noise, plot_sweep

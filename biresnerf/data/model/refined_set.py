@@ -21,6 +21,7 @@ from biresnerf.uncertainty import PoseUncertainty
 # ``given``: the input's, as nothing moved; ``tracks``: its tracks triangulated again; ``features``: matches of features
 # triangulated; ``moved``: the input's points carried along with the cameras nearest to them.
 PointsSource = Literal["none", "given", "features", "tracks", "moved"]
+REFINED = "refined"  # where a result that returns the input's poses has the refined ones
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,1 +1,1 @@
-"""Pictures and files made to be looked at: renders, thumbnails, view.json. Decides nothing."""
+"""What is made of a result to be looked at: renders, thumbnails, view.json, the training curve. Decides nothing."""

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.data.show.history import History, HistoryLine
 from biresnerf.errors import Interrupted, RefinementError
 from biresnerf.forecast import Phase
 from biresnerf.geometry.pose_error import rotation_between_deg
@@ -31,7 +32,6 @@ from biresnerf.refine.stages.checkpoint import (
     save_checkpoint,
     track_tensors,
 )
-from biresnerf.refine.stages.history import History, HistoryLine
 from biresnerf.refine.stages.observer import Observer
 from biresnerf.refine.stages.stability import StabilityDetector
 from biresnerf.refine.stages.timing import Part, PreviewTimer, StageName

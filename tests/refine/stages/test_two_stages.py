@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from biresnerf.data.show.history import HISTORY, read_history
 from biresnerf.errors import RefinementError
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refine.stages.checkpoint import CHECKPOINT, load_checkpoint
-from biresnerf.refine.stages.history import HISTORY, read_history
 from biresnerf.refine.stages.two_stages import TwoStages
 from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 

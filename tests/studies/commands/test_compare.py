@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from biresnerf.data.formats.read_dataset import read_poses
+from biresnerf.data.show.history import read_history
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error
-from biresnerf.refine.stages.history import read_history
 from biresnerf.studies.tables import Tables
 
 SETTINGS = {

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 
+from biresnerf.data.show.history import HISTORY, History, read_history
 from biresnerf.progress import Monitor
 from biresnerf.refine.stages.checkpoint import load_checkpoint
-from biresnerf.refine.stages.history import HISTORY, History, read_history
 from biresnerf.refine.stages.observer import Observer
 from biresnerf.refine.stages.two_stages import TwoStages
 from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
