@@ -89,16 +89,25 @@ def api_command(host: str | None, port: int | None) -> None:
 
 @click.command("worker")
 @click.option("--slot", default="cpu0", show_default=True, help="cpuN, or gpuN for GPU number N.")
-def worker_command(slot: str) -> None:
+@click.option("--one-job", is_flag=True, help="End after one job; the exit status says how it ended.")
+@click.option(
+    "--idle-exit", type=click.FloatRange(min=0), metavar="SECONDS", help="End where no job came for so long."
+)
+def worker_command(slot: str, one_job: bool, idle_exit: float | None) -> None:
     """Run one worker slot, which runs one job at a time.
 
-    Needs BIRESNERF_DATABASE_URL, and a database brought up to date by `biresnerf migrate`.
+    Needs BIRESNERF_DATABASE_URL, and a database brought up to date by `biresnerf migrate`. With --one-job the exit
+    status says how the job ended, or that there was none; docs/operations.md lists the statuses.
     """
     from workers.queue.slot import main
 
     with setup_problems():
         settings_with().require_database_url()
     sys.argv = ["biresnerf worker", "--slot", slot]
+    if one_job:
+        sys.argv += ["--one-job"]
+    if idle_exit is not None:
+        sys.argv += ["--idle-exit", str(idle_exit)]
     sys.exit(main())
 
 

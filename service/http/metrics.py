@@ -39,6 +39,13 @@ _COUNTERS = {
     "stored_files": ("biresnerf_stored_files", "", "Files stored in datasets."),
     "stored_bytes": ("biresnerf_stored_bytes", "", "Bytes of the files stored in datasets."),
 }
+# The columns of the view queue_depth, by kind of slot.
+_QUEUE = (
+    ("biresnerf_queue_waiting", "Jobs that a free slot would be given.", "waiting"),
+    ("biresnerf_queue_held", "Jobs that wait for their tenant's limit.", "held"),
+    ("biresnerf_queue_running", "Jobs that run on slots of this kind.", "running"),
+    ("biresnerf_queue_oldest_seconds", "Age of the oldest job that a free slot would be given.", "oldest_s"),
+)
 # Reported as 0 before they first happen: a rate needs the zero before the one.
 _FROM_ZERO: dict[str, tuple[str, ...]] = {
     "job_events": get_args(EventType),
@@ -111,12 +118,16 @@ def _families(now: Statistics) -> Iterator[Metric]:
     yield _by_state("biresnerf_datasets", "Datasets by state.", now.datasets)
     late = "How long the most urgent webhook message is overdue: grows where no dispatcher runs."
     for name, help_text, amount in (
-        ("queue_oldest_seconds", "Age of the job queued longest.", now.oldest_queued_s),
         ("trash", "Folders of files that wait for deletion.", now.trash),
         ("webhooks_pending", "Webhook messages to send.", now.webhooks_pending),
         ("webhooks_late_seconds", late, now.webhooks_late_s),
     ):
         yield GaugeMetricFamily(f"biresnerf_{name}", help_text, amount)
+    for name, help_text, column in _QUEUE:
+        depth = GaugeMetricFamily(name, help_text, labels=["kind"])
+        for row in now.queue:
+            depth.add_metric([row.slot_kind], getattr(row, column))
+        yield depth
     slots = GaugeMetricFamily("biresnerf_slots", "Living worker slots.", labels=["kind", "busy"])
     for slot in now.slots:
         slots.add_metric([slot.kind, str(slot.busy).lower()], slot.slots)

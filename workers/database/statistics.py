@@ -26,12 +26,22 @@ class SlotCount(FrozenModel):
     slots: int
 
 
+class QueueDepth(FrozenModel):
+    """A row of the view ``queue_depth``: what waits for a slot of one kind, and what runs on one."""
+
+    slot_kind: str
+    waiting: int
+    held: int
+    running: int
+    oldest_s: float
+
+
 class Statistics(FrozenModel):
     """The installation at one moment. ``tallies`` only ever grow."""
 
     jobs: dict[JobState, int]
     datasets: dict[DatasetState, int]
-    oldest_queued_s: float
+    queue: tuple[QueueDepth, ...]
     slots: tuple[SlotCount, ...]
     trash: int
     webhooks_pending: int
@@ -41,7 +51,7 @@ class Statistics(FrozenModel):
 
 
 _SLOTS = """
-    SELECT CASE WHEN slots.name LIKE 'gpu%%' THEN 'gpu' ELSE 'cpu' END AS kind,
+    SELECT slots.kind,
         EXISTS (SELECT FROM queue_entries AS entry
             WHERE entry.worker_id = worker.id AND entry.state = 'doing') AS busy,
         count(*) AS slots
@@ -52,9 +62,6 @@ _TALLIES = """
         SELECT name, label, bucket, count, amount FROM tallies
         UNION ALL SELECT name, label, bucket, 1, amount FROM tally_log) AS counted
     GROUP BY 1, 2, 3 ORDER BY 1, 2, 3"""
-_JOBS = """
-    SELECT state, jobs, greatest(extract(epoch FROM clock_timestamp() - oldest_at), 0)::float8 AS oldest_s
-    FROM job_counts"""
 _WEBHOOKS = """
     SELECT count(*) AS pending,
         greatest(coalesce(extract(epoch FROM clock_timestamp() - min(due_at)), 0), 0)::float8 AS late_s
@@ -65,7 +72,7 @@ async def read_statistics(database: Database, stall_s: float) -> Statistics:
     """Everything in one snapshot; raises `Unavailable`."""
     async with database.transaction() as connection:
         await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
-        jobs = await connection.rows(_JOBS)
+        jobs = await connection.rows("SELECT state, jobs FROM job_counts")
         datasets = await connection.rows("SELECT state, count(*) AS n FROM datasets GROUP BY state")
         (trash,) = await connection.rows("SELECT count(*) AS n FROM trash")
         (webhooks,) = await connection.rows(_WEBHOOKS)
@@ -73,7 +80,7 @@ async def read_statistics(database: Database, stall_s: float) -> Statistics:
         return Statistics(
             jobs={row["state"]: row["jobs"] for row in jobs},
             datasets={row["state"]: row["n"] for row in datasets},
-            oldest_queued_s=next((row["oldest_s"] for row in jobs if row["state"] == "queued"), 0.0),
+            queue=tuple(QueueDepth(**row) for row in await connection.rows("SELECT * FROM queue_depth")),
             slots=tuple(SlotCount(**row) for row in await connection.rows(_SLOTS, stall_s)),
             trash=trash["n"],
             webhooks_pending=webhooks["pending"],

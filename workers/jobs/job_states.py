@@ -60,6 +60,8 @@ async def start_attempt(connection: Connection, job_id: str, token: uuid.UUID) -
     """Begin one more attempt, which owns the job from now on; returns the row."""
     row = await connection.only_row(
         "UPDATE jobs SET state = 'running', attempt = attempt + 1, run_token = %s, fraction = 0,"
+        " slot_kind = (SELECT slots.kind FROM queue_entries AS entry JOIN slots USING (worker_id)"
+        " WHERE entry.id = jobs.queue_id),"
         " step = 0, stage = NULL, eta_s = NULL, message = '',"
         " started_at = coalesce(started_at, clock_timestamp()) WHERE id = %s RETURNING *",
         token,

@@ -174,16 +174,17 @@ class Ledger:
         await trash_attempts(connection, job["id"], self.claim.name, self._stall_s)
         return True
 
-    @_fenced(None)
+    @_fenced(True)
     async def fail(
         self, connection: Connection, job: DictRow, error: JobError, artifacts: Sequence[Artifact]
-    ) -> None:
-        """End the job as failed (or cancelled, if that was asked for)."""
+    ) -> bool:
+        """End the job as failed; False if it was cancelled instead."""
         if job["cancel_requested"]:
             await finish_cancelled(connection, job["id"], artifacts, self.claim.name, self._stall_s)
-            return
+            return False
         await finish(connection, job["id"], "failed", error, artifacts)
         await trash_attempts(connection, job["id"], self.claim.name, self._stall_s)
+        return True
 
     @_fenced(None)
     async def cancelled(self, connection: Connection, job: DictRow, artifacts: Sequence[Artifact]) -> None:

@@ -11,13 +11,13 @@ import sys
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable
 
+from workers.process.exit_status import ExitStatus
 from workers.settings.errors import SetupError
 from workers.settings.logs import set_up_logging
 from workers.settings.settings import Settings
 
 log = logging.getLogger(__name__)
 
-EXIT_STUCK = 70
 # Long for anything that a loop of ours does in one step; a file system that hangs takes longer.
 STUCK_S = 60.0
 LOOKS = 10
@@ -25,7 +25,7 @@ LOOKS = 10
 
 @contextlib.asynccontextmanager
 async def end_if_hung(stuck_s: float = STUCK_S) -> AsyncIterator[None]:
-    """While inside, the process ends with `EXIT_STUCK` where this event loop does nothing for ``stuck_s``."""
+    """While inside, the process ends with `ExitStatus.STUCK` where this event loop does nothing for ``stuck_s``."""
     watchdog = _Watchdog(stuck_s / LOOKS)
     watchdog.start()
     ticking = asyncio.create_task(watchdog.tick())
@@ -36,21 +36,20 @@ async def end_if_hung(stuck_s: float = STUCK_S) -> AsyncIterator[None]:
         ticking.cancel()
 
 
-def run_process(name: str, work: Callable[[Settings], Awaitable[None]]) -> int:
-    """Run ``work`` with the settings of the environment; returns the exit status, 2 after a `SetupError`."""
+def run_process(name: str, work: Callable[[Settings], Awaitable[ExitStatus]]) -> ExitStatus:
+    """Run ``work``, which tells the exit status, with the settings of the environment."""
     settings = Settings()
     set_up_logging(name, settings)
 
-    async def watched() -> None:
+    async def watched() -> ExitStatus:
         async with end_if_hung():
-            await work(settings)
+            return await work(settings)
 
     try:
-        asyncio.run(watched())
+        return asyncio.run(watched())
     except SetupError as error:
         sys.stderr.write(f"{error.detail}\n")
-        return 2
-    return 0
+        return ExitStatus.SETUP
 
 
 class _Watchdog(threading.Thread):
@@ -75,4 +74,4 @@ class _Watchdog(threading.Thread):
             if in_vain >= LOOKS:
                 log.critical("the event loop is blocked; exiting")
                 faulthandler.dump_traceback(all_threads=True)
-                os._exit(EXIT_STUCK)
+                os._exit(ExitStatus.STUCK)

@@ -7,12 +7,14 @@ import asyncio
 import contextlib
 import fcntl
 import logging
+import math
 import os
 import platform
 import re
 import shutil
 import signal
 import sys
+import time
 from collections.abc import AsyncIterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -26,11 +28,12 @@ from workers.database.statistics import announce_slot
 from workers.jobs.claim import Claim, Fenced, cancel_requested, claim_job, input_bytes
 from workers.jobs.job_states import say_what_it_waits_for
 from workers.process.disk_space import job_disk_budget
+from workers.process.exit_status import ExitStatus
 from workers.process.waiting import first_done, retry_while_unavailable
 from workers.process.watchdog import run_process
 from workers.queue.heartbeat import Heartbeat
 from workers.queue.janitor import Janitor, release_worker
-from workers.run.attempt import Attempt
+from workers.run.attempt import Attempt, Ending
 from workers.settings.errors import LimitReached, SetupError, Unavailable
 from workers.settings.logs import log_context
 from workers.settings.settings import Settings
@@ -40,7 +43,6 @@ from workers.store.store_identity import require_same_store
 
 log = logging.getLogger(__name__)
 
-EXIT_FENCED = 75
 STORE_PATIENCE_S = 180.0  # a job that has run for an hour waits for its store to come back
 HOST = platform.node() or "localhost"
 
@@ -71,19 +73,34 @@ class SlotLock:
         self._file.flush()
 
 
-class Slot:
-    """Takes jobs from the queue and runs them one after the other until it is stopped."""
+ENDS = {
+    "succeeded": ExitStatus.DONE,
+    "failed": ExitStatus.JOB_FAILED,
+    "cancelled": ExitStatus.JOB_CANCELLED,
+    "stopped": ExitStatus.STOPPED,
+    "setback": ExitStatus.GIVEN_BACK,
+}
 
-    def __init__(self, settings: Settings, name: str) -> None:
+
+class Slot:
+    """Takes jobs from the queue and runs them one after the other until it is stopped.
+
+    With ``one_job`` it ends after the first, and with ``idle_exit_s`` where it found none for so long.
+    """
+
+    def __init__(
+        self, settings: Settings, name: str, *, one_job: bool = False, idle_exit_s: float | None = None
+    ) -> None:
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", name):
             raise SetupError("bad_slot_name", f"--slot {name!r}: letters, digits, - and _ only, at most 40.")
         self._settings, self._name = settings, name
+        self._one_job, self._idle_exit_s = one_job, math.inf if idle_exit_s is None else idle_exit_s
         self._files = open_files(settings, patience_s=STORE_PATIENCE_S)
         self._lock = SlotLock(settings.data_dir, name)
         self._scratch = settings.scratch_dir / f"{HOST}.{name}"
         self._stop = asyncio.Event()
 
-    async def run(self) -> None:
+    async def run(self) -> ExitStatus:
         """Until SIGTERM or SIGINT. A running job then writes a checkpoint and goes back to the queue."""
         # Left by a predecessor, which the lock shows to be gone.
         shutil.rmtree(self._scratch, ignore_errors=True)
@@ -103,7 +120,7 @@ class Slot:
                 side = [asyncio.create_task(listener.run()), asyncio.create_task(janitor.run())]
                 try:
                     log.info("slot %s is ready", self._name)
-                    await self._work(database, listener, worker_id)
+                    return await self._work(database, listener, worker_id)
                 finally:
                     for task in side:
                         task.cancel()
@@ -125,9 +142,10 @@ class Slot:
             with contextlib.suppress(Unavailable):  # then a janitor does it
                 await database.run(job_queue.unregister_worker, worker_id)
 
-    async def _work(self, database: Database, listener: Listener, worker_id: int) -> None:
+    async def _work(self, database: Database, listener: Listener, worker_id: int) -> ExitStatus:
         for number in (signal.SIGTERM, signal.SIGINT):
             asyncio.get_running_loop().add_signal_handler(number, self._stop.set)
+        idle_from = time.monotonic()
         with listener.waiting(job_queue.NEW_ENTRY) as added:
             while not self._stop.is_set():
                 added.clear()
@@ -135,32 +153,43 @@ class Slot:
                     entry = await database.run(job_queue.take, worker_id)
                 except Unavailable as error:
                     log.warning("the queue cannot be read: %s", error)
-                    entry = None
-                if entry is None:
-                    await first_done(added.wait(), self._stop.wait(), asyncio.sleep(self._settings.poll_s))
-                else:
-                    await self._work_on(database, listener, entry, worker_id)
+                    entry, idle_from = None, time.monotonic()  # nobody knows whether there is work
+                if entry is not None:
+                    ending = await self._work_on(database, listener, entry, worker_id)
+                    if self._one_job and ending is not None:
+                        return ENDS[ending.how]
+                    idle_from = time.monotonic()
+                    continue
+                left_s = idle_from + self._idle_exit_s - time.monotonic()
+                if left_s <= 0:
+                    break
+                pause_s = min(self._settings.poll_s, left_s)
+                await first_done(added.wait(), self._stop.wait(), asyncio.sleep(pause_s))
+        return ExitStatus.NO_JOB if self._one_job else ExitStatus.DONE
 
-    async def _work_on(self, database: Database, listener: Listener, entry: Entry, worker_id: int) -> None:
+    async def _work_on(
+        self, database: Database, listener: Listener, entry: Entry, worker_id: int
+    ) -> Ending | None:
+        """How the attempt ended; none where there was nothing to run."""
         with log_context(job_id=entry.job_id):
             try:
-                again_in_s = await self._run_job(database, listener, entry)
+                ending = await self._run_job(database, listener, entry)
             except Fenced as fenced:
                 log.warning("%s; exiting", fenced)
-                os._exit(EXIT_FENCED)  # its queue entry belongs to the new owner
+                os._exit(ExitStatus.FENCED)  # its queue entry belongs to the new owner
             except Exception:  # our own failure must not end the slot
                 log.exception("the job goes back to the queue")
-                again_in_s = self._settings.stall_s / 4
-            acknowledge = partial(job_queue.acknowledge, again_in_s=again_in_s)
+                ending = Ending("setback", self._settings.stall_s / 4)
+            acknowledge = partial(job_queue.acknowledge, again_in_s=ending.again_in_s if ending else None)
             if not await retry_while_unavailable(lambda: database.run(acknowledge, entry.id, worker_id)):
                 log.warning("queue entry %d now belongs to another worker", entry.id)
+            return ending
 
-    async def _run_job(self, database: Database, listener: Listener, entry: Entry) -> float | None:
-        """In how many seconds the queue offers the job again; none where it is over."""
+    async def _run_job(self, database: Database, listener: Listener, entry: Entry) -> Ending | None:
         if not await self._fits_on_disk(database, entry.job_id):
             say = partial(say_what_it_waits_for, job_id=entry.job_id, cause="disk_full")
             await retry_while_unavailable(lambda: database.run(say))
-            return self._settings.stall_s / 4
+            return Ending("setback", self._settings.stall_s / 4)
         claim = await claim_job(database, entry.job_id, self._settings.max_attempts)
         if claim is None:
             return None
@@ -199,7 +228,7 @@ class Slot:
             return False
         return True
 
-    async def _traced(self, attempt: Attempt, claim: Claim) -> float | None:
+    async def _traced(self, attempt: Attempt, claim: Claim) -> Ending:
         """Run the attempt, as part of the trace of its submission."""
         if self._settings.traces == "off":
             return await attempt.run()
@@ -223,13 +252,16 @@ def main() -> int:
     """`python -m workers.queue.slot --slot NAME`, settings from the environment."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--slot", default="cpu0")
-    name = parser.parse_args().slot
+    parser.add_argument("--one-job", action="store_true")
+    parser.add_argument("--idle-exit", type=float, metavar="S")
+    given = parser.parse_args()
 
-    async def work(settings: Settings) -> None:
-        set_up_traces(name, settings)
-        await Slot(settings, name).run()
+    async def work(settings: Settings) -> ExitStatus:
+        set_up_traces(given.slot, settings)
+        slot = Slot(settings, given.slot, one_job=given.one_job, idle_exit_s=given.idle_exit)
+        return await slot.run()
 
-    return run_process(name, work)
+    return run_process(given.slot, work)
 
 
 if __name__ == "__main__":

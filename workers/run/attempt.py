@@ -9,6 +9,7 @@ import logging
 import shutil
 import signal
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -48,6 +49,17 @@ STALE_CHECKPOINT = {"output_not_resumable", "checkpoint_invalid"}
 DISCARDED_GRACE_S = 2.0  # for a cancelled job of which no partial result is wanted
 
 
+@dataclass(frozen=True)
+class Ending:
+    """How an attempt ended: with its job, stopped from outside, or too early.
+
+    ``again_in_s``: in how many seconds the queue offers the job again; none where it is over.
+    """
+
+    how: Literal["succeeded", "failed", "cancelled", "stopped", "setback"]
+    again_in_s: float | None = None
+
+
 class Attempt:
     """Runs a claimed job in ``folder`` (fresh, local, ours). `ask_stop` may be called at any time."""
 
@@ -77,8 +89,8 @@ class Attempt:
             self._stop_reason = reason
         self._stop.set()
 
-    async def run(self) -> float | None:
-        """Run to the end; in how many seconds to offer the job again, None where it is over. Raises `Fenced`.
+    async def run(self) -> Ending:
+        """Run to the end. Raises `Fenced`.
 
         What goes wrong on our side counts as a crash of the attempt, unless disk or store are to blame.
         """
@@ -91,7 +103,7 @@ class Attempt:
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
 
-    async def _run(self) -> float | None:
+    async def _run(self) -> Ending:
         try:
             return await self._conclude(await self._run_process())
         except Unavailable:
@@ -103,10 +115,15 @@ class Attempt:
             log.exception("attempt %s of %s failed on our side", self._claim.name, self._claim.job_id)
             return await self._crashed("error", "an error on the worker's side")
 
-    async def _give_back(self, how: Requeue, again_in_s: float = 0.0) -> float | None:
-        return again_in_s if await self._ledger.give_back(how) else None
+    async def _give_back(self, how: Requeue, again_in_s: float = 0.0) -> Ending:
+        if not await self._ledger.give_back(how):
+            return Ending("cancelled")
+        return Ending("stopped" if how.setback is None else "setback", again_in_s)
 
-    async def _wait(self, cause: Cause) -> float | None:
+    async def _fail(self, error: JobError, artifacts: list[Artifact]) -> Ending:
+        return Ending("failed" if await self._ledger.fail(error, artifacts) else "cancelled")
+
+    async def _wait(self, cause: Cause) -> Ending:
         """Back to the queue until there is room, or the store answers."""
         log.warning("job %s goes back to the queue: %s", self._claim.job_id, cause)
         return await self._give_back(Requeue("requeued", {"why": cause}, cause), self._settings.stall_s / 4)
@@ -172,12 +189,13 @@ class Attempt:
                 with self._log.open("ab") as file:  # a library printed something
                     file.write(line)
 
-    async def _conclude(self, status: int | None) -> float | None:
+    async def _conclude(self, status: int | None) -> Ending:
         if status == 0:
             artifacts = await self._store(enough=lambda: self._stop_reason == "cancel")
-            if not await self._ledger.publish(artifacts, self._verdict()):
-                await self._ledger.cancelled(artifacts)
-            return None
+            if await self._ledger.publish(artifacts, self._verdict()):
+                return Ending("succeeded")
+            await self._ledger.cancelled(artifacts)
+            return Ending("cancelled")
         self._log_crash()
         if status == EXIT_MEMORY or (status in (KILLED, *EXIT_ERRORS) and self._killed_for_memory(status)):
             return await self._ran_out_of_memory()
@@ -185,12 +203,11 @@ class Attempt:
             error = self._reported_error()
             if error.code in STALE_CHECKPOINT and self._claim.checkpoint is not None:
                 return await self._crashed("error", error.detail, forget_checkpoint=True)
-            await self._ledger.fail(error, await self._store(log_only=True))
-            return None
+            return await self._fail(error, await self._store(log_only=True))
         if self._stop_reason == "cancel":
             unwanted = not await self._ledger.wants_partial()
             await self._ledger.cancelled(await self._store(log_only=unwanted))
-            return None
+            return Ending("cancelled")
         if self._stop_reason == "shutdown":
             return await self._give_back(Requeue("requeued", {"why": "shutdown"}))
         if status == EXIT_DISK:
@@ -202,11 +219,10 @@ class Attempt:
                 hint="Ask for fewer steps or smaller images, or raise BIRESNERF_JOB_TIMEOUT_S.",
                 log_tail=log_tail(self._log),
             )
-            await self._ledger.fail(error, await self._store())
-            return None
+            return await self._fail(error, await self._store())
         return await self._crashed("killed" if status == KILLED else "error", f"exit status {status}")
 
-    async def _crashed(self, cause: Cause, how: str, *, forget_checkpoint: bool = False) -> float | None:
+    async def _crashed(self, cause: Cause, how: str, *, forget_checkpoint: bool = False) -> Ending:
         tail = log_tail(self._log)
         if await self._may_try_again():
             data = {"how": how, "log_tail": tail}
@@ -214,8 +230,7 @@ class Attempt:
                 Requeue("attempt_crashed", data, cause, forget_checkpoint=forget_checkpoint)
             )
         error = crashed_too_often(self._claim.attempt, cause, tail)
-        await self._ledger.fail(error, await self._store(log_only=True))
-        return None
+        return await self._fail(error, await self._store(log_only=True))
 
     async def _may_try_again(self) -> bool:
         crashes = await self._ledger.crashes() + 1
@@ -236,7 +251,7 @@ class Attempt:
         now = self._oom_kills.count()
         return now is not None and now > (self._oom_kills_before or 0)
 
-    async def _ran_out_of_memory(self) -> float | None:
+    async def _ran_out_of_memory(self) -> Ending:
         """Once more with less, from the start: a checkpoint is of the sizes that were too large."""
         tail = log_tail(self._log)
         smaller: dict[str, Any] = {}
@@ -248,8 +263,8 @@ class Attempt:
             return await self._give_back(
                 Requeue("retried_smaller", data, "killed", forget_checkpoint=True, smaller=smaller)
             )
-        await self._ledger.fail(out_of_memory(self._claim.smaller, tail), await self._store(log_only=True))
-        return None
+        error = out_of_memory(self._claim.smaller, tail)
+        return await self._fail(error, await self._store(log_only=True))
 
     def _verdict(self) -> VerdictName | None:
         """What the report says of the result; None where it passes no verdict."""

@@ -13,6 +13,7 @@ import sys
 
 from workers.database.database import open_database
 from workers.database.notifications import Listener
+from workers.process.exit_status import ExitStatus
 from workers.process.waiting import first_done
 from workers.process.watchdog import run_process
 from workers.settings.settings import Settings
@@ -44,11 +45,12 @@ async def dispatch(settings: Settings, stop: asyncio.Event) -> None:
                 task.cancel()
 
 
-async def _until_signalled(settings: Settings) -> None:
+async def _until_signalled(settings: Settings) -> ExitStatus:
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     await dispatch(settings, stop)
+    return ExitStatus.DONE
 
 
 def main() -> int:

@@ -64,6 +64,8 @@ def test_a_job_is_told_from_queue_to_end(http: httpx.Client, scene: Path) -> Non
     during = figures(http)
     assert at(during, "biresnerf_jobs", state="running") == 1
     assert at(during, "biresnerf_slots", kind="cpu", busy="true") == 1
+    assert at(during, "biresnerf_queue_running", kind="cpu") == 1
+    assert ("biresnerf_queue_waiting", frozenset({("kind", "cpu")})) in during
     until(http, job, lambda found: found["state"] == "succeeded")
     after = figures(http)
 

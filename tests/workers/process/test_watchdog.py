@@ -9,7 +9,7 @@ import sys
 import time
 
 from tests.workers.conftest import ROOT
-from workers.process.watchdog import EXIT_STUCK
+from workers.process.exit_status import ExitStatus
 
 PROGRAM = """
 import asyncio, sys, time
@@ -42,7 +42,7 @@ def start(how: str) -> subprocess.Popen[str]:
 def test_a_loop_that_stands_still_ends_the_process_and_says_where():
     process = start("hangs")
     _, said = process.communicate(timeout=40)
-    assert process.returncode == EXIT_STUCK
+    assert process.returncode == ExitStatus.STUCK
     assert "in main" in said
 
 

@@ -1,0 +1,73 @@
+"""The view that autoscalers read, on the real database, as a role that may read nothing else."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator
+
+import psycopg
+import pytest
+from psycopg import sql
+from psycopg.conninfo import make_conninfo
+
+from tests.workers.conftest import Counting, Slots
+from workers.settings.settings import Settings
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def scaler(database_url: str) -> Iterator[psycopg.Connection]:
+    """A connection of a role with the right to read the view alone."""
+    role = f"scaler_{uuid.uuid4().hex[:12]}"
+    with psycopg.connect(database_url, autocommit=True) as owner:
+        schema = owner.execute("SELECT current_schema()").fetchone()[0]
+        for statement in (
+            "CREATE ROLE {role} LOGIN",
+            "GRANT USAGE ON SCHEMA {schema} TO {role}",
+            "GRANT SELECT ON queue_depth TO {role}",
+        ):
+            owner.execute(sql.SQL(statement).format(role=sql.Identifier(role), schema=sql.Identifier(schema)))
+        with psycopg.connect(make_conninfo(database_url, user=role), autocommit=True) as connection:
+            yield connection
+        for statement in ("DROP OWNED BY {role}", "DROP ROLE {role}"):
+            owner.execute(sql.SQL(statement).format(role=sql.Identifier(role)))
+
+
+def depth(connection: psycopg.Connection, kind: str) -> tuple[int, int, int, float]:
+    row = connection.execute(
+        "SELECT waiting, held, running, oldest_s FROM queue_depth WHERE slot_kind = %s", (kind,)
+    ).fetchone()
+    return tuple(row)
+
+
+async def test_it_tells_what_waits_what_is_held_and_what_runs_where(
+    counting: Counting, settings: Settings, slots: Slots, scaler: psycopg.Connection
+):
+    assert depth(scaler, "cpu") == depth(scaler, "gpu") == (0, 0, 0, 0.0)
+    first = await counting.submit(1000, 0.05)
+    await counting.stores.jobs._database.fetch(
+        "UPDATE jobs SET created_at = created_at - interval '90 s' WHERE id = %s", first
+    )
+    waiting, held, running, oldest_s = depth(scaler, "gpu")
+    assert (waiting, held, running) == (1, 0, 0)
+    assert 90 <= oldest_s < 150
+    slots.start(settings, "gpu0")
+    await counting.until(lambda job: job.state == "running")
+    assert depth(scaler, "gpu") == (0, 0, 1, 0.0)
+    assert depth(scaler, "cpu") == (0, 0, 0, 0.0)
+    await counting.stores.jobs._database.fetch("UPDATE tenants SET max_running = 2 WHERE id = 'local'")
+    await counting.submit(5, 0.01)
+    await counting.submit(5, 0.01)
+    waiting, held, running, oldest_s = depth(scaler, "gpu")
+    assert (waiting, held, running) == (1, 1, 1), "the third job waits for its tenant's limit"
+    assert depth(scaler, "cpu")[:3] == (1, 1, 0)
+    assert 0 < oldest_s < 60
+    for job in (first, counting.id):
+        await counting.stores.jobs.cancel(job)
+
+
+async def test_a_reader_of_the_view_reads_nothing_else(scaler: psycopg.Connection):
+    for table in ("jobs", "tenants", "api_keys", "procrastinate_jobs"):
+        with pytest.raises(psycopg.errors.InsufficientPrivilege):
+            scaler.execute(f"SELECT * FROM {table}".encode())
