@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-Need = Literal["photos", "lens file", "bounds", "input"]
+Need = Literal["photos", "images folder", "lens file", "bounds", "input"]
 Loss = Literal["names", "lenses", "some lenses", "distortion", "rigs", "points", "mask paths", "masks"]
 
 _PACKAGE = Path(__file__).resolve().parents[2]
@@ -39,8 +39,9 @@ class Format:
         in_set: where `convert` writes it in its folder; empty for formats that it does not write.
         in_result: where it lies in the folder of a result; the same place where left out.
         always: every result has it.
-        needs: ``photos``: the input's photos; ``lens file``: a camera.json beside it, as it has no lenses;
-            ``bounds``: depths of the nearest and farthest point; ``input``: the input's own file.
+        needs: ``photos``: the input's photos; ``images folder``: all of them directly in images/; ``lens file``: a
+            camera.json beside it, as it has no lenses; ``bounds``: depths of the nearest and farthest point; ``input``:
+            the input's own file.
         loses: what of a set it cannot hold.
         lacks: more that it cannot hold, in words, for the docs.
         heading, hint: whom its download is for, and how it is used.

@@ -21,6 +21,7 @@ _LOSSES: dict[Loss, str] = {
 }
 _NEEDS: dict[Need, str] = {
     "photos": "the input's photos",
+    "images folder": "photos directly in `images/`, where `convert` puts them",
     "lens file": "`camera.json` beside it for the lens",
     "bounds": "depth bounds",
     "input": "the input's own keys",

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from biresnerf.data.formats.codec import WriteContext
@@ -17,9 +17,11 @@ from biresnerf.data.formats.transforms.write_intrinsics import lens_values
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.model.refined_set import refined_set
+from biresnerf.data.model.refined_set import RefinedSet, refined_set
 from biresnerf.data.photos.masks import mask_beside
+from biresnerf.data.photos.named_images import IMAGE_FOLDER
 from biresnerf.data.points.refined_points import with_given_points
+from biresnerf.data.show.renders import picture_stems
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Loss, formats
 
@@ -67,16 +69,23 @@ def convert(
     refined = refined_set(chosen, chosen.world_from_cam)
     if dataset.source.colmap is not None:
         refined = with_given_points(refined, dataset.source.colmap)
+    flat = refined
+    if photos != "none" and any(map(_wants_flat, names)):
+        flat = _in_images_folder(refined)
+        _refuse_two_names(refined, flat, names)
     with _whole_folder(folder) as staging:
         context = WriteContext(chosen, bounds)
         for name in names:
             codec = ALL_CODECS[name]
             assert codec.write is not None, f"{name} is declared with a place in a set"
-            codec.write(refined, staging / codec.format.in_set, context)
+            codec.write(flat if _wants_flat(name) else refined, staging / codec.format.in_set, context)
         if any("lens file" in formats()[name].needs for name in names) and len(chosen.cameras) == 1:
             write_json(staging / CAMERA, lens_values(chosen.cameras[0]))
         if photos != "none":
-            _transfer_photos(chosen, staging, photos)
+            if flat is not refined:
+                moved = zip(posed, flat.images, strict=True)
+                _transfer([(frame.path, staging / image.file_name) for frame, image in moved], photos)
+            _transfer_photos(chosen, staging, photos, without_images=all(map(_wants_flat, names)))
     places = {name: folder / formats()[name].in_set for name in names}
     return Written(places, left_out, _notes(chosen, names))
 
@@ -122,9 +131,47 @@ def _mask_notes(dataset: Dataset, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _transfer_photos(dataset: Dataset, folder: Path, how: Literal["link", "copy"]) -> None:
-    files = {frame.path for frame in dataset.frames}
+def _wants_flat(name: str) -> bool:
+    return "images folder" in formats()[name].needs
+
+
+def _in_images_folder(refined: RefinedSet) -> RefinedSet:
+    """The set with all photos directly in images/: by their file names, with their folders where two share one."""
+    names = [PurePosixPath(image.file_name) for image in refined.images]
+    flat = [name.name for name in names]
+    if len({name.casefold() for name in flat}) < len(flat):
+        stems = picture_stems([str(name).removeprefix(f"{IMAGE_FOLDER}/") for name in names])
+        flat = [stem + name.suffix for stem, name in zip(stems, names, strict=True)]
+    images = [
+        replace(image, file_name=f"{IMAGE_FOLDER}/{name}")
+        for image, name in zip(refined.images, flat, strict=True)
+    ]
+    return replace(refined, images=tuple(images))
+
+
+def _refuse_two_names(refined: RefinedSet, flat: RefinedSet, names: Sequence[str]) -> None:
+    """Raises InputError where one format needs a photo under a name by which another's readers would not find it."""
+    if all(map(_wants_flat, names)):
+        return
+    for image, moved in zip(refined.images, flat.images, strict=True):
+        old, new = PurePosixPath(image.file_name), PurePosixPath(moved.file_name)
+        found_by_its_name = old.name == new.name and old.parts[0] != IMAGE_FOLDER
+        if old != new and not found_by_its_name:
+            raise InputError(
+                "export_not_possible",
+                f"{old} must be {new} for one of the formats, and keep its name for another.",
+                where=", ".join(names),
+                hint=f"Convert to {', '.join(filter(_wants_flat, names))} in a folder of its own.",
+            )
+
+
+def _transfer_photos(
+    dataset: Dataset, folder: Path, how: Literal["link", "copy"], *, without_images: bool = False
+) -> None:
+    """Photos (but ``without_images``) and masks, at the places that they have in the set's folder."""
+    files = set() if without_images else {frame.path for frame in dataset.frames}
     files |= {frame.mask for frame in dataset.frames if frame.mask is not None}
+    pairs = []
     for file in sorted(files):
         name = Path(os.path.relpath(file, dataset.root))
         if ".." in name.parts:
@@ -134,7 +181,14 @@ def _transfer_photos(dataset: Dataset, folder: Path, how: Literal["link", "copy"
                 where=str(file),
                 hint="Leave photos where they are: --photos none.",
             )
-        target = folder / name
+        pairs.append((file, folder / name))
+    _transfer(pairs, how)
+
+
+def _transfer(files: Iterable[tuple[Path, Path]], how: Literal["link", "copy"]) -> None:
+    for file, target in files:
+        if target.is_symlink() or target.exists():
+            continue  # it lies in images/ in its own folder, too
         target.parent.mkdir(parents=True, exist_ok=True)
         if how == "link":
             target.symlink_to(file.resolve())

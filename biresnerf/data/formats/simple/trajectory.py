@@ -15,7 +15,6 @@ from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntr
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import rigid_pose
 from biresnerf.data.formats.simple.camera_file import read_camera_file
-from biresnerf.data.formats.simple.llff import rows_by_name
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.colmap_scene import matrix_of_pose
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation
@@ -60,12 +59,13 @@ KITTI = Format(
     rank=82,
     in_set="kitti.txt",
     needs=("lens file",),
-    loses=("names", "lenses", "rigs", "points", "mask paths"),
+    loses=("lenses", "rigs", "points", "mask paths"),
     heading="For odometry tools",
     hint="A trajectory in KITTI format",
 )
 
 TIMES_OF_IMAGES = "rgb.txt"  # of TUM's sets
+_IMAGES_OF = "{stem}_images.txt"  # beside our KITTI files, which have no room for names: an image a line
 MAX_POSES = 100_000
 MAX_TIME_APART_S = 0.02  # between an image and its pose, as in TUM's own tools
 _HINT = "Give lines of `time x y z qx qy qz qw` (TUM), or of 12 numbers, [R | t] by rows (KITTI)."
@@ -107,6 +107,16 @@ class Trajectory:
         if not self.poses:
             raise _invalid(file.name, "holds no pose.")
         self.dialect = _COLUMNS[columns]
+        self.image_names = [self.name_of_time.get(time, "") for time in self.times_s]
+        list_file = file.with_name(_IMAGES_OF.format(stem=file.stem))
+        self.files = [file]
+        if not self.times_s and list_file.is_file():
+            self.files.append(list_file)
+            self.image_names = read_text(list_file).splitlines()
+            if len(self.image_names) != len(self.poses):
+                raise _invalid(
+                    list_file.name, f"names {len(self.image_names)} images for {len(self.poses)} poses."
+                )
         if len(set(self.times_s)) != len(self.times_s):
             raise _invalid(file.name, "two poses have the same time.")
 
@@ -119,14 +129,15 @@ class Trajectory:
     def names(self) -> list[str]:
         """A name for each pose: the image's where the file has one, else the time, else the pose's number from 0."""
         if not self.times_s:
-            return [str(index) for index in range(len(self.poses))]
-        return [self.name_of_time.get(time, f"{time:.17g}") for time in self.times_s]
+            return self.image_names or [str(index) for index in range(len(self.poses))]
+        return [name or f"{time:.17g}" for name, time in zip(self.image_names, self.times_s, strict=True)]
 
 
 def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
     """The poses of the trajectory ``file``, camera to world with OpenCV axes.
 
-    Which pose belongs to which image is decided by the first of these that applies: names in the file's own comments;
+    Which pose belongs to which image is decided by the first of these that applies: names in the file's own comments
+    (TUM) or in the list beside it that `write_kitti` writes;
     rgb.txt (times and names, as in TUM's sets) or images named by their time, nearest within 0.02 s; times that are the
     images' numbers from 0; as many poses as images, in order. The camera is that of `read_camera_file`, else a guess.
 
@@ -153,7 +164,7 @@ def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
         return pairs, [f"{file.name}: images and poses were matched {how}"]
 
     table = [root / TIMES_OF_IMAGES] if (root / TIMES_OF_IMAGES).is_file() else []
-    source = SourceFormat(trajectory.dialect, files=(file, *camera_files, *table))
+    source = SourceFormat(trajectory.dialect, files=(*trajectory.files, *camera_files, *table))
     return ParsedPoses(source, tuple(entries), assign, named=False)
 
 
@@ -168,13 +179,15 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
         InputError: ``pose_count_mismatch``.
     """
     count, times = len(trajectory.poses), trajectory.times_s
-    named = [trajectory.name_of_time.get(time, "") for time in times]
+    named = trajectory.image_names
     if named and all(named) and len(set(named)) == count:
         try:
             found, _ = match_files(named, names, lambda _: trajectory.file.name)
-            return {name: index for index, name in enumerate(found)}, "by the names in its comments"
+            how = "in its comments" if times else "in the list beside it"
+            return {name: index for index, name in enumerate(found)}, f"by the names {how}"
         except InputError:
-            pass  # comments about something else
+            if not times:
+                raise  # such a list names images, comments may be about something else
     if times:
         taken, by = _times_of_images(names, root)
         nearest = _nearest(taken, times)
@@ -260,12 +273,15 @@ def write_tum(refined: RefinedSet, path: Path) -> None:
 
 
 def write_kitti(refined: RefinedSet, path: Path) -> None:
-    """One line an image: the 12 numbers of [R | t], row by row.
+    """One line an image, in the set's order: the 12 numbers of [R | t], row by row.
 
-    The format has neither names nor comments, so lines are in the order of the files' names, as readers take them.
+    The format has neither names nor comments, so a list beside it, NAME_images.txt, names the image of each line.
     """
-    poses = refined.world_from_cam[rows_by_name(refined)]
-    _write_lines(path, [" ".join(repr(value) for value in pose[:3].ravel().tolist()) for pose in poses])
+    rows = [" ".join(repr(value) for value in pose[:3].ravel().tolist()) for pose in refined.world_from_cam]
+    _write_lines(
+        path.with_name(_IMAGES_OF.format(stem=path.stem)), [image.file_name for image in refined.images]
+    )
+    _write_lines(path, rows)
 
 
 def _write_lines(path: Path, lines: list[str]) -> None:
