@@ -252,7 +252,7 @@ class SimilarityReport(FrozenModel):
 class PointsReport(FrozenModel):
     """The sparse points of the COLMAP model; docs/formats.md says what the sources are."""
 
-    source: Literal["none", "given", "features", "tracks", "moved"] = Field(examples=["features"])
+    source: Literal["none", "given", "features", "tracks", "moved", "field"] = Field(examples=["features"])
     count: int = Field(examples=[5210])
 
 

@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 Need = Literal["photos", "images folder", "lens file", "bounds", "input"]
-Loss = Literal["names", "lenses", "some lenses", "distortion", "rigs", "points", "mask paths", "masks"]
+Loss = Literal[
+    "poses", "names", "lenses", "some lenses", "distortion", "rigs", "points", "mask paths", "masks"
+]
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _FOLDER = _PACKAGE / "biresnerf" / "data" / "formats"
@@ -43,6 +45,8 @@ class Format:
             camera.json beside it, as it has no lenses; ``bounds``: depths of the nearest and farthest point; ``input``:
             the input's own file.
         loses: what of a set it cannot hold.
+        splats: programs that train splats start from its points.
+        instead: the format that is written in its place where it cannot hold the set's lenses.
         lacks: more that it cannot hold, in words, for the docs.
         heading, hint: whom its download is for, and how it is used.
         downloads: the files that belong to it in a result: one file, or a folder with a slash at its end; `in_result`
@@ -62,6 +66,8 @@ class Format:
     always: bool = False
     needs: tuple[Need, ...] = ()
     loses: tuple[Loss, ...] = ()
+    splats: bool = False
+    instead: str = ""
     lacks: str = ""
     heading: str = ""
     hint: str = ""

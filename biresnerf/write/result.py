@@ -16,7 +16,7 @@ from biresnerf.data.formats.transforms.write_transforms import transforms_notes
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import REFINED, RefinedSet, refined_set
-from biresnerf.data.points.refined_points import with_points_of
+from biresnerf.data.points.refined_points import FieldPoints, with_points_of
 from biresnerf.data.show.renders import picture_stems, write_orbit, write_view
 from biresnerf.data.show.view_file import THUMBNAIL, ShownPictures, ShownView, ViewFile, write_view_file
 from biresnerf.data.show.view_pictures import write_contact_sheet, write_points, write_thumbnail
@@ -57,6 +57,8 @@ def write_result(folder: OutputFolder, stages: TwoStages, evaluation: Evaluation
     write_text(path / CONFIG, optimiser.options.model_dump_json(indent=2))
     refined, input_from_optimised = poses_in_input_frame(scene.dataset, optimiser)
     refined_dataset = optimiser.lenses.refined(scene.dataset)
+    surface = evaluation.surface(optimiser.frame.unit_from_world, input_from_optimised)
+    field = FieldPoints(*surface, refined) if np.isfinite(refined).all() else None
     returned, returned_dataset, poses, moved = refined, refined_dataset, POSES, None
     if report.verdict is not None and report.verdict.returned == "input":
         returned, returned_dataset = scene.dataset.world_from_cam, scene.dataset
@@ -64,12 +66,11 @@ def write_result(folder: OutputFolder, stages: TwoStages, evaluation: Evaluation
             # What is said of the returned poses is not said of these.
             images = tuple(image.model_copy(update={"uncertainty": None}) for image in report.images)
             of_refined = report.model_copy(update={"images": images})
-            _, moved = _write_poses(path / REFINED, scene, refined_dataset, refined, of_refined)
+            _, moved = _write_poses(path / REFINED, scene, refined_dataset, refined, of_refined, field)
             poses = f"{REFINED}/{POSES}"
     # A run that is stopped must end soon: it leaves large exports out.
     exports, monitor = (optimiser.options.exports, stages.monitor) if complete else ((), Monitor())
-    report, result = _write_poses(path, scene, returned_dataset, returned, report, exports, monitor)
-    surface = evaluation.surface(optimiser.frame.unit_from_world, input_from_optimised)
+    report, result = _write_poses(path, scene, returned_dataset, returned, report, field, exports, monitor)
     _write_view_file(path, scene, evaluation, moved or result, surface, poses)
     notes = write_report_html(path, report)
     for note in notes:
@@ -132,17 +133,19 @@ def _write_poses(
     dataset: Dataset,
     world_from_cam: NDArray[np.float64],
     report: Report,
+    field: FieldPoints | None,
     exports: Sequence[str] = (),
     monitor: Monitor = Monitor(),
 ) -> tuple[Report, RefinedSet]:
     """Write poses [n, 4, 4] in the formats of every result, in the input's own and in the exports.
 
-    ``dataset`` is the input, with the refined lenses where those are returned.
+    ``dataset`` is the input, with the refined lenses where those are returned; ``field`` are points for where no
+    others are known.
 
     Returns the report with notes on them, and the set as written.
     """
     refined = described(dataset, world_from_cam, report)
-    refined = with_points_of(refined, dataset.source.colmap, scene.tracks, scene.images)
+    refined = with_points_of(refined, dataset.source.colmap, scene.tracks, scene.images, field)
     notes = write_result_formats(
         refined, folder, exports, WriteContext(dataset, should_stop=monitor.should_stop)
     )
@@ -157,7 +160,9 @@ def _write_view_file(
     """view.json and what it lists beside the renders; ``poses`` is the file that holds the poses of ``refined``."""
     images, sparse = scene.images, refined.model.points
     write_thumbnail(images.image((scene.held_out or [0])[0]), folder / THUMBNAIL)
-    layers = [(refined.points_source, sparse.xyz, sparse.rgb), ("field", *surface)]
+    layers = [(refined.points_source, sparse.xyz, sparse.rgb)]
+    if refined.points_source != "field":
+        layers.append(("field", *surface))
     view = ViewFile(
         poses=poses,
         thumbnail=THUMBNAIL,

@@ -10,6 +10,7 @@ from docs.generate.markdown import DASH, table
 
 _END = "<!-- end -->"
 _LOSSES: dict[Loss, str] = {
+    "poses": "poses",
     "names": "names: rows are in the order of the files' names",
     "lenses": "lenses",
     "some lenses": "two focal lengths, a principal point off the centre, lenses other than [these](#camera-models)",

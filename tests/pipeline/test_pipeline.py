@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 
 import biresnerf
+from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
 from biresnerf.data.synthetic.scene import synthetic_cameras, write_synthetic_scene
@@ -206,10 +207,17 @@ def test_options_as_used_lie_beside_the_result(run):
 def test_a_finished_folder_holds_results_only(run):
     names = {path.name for path in run.output.iterdir()}
     packs = {"transforms.json", "colmap", "poses.json", "poses.csv", "tum.txt", "scene.glb"}
+    packs |= {"transforms_nerfstudio.json", "points.ply"}
     shown = {"view.json", "view", "thumbnail.jpg", "renders"} | (
         {"report.html"} if (BUNDLE / "report.js").is_file() else set()
     )
     assert names == packs | shown | {"report.json", "config.json", "history.jsonl"}
+
+
+def test_splatting_has_points_to_start_from(run):
+    assert run.report.points is not None
+    model = read_colmap_model(run.output / "colmap/sparse/0")
+    assert len(model.points) == run.report.points.count > 100
 
 
 def test_progress_goes_through_the_stages_and_never_falls(run):

@@ -142,14 +142,15 @@ def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop)
 def _export(order: Order, stop: _Stop) -> None:
     """Write the result in further formats; the photos are in the input where a format needs them."""
     from biresnerf.data.formats.codec import WriteContext
-    from biresnerf.data.formats.result_formats import read_result, write_format
+    from biresnerf.data.formats.result_formats import read_result, write_exports
 
     assert order.result is not None, "every export names it"
     names = TypeAdapter(tuple[ExportName, ...]).validate_python(order.options["formats"])
     photos = order.input if any(order.input.iterdir()) else None
     refined = read_result(order.result, photos)
-    for name in names:
-        write_format(refined, order.output, name, WriteContext(should_stop=stop.asked.is_set))
+    _, notes = write_exports(refined, order.output, names, WriteContext(should_stop=stop.asked.is_set))
+    for note in notes:
+        logging.getLogger(__name__).warning("%s", note)
 
 
 def _protocol_only() -> TextIO:

@@ -33,13 +33,15 @@ def export_command(
     docs/formats.md says what each format holds, and which program reads it.
     """
     from biresnerf.data.formats.codec import WriteContext
-    from biresnerf.data.formats.result_formats import read_result, write_format
+    from biresnerf.data.formats.result_formats import read_result, write_exports
 
     refined = read_result(result, photos)
     folder = output or result
-    for name in names:
-        write_format(refined, folder, name, WriteContext())
-        if not as_json:
-            click.echo(f"{name} written to {folder}")
+    written, notes = write_exports(refined, folder, names, WriteContext())
     if as_json:
-        print_json({"folder": str(folder), "formats": list(names)})
+        print_json({"folder": str(folder), "formats": written, "warnings": notes})
+        return
+    for name in written:
+        click.echo(f"{name} written to {folder}")
+    for note in notes:
+        click.echo(f"warning: {note}", err=True)

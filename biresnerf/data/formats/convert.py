@@ -15,6 +15,7 @@ from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.transforms.write_intrinsics import lens_values
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes
+from biresnerf.data.formats.write_each import write_each
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet, refined_set
@@ -75,10 +76,9 @@ def convert(
         _refuse_two_names(refined, flat, names)
     with _whole_folder(folder) as staging:
         context = WriteContext(chosen, bounds)
-        for name in names:
-            codec = ALL_CODECS[name]
-            assert codec.write is not None, f"{name} is declared with a place in a set"
-            codec.write(flat if _wants_flat(name) else refined, staging / codec.format.in_set, context)
+        writing = write_each(refined, names, lambda name: _write(flat, refined, name, staging, context))
+        writing.raise_first()
+        names = writing.written
         if any("lens file" in formats()[name].needs for name in names) and len(chosen.cameras) == 1:
             write_json(staging / CAMERA, lens_values(chosen.cameras[0]))
         if photos != "none":
@@ -87,7 +87,13 @@ def convert(
                 _transfer([(frame.path, staging / image.file_name) for frame, image in moved], photos)
             _transfer_photos(chosen, staging, photos, without_images=all(map(_wants_flat, names)))
     places = {name: folder / formats()[name].in_set for name in names}
-    return Written(places, left_out, _notes(chosen, names))
+    return Written(places, left_out, (*writing.notes, *_notes(chosen, names)))
+
+
+def _write(flat: RefinedSet, refined: RefinedSet, name: str, folder: Path, context: WriteContext) -> None:
+    codec = ALL_CODECS[name]
+    assert codec.write is not None, f"{name} is declared with a place in a set"
+    codec.write(flat if _wants_flat(name) else refined, folder / codec.format.in_set, context)
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from biresnerf.data.formats.colmap.format import COLMAP
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.simple.poses_json import POSES, PoseImage, matrix_of, read_poses_json
+from biresnerf.data.formats.write_each import write_each
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
 from biresnerf.errors import InputError
@@ -26,7 +27,8 @@ def write_result_formats(
 ) -> tuple[str, ...]:
     """Writes the formats of every result into ``folder``, the input's own format, and ``exports``.
 
-    Without the input in ``context``, the formats that need it are left out.
+    Without the input in ``context``, the formats that need it are left out. An export that cannot hold the set is
+    written in the format that its declaration names `instead`.
 
     Returns:
         a sentence for each export, or own format, that cannot hold this set.
@@ -35,21 +37,34 @@ def write_result_formats(
         Interrupted: `WriteContext.should_stop` returned true.
     """
     context = context or WriteContext()
+    own = () if context.dataset is None else formats_given_back(context.dataset)
+    refused = {}
     for one in formats().values():
         if one.always and (context.dataset is not None or "input" not in one.needs):
-            write_format(refined, folder, one.name, context)
-    notes = []
-    own = () if context.dataset is None else formats_given_back(context.dataset)
-    for name in dict.fromkeys((*own, *exports)):
-        try:
-            write_format(refined, folder, name, context)
-        except InputError as error:
-            notes.append(f"{name} was not written: {error}")
-    return tuple(notes)
+            try:
+                _write(refined, folder, one.name, context)
+            except InputError as error:
+                refused[one.name] = error
+    writing = write_each(refined, (*own, *exports), lambda name: _write(refined, folder, name, context))
+    refused |= writing.refused
+    notes = [f"{name} was not written: {error}" for name, error in refused.items()]
+    return (*notes, *writing.notes)
 
 
-def write_format(refined: RefinedSet, folder: Path, name: str, context: WriteContext) -> None:
-    """Writes one format where a result in ``folder`` has it. Raises InputError ``export_not_possible``."""
+def write_exports(
+    refined: RefinedSet, folder: Path, names: Iterable[str], context: WriteContext
+) -> tuple[list[str], list[str]]:
+    """Writes formats where a result in ``folder`` has them. Returns those written, and notes on what stands for what.
+
+    Raises:
+        InputError: ``export_not_possible``; formats before it are written.
+    """
+    writing = write_each(refined, names, lambda name: _write(refined, folder, name, context))
+    writing.raise_first()
+    return writing.written, writing.notes
+
+
+def _write(refined: RefinedSet, folder: Path, name: str, context: WriteContext) -> None:
     codec = ALL_CODECS[name]
     assert codec.write is not None, f"{name} has a place in results"
     codec.write(refined, folder / codec.format.in_result, context)

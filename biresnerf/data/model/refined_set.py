@@ -19,8 +19,9 @@ from biresnerf.geometry.similarity import Similarity
 from biresnerf.uncertainty import PoseUncertainty
 
 # ``given``: the input's, as nothing moved; ``tracks``: its tracks triangulated again; ``features``: matches of features
-# triangulated; ``moved``: the input's points carried along with the cameras nearest to them.
-PointsSource = Literal["none", "given", "features", "tracks", "moved"]
+# triangulated; ``moved``: the input's points carried along with the cameras nearest to them; ``field``: where rays of
+# rendered views end in the radiance field.
+PointsSource = Literal["none", "given", "features", "tracks", "moved", "field"]
 REFINED = "refined"  # where a result that returns the input's poses has the refined ones
 
 

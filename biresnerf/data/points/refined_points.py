@@ -7,6 +7,7 @@ Trainers start from these points, and points that lie beside the refined cameras
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,16 +27,37 @@ LEAST_AGREEING = 0.5  # of a track's observations: two of eight wrong ones agree
 NEAREST = 4  # cameras that carry a point along that no image is known to see
 
 
+class FieldPoints(NamedTuple):
+    """Where rays of rendered views end in the radiance field.
+
+    Attributes:
+        xyz: float64 [m, 3], in the caller's world.
+        rgb: uint8 [m, 3].
+        world_from_cam: the poses [n, 4, 4] that the field was trained on.
+    """
+
+    xyz: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    world_from_cam: NDArray[np.float64]
+
+
 def with_points_of(
-    refined: RefinedSet, given: ColmapModel | None, tracks: Tracks | None, images: ImageSet
+    refined: RefinedSet,
+    given: ColmapModel | None,
+    tracks: Tracks | None,
+    images: ImageSet,
+    field: FieldPoints | None = None,
 ) -> RefinedSet:
-    """The result with the best points there are: of the input's tracks, else of feature matches, else carried along.
+    """The result with the best points there are.
+
+    Those of the input's tracks, else of feature matches, else the input's points carried along, else the field's.
 
     Args:
         refined: without points.
         given: the input, where it was a COLMAP model.
         tracks: through feature matches, of frames in the order of ``refined``.
         images: the photos, for colours.
+        field: points of the radiance field.
     """
     if given is not None and len(given.points.track_image_ids):
         return with_given_points(refined, given)
@@ -43,7 +65,9 @@ def with_points_of(
         matched = with_matched_points(refined, tracks, images)
         if len(matched.model.points):
             return matched
-    return refined if given is None else with_given_points(refined, given)
+    if given is not None and len(given.points):
+        return with_given_points(refined, given)
+    return refined if field is None else with_field_points(refined, field)
 
 
 def with_matched_points(refined: RefinedSet, tracks: Tracks, images: ImageSet) -> RefinedSet:
@@ -94,8 +118,29 @@ def with_given_points(refined: RefinedSet, given: ColmapModel) -> RefinedSet:
     if len(given.points.track_image_ids):
         points = triangulated(refined.model, given.points)
         return replace(refined, model=with_points(refined.model, points), points_source="tracks")
-    points = replace(given.points, xyz=_carried(refined, given.points.xyz))
+    pairs = [(image.given, image.world_from_cam) for image in refined.images if image.given is not None]
+    before, after = (np.stack(poses) for poses in zip(*pairs, strict=True))
+    points = replace(given.points, xyz=_carried(given.points.xyz, before, after))
     return replace(refined, model=with_points(refined.model, points), points_source="moved")
+
+
+def with_field_points(refined: RefinedSet, field: FieldPoints) -> RefinedSet:
+    """The result with points of the field, which no image is known to see, carried to its poses where those differ."""
+    if not len(field.xyz):
+        return refined
+    count, xyz, none = len(field.xyz), field.xyz, np.zeros(0, np.int64)
+    if not np.array_equal(field.world_from_cam, refined.world_from_cam):
+        xyz = _carried(xyz, field.world_from_cam, refined.world_from_cam)
+    points = ColmapPoints(
+        np.arange(1, count + 1),
+        xyz,
+        field.rgb,
+        np.full(count, -1.0),
+        np.zeros(count + 1, np.int64),
+        none,
+        none,
+    )
+    return replace(refined, model=with_points(refined.model, points), points_source="field")
 
 
 def _unmoved(refined: RefinedSet, given: ColmapModel) -> bool:
@@ -183,11 +228,12 @@ class _Views:
         return off
 
 
-def _carried(refined: RefinedSet, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points [m, 3] moved as the cameras nearest to them moved, the nearer the more."""
-    pairs = [(image.world_from_cam, image.given) for image in refined.images if image.given is not None]
-    after_from_before = np.stack([after @ rigid_inverse(before) for after, before in pairs])
-    centres = np.stack([before[:3, 3] for _, before in pairs])
+def _carried(
+    xyz: NDArray[np.float64], before: NDArray[np.float64], after: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points [m, 3] moved as the cameras nearest to them moved between poses [n, 4, 4], the nearer the more."""
+    after_from_before = after @ rigid_inverse(before)
+    centres = before[:, :3, 3]
     carried = np.empty_like(xyz)
     for part in np.array_split(np.arange(len(xyz)), -(-len(xyz) // 4096)):
         away = np.linalg.norm(xyz[part, None] - centres[None], axis=2)

@@ -20,7 +20,7 @@ from biresnerf.errors import InputError
 from biresnerf.options.formats import formats
 from tests.data.formats.random_sets import random_poses
 from tests.data.formats.simple import trajectories
-from tests.data.scenes import assert_complete, write_image
+from tests.data.scenes import write_image
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # Where each form is written that is read again.
@@ -28,6 +28,7 @@ PLACES = {
     "transforms": "transforms.json",
     "colmap": "sparse/0",
     "colmap-text": "sparse_txt/0",
+    "nerfstudio": "transforms_nerfstudio.json",
     "instant-ngp": "transforms_ngp.json",
     "tum": "tum.txt",
     "kitti": "kitti.txt",
@@ -46,12 +47,6 @@ def converted(*arguments: object) -> dict:
     result = run(*arguments, "--json")
     assert result.exit_code == 0, (result.output, result.exception)
     return json.loads(result.stdout)
-
-
-def by_photo(dataset: Dataset) -> dict[Path, np.ndarray]:
-    """Poses by what a link to a photo leads to, so by the photo itself, wherever a format has it."""
-    photos = [frame.path.resolve() for frame in dataset.frames]
-    return dict(zip(photos, dataset.world_from_cam, strict=True))
 
 
 def by_file(dataset: Dataset) -> dict[str, np.ndarray]:
@@ -96,78 +91,13 @@ def test_there_and_back_keeps_poses_and_names(tmp_path_factory, form: str, seed:
     converted(folder / "there" / PLACES[form], folder / "back", "--to", "transforms")
     back = read_dataset(folder / "back")
     assert_same(back, given_set)
-    if form in ("transforms", "instant-ngp", "bundler"):  # the others are read in the order of names
+    if form in (
+        "transforms",
+        "nerfstudio",
+        "instant-ngp",
+        "bundler",
+    ):  # the others are read in the order of names
         assert list(back.file_names) == list(given_set.file_names)
-
-
-@pytest.mark.parametrize("places", [("train/{}.png", "train/{}.png"), ("left/{}.png", "right/{}.png")])
-def test_llff_has_its_photos_in_images_in_the_order_of_its_rows(
-    tmp_path: Path, places: tuple[str, str]
-) -> None:
-    write_set(tmp_path / "given", seed=1, count=6, k1=0.0)
-    file = tmp_path / "given" / "transforms.json"
-    document = json.loads(file.read_text())
-    for index, frame in enumerate(document["frames"]):
-        number = index if places[0] == places[1] else index // 2
-        place = tmp_path / "given" / places[index % 2].format((5 * number) % 7)
-        place.parent.mkdir(exist_ok=True)
-        (tmp_path / "given" / frame["file_path"]).rename(place)
-        frame["file_path"] = place.relative_to(tmp_path / "given").as_posix()
-    (tmp_path / "given/images").rmdir()
-    file.write_text(json.dumps(document))
-    truth = by_photo(read_dataset(tmp_path / "given"))
-    beside = [("beside", ("--to", "transforms", "--to", "kitti"))] if places[0] == places[1] else []
-    for name, more in [("alone", ()), *beside]:
-        there = tmp_path / name
-        converted(tmp_path / "given", there, "--to", "llff", *more, *BOUNDS)
-        assert sorted(path.name for path in there.iterdir() if path.is_dir()) == (
-            ["images", "train"] if more else ["images"]
-        )
-        # As LLFF's readers pair them: the files of images/ by name, and the rows.
-        photos = sorted((there / "images").iterdir())
-        rows = np.load(there / "poses_bounds.npy")
-        assert len(photos) == len(rows) == 6
-        for photo, row in zip(photos, rows, strict=True):
-            np.testing.assert_array_equal(row[:15].reshape(3, 5)[:, 3], truth[photo.resolve()][:3, 3])
-        for place in ("poses_bounds.npy", *(("transforms.json", "kitti.txt") if more else ())):
-            found = by_photo(read_dataset(there / place))
-            for path, pose in truth.items():
-                np.testing.assert_allclose(found[path], pose, rtol=0, atol=1e-9)
-
-
-def test_photos_below_images_do_not_lie_there_twice(tmp_path: Path) -> None:
-    write_set(tmp_path / "given", seed=1, count=4, k1=0.0)
-    file = tmp_path / "given" / "transforms.json"
-    (tmp_path / "given/images").rename(tmp_path / "given/left")
-    (tmp_path / "given/images").mkdir()
-    (tmp_path / "given/left").rename(tmp_path / "given/images/left")
-    file.write_text(file.read_text().replace("images/", "images/left/"))
-    refused = run(tmp_path / "given", tmp_path / "out", "--to", "llff", "--to", "tum", *BOUNDS)
-    assert isinstance(refused.exception, InputError)
-    assert_complete(refused.exception, "export_not_possible", "llff")
-    converted(tmp_path / "given", tmp_path / "out", "--to", "llff", *BOUNDS)
-    assert_same(read_dataset(tmp_path / "out"), read_dataset(tmp_path / "given"))
-
-
-def test_kitti_has_its_rows_in_the_sets_order_and_names_their_images(tmp_path: Path) -> None:
-    write_set(tmp_path / "given", seed=3, count=6)
-    given_set = read_dataset(tmp_path / "given")
-    assert list(given_set.names) != sorted(given_set.names)
-    converted(tmp_path / "given", tmp_path / "there", "--to", "kitti", "--to", "tum")
-    rows = np.loadtxt(tmp_path / "there/kitti.txt").reshape(-1, 3, 4)
-    np.testing.assert_array_equal(rows, given_set.world_from_cam[:, :3])
-    np.testing.assert_array_equal(rows[:, :, 3], np.loadtxt(tmp_path / "there/tum.txt")[:, 1:4])
-    assert_same(read_dataset(tmp_path / "there/kitti.txt"), given_set)
-    listed = tmp_path / "there/kitti_images.txt"
-    assert listed.read_text().splitlines() == list(given_set.file_names)
-    for text, code, where in (
-        (listed.read_text().replace("12.png", "77.png"), "image_missing", "kitti.txt"),
-        ("0.png\n", "pose_file_invalid", "kitti_images.txt"),
-    ):
-        listed.write_text(text)
-        with pytest.raises(InputError) as caught:
-            read_dataset(tmp_path / "there/kitti.txt")
-        assert_complete(caught.value, code, where)
 
 
 @pytest.mark.parametrize("form", trajectories.FORMS)
@@ -175,8 +105,8 @@ def test_every_form_that_is_read_becomes_every_form_that_is_written(tmp_path: Pa
     scene = tmp_path / "scene"
     trajectories.write_set(form, scene)
     given_set = read_dataset(scene)
-    # Bundler knows one focal length, in the middle of the image; LLFF that without distortion.
-    fitting = {"bundler": ("llff", "bundler"), "llff": ("llff",)}
+    # Bundler knows one focal length, in the middle of the image; LLFF that without distortion; no points are read.
+    fitting = {"bundler": ("llff", "bundler"), "llff": ("llff",), "points": ()}
     forms = [name for name in FORMS if form in fitting.get(name, (form,))]
     wanted = [word for name in forms for word in ("--to", name)]
     done = converted(scene, tmp_path / "all", *wanted, "--photos", "copy")
@@ -201,12 +131,12 @@ def test_the_folder_that_was_written_is_read_with_its_poses(tmp_path: Path, form
 
 def test_the_command_offers_every_form_there_is() -> None:
     [option] = [one for one in convert_command.params if one.name == "names"]
-    assert set(option.type.choices) == {*PLACES, "pinhole", "poses", "csv", "scene"} == set(FORMS)
+    assert set(option.type.choices) == {*PLACES, "pinhole", "poses", "csv", "scene", "points"} == set(FORMS)
 
 
 def test_a_form_that_cannot_hold_the_set_leaves_nothing_behind(tmp_path: Path) -> None:
     trajectories.tum_set(tmp_path / "scene", ["0", "1", "2", "3"])
-    refused = run(tmp_path / "scene", tmp_path / "out", "--to", "tum", "--to", "bundler")
+    refused = run(tmp_path / "scene", tmp_path / "out", "--to", "tum", "--to", "points")
     assert isinstance(refused.exception, InputError)
     assert refused.exception.code == "export_not_possible"
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]

@@ -66,7 +66,7 @@ def test_forms_are_written_where_they_are_asked_for(result):
     assert (folder / "more/colmap/sparse_txt/0/images.txt").is_file()
     assert not (folder / "out/kitti.txt").exists()
     said = run(folder / "out", "kitti", "--json")
-    assert json.loads(said.stdout) == {"folder": str(folder / "out"), "formats": ["kitti"]}
+    assert json.loads(said.stdout) == {"folder": str(folder / "out"), "formats": ["kitti"], "warnings": []}
     assert (folder / "out/kitti.txt").is_file()
 
 

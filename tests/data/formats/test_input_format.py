@@ -13,14 +13,16 @@ from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.result_formats import formats_given_back, write_result_formats
 from biresnerf.data.formats.simple.llff import LLFF, parse_llff
+from biresnerf.data.formats.simple.nerfstudio import write_nerfstudio
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes, write_transforms
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.refined_set import refined_set
+from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
 from biresnerf.geometry.perturb import perturb_poses
-from tests.data.formats.random_sets import random_camera, random_model, random_poses
+from tests.data.formats.random_sets import random_camera, random_model, random_poses, random_result
 from tests.data.formats.readers import ours, seen_points, through_json_frame
-from tests.data.scenes import write_image
+from tests.data.scenes import assert_complete, nerfstudio_scene, save, write_image
 
 # What nerfstudio 1.1.5 knows (nerfstudio/cameras/cameras.py, CAMERA_MODEL_TO_TYPE).
 NERFSTUDIO_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"}
@@ -65,6 +67,52 @@ def test_nerfstudio_sees_points_where_we_do(tmp_path, model, several):
     for index, frame in enumerate(document["frames"]):
         points = seen_points(result, index)
         assert np.abs(through_json_frame(document, frame, points) - ours(result, index, points)).max() < 0.01
+
+
+@pytest.mark.parametrize("model", sorted(MODEL_PARAMETERS))
+@pytest.mark.parametrize("several", [False, True])
+def test_the_file_for_nerfstudio_follows_its_rules_whatever_the_input_was(tmp_path, model, several):
+    refined = random_result(11, model=model, several=several)
+    if model == "FULL_OPENCV":  # without its rational terms, nerfstudio has that lens
+        named = [dict(zip(MODEL_PARAMETERS[model], camera.params, strict=True)) for camera in refined.cameras]
+        flat = [tuple((values | dict.fromkeys(("k4", "k5", "k6"), 0.0)).values()) for values in named]
+        cameras = [replace(c, params=params) for c, params in zip(refined.cameras, flat, strict=True)]
+        refined = replace(refined, cameras=tuple(cameras))
+    write_nerfstudio(refined, tmp_path / "t.json")
+    document = json.loads((tmp_path / "t.json").read_text())
+    lint_for_nerfstudio(document)
+    assert document["ply_file_path"] == "points.ply"
+    for index, frame in enumerate(document["frames"]):
+        points = seen_points(refined, index)
+        assert np.abs(through_json_frame(document, frame, points) - ours(refined, index, points)).max() < 0.01
+        assert frame["file_path"] == refined.images[index].file_name
+
+
+def test_nerfstudio_refuses_what_it_would_misread(tmp_path):
+    mixed = random_result(1, model="OPENCV", several=True)
+    fisheye = random_result(1, model="OPENCV_FISHEYE").cameras[0]
+    for refined in (
+        random_result(1, model="FULL_OPENCV"),
+        replace(mixed, cameras=(mixed.cameras[0], fisheye)),
+    ):
+        with pytest.raises(InputError) as caught:
+            write_nerfstudio(refined, tmp_path / "t.json")
+        assert_complete(caught.value, "export_not_possible", "transforms_nerfstudio.json")
+        assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_nerfstudio_gets_all_masks_or_none(tmp_path, complete):
+    document = nerfstudio_scene(tmp_path)
+    for index, frame in enumerate(document["frames"][0 if complete else 1 :]):
+        frame["mask_path"] = f"silhouettes/{index}.png"
+        write_image(tmp_path / frame["mask_path"], index, mode="L")
+    dataset = read_dataset(save(tmp_path, document))
+    write_nerfstudio(refined_set(dataset, dataset.world_from_cam), tmp_path / "t.json", dataset)
+    written = json.loads((tmp_path / "t.json").read_text())
+    expected = [f["mask_path"] if complete else None for f in document["frames"]]
+    assert [frame.get("mask_path") for frame in written["frames"]] == expected
+    assert "ply_file_path" not in written
 
 
 def test_lenses_of_several_kinds_are_told_of():

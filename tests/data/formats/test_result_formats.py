@@ -223,7 +223,7 @@ def test_the_scene_is_a_valid_gltf_and_blender_would_show_the_callers_coordinate
     assert sorted(root["children"]) == [0, 1, 2]
     shown = {}
     for node in document["nodes"][:3]:
-        [primitive] = document["meshes"][node["mesh"]]["primitives"]
+        primitive, *faces = document["meshes"][node["mesh"]]["primitives"]
         xyz = glb_accessor(document, binary, primitive["attributes"]["POSITION"])
         accessor = document["accessors"][primitive["attributes"]["POSITION"]]
         np.testing.assert_array_equal(accessor["min"], xyz.min(0))
@@ -234,6 +234,14 @@ def test_the_scene_is_a_valid_gltf_and_blender_would_show_the_callers_coordinate
             indices = glb_accessor(document, binary, primitive["indices"])
             assert indices.max() < len(xyz)
             assert len(indices) % 2 == 0
+            [drawn] = faces
+            assert (drawn["mode"], drawn["attributes"]) == (4, primitive["attributes"])
+            sides = glb_accessor(document, binary, drawn["indices"])[:, 0].reshape(-1, 3)
+            # Every face joins vertices of one camera, and of each camera there are four sides and the tip.
+            np.testing.assert_array_equal(
+                sides // 6, np.repeat(np.arange(len(xyz) // 6), 5)[:, None].repeat(3, 1)
+            )
+            assert document["materials"][drawn["material"]]["alphaMode"] == "BLEND"
         # Node, then the turn that Blender's importer makes: (x, y, z) of glTF becomes (x, -z, y).
         x, y, z = turned(xyz, root["rotation"]).T + np.array(root["translation"])[:, None]
         shown[node["name"]] = np.stack([x, -z, y], 1)
@@ -276,11 +284,11 @@ def test_all_exports_are_written_and_those_that_cannot_be_say_why(tmp_path):
     assert found == {
         *(f"colmap/sparse/0/{table}.bin" for table in ("cameras", "images", "points3D")),
         *("tum.txt", "scene.glb", "poses.json", "poses.csv", "kitti.txt", "kitti_images.txt"),
-        "transforms_ngp.json",
+        *("transforms_ngp.json", "transforms_nerfstudio.json", "points.ply"),
         *("bundler/bundle.out", "bundler/list.txt"),
     }
     always = {name for name, one in formats().items() if one.always}
-    assert always == {"transforms", "colmap", "tum", "scene", "poses", "csv"}
+    assert always == {"transforms", "nerfstudio", "colmap", "tum", "scene", "points", "poses", "csv"}
 
 
 def test_every_export_that_may_be_asked_for_has_a_writer():

@@ -38,6 +38,7 @@ BUNDLER = Format(
     in_set="bundle.out",
     in_result="bundler/bundle.out",
     loses=("some lenses", "rigs", "mask paths"),
+    instead="pinhole",
     heading="For Metashape",
     hint="Bundler format: File › Import › Import Cameras",
     downloads="bundler/",

@@ -1,4 +1,4 @@
-"""Binary glTF 2.0 of points and lines: what a picture of a scene needs, and no more of the format.
+"""Binary glTF 2.0 of points, lines and triangles: what a picture of a scene needs, and no more of the format.
 
 Layout: Khronos glTF 2.0 specification, sections 3.6 (buffers and accessors) and 4.4 (GLB); little-endian.
 """
@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-POINTS, LINES = 0, 1  # primitive modes
+POINTS, LINES, TRIANGLES = 0, 1, 4  # primitive modes
 _UNSIGNED_BYTE, _UNSIGNED_INT, _FLOAT = 5121, 5125, 5126
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
+_CLEAR = 0.2  # opacity of triangles, so that what lies behind is seen
 _MAGIC, _VERSION, _JSON_CHUNK, _BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 
 
@@ -41,6 +42,7 @@ class GlbFile:
         xyz: NDArray[np.floating],
         rgb: NDArray[np.uint8],
         indices: NDArray[np.integer] | None = None,
+        triangles: NDArray[np.integer] | None = None,
     ) -> None:
         """A mesh with a node of its own.
 
@@ -50,6 +52,7 @@ class GlbFile:
             xyz: [vertices, 3], finite; kept as float32.
             rgb: uint8 [vertices, 3], sRGB.
             indices: of the vertices, for lines two a line.
+            triangles: faces between the same vertices, indices [m, 3], drawn faintly from both sides.
 
         Raises:
             ValueError: nothing to draw, positions that are not finite, or an index of no vertex.
@@ -57,10 +60,9 @@ class GlbFile:
         positions = np.ascontiguousarray(xyz, dtype="<f4")
         if len(positions) == 0 or not np.isfinite(positions).all() or len(rgb) != len(positions):
             raise ValueError(f"{name}: need a finite position and a colour for each vertex")
-        if indices is not None and (
-            len(indices) == 0 or indices.min() < 0 or indices.max() >= len(positions)
-        ):
-            raise ValueError(f"{name}: an index names no vertex")
+        for part in (indices, triangles):
+            if part is not None and (len(part) == 0 or part.min() < 0 or part.max() >= len(positions)):
+                raise ValueError(f"{name}: an index names no vertex")
         colours = np.full(
             (len(rgb), 4), 255, dtype=np.uint8
         )  # four bytes each: rows must start at multiples of 4
@@ -74,29 +76,30 @@ class GlbFile:
                 "COLOR_0": self._accessor(colours, _UNSIGNED_BYTE, "VEC4", _ARRAY_BUFFER, normalized=True),
             },
         }
+        primitives = [primitive]
         if indices is not None:
-            flat = np.ascontiguousarray(indices, dtype="<u4").ravel()
-            primitive["indices"] = self._accessor(flat, _UNSIGNED_INT, "SCALAR", _ELEMENT_BUFFER)
+            primitive["indices"] = self._indices(indices)
+        if triangles is not None:
+            primitives.append(
+                {**primitive, "mode": TRIANGLES, "material": 1, "indices": self._indices(triangles)}
+            )
         self._nodes.append({"name": name, "mesh": len(self._meshes)})
-        self._meshes.append({"name": name, "primitives": [primitive]})
+        self._meshes.append({"name": name, "primitives": primitives})
 
     def content(self, root: dict[str, Any]) -> bytes:
         """The file. ``root`` is the node above all meshes: its name, translation and rotation."""
         nodes = [*self._nodes, {**root, "children": list(range(len(self._nodes)))}]
         document = {
             "asset": {"version": "2.0", "generator": "BiResNeRF", "extras": self.extras},
-            # Colours as they are, not shaded: points and lines have no sides.
+            # Colours as they are, not shaded: this is a drawing.
             "extensionsUsed": ["KHR_materials_unlit"],
             "scene": 0,
             "scenes": [{"nodes": [len(nodes) - 1]}],
             "nodes": nodes,
             "meshes": self._meshes,
             "materials": [
-                {
-                    "name": "unlit",
-                    "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-                    "extensions": {"KHR_materials_unlit": {}},
-                }
+                _material("unlit", 1.0),
+                _material("faint", _CLEAR, alphaMode="BLEND", doubleSided=True),
             ],
             "accessors": self._accessors,
             "bufferViews": self._views,
@@ -113,6 +116,10 @@ class GlbFile:
                 struct.pack("<2I", len(binary), _BINARY_CHUNK) + binary,
             ]
         )
+
+    def _indices(self, of_vertices: NDArray[np.integer]) -> int:
+        flat = np.ascontiguousarray(of_vertices, dtype="<u4").ravel()
+        return self._accessor(flat, _UNSIGNED_INT, "SCALAR", _ELEMENT_BUFFER)
 
     def _accessor(
         self, values: NDArray[np.generic], component: int, kind: str, target: int, **more: Any
@@ -133,6 +140,16 @@ class GlbFile:
             }
         )
         return len(self._accessors) - 1
+
+
+def _material(name: str, opacity: float, **more: Any) -> dict[str, Any]:
+    shown = {"baseColorFactor": [1.0, 1.0, 1.0, opacity], "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    return {
+        "name": name,
+        "pbrMetallicRoughness": shown,
+        "extensions": {"KHR_materials_unlit": {}},
+        **more,
+    }
 
 
 def _linear(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -21,6 +21,8 @@ from PIL import Image
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.simple.bundler import write_bundler
+from biresnerf.data.formats.simple.nerfstudio import NERFSTUDIO, write_nerfstudio
+from biresnerf.data.formats.transforms.instant_ngp import INSTANT_NGP, write_transforms_ngp
 from biresnerf.data.model.atomic_file import whole_file, write_json
 from biresnerf.data.model.colmap_scene import ColmapImage
 from biresnerf.data.model.dataset import Frame
@@ -41,8 +43,9 @@ PINHOLE = Format(
     in_set="pinhole",
     needs=("photos",),
     loses=("rigs", "masks"),
+    splats=True,
     heading="For 3D Gaussian splatting, gsplat, OpenMVS",
-    hint="Photos without distortion, with PINHOLE cameras and points",
+    hint="Photos without distortion, with PINHOLE cameras and points, for all programs that do not know the lens",
     downloads="pinhole/",
 )
 
@@ -94,7 +97,7 @@ def _tangents(rays: NDArray[np.float64], axis: int, sign: int) -> NDArray[np.flo
 
 
 def write_pinhole(refined: RefinedSet, folder: Path, should_stop: Callable[[], bool] = lambda: False) -> None:
-    """Writes images/, sparse/0/, bundle.out, list.txt and names.json (new name: input's name) into ``folder``.
+    """Writes images/, a file for each program that needs such photos, and names.json (new name: input's name).
 
     Photos keep their names without folders, where those differ; JPEG stays JPEG, all else becomes PNG. EXIF data are
     not carried over.
@@ -123,6 +126,8 @@ def write_pinhole(refined: RefinedSet, folder: Path, should_stop: Callable[[], b
     undistorted_set = _as_pinhole(refined, cameras, names)
     write_colmap_binary(undistorted_set.model, folder / "sparse" / "0")
     write_bundler(undistorted_set, folder)
+    write_nerfstudio(undistorted_set, folder / NERFSTUDIO.in_set)
+    write_transforms_ngp(undistorted_set, folder / INSTANT_NGP.in_set)
     named = dict(zip(names, (image.name for image in refined.images), strict=True))
     write_json(folder / "names.json", named, indent=1)
 

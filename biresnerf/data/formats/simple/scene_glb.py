@@ -2,7 +2,7 @@
 
 Positions are the caller's world. glTF is y up and Blender z up, and Blender's importer turns the one into the other;
 the node above all meshes turns back beforehand, so that Blender shows the caller's own coordinates. Other viewers
-show z upwards.
+show z upwards. Frusta have edges and faint faces, as some readers (Open3D) take triangles only.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ _Y_UP_FROM_Z_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]  # quaternion x, y
 _EDGES = np.array(
     [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (1, 5), (5, 2)], dtype=np.uint32
 )
+_FACES = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1), (1, 5, 2)], dtype=np.uint32)
 
 
 def write_scene(refined: RefinedSet, path: Path) -> None:
@@ -58,11 +59,12 @@ def write_scene(refined: RefinedSet, path: Path) -> None:
     before = [i for i, image in enumerate(refined.images) if image.given is not None]
     if before:
         given = np.stack([image.given for image in refined.images if image.given is not None])
-        vertices, edges = _frusta(refined, before, given, depth, centre)
+        vertices = _frusta(refined, before, given, depth, centre)
         grey = np.tile(np.array(GREY, np.uint8), (len(vertices), 1))
-        glb.add_mesh("cameras before", LINES, vertices, grey, edges)
-    vertices, edges = _frusta(refined, range(len(refined)), after, depth, centre)
-    glb.add_mesh("cameras after", LINES, vertices, np.repeat(_turn_colours(refined), 6, axis=0), edges)
+        glb.add_mesh("cameras before", LINES, vertices, grey, *_parts(len(before)))
+    vertices = _frusta(refined, range(len(refined)), after, depth, centre)
+    colours = np.repeat(_turn_colours(refined), 6, axis=0)
+    glb.add_mesh("cameras after", LINES, vertices, colours, *_parts(len(refined)))
     points = refined.model.points
     if len(points):
         step = -(-len(points) // MOST_POINTS)
@@ -82,14 +84,20 @@ def _depth(world_from_cam: NDArray[np.float64]) -> float:
     return max(spread / math.sqrt(len(centres)), 1e-9)
 
 
+def _parts(cameras: int) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+    """The edges [n, 2] and faces [m, 3] of so many frusta, as indices of their vertices."""
+    first = 6 * np.arange(cameras, dtype=np.uint32)[:, None, None]
+    return (_EDGES + first).reshape(-1, 2), (_FACES + first).reshape(-1, 3)
+
+
 def _frusta(
     refined: RefinedSet,
     which: list[int] | range,
     world_from_cam: NDArray[np.float64],
     depth: float,
     origin: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
-    """Six vertices a camera, relative to ``origin``, and the edges between them."""
+) -> NDArray[np.float64]:
+    """Six vertices a camera, relative to ``origin``."""
     vertices = []
     for index, pose in zip(which, world_from_cam, strict=True):
         camera = refined.camera_of(index)
@@ -101,8 +109,7 @@ def _frusta(
         corners = [(left, top), (right, top), (right, bottom), (left, bottom), ((left + right) / 2, tip)]
         in_cam = depth * np.array([(0.0, 0.0, 0.0), *((x, y, 1.0) for x, y in corners)])
         vertices.append(in_cam @ pose[:3, :3].T + (pose[:3, 3] - origin))
-    edges = _EDGES[None] + 6 * np.arange(len(vertices), dtype=np.uint32)[:, None, None]
-    return np.concatenate(vertices), edges.reshape(-1, 2)
+    return np.concatenate(vertices)
 
 
 def _turn_colours(refined: RefinedSet) -> NDArray[np.uint8]:

@@ -32,6 +32,7 @@ INSTANT_NGP = Format(
     checked_against="files that `convert` and `export` wrote",
     in_set="transforms_ngp.json",
     loses=("rigs", "points", "mask paths"),
+    instead="pinhole",
     lacks="FULL_OPENCV; WebP and TIFF images",
     heading="For instant-ngp",
     hint="Put it into the folder of the photos and open it in instant-ngp",

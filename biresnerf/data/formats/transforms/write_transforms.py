@@ -34,8 +34,8 @@ TRANSFORMS = Format(
     always=True,
     needs=("input",),
     loses=("rigs", "points"),
-    heading="For nerfstudio",
-    hint="Replaces the transforms.json of the photos; then: ns-train nerfacto --data FOLDER",
+    heading="For the program of the input",
+    hint="Replaces the transforms.json of the photos",
 )
 
 

@@ -124,6 +124,7 @@ def test_photos_model_and_bundle_agree_and_names_lead_back(tmp_path):
         *(f"images/{name}" for name in stored),
         *(f"sparse/0/{table}.bin" for table in ("cameras", "images", "points3D")),
         *("bundle.out", "list.txt", "names.json"),
+        *("transforms_nerfstudio.json", "transforms_ngp.json", "points.ply"),
     }
     assert json.loads((tmp_path / "out/names.json").read_text("utf-8")) == dict(
         zip(stored, names, strict=True)
