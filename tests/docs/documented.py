@@ -15,7 +15,7 @@ PAGES = (
 )
 SHELL, PYTHON = "sh", "python"
 # Blocks of these hold no commands: formulas, trees, diagrams, and output of programs.
-OTHER = {"", "json", "yaml", "text", "mermaid"}
+OTHER = {"", "json", "yaml", "text", "mermaid", "sql"}
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 _STARTS = re.compile(r"^\s*(\$ |biresnerf |curl |docker |make |pip |python |podman )")
 
