@@ -110,8 +110,8 @@ def test_downloads_are_the_artifacts_to_the_byte(desktop: Watched, digests: dict
     with page.expect_download() as coming:
         page.get_by_role("link", name="Download For nerfstudio").click()
     sent = Path(coming.value.path()).read_bytes()
-    assert coming.value.suggested_filename == "transforms.json"
-    assert hashlib.sha256(sent).hexdigest() == digests["transforms.json"]
+    assert coming.value.suggested_filename == "transforms_nerfstudio.json"
+    assert hashlib.sha256(sent).hexdigest() == digests["transforms_nerfstudio.json"]
     with page.expect_download() as coming:
         page.get_by_role("button", name="Download .zip For COLMAP", exact=True).click()
     with zipfile.ZipFile(io.BytesIO(Path(coming.value.path()).read_bytes())) as archive:
@@ -140,8 +140,8 @@ def test_the_lines_beside_a_download_bring_the_same(
     row.get_by_role("button", name="curl, Python").click()
     curl = row.get_by_label("curl", exact=True).inner_text()
     subprocess.run(shlex.split(curl), cwd=tmp_path, check=True, capture_output=True)
-    sent = (tmp_path / "transforms.json").read_bytes()
-    assert hashlib.sha256(sent).hexdigest() == digests["transforms.json"]
+    sent = (tmp_path / "transforms_nerfstudio.json").read_bytes()
+    assert hashlib.sha256(sent).hexdigest() == digests["transforms_nerfstudio.json"]
 
 
 def test_a_form_that_is_not_there_is_written_on_demand(desktop: Watched, done: dict[str, Any]) -> None:
@@ -288,7 +288,7 @@ def test_a_service_with_keys_is_used_with_one(
     assert page.locator(".compare-frame img").first.get_attribute("src").startswith("blob:")
     with page.expect_download() as coming:
         page.get_by_role("button", name="Download For nerfstudio").click()
-    assert coming.value.suggested_filename == "transforms.json"
+    assert coming.value.suggested_filename == "transforms_nerfstudio.json"
     page.reload()
     expect(page.get_by_role("heading", name="Downloads")).to_be_visible()
     assert tab.outside == []
