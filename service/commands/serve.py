@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import sys
 from pathlib import Path
@@ -34,7 +35,18 @@ def free_port() -> int:
     "--slots", type=click.IntRange(0, 64), help="Jobs at the same time. Default: BIRESNERF_SLOTS, else 1."
 )
 @data_dir_option
-def up_command(host: str | None, port: int | None, slots: int | None, data_dir: Path | None) -> None:
+@click.option(
+    "--open/--no-open", "open_page", default=None, help="Open the page in a browser. Default: on a desktop."
+)
+@click.option("--verbose", "-v", is_flag=True, help="Log every request and job, not only warnings.")
+def up_command(
+    host: str | None,
+    port: int | None,
+    slots: int | None,
+    data_dir: Path | None,
+    open_page: bool | None,
+    verbose: bool,
+) -> None:
     """Run a whole service on this machine: database, API, dispatcher and workers.
 
     Without BIRESNERF_DATABASE_URL a private PostgreSQL is started from the installed package. Ctrl-C stops
@@ -45,6 +57,9 @@ def up_command(host: str | None, port: int | None, slots: int | None, data_dir: 
     from workers.settings.logs import set_up_logging
     from workers.upkeep.supervise import ChildSpec, dispatcher_spec, slot_specs, supervise
 
+    os.environ.setdefault("BIRESNERF_LOG_LEVEL", "INFO" if verbose else "WARNING")  # of the children, too
+    if open_page is None:
+        open_page = sys.stdout.isatty() and ("DISPLAY" in os.environ or sys.platform == "darwin")
     with setup_problems():
         settings = settings_with(host=host, port=port, slots=slots, data_dir=data_dir)
         set_up_logging("up", settings)
@@ -53,11 +68,13 @@ def up_command(host: str | None, port: int | None, slots: int | None, data_dir: 
         variables = {"BIRESNERF_HOST": settings.host, "BIRESNERF_PORT": str(settings.port)}
         api = ChildSpec("api", (sys.executable, "-m", "service.server"), variables)
         children = [api, dispatcher_spec(settings), *slot_specs(settings)]
-        sys.exit(asyncio.run(supervise(settings, children, on_ready=lambda _: _announce(settings))))
+        sys.exit(
+            asyncio.run(supervise(settings, children, on_ready=lambda _: _announce(settings, open_page)))
+        )
 
 
-async def _announce(settings: Settings) -> None:
-    """Prints the service's address once it is ready."""
+async def _announce(settings: Settings, open_page: bool) -> None:
+    """Prints the service's address once it is ready, and opens the page if asked to."""
     import asyncio
 
     from biresnerf.client import AsyncClient
@@ -67,7 +84,9 @@ async def _announce(settings: Settings) -> None:
     async with AsyncClient(url) as client:
         while not await client.ready():
             await asyncio.sleep(0.1)
-    click.echo(f"ready at {url}  (the page; API docs: {url}/docs)")
+    click.echo(f"ready at {url}  (the page; API docs: {url}/docs; Ctrl-C stops everything)")
+    if open_page:
+        click.launch(url)
 
 
 @click.command("api")

@@ -12,6 +12,7 @@ import click
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import print_json
 from biresnerf.commands.jobs.job_progress import BytesView, JobProgressView, watch
+from biresnerf.commands.jobs.service_options import page_of
 
 if TYPE_CHECKING:
     from biresnerf.client import Client
@@ -39,9 +40,9 @@ def follow_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def see_through(
     client: Client, job: JobView, *, wait: bool, timeout_s: float | None, output: Path | None, as_json: bool
 ) -> None:
-    """Print the job's address, then wait for it and fetch its files if asked to. Raises `JobFailed`."""
+    """Print the address of the job's page, then wait for it and fetch its files if asked to. Raises `JobFailed`."""
     if not as_json:
-        click.echo(f"{client.url}{job.links.self}")
+        click.echo(page_of(client, job.id))
     if wait or timeout_s is not None or output is not None:
         job = waited_for(client, job, timeout_s, as_json=as_json)
         if as_json:
@@ -79,9 +80,9 @@ def waited_for(client: Client, job: JobView, timeout_s: float | None, *, as_json
 
 
 def _print_how_to_wait_again(client: Client, job: JobView) -> None:
-    address = f"{client.url}{job.links.self}"
-    click.echo(f"The job continues. To wait again: biresnerf wait {address}", err=True)
-    click.echo(f"To stop it: biresnerf cancel {address}", err=True)
+    address = page_of(client, job.id)
+    click.echo(f"The job continues. To wait again: biresnerf wait '{address}'", err=True)
+    click.echo(f"To stop it: biresnerf cancel '{address}'", err=True)
 
 
 def require_success(job: JobView) -> None:

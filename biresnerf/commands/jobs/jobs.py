@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, get_args
 
 import click
@@ -11,7 +12,7 @@ from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option, print_json, show, table
 from biresnerf.commands.jobs.follow_job import require_success, timeout_option, waited_for
 from biresnerf.commands.jobs.job_progress import left_of, numbers_of, stage_of
-from biresnerf.commands.jobs.service_options import JOB, JobName, service_at, service_options
+from biresnerf.commands.jobs.service_options import JOB, JobName, page_of, service_at, service_options
 from biresnerf.wire.jobs import JobState, JobView
 
 if TYPE_CHECKING:
@@ -75,18 +76,32 @@ def list_command(
         wanted = (name, value)
     with service_at(url, api_key) as client:
         found = client.jobs(state=state, label=wanted, limit=limit)
-    rows = [
-        (
-            job.id,
-            stage_of(job),
-            f"{100 * job.progress.fraction:.0f} %",
-            f"{job.created_at:%Y-%m-%d %H:%M}",
-            job.verdict or (job.error.code if job.error else "-"),
-            " ".join(f"{name}={value}" for name, value in job.labels.items()),
-        )
-        for job in found
-    ]
-    show({"items": found}, table(rows) or "no jobs", as_json=as_json)
+    text = "no jobs"
+    if found:
+        text = table([("JOB", "STATE", "DONE", "SUBMITTED", "OUTCOME", "LABELS"), *map(_row, found)])
+        if len(found) == limit:
+            text += f"\nThe newest {limit}; --limit shows more."
+    show({"items": found}, text, as_json=as_json)
+
+
+def _row(job: JobView) -> tuple[str, ...]:
+    return (
+        job.id,
+        stage_of(job),
+        f"{100 * job.progress.fraction:.0f} %",
+        _age(job),
+        job.verdict or (job.error.code if job.error else ""),
+        " ".join(f"{name}={value}" for name, value in job.labels.items()),
+    )
+
+
+def _age(job: JobView) -> str:
+    """How long ago it was submitted, in the largest unit."""
+    seconds = max(0, int((datetime.now(UTC) - job.created_at).total_seconds()))
+    for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= length:
+            return f"{seconds // length} {unit} ago"
+    return f"{seconds} s ago"
 
 
 @click.command("wait")
@@ -143,7 +158,7 @@ def _sleep_or_leave(client: Client, job: JobName) -> None:
     try:
         time.sleep(_LOG_EVERY_S)
     except KeyboardInterrupt:
-        click.echo(f"The job continues: biresnerf wait {client.url}/v1/jobs/{job.id}", err=True)
+        click.echo(f"The job continues: biresnerf wait '{page_of(client, job.id)}'", err=True)
         raise click.exceptions.Exit(exit_codes.SIGINT) from None
 
 

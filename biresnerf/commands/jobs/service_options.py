@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from biresnerf.client import Client, ServiceError
 
 DEFAULT_URL = "http://127.0.0.1:8000"
+PAGE = "/#/jobs/"
 
 
 class JobName(NamedTuple):
@@ -32,13 +34,18 @@ class _JobParameter(click.ParamType):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> JobName:
         if isinstance(value, JobName):
             return value
-        url, path, ident = value.rpartition("/v1/jobs/")
+        url, path, ident = re.sub("/#/jobs/|/v1/jobs/", PAGE, value).rpartition(PAGE)
         if (not path and "/" in value) or not ident.strip("/"):
             self.fail(f"{value!r} is neither a job's id nor its address.", param, ctx)
         return JobName(ident.strip("/"), url or None)
 
 
 JOB = _JobParameter()
+
+
+def page_of(client: Client, job_id: str) -> str:
+    """The address of a job's page, which commands take as well."""
+    return f"{client.url}{PAGE}{job_id}"
 
 
 def service_options(command: Callable[..., Any]) -> Callable[..., Any]:

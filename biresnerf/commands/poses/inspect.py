@@ -10,8 +10,8 @@ import click
 
 from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.settings_option import settings_option
-from biresnerf.options.presets import PRESETS
-from biresnerf.options.refine_options import ResolvedOptions, parse_options
+from biresnerf.options.presets import PRESETS, PresetName
+from biresnerf.options.refine_options import RefineOptions, ResolvedOptions, parse_options
 
 if TYPE_CHECKING:
     from biresnerf.data.model.dataset import Dataset
@@ -45,7 +45,8 @@ def inspect_command(
     missing_names = sorted(set(options.fixed) - {*dataset.names, *dataset.file_names})
     if pixels:
         load_images(dataset, options.max_image_size, options.background)
-    found = {**contents(dataset), "pixels_checked": pixels, "plan": plan(dataset, options)}
+    wanted = {**plan(dataset, options), "seconds": expected_seconds(dataset, asked)}
+    found = {**contents(dataset), "pixels_checked": pixels, "plan": wanted}
     found["warnings"] += turning_notes(dataset)
     found["warnings"] += [f"fixed names no image: {name}" for name in missing_names]
     show(found, "\n".join(_lines(found)), as_json=as_json)
@@ -91,9 +92,23 @@ def plan(dataset: Dataset, options: ResolvedOptions) -> dict[str, Any]:
         "steps": options.steps,
         "working_size": max(sizes),
         "photo_bytes": sum(3 * width * height for width, height in sizes),
-        # Unknown: a step's time depends on its number of samples, which depends on the field.
-        "seconds": None,
     }
+
+
+def expected_seconds(dataset: Dataset, asked: RefineOptions) -> dict[PresetName, float]:
+    """How long a run with each preset would take on this machine, by what earlier runs measured."""
+    from biresnerf.cores import usable_cores
+    from biresnerf.field.backends import resolve_here
+    from biresnerf.forecast import Forecast, remembered_rates
+    from biresnerf.refine.finish.work_ahead import expect_run
+
+    found: dict[PresetName, float] = {}
+    for preset in PRESETS:
+        options, device = resolve_here(asked.model_copy(update={"preset": preset}))
+        forecast = Forecast(remembered_rates(device.type, options.threads or usable_cores()))
+        expect_run(forecast, dataset, options)
+        found[preset] = forecast.left_s()
+    return found
 
 
 def start_in_words(dataset: Dataset, options: ResolvedOptions) -> str:
@@ -129,6 +144,14 @@ def start_in_words(dataset: Dataset, options: ResolvedOptions) -> str:
     return f"the given poses, or what feature matches make of them where that predicts unseen views better{found}"
 
 
+def in_minutes(seconds: float) -> str:
+    """A predicted time, no more exact than it is."""
+    if seconds < 55:
+        return f"{max(5, 5 * round(seconds / 5))} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
+
+
 def _lines(found: dict[str, Any]) -> list[str]:
     lines = [f"{found['folder']}: {found['images']} images, {found['format']}"]
     lines += [f"  poses from {file}" for file in found["pose_files"][:5]]
@@ -151,6 +174,6 @@ def _lines(found: dict[str, Any]) -> list[str]:
         f"  start from: {wanted['start']}",
         f"  take {wanted['steps']} steps on photos of up to {width} x {height} px"
         f" ({wanted['photo_bytes'] / 2**20:.0f} MiB of pixels)",
-        "  take a time that cannot be predicted; `biresnerf bench` measures steps on this machine",
+        "  take about " + ", ".join(f"{in_minutes(s)} ({preset})" for preset, s in wanted["seconds"].items()),
     ]
     return lines + [f"warning: {warning}" for warning in found["warnings"]]

@@ -10,6 +10,7 @@ from types import FrameType
 from typing import Any
 
 import click
+from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as ProgressBar
@@ -23,6 +24,7 @@ from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import Progress
 from biresnerf.report import Report
+from biresnerf.viewer.report_html import REPORT_HTML
 
 LINE_EVERY = 20  # reports of progress between two lines where there is no terminal
 
@@ -55,12 +57,13 @@ class ProgressPrinter:
             TextColumn("{task.percentage:>3.0f} %"),
             TimeElapsedColumn(),
             TextColumn("{task.fields[detail]}"),
+            console=Console(stderr=True),
             disable=not sys.stderr.isatty(),
             transient=True,
         )
         self._task = self._bar.add_task("preparing", total=1.0, detail="")
         self._lines = not sys.stderr.isatty()
-        self._count, self._stage = 0, ""
+        self._count, self._stage, self._message = 0, "", ""
 
     def __enter__(self) -> ProgressPrinter:
         self._bar.start()
@@ -73,9 +76,12 @@ class ProgressPrinter:
         detail = describe(progress)
         self._bar.update(self._task, completed=progress.fraction, description=progress.stage, detail=detail)
         self._count += 1
-        if self._lines and (progress.stage != self._stage or self._count % LINE_EVERY == 0):
+        news = progress.stage == "preparing" and progress.message not in {"", self._message}
+        if self._lines and (news or progress.stage != self._stage or self._count % LINE_EVERY == 0):
             click.echo(f"{progress.stage:<10} {100 * progress.fraction:3.0f} % {detail}", err=True)
-        self._stage = progress.stage
+        elif news:
+            self._bar.console.print(progress.message, highlight=False)
+        self._stage, self._message = progress.stage, progress.message
 
 
 def describe(progress: Progress) -> str:
@@ -105,6 +111,8 @@ def describe(progress: Progress) -> str:
 @click.option("--seed", type=int, default=None, help="Default: 0.")
 @budget_option
 @settings_option
+@click.option("--overwrite", is_flag=True, help="Replace a finished result in OUT.")
+@click.option("--open", "open_report", is_flag=True, help="Open OUT/report.html in a browser at the end.")
 @click.option("--verbose", "-v", is_flag=True, help="Print log messages.")
 @json_option
 def refine_command(
@@ -115,6 +123,8 @@ def refine_command(
     seed: int | None,
     time_budget_s: float | None,
     settings: dict[str, Any],
+    overwrite: bool,
+    open_report: bool,
     verbose: bool,
     as_json: bool,
 ) -> int:
@@ -134,15 +144,16 @@ def refine_command(
     try:
         with ProgressPrinter() as printer:
             dataset = read_dataset(input_path)
-            from biresnerf.pipeline import (
-                refine_poses,
-            )  # loads torch, for seconds: what cannot be read is told before
+            # Loads torch, which takes seconds: errors of the input come before.
+            from biresnerf.pipeline import refine_poses
 
-            report = refine_poses(dataset, output, options, printer, stop)
+            report = refine_poses(dataset, output, options, printer, stop, overwrite=overwrite)
     except Interrupted as interrupted:
         click.echo(str(interrupted), err=True)
         return 128 + (stop.signal or signal.SIGINT)
     show(report, summary(report, output), as_json=as_json)
+    if open_report:
+        click.launch(str(output / REPORT_HTML))
     return exit_codes.DONE
 
 
@@ -167,4 +178,5 @@ def summary(report: Report, output: Path) -> str:
             )
     lines += [f"warning: {warning}" for warning in report.warnings]
     lines.append(f"time: {sum(report.seconds.values()):.0f} s; results in {output}")
+    lines.append(f"report: {output / REPORT_HTML}")
     return "\n".join(lines)

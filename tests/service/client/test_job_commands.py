@@ -171,7 +171,7 @@ def test_waiting_ends_when_its_time_is_up_with_a_status_of_its_own(
     result = run(service, "wait", job["id"], "--timeout", 0.1, "--json")
     assert result.exit_code == exit_codes.NOT_OVER, result.output
     assert json.loads(result.stdout)["state"] in {"queued", "running"}
-    assert f"biresnerf wait {service.url}/v1/jobs/{job['id']}" in result.stderr
+    assert f"biresnerf wait '{service.url}/#/jobs/{job['id']}'" in result.stderr
     assert run(service, "wait", job["id"], "--timeout", 0).exit_code == exit_codes.INPUT
     http.post(job["links"]["cancel"])
     finished(http, job["id"])
@@ -225,7 +225,7 @@ def test_a_service_that_stays_away_while_a_job_is_waited_for_leaves_the_way_back
         with pytest.raises(ServiceError) as caught:
             waited_for(client, found, None, as_json=False)
         assert (caught.value.code, exit_code_of(caught.value)) == ("unreachable", exit_codes.AWAY)
-        assert f"biresnerf wait {client.url}/v1/jobs/{job}" in capsys.readouterr().err
+        assert f"biresnerf wait '{client.url}/#/jobs/{job}'" in capsys.readouterr().err
     http.post(found.links.cancel)
     finished(http, job)
 
@@ -277,8 +277,8 @@ def test_ctrl_c_while_waiting_leaves_the_job_running(
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=30)
     assert process.returncode == exit_codes.SIGINT
-    assert f"biresnerf wait {service.url}/v1/jobs/{job}" in said
-    assert f"biresnerf cancel {service.url}/v1/jobs/{job}" in said
+    assert f"biresnerf wait '{service.url}/#/jobs/{job}'" in said
+    assert f"biresnerf cancel '{service.url}/#/jobs/{job}'" in said
     reached = http.get(f"/v1/jobs/{job}").json()
     assert reached["state"] in {"queued", "running"}
     until(http, job, lambda found: found["progress"]["step"] > reached["progress"]["step"])

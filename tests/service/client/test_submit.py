@@ -89,7 +89,7 @@ def test_on_a_terminal_there_is_a_bar(service: Running, scene: Path) -> None:
 def test_without_wait_only_the_address_is_printed(http: httpx.Client, service: Running, scene: Path) -> None:
     done = submit(service, scene / "transforms.json", *FAST)
     assert done.returncode == 0, done.stderr
-    assert re.fullmatch(rf"{service.url}/v1/jobs/job_\w+\n", done.stdout)
+    assert re.fullmatch(rf"{service.url}/#/jobs/job_\w+\n", done.stdout)
     assert finished(http, done.stdout.strip().rsplit("/", 1)[1])["state"] == "succeeded"
 
 
