@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from biresnerf.stages import Stage
 
-Level = Literal["usual", "expert", "research"]
+Level = Literal["main", "usual", "expert", "research"]
 Schema = dict[str, Any]
 
 
@@ -18,20 +18,22 @@ class Option:
 
     Attributes:
         stage: the first stage whose work depends on it.
+        title: its name in forms; empty for what forms leave out.
         changes_result: whether poses, field or verdict depend on it. Other options may change when a run resumes.
-        level: usual: for every user; expert: for users who know the method; research: for experiments with the method,
-            left out of forms.
+        level: main: what forms show first; usual: for every user; expert: for users who know the method; research: for
+            experiments with the method, left out of forms.
         smaller: from the value of a try that ran out of memory to that of the next; None if it saves none.
     """
 
     stage: Stage
+    title: str = ""
     changes_result: bool = True
     level: Level = "expert"
     smaller: Callable[[Any], Any] | None = None
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Callable[[Any], Schema]) -> Schema:
         metadata = {"stage": self.stage, "changes_result": self.changes_result, "level": self.level}
-        return {**handler(schema), **metadata}
+        return {**handler(schema), **metadata, **({"title": self.title} if self.title else {})}
 
 
 def divided(by: int, least: int) -> Callable[[int], int]:

@@ -11,10 +11,10 @@ from typing import Annotated, Any, Generic, Literal, Never, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from biresnerf.errors import InputError
 from biresnerf.options.formats import ExportName
 from biresnerf.options.option import Option, divided, lowered
 from biresnerf.options.presets import ComputeDevice, MethodName, PresetName, in_proportion, preset_values
+from biresnerf.options.validated_options import refuse_unknown, validated
 from biresnerf.stages import STAGES
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -46,97 +46,103 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         "biresnerf",
         description="biresnerf-paper: the two stages as published; the last three: other published methods.",
     )
-    device: Annotated[DeviceName, Option("coarse", level="usual")] = Field(
+    device: Annotated[DeviceName, Option("coarse", "Compute on", level="usual")] = Field(
         AUTO, description="Where to compute; auto: on a CUDA GPU if there is one."
     )
-    seed: Annotated[int, Option("seeding", level="usual")] = Field(
-        0, ge=0, lt=2**31, description="Random seed; on one CPU the same seed gives the same result."
+    seed: Annotated[int, Option("seeding", "Random seed", level="usual")] = Field(
+        0, ge=0, lt=2**31, description="On one CPU the same seed gives the same result."
     )
-    threads: Annotated[int, Option("coarse", changes_result=False)] = Field(
+    threads: Annotated[int, Option("coarse", "CPU threads", changes_result=False)] = Field(
         0, ge=0, le=256, description="CPU threads; 0: all cores that the process may use."
     )
-    max_image_size: Annotated[int | Open, Option("coarse", level="usual", smaller=divided(2, 64))] = Field(
+    max_image_size: Annotated[
+        int | Open, Option("coarse", "Working image size", level="usual", smaller=divided(2, 64))
+    ] = Field(
         OPEN,
         ge=16,
         le=4096,
         description="Long side (px) of images during optimisation; results are full size.",
     )
-    holdout: Annotated[HeldOut | Open, Option("coarse", level="usual")] = Field(
+    holdout: Annotated[HeldOut | Open, Option("coarse", "Held-out views", level="usual")] = Field(
         OPEN, description="Views excluded from training, to measure quality; auto: a tenth, at most 10."
     )
-    background: Annotated[Background, Option("coarse", level="usual")] = Field(
+    background: Annotated[Background, Option("coarse", "Background", level="usual")] = Field(
         "auto", description="Colour behind the scene; none: photos show surroundings; auto: detected."
     )
-    exposure: Annotated[ExposureChoice | Open, Option("coarse", level="usual")] = Field(
+    exposure: Annotated[ExposureChoice | Open, Option("coarse", "Exposure", level="usual")] = Field(
         OPEN,
         description="on: estimate a brightness factor for each photo; none: all photos are equally bright; auto: on if "
         "opaque photos differ in brightness.",
     )
-    start: Annotated[StartPoses | Open, Option("seeding", level="usual")] = Field(
+    start: Annotated[StartPoses | Open, Option("seeding", "Starting poses", level="main")] = Field(
         OPEN,
-        description="Initial poses. auto: feature matches find missing poses, and poses that they support compete with "
-        "the given ones; given: the given poses, which every image must have; colmap: COLMAP's poses even if "
-        "others are given; none: no feature matching, missing poses are guessed from similar images; turntable: no "
-        "feature matching, the photos go once around an object in the order of their names.",
+        description="Where to start from. auto: your poses, with COLMAP filling the gaps, and whichever start scores "
+        "better where both exist; given: your poses only; colmap: COLMAP's poses only; none: no feature matching, "
+        "missing poses are guessed from similar photos; turntable: the photos go once around an object, in the order "
+        "of their names.",
     )
-    seeding_effort: Annotated[SeedingEffort, Option("seeding", smaller=lambda _: "low")] = Field(
+    seeding_effort: Annotated[
+        SeedingEffort, Option("seeding", "Feature matching effort", smaller=lambda _: "low")
+    ] = Field(
         "full",
         description="low: fewer features from smaller photos in one thread: takes less memory, places fewer photos.",
     )
-    fixed: Annotated[tuple[str, ...], Option("coarse", level="usual")] = Field(
+    fixed: Annotated[tuple[str, ...], Option("coarse", "Photos to keep fixed", level="main")] = Field(
         (),
         max_length=10_000,
-        description="Names of images with poses that stay exactly as given; they define the result's frame.",
+        description="Names of photos whose poses stay exactly as given; they define the result's frame.",
     )
-    refine_intrinsics: Annotated[RefineIntrinsics, Option("coarse", level="usual")] = Field(
+    refine_intrinsics: Annotated[RefineIntrinsics, Option("coarse", "Lens", level="main")] = Field(
         "auto",
-        description="Intrinsics to refine; auto: focal length and distortion of cameras not given; all: of every "
-        "camera, and without feature matches the principal point as well.",
+        description="What to refine of focal length and distortion. auto: lenses that were not given; all: every lens, "
+        "and without feature matches the principal point as well.",
     )
-    input_rotation_deg: Annotated[float, Option("fine")] = Field(
+    input_rotation_deg: Annotated[float, Option("fine", "Accuracy of given rotations")] = Field(
         0.0,
         ge=0,
         le=180,
         description="How exact the given rotations are: standard deviation about each axis, degrees; 0: measured.",
     )
-    input_position: Annotated[float, Option("fine")] = Field(
+    input_position: Annotated[float, Option("fine", "Accuracy of given positions")] = Field(
         0.0,
         ge=0,
         le=1e9,
         description="How exact the given positions are: standard deviation along each axis, in the input's unit; 0: "
         "measured.",
     )
-    steps: Annotated[int | Open, Option("coarse", level="usual")] = Field(
+    steps: Annotated[int | Open, Option("coarse", "Steps", level="usual")] = Field(
         OPEN, ge=20, le=1_000_000, description="Optimisation steps of both stages together."
     )
-    time_budget_s: Annotated[float, Option("coarse", level="usual")] = Field(
+    time_budget_s: Annotated[float, Option("coarse", "Time budget", level="main")] = Field(
         0.0,
         ge=0,
         le=1e6,
-        description="Seconds that the run may take, with all it does: fewer steps, as many as fit; 0: all steps.",
+        description="Seconds the whole run may take: it does as many steps as fit; 0: no limit.",
     )
-    coarse_steps_min: Annotated[int | Open, Option("coarse")] = Field(
+    coarse_steps_min: Annotated[int | Open, Option("coarse", "Shortest stage 1")] = Field(
         OPEN, ge=10, description="Shortest stage 1, steps."
     )
-    coarse_steps_max: Annotated[int | Open, Option("coarse")] = Field(
+    coarse_steps_max: Annotated[int | Open, Option("coarse", "Longest stage 1")] = Field(
         OPEN, ge=10, description="Longest stage 1, steps, even if the error is not stable by then."
     )
-    check_every: Annotated[int | Open, Option("coarse")] = Field(
+    check_every: Annotated[int | Open, Option("coarse", "Steps between checks")] = Field(
         OPEN, ge=5, description="Steps between two checks whether the error is stable."
     )
-    samples_per_step: Annotated[int | Open, Option("coarse", smaller=divided(4, 1024))] = Field(
+    samples_per_step: Annotated[
+        int | Open, Option("coarse", "Samples per step", smaller=divided(4, 1024))
+    ] = Field(
         OPEN, ge=1024, le=2**22, description="Field samples per step at the end of the coarse-to-fine ramp."
     )
-    pose_rate: Annotated[float | Open, Option("coarse")] = Field(
+    pose_rate: Annotated[float | Open, Option("coarse", "Pose rate at the start")] = Field(
         OPEN, gt=0, le=0.1, description="Pose learning rate at the start."
     )
-    pose_rate_final: Annotated[float | Open, Option("coarse")] = Field(
+    pose_rate_final: Annotated[float | Open, Option("coarse", "Pose rate at the end")] = Field(
         OPEN, gt=0, le=0.1, description="Pose learning rate at the end."
     )
-    field_rate: Annotated[float | Open, Option("coarse")] = Field(
+    field_rate: Annotated[float | Open, Option("coarse", "Field rate at the start")] = Field(
         OPEN, gt=0, le=0.5, description="Field learning rate at the start."
     )
-    field_rate_final: Annotated[float | Open, Option("coarse")] = Field(
+    field_rate_final: Annotated[float | Open, Option("coarse", "Field rate at the end")] = Field(
         OPEN, gt=0, le=0.5, description="Field learning rate at the end."
     )
     warmup_steps: Annotated[int | Open, Option("fine", level="research")] = Field(
@@ -164,38 +170,46 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     reconstruction_resolution_max: Annotated[int | Open, Option("fine", level="research")] = Field(
         OPEN, ge=4, le=16384, description="Cells per side of its finest level."
     )
-    table_size_log2: Annotated[int | Open, Option("fine", smaller=lowered(2, 10))] = Field(
+    table_size_log2: Annotated[int | Open, Option("fine", "Table size", smaller=lowered(2, 10))] = Field(
         OPEN, ge=10, le=22, description="log2 of the entries of a hashed level."
     )
-    verdict: Annotated[bool, Option("evaluating")] = Field(
+    verdict: Annotated[bool, Option("evaluating", "Verdict")] = Field(
         True,
         description="Compare the refined poses with the input's at the end, and return the input's unless the refined "
         "ones are better; false: always return the refined ones.",
     )
-    trial_steps: Annotated[int | Open, Option("evaluating")] = Field(
+    trial_steps: Annotated[int | Open, Option("evaluating", "Steps of the verdict")] = Field(
         OPEN,
         ge=0,
         le=100_000,
         description="Steps of each of the verdict's two short trainings, twice as many for scenes with surroundings; "
         "0: none.",
     )
-    checkpoint_every_s: Annotated[float, Option("coarse", changes_result=False)] = Field(
-        20.0, gt=0, description="Seconds between checkpoints."
-    )
-    orbit_frames: Annotated[int | Open, Option("evaluating", changes_result=False)] = Field(
-        OPEN, ge=0, le=600, description="Frames of the orbit video; 0: no video."
-    )
-    shown_views: Annotated[int | Open, Option("evaluating", changes_result=False)] = Field(
+    checkpoint_every_s: Annotated[
+        float, Option("coarse", "Seconds between checkpoints", changes_result=False)
+    ] = Field(20.0, gt=0, description="Seconds between checkpoints.")
+    orbit_frames: Annotated[
+        int | Open, Option("evaluating", "Frames of the orbit video", changes_result=False)
+    ] = Field(OPEN, ge=0, le=600, description="Frames of the orbit video; 0: no video.")
+    shown_views: Annotated[int | Open, Option("evaluating", "Views to render", changes_result=False)] = Field(
         OPEN,
         ge=0,
         le=200,
         description="Views to render for display besides the held-out ones; fewer if they would take more than a "
         "twentieth of the run.",
     )
-    exports: Annotated[Exports, Option("exporting", level="usual", changes_result=False)] = Field(
+    exports: Annotated[
+        Exports, Option("exporting", "Further formats", level="usual", changes_result=False)
+    ] = Field(
         (),
         description="Further formats to write the result in; pinhole: undistorted photos with a PINHOLE model.",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known(cls, values: Any) -> Any:
+        refuse_unknown(values, cls)
+        return values
 
     @field_validator("fixed", "exports", mode="before")
     @classmethod
@@ -260,7 +274,7 @@ class RefineOptions(_Options[None, Device]):
             InputError: ``invalid_options``: the requested values contradict those of the preset.
         """
         values = preset_values(self.preset, self.method, device, self.steps)
-        return _parse(ResolvedOptions, {**values, **self.model_dump(exclude_none=True), "device": device})
+        return validated(ResolvedOptions, {**values, **self.model_dump(exclude_none=True), "device": device})
 
 
 OPTIONS: Mapping[str, Option] = {
@@ -274,26 +288,7 @@ STAGE_1_OPTIONS = frozenset(
     name for name in RESULT_OPTIONS if STAGES.index(OPTIONS[name].stage) <= STAGES.index("coarse")
 )
 
-Parsed = TypeVar("Parsed", bound=BaseModel)
-
 
 def parse_options(values: Mapping[str, Any]) -> RefineOptions:
     """Options from untrusted values; raises `InputError` with the path of every wrong key."""
-    return _parse(RefineOptions, values)
-
-
-def _parse(model: type[Parsed], values: Mapping[str, Any]) -> Parsed:
-    try:
-        return model.model_validate(values)
-    except ValidationError as error:
-        problems = []
-        for item in error.errors():
-            path = ".".join(str(part) for part in item["loc"]) or "options"
-            known = "unknown option" if item["type"] == "extra_forbidden" else item["msg"]
-            problems.append(f"{path}: {known}")
-        raise InputError(
-            "invalid_options",
-            "; ".join(problems) + ".",
-            where="options",
-            hint="`biresnerf refine --help` and GET /v1/options list all options.",
-        ) from None
+    return validated(RefineOptions, values)

@@ -15,7 +15,8 @@ from docs.generate.markdown import DASH, code, table
 from docs.generate.schema_words import takes
 
 _LEVELS: dict[Level, str] = {
-    "usual": "The usual options",
+    "main": "The main options",
+    "usual": "Further options",
     "expert": "Schedule, sizes and output",
     "research": "For research",
 }

@@ -53,7 +53,7 @@ export function OptionsForm({ values, onChange, base, problems = [] }: Props) {
       onChange={(value) => set(field.name, value)}
     />
   );
-  const changed = fields.expert.filter(({ name }) => name in values).length;
+  const changed = [...fields.usual, ...fields.expert].filter(({ name }) => name in values).length;
   return (
     <div class="options">
       <fieldset class="presets">
@@ -61,7 +61,7 @@ export function OptionsForm({ values, onChange, base, problems = [] }: Props) {
         {Object.entries(view.presets).map(([name, filled]) => (
           <label key={name} class={name === preset ? "preset chosen" : "preset"}>
             <input type="radio" name="preset" checked={name === preset} onChange={() => set("preset", name)} />
-            <strong>{name}</strong>
+            <strong>{name[0]!.toUpperCase() + name.slice(1)}</strong>
             <span>{PRESET_WORDS[name]}</span>
             <span class="soft">
               {filled.steps} steps at {filled.max_image_size} px ({view.presets_on_gpu[name as keyof OptionsView["presets"]]?.max_image_size} px on a GPU)
@@ -69,11 +69,13 @@ export function OptionsForm({ values, onChange, base, problems = [] }: Props) {
           </label>
         ))}
       </fieldset>
-      <div class="fields">{fields.usual.map(row)}</div>
+      <div class="fields">{fields.main.map(row)}</div>
       <details>
         <summary>
-          Schedule, sizes and output <span class="soft">{changed ? `${changed} changed` : "from the preset"}</span>
+          More options <span class="soft">{changed ? `${changed} changed` : "decided by the preset"}</span>
         </summary>
+        <div class="fields">{fields.usual.map(row)}</div>
+        <h3>Schedule, sizes and output</h3>
         <div class="fields">{fields.expert.map(row)}</div>
       </details>
     </div>
@@ -95,7 +97,7 @@ function FieldRow(props: RowProps) {
   const described = `${id}-help${problem ? ` ${id}-problem` : ""}`;
   return (
     <div class={value === undefined ? "field" : "field changed"}>
-      {grouped ? <span class="field-name">{field.name}</span> : <label for={id}>{field.name}</label>}
+      {grouped ? <span class="field-name">{field.title}</span> : <label for={id}>{field.title}</label>}
       {grouped ? <Several {...props} /> : <Control {...props} id={id} described={described} />}
       <p class="soft" id={`${id}-help`}>
         {field.help}
@@ -152,7 +154,7 @@ function Several({ field, value, onChange }: RowProps) {
     onChange(next.length ? next : undefined);
   };
   return (
-    <div class="several" role="group" aria-label={field.name}>
+    <div class="several" role="group" aria-label={field.title}>
       {field.choices.map((choice) => (
         <label key={choice}>
           <input

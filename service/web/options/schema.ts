@@ -9,7 +9,8 @@ interface Schema {
   readonly enum?: readonly (string | number)[];
   readonly anyOf?: readonly Schema[];
   readonly items?: Schema;
-  readonly level?: "usual" | "expert" | "research";
+  readonly level?: "main" | "usual" | "expert" | "research";
+  readonly title?: string;
   readonly properties?: Readonly<Record<string, Schema>>;
   readonly minimum?: number;
   readonly maximum?: number;
@@ -21,6 +22,7 @@ export type Values = Record<string, unknown>;
 
 export interface Field {
   name: string;
+  title: string;
   help: string;
   kind: "choice" | "yes-no" | "number" | "several" | "words";
   choices: string[];
@@ -29,12 +31,12 @@ export interface Field {
   most: number | null;
 }
 
-/** The usual fields and those for experts, without those for research. */
-export function fieldsOf(schema: Schema): { usual: Field[]; expert: Field[] } {
+/** The fields by level, without those for research. */
+export function fieldsOf(schema: Schema): { main: Field[]; usual: Field[]; expert: Field[] } {
   const properties = Object.entries(schema.properties ?? {}).filter(([name]) => name !== "preset");
   const fields = (level: string) =>
     properties.filter(([, property]) => property.level === level).map(([name, property]) => fieldOf(name, property));
-  return { usual: fields("usual"), expert: fields("expert") };
+  return { main: fields("main"), usual: fields("usual"), expert: fields("expert") };
 }
 
 function fieldOf(name: string, property: Schema): Field {
@@ -42,7 +44,7 @@ function fieldOf(name: string, property: Schema): Field {
   const type = property.anyOf?.find((one) => one.type !== "null") ?? property;
   const items = type.items?.enum?.map(String);
   const field: Field = {
-    ...{ name, help: property.description ?? "", kind: "words", choices: [] },
+    ...{ name, title: property.title ?? name, help: property.description ?? "", kind: "words", choices: [] },
     whole: type.type === "integer",
     least: type.minimum ?? type.exclusiveMinimum ?? null,
     most: type.maximum ?? type.exclusiveMaximum ?? null,
