@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -43,18 +42,17 @@ from biresnerf.write.output_folder import OutputFolder
 from biresnerf.write.preview import SeedingPreview, write_preview
 from biresnerf.write.result import ResultPictures, write_result
 
-logger = logging.getLogger(__name__)
-
 
 def refine_poses(
-    input: Path | Dataset,
-    output: Path,
+    input: str | Path | Dataset,
+    output: str | Path,
     options: RefineOptions,
     on_progress: OnProgress | None = None,
     should_stop: Callable[[], bool] | None = None,
     observer: Observer | None = None,
     *,
     keep_reusable: bool = False,
+    overwrite: bool = False,
 ) -> Report:
     """Refine the poses of an image set; all results go to the folder `output`.
 
@@ -69,6 +67,7 @@ def refine_poses(
             written.
         observer: looks into the run, for comparisons with the truth.
         keep_reusable: leave in `output`/checkpoint what other runs of the set can start from.
+        overwrite: remove a finished result from `output` first.
 
     Raises:
         InputError: the user can fix it.
@@ -77,7 +76,9 @@ def refine_poses(
             yet where initial poses were still being looked for.
     """
     started = time.monotonic()
-    setup = _set_up(output, options, on_progress, should_stop, keep_reusable=keep_reusable)
+    setup = _set_up(
+        Path(output), options, on_progress, should_stop, keep_reusable=keep_reusable, overwrite=overwrite
+    )
 
     dataset = input if isinstance(input, Dataset) else read_dataset(Path(input))
     scene, origin = _seed(dataset, setup)
@@ -90,8 +91,11 @@ def refine_poses(
         stages.run_stage_1()
         finish = run_stage_2(stages)
         stages.observer.at_end(stages)
-        evaluation = evaluate(stages, ResultPictures(setup.folder, scene))
+        pictures = ResultPictures(setup.folder, scene)
+        evaluation = evaluate(stages, pictures)
         judgement = judge(stages)
+        if judgement is not None:
+            evaluation.views = pictures.write_before_after(evaluation.views, judgement.renders)
         known = pose_uncertainty(stages, finish, judgement)
         report = run_report(stages, evaluation.scores, judgement, "complete", finish, known)
         report = write_result(setup.folder, stages, evaluation, report)
@@ -129,9 +133,12 @@ def _set_up(
     should_stop: Callable[[], bool] | None,
     *,
     keep_reusable: bool,
+    overwrite: bool,
 ) -> _Setup:
     """Check the folder, find earlier work in it, and choose the backend, and compile the kernels."""
     folder = OutputFolder(output, keep_reusable=keep_reusable)
+    if overwrite:
+        folder.remove_result()
     folder.refuse_finished()
     earlier = earlier_work(folder.path)
     options, device = resolve_here(asked)
@@ -189,6 +196,6 @@ def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observ
     stages = TwoStages(optimiser, scene, setup.folder.path, origin, setup.monitor, observer)
     if setup.earlier is not None:
         stages.restore(setup.earlier)
-        logger.info("continuing from step %d", optimiser.step_index)
+        setup.monitor.report(Progress(stage="preparing", message=f"resuming at step {optimiser.step_index}"))
     expect_rest(stages)
     return stages

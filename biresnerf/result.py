@@ -25,7 +25,8 @@ from biresnerf.data.show.history import HISTORY, read_history
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.report import Report, Verdict
+from biresnerf.report import Report
+from biresnerf.verdict import Verdict
 from biresnerf.viewer.report_html import read_report
 
 if TYPE_CHECKING:

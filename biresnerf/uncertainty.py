@@ -29,7 +29,9 @@ class PoseUncertainty(FrozenModel, allow_inf_nan=False):
         "returned world_from_cam; then of the centre (the input's unit). Both along the axes of the input's world.",
     )
     why_unknown: str | None = Field(
-        None, examples=["nothing but the field speaks for it"], description="None where the bounds are known."
+        None,
+        examples=["no feature matches or patches support them"],
+        description="None where the bounds are known.",
     )
 
 

@@ -8,7 +8,7 @@ import { Curves } from "./widgets/curves";
 import { ImageCompare } from "./widgets/image_compare";
 import { ImageTable } from "./widgets/image_table";
 import { count, duration, fixed } from "./widgets/numbers";
-import { VerdictSentence } from "./widgets/verdict";
+import { ResultSummary } from "./widgets/result_summary";
 
 /** What report_html.py embeds. */
 interface Embedded {
@@ -52,7 +52,6 @@ function ReportPage({ data, licences }: { data: Embedded; licences: string }) {
             <video class="orbit" src={orbit} poster={files[view?.views[0]?.pictures.render ?? ""]} controls loop muted playsInline aria-label="A flight around the scene" />
           </div>
         )}
-        <Notes title="Warnings" lines={report.warnings} />
         <Notes title="Not in this file" lines={data.left_out} />
         <details class="panel">
           <summary>Options</summary>
@@ -87,14 +86,16 @@ function Widgets({ data, points }: { data: Embedded; points: readonly PointLayer
   const choice = { selected, onSelect: setSelected };
   return (
     <div class="job-view">
-      <VerdictSentence verdict={report.verdict} state={report.state} requested={report.options.verdict !== false} />
+      <div class="panel">
+        <ResultSummary {...{ report, rows, cellOf }} onSelect={setSelected} />
+      </div>
       <div class="job-pictures">
         <div class="panel panel-scene">
           <h2>Cameras</h2>
           <SceneView cameras={cameras} points={points} {...choice} />
         </div>
         <div class="panel panel-compare">
-          <h2>Photo and render</h2>
+          <h2>Before and after</h2>
           <ImageCompare names={names} views={view?.views ?? []} centres={centres} urlOf={urlOf} {...choice} />
         </div>
       </div>
@@ -120,7 +121,6 @@ function factsOf(report: Report): string[] {
     ...(report.heldout?.unshared_opacity != null
       ? [`${fixed(100 * report.heldout.unshared_opacity, 1)} % of what is rendered lies where no second camera looks`]
       : []),
-    ...(report.heldout ? [`held-out PSNR ${fixed(report.heldout.psnr, 2)} dB, SSIM ${fixed(report.heldout.ssim, 3)}`] : []),
     `${duration(seconds)} on ${report.device}`,
   ];
 }

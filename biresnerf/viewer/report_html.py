@@ -144,8 +144,8 @@ def _wanted(view: ViewFile) -> Iterator[str]:
     yield from (points.file for points in view.points)
     if view.contact_sheet is not None:
         yield view.contact_sheet.file
-    for kind in ("render", "photo", "difference", "depth"):
-        yield from (getattr(shown.pictures, kind) for shown in view.views)
+    for kind in ("before", "after", "render", "photo", "difference", "depth"):
+        yield from (shown.pictures.files()[kind] for shown in view.views if kind in shown.pictures.files())
 
 
 def _content(path: Path) -> tuple[bytes, str]:

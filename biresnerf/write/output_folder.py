@@ -6,11 +6,16 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
+from biresnerf.data.model.refined_set import REFINED
 from biresnerf.data.show.history import HISTORY
+from biresnerf.data.show.view_file import CONTACT_SHEET, THUMBNAIL, VIEW
 from biresnerf.errors import InputError
+from biresnerf.options.formats import formats
 from biresnerf.refine.stages.checkpoint import CHECKPOINT, OTHER_FOLDER
+from biresnerf.viewer.report_html import REPORT_HTML
 
-REPORT, PREVIEW = "report.json", "preview"
+REPORT, PREVIEW, CONFIG = "report.json", "preview", "config.json"
+RENDERS, ORBIT = "renders", "renders/orbit.mp4"
 
 
 class OutputFolder:
@@ -37,9 +42,24 @@ class OutputFolder:
             return  # new, or killed before the first checkpoint
         where = str(self.path)
         if (self.path / REPORT).is_file():
-            raise InputError("output_finished", "holds a finished result.", where=where, hint=OTHER_FOLDER)
+            hint = f"Look at {self.path / REPORT_HTML}; --overwrite replaces it."
+            raise InputError("output_finished", "holds a finished result.", where=where, hint=hint)
         detail = "is not empty, and nothing in it can be resumed."
         raise InputError("output_not_empty", detail, where=where, hint=OTHER_FOLDER)
+
+    def remove_result(self) -> None:
+        """Remove the files of a finished result, and nothing else."""
+        if not (self.path / REPORT).is_file():
+            return
+        written = {one.in_result for one in formats().values()}
+        written |= {REPORT, REPORT_HTML, CONFIG, HISTORY, RENDERS, REFINED, THUMBNAIL, VIEW, CONTACT_SHEET}
+        written.add(CHECKPOINT.parent.name)
+        for name in {Path(file).parts[0] for file in written if file}:
+            path = self.path / name
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
 
     def remove_preview(self) -> None:
         """Remove previews, and the folder where it holds nothing else."""

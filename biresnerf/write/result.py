@@ -17,7 +17,7 @@ from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import REFINED, RefinedSet, refined_set
 from biresnerf.data.points.refined_points import FieldPoints, with_points_of
-from biresnerf.data.show.renders import picture_stems, write_orbit, write_view
+from biresnerf.data.show.renders import picture_stems, write_orbit, write_pictures, write_view
 from biresnerf.data.show.view_file import THUMBNAIL, ShownPictures, ShownView, ViewFile, write_view_file
 from biresnerf.data.show.view_pictures import write_contact_sheet, write_points, write_thumbnail
 from biresnerf.geometry.similarity import Similarity
@@ -26,16 +26,15 @@ from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.first_step import poses_in_input_frame
 from biresnerf.refine.verdict.evaluate import Evaluation
+from biresnerf.refine.views.compare_rigs import BeforeAfter
 from biresnerf.refine.views.evaluation import RenderedView, ViewScore
 from biresnerf.refine.views.shown_views import Points
 from biresnerf.report import PointsReport, Report
 from biresnerf.viewer.report_html import write_report_html
-from biresnerf.write.output_folder import REPORT, OutputFolder
+from biresnerf.write.output_folder import CONFIG, ORBIT, RENDERS, REPORT, OutputFolder
 
 logger = logging.getLogger(__name__)
 
-CONFIG = "config.json"
-RENDERS, ORBIT = "renders", "renders/orbit.mp4"
 SOLID = 0.5  # opacity from which a depth means something
 
 
@@ -103,6 +102,19 @@ class ResultPictures:
             psnr=score.psnr,
             pictures=ShownPictures.model_validate(names),
         )
+
+    def write_before_after(self, views: Sequence[ShownView], renders: BeforeAfter) -> list[ShownView]:
+        """The shown views, with what the verdict's two trainings make of them."""
+        stems, shown = picture_stems(self._scene.dataset.names), []
+        for view in views:
+            if view.image in renders:
+                before, after = renders[view.image]
+                pictures = {"before": before, "after": after}
+                files = write_pictures(self._folder / RENDERS, stems[view.image], pictures)
+                names = {kind: f"{RENDERS}/{file.name}" for kind, file in zip(pictures, files, strict=True)}
+                view = view.model_copy(update={"pictures": view.pictures.model_copy(update=names)})
+            shown.append(view)
+        return shown
 
     def write_orbit(self, frames: Iterator[NDArray[np.generic]]) -> None:
         """Film the frames."""

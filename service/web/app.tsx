@@ -5,6 +5,7 @@ import { apiKey, keyRequired, setKey } from "./api/http";
 import { useStore } from "./api/store";
 import { JobPage } from "./job/page";
 import { JobsPage } from "./jobs/list";
+import { ErrorBoundary } from "./parts/error_boundary";
 import { KeyForm } from "./parts/key_form";
 import { DatasetPage } from "./upload/dataset_page";
 
@@ -56,7 +57,13 @@ function App() {
         </nav>
       </header>
       <main id="main" ref={main} tabIndex={-1}>
-        {keyError !== null ? <KeyForm error={keyError} /> : <View key={`${route.name} ${route.id} ${key}`} {...route} />}
+        {keyError !== null ? (
+          <KeyForm error={keyError} />
+        ) : (
+          <ErrorBoundary key={`${route.name} ${route.id} ${key}`}>
+            <View {...route} />
+          </ErrorBoundary>
+        )}
       </main>
     </>
   );

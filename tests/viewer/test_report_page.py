@@ -126,6 +126,7 @@ def test_a_camera_without_a_render_says_so_and_names_the_nearest(opened, result)
 def test_the_swipe_is_worked_by_keys_and_uncovers_the_render(opened, result):
     page = opened.page
     choose(page, result.view["views"][0]["image"])
+    page.get_by_role("radio", name="photo | render").check()
     page.get_by_label("Swipe between photo and render").focus()
     for key, uncovered in (("Home", 0), ("End", 1)):
         page.keyboard.press(key)

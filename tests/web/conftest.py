@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -198,6 +199,13 @@ def drop(page: Page, *paths: Path) -> None:
         wire.send("Input.dispatchDragEvent", {"type": kind, **where, "data": data})
 
 
+def zip_of(folder: Path, path: Path) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in sorted(folder.rglob("*")):
+            archive.write(file, file.relative_to(folder))
+    return path
+
+
 def check_row(page: Page, name: str) -> Locator:
     """A line of the check's table."""
     return page.locator(".checks tr", has=page.get_by_role("rowheader", name=name, exact=True))
@@ -216,17 +224,17 @@ def job_url(desktop: Watched, service: Running, kitchen: Path) -> str:
     expect(check_row(page, "Poses")).to_contain_text("10 of 10 given")
     assert desktop.serious_findings() == []
     page.get_by_text("A first result within minutes").click()
-    page.get_by_label("steps", exact=True).fill("500")
-    page.get_by_label("start", exact=True).select_option("given")
-    page.get_by_text("Schedule, sizes and output").click()
+    page.get_by_label("Starting poses", exact=True).select_option("given")
+    page.get_by_text("More options").click()
+    page.get_by_label("Steps", exact=True).fill("500")
     for name, value in (
-        ("checkpoint_every_s", 2),
-        ("coarse_steps_min", 100),
-        ("coarse_steps_max", 200),
-        ("check_every", 10),
-        ("samples_per_step", 4096),
-        ("trial_steps", 20),
-        ("orbit_frames", 4),
+        ("Seconds between checkpoints", 2),
+        ("Shortest stage 1", 100),
+        ("Longest stage 1", 200),
+        ("Steps between checks", 10),
+        ("Samples per step", 4096),
+        ("Steps of the verdict", 20),
+        ("Frames of the orbit video", 4),
     ):
         page.get_by_label(name, exact=True).fill(str(value))
     desktop.screenshot("new-job")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 import sys
-import zipfile
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -16,8 +15,8 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, Route, expect
 
 from biresnerf.client import Client
-from tests.service.conftest import LIMITS, Running, running_service, short_folder
-from tests.web.conftest import DESKTOP, PHONE, Watched, check_row, drop, watched_page
+from tests.service.conftest import Running, running_service, short_folder
+from tests.web.conftest import DESKTOP, PHONE, Watched, check_row, drop, watched_page, zip_of
 
 PROGRAM = Path(__file__).with_name("matching_program.py")
 WAITING = 55
@@ -136,35 +135,6 @@ def test_an_archive_goes_on_after_a_reload_from_its_last_byte(
     expect(check_row(page, "Images")).to_contain_text("10 images")
 
 
-def test_an_archive_that_cannot_be_taken_says_why_and_another_takes_its_place(
-    page: Page, service: Running, kitchen: Path, tmp_path: Path
-) -> None:
-    broken = zip_of(kitchen, tmp_path / "broken.zip")
-    broken.write_bytes(broken.read_bytes()[:-100])
-    page.goto(service.url)
-    page.locator("input[type=file]").nth(1).set_input_files(broken)
-    expect(page.get_by_role("alert")).to_contain_text("The archive was rejected")
-    expect(page.get_by_role("alert")).to_contain_text("archive_rejected")
-    page.locator("input[type=file]").nth(1).set_input_files(zip_of(kitchen, tmp_path / "whole.zip"))
-    expect(page.get_by_role("button", name="Refine the poses")).to_be_visible()
-
-
-def test_files_that_are_too_large_are_named_before_anything_is_sent(
-    page: Page, service: Running, tmp_path: Path, api: httpx.Client
-) -> None:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    (folder / "small.png").write_bytes(bytes(100))
-    (folder / "huge.png").write_bytes(bytes(LIMITS["max_file_bytes"] + 1))
-    before = api.get("/datasets").json()["items"]
-    page.goto(service.url)
-    drop(page, folder)
-    refusal = page.get_by_role("alert")
-    expect(refusal).to_contain_text("huge.png")
-    assert "small.png" not in refusal.inner_text()
-    assert [item["id"] for item in api.get("/datasets").json()["items"]] == [item["id"] for item in before]
-
-
 def test_a_job_that_fails_says_what_and_what_to_do(
     tab: Watched, service: Running, kitchen: Path, tmp_path: Path
 ) -> None:
@@ -176,19 +146,12 @@ def test_a_job_that_fails_says_what_and_what_to_do(
         shutil.copy(photo, folder)
     drop(page, folder)
     expect(check_row(page, "Poses")).to_contain_text("0 of 4 given")
-    page.get_by_label("start", exact=True).select_option("given")
+    page.get_by_label("Starting poses", exact=True).select_option("given")
     page.get_by_role("button", name="Refine the poses").click()
     expect(page.get_by_role("alert")).to_contain_text("What to do")
     tab.screenshot("job-failed")
     assert tab.serious_findings() == []
     expect(page.get_by_role("button", name="Run again …")).to_be_visible()
-
-
-def zip_of(folder: Path, path: Path) -> Path:
-    with zipfile.ZipFile(path, "w") as archive:
-        for file in sorted(folder.rglob("*")):
-            archive.write(file, file.relative_to(folder))
-    return path
 
 
 def test_a_long_list_is_shown_piece_by_piece_and_all_of_it_is_live(

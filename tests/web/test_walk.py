@@ -52,14 +52,16 @@ def test_the_slider_goes_from_the_inputs_poses_to_the_refined_ones(
     slider.press("End")
 
 
-def test_the_swipe_uncovers_the_photo(desktop: Watched, done: dict[str, Any]) -> None:
+def test_the_swipe_uncovers_the_view_before_and_the_photo(desktop: Watched, done: dict[str, Any]) -> None:
     page = desktop.page
-    swipe = page.get_by_role("slider", name="Swipe between photo and render")
     frame = page.locator(".compare-frame")
-    swipe.press("Home")
-    all_render = frame.screenshot()
-    swipe.press("End")
-    assert frame.screenshot() != all_render
+    for mode, left, right in (("before | after", "before", "after"), ("photo | render", "photo", "render")):
+        page.get_by_role("radio", name=mode).check()
+        swipe = page.get_by_role("slider", name=f"Swipe between {left} and {right}")
+        swipe.press("Home")
+        all_right = frame.screenshot()
+        swipe.press("End")
+        assert frame.screenshot() != all_right
     for mode in ("difference", "depth"):
         page.get_by_role("radio", name=mode).check()
         picture = page.locator(".compare-figure img").first
@@ -90,7 +92,7 @@ def test_ticked_images_are_held_in_another_run(desktop: Watched, done: dict[str,
         page.get_by_label(f"Select {name}", exact=True).check()
     page.get_by_role("button", name="Run again with their given poses fixed").click()
     dialog = page.get_by_role("dialog", name="Run again with other options")
-    expect(dialog.get_by_label("fixed", exact=True)).to_have_value("./train/r_3, ./train/r_8")
+    expect(dialog.get_by_label("Photos to keep fixed", exact=True)).to_have_value("./train/r_3, ./train/r_8")
     page.keyboard.press("Escape")
     expect(dialog).to_be_hidden()
 
@@ -99,7 +101,7 @@ def test_the_verdict_is_the_reports(desktop: Watched, done: dict[str, Any], api:
     said = api.get(f"/jobs/{done['id']}/report").json()["verdict"]
     assert said["verdict"] == done["verdict"]
     shown = desktop.page.get_by_role("region", name="Verdict").inner_text()
-    assert {"improved": "improved", "kept_input": "kept"}.get(
+    assert {"improved": "improved", "kept_input": "not improved"}.get(
         said["verdict"], said["verdict"]
     ).lower() in shown.lower()
     desktop.screenshot("job-done")
@@ -185,7 +187,7 @@ def test_all_of_it_can_be_reached_by_keyboard(desktop: Watched, done: dict[str, 
         "Run again …",
         "Delete",
         "From the input's poses to the refined ones",
-        "Swipe between photo and render",
+        "Swipe between before and after",
     }
     assert wanted <= names, names
     page.get_by_role("button", name="Delete").press("Enter")
@@ -208,7 +210,7 @@ def test_a_phone_shows_the_same_without_scrolling_sideways(
         page.goto(url)
         expect(page.get_by_text("kitchen").first).to_be_visible()
         if name == "phone-job":
-            expect(page.get_by_role("slider", name="Swipe between photo and render")).to_be_visible()
+            expect(page.get_by_role("slider", name="Swipe between before and after")).to_be_visible()
             expect(page.locator(".curves canvas").first).to_be_visible()
         phone.screenshot(name)
         assert not phone.overflows(), name
@@ -222,7 +224,8 @@ def test_a_job_is_run_again_ended_and_deleted(
 ) -> None:
     page = tab.page
     dialog = again(page, job_url)
-    steps = dialog.get_by_label("steps", exact=True)
+    dialog.get_by_text("More options").click()
+    steps = dialog.get_by_label("Steps", exact=True)
     assert steps.get_attribute("placeholder") == "500"
     steps.fill("20000")
     assert tab.serious_findings() == []
@@ -244,8 +247,8 @@ def test_a_fork_goes_on_after_stage_1_and_its_end_on_request_leaves_a_partial_re
 ) -> None:
     page = tab.page
     dialog = again(page, job_url)
-    dialog.get_by_text("Schedule, sizes and output").click()
-    dialog.get_by_label("trial_steps", exact=True).fill("100000")  # it would take hours
+    dialog.get_by_text("More options").click()
+    dialog.get_by_label("Steps of the verdict", exact=True).fill("100000")  # it would take hours
     dialog.get_by_role("button", name="Fork: continue").click()
     fork = another_job(page, job_url)
     made = api.get(f"/jobs/{fork}").json()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -78,11 +78,16 @@ def write_view(
     pictures = {"render": rendered, "photo": taken, "difference": ramp_colours(error / DIFFERENCE_AT_TOP)}
     if depth is not None:
         pictures["depth"] = depth_picture(depth)
+    return write_pictures(folder, stem, pictures)
+
+
+def write_pictures(folder: Path, stem: str, pictures: Mapping[str, NDArray[np.generic]]) -> list[Path]:
+    """Writes ``<stem>_<kind>.png`` for each picture [h, w, 3], uint8 or floats from 0 to 1; returns the files."""
     written = []
     for kind, picture in pictures.items():
         path = folder / f"{stem}_{kind}.png"
         with whole_file(path) as temporary:
-            Image.fromarray(picture).save(temporary)
+            Image.fromarray(_bytes(picture)).save(temporary)
         written.append(path)
     return written
 

@@ -16,12 +16,21 @@ CONTACT_SHEET, POINTS = "view/contact_sheet.jpg", "view/points_{source}.bin"
 
 
 class ShownPictures(FrozenModel, allow_inf_nan=False):
-    """A rendered view's files, relative to the result's folder."""
+    """A rendered view's files, relative to the result's folder.
+
+    `before` and `after` come from the verdict's two trainings, on the input's poses and on the refined ones.
+    """
 
     render: str
     photo: str
     difference: str
     depth: str
+    before: str | None = None
+    after: str | None = None
+
+    def files(self) -> dict[str, str]:
+        """The files there are, by what they show."""
+        return {kind: file for kind, file in self if file is not None}
 
 
 class ShownView(FrozenModel, allow_inf_nan=False):

@@ -28,9 +28,9 @@ from biresnerf.refine.verdict.pose_evidence import (
     working_share,
 )
 from biresnerf.refine.verdict.verdict import MEASURABLE_PX, Findings, decide, failed_checks, frame_doubt
-from biresnerf.refine.views.compare_rigs import HeldOutComparison, Rig, compare_placed
+from biresnerf.refine.views.compare_rigs import BeforeAfter, HeldOutComparison, Rig, compare_placed
 from biresnerf.refine.views.held_out_views import ROUNDS_MOST
-from biresnerf.report import Verdict
+from biresnerf.verdict import Verdict
 
 logger = logging.getLogger(__name__)
 
@@ -46,12 +46,14 @@ class Judgement:
     Attributes:
         trial_psnr: of the unseen views, before and after [2, n]; NaN for the others.
         epipolar_px: before and after [2, n]; NaN where there are too few matches.
+        renders: of some held-out views, in the verdict's training on the input's poses and on the refined ones.
         sharpness, gain: see `image_flags`.
         contradicted, moved_far, blurred, exposure_off: bool.
     """
 
     verdict: Verdict
     trial_psnr: Array
+    renders: BeforeAfter
     epipolar_px: Array
     sharpness: Array
     gain: Array
@@ -175,6 +177,7 @@ def _with_images(
     return Judgement(
         verdict=verdict,
         trial_psnr=trial_psnr,
+        renders=heldout.renders if heldout is not None else {},
         epipolar_px=epipolar_px,
         sharpness=sharpness,
         gain=gain,

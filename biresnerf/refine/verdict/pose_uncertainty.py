@@ -13,11 +13,11 @@ from biresnerf.refine.start.first_step import poses_in_input_frame
 from biresnerf.refine.verdict.judgement import Judgement
 from biresnerf.uncertainty import KnownFrom, PoseUncertainty
 
-FIXED = "it was kept as given, on request"
-CONTRADICTED = "its own feature matches contradict it"
-NO_EVIDENCE = "nothing but the field speaks for it"
-LOST = "no pose that was found agrees with its photo"
-OPEN = "what speaks for it does not determine it"
+FIXED = "they were kept as given, on request"
+CONTRADICTED = "their feature matches contradict them"
+NO_EVIDENCE = "no feature matches or patches support them"
+LOST = "no pose was found that agrees with the photo"
+OPEN = "their matches do not determine them"
 
 
 def pose_uncertainty(

@@ -102,8 +102,8 @@ def turntable_warnings(start: InitialPoses) -> tuple[str, ...]:
         return ()
     better, other = start.trials
     return (
-        f"Photos tell hardly which way the table turned ({better.psnr:.2f} dB, the other way {other.psnr:.2f} dB): the "
-        "result may be a mirror image.",
+        f"The photos hardly show which way the table turned ({better.psnr:.2f} dB, the other way {other.psnr:.2f} dB). "
+        "The result may be a mirror image.",
     )
 
 
@@ -127,8 +127,8 @@ def unmatched_warnings(scene: Scene) -> tuple[str, ...]:
         return ()
     names = ", ".join(scene.dataset.names[i] for i in unmatched)
     return (
-        f"Feature matches say nothing of {len(unmatched)} of {count} images: of {names} only the photo tells where it "
-        "was taken from. Look at these poses before you rely on them.",
+        f"{len(unmatched)} of {count} images have no feature matches; their poses come from the photos alone. Check "
+        f"them before you rely on them: {names}.",
     )
 
 
@@ -139,8 +139,8 @@ def _unknown_warnings(dataset: Dataset, uncertainty: tuple[PoseUncertainty, ...]
         if pose.why_unknown is not None and pose.why_unknown != FIXED:
             named.setdefault(pose.why_unknown, []).append(name)
     return tuple(
-        f"How exact the pose is cannot be said of {len(names)} of {len(dataset)} images, as {why}: "
-        f"{few_names(names, 20)}. Look at these poses before you rely on them."
+        f"The accuracy of {len(names)} of {len(dataset)} poses is not known: {why}. Check before you rely on them: "
+        f"{few_names(names, 20)}."
         for why, names in named.items()
     )
 

@@ -12,13 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.report import (
-    EpipolarEvidence,
-    HeldOutEvidence,
-    PairedDifference,
-    Verdict,
-    VerdictName,
-)
+from biresnerf.verdict import EpipolarEvidence, HeldOutEvidence, PairedDifference, Verdict, VerdictName
 
 Array = NDArray[np.float64]
 
@@ -186,19 +180,29 @@ def _sentences(f: Findings) -> list[str]:
         p = f.heldout.psnr
         sentences.append(
             f"{p.count} unseen views: {p.before:.2f} dB with the input's poses, {p.after:.2f} dB with the refined ones"
-            f"{_interval(p, 'dB')}."
+            f" ({_gain_db(p)})."
         )
     if f.epipolar is not None:
         e = f.epipolar.error_px
-        source = "" if f.epipolar.independent else ", which the start came from"
+        source = "" if f.epipolar.independent else ", which the initial poses came from"
         sentences.append(
             f"{f.epipolar.matches} feature matches{source}: epipolar error {e.before:.2f} px with the input's poses, "
-            f"{e.after:.2f} px with the refined ones{_interval(e, 'octaves')}."
+            f"{e.after:.2f} px with the refined ones ({_times(e)})."
         )
     return sentences
 
 
-def _interval(item: PairedDifference, unit: str) -> str:
+def _gain_db(item: PairedDifference) -> str:
     if item.low is None or item.high is None:
-        return f" ({item.difference:+.2f} {unit})"
-    return f" ({item.difference:+.2f} {unit}, 95 % interval {item.low:+.2f} to {item.high:+.2f})"
+        return f"{item.difference:+.2f} dB"
+    return f"{item.difference:+.2f} dB, 95 % interval {item.low:+.2f} to {item.high:+.2f}"
+
+
+def _times(item: PairedDifference) -> str:
+    """A ratio of errors given as its logarithm to base 2."""
+    words = (
+        f"typically {2 ** abs(item.difference):.2g} times {'larger' if item.difference < 0 else 'smaller'}"
+    )
+    if item.low is None or item.high is None:
+        return words
+    return f"{words}, 95 % interval of before / after {2**item.low:.2g} to {2**item.high:.2g}"

@@ -17,10 +17,12 @@ from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.views.held_out_views import ROUNDS_MOST, unseen_rounds
 from biresnerf.refine.views.pose_trials import PoseTrials, TrialScores, joined
-from biresnerf.report import HeldOutEvidence
+from biresnerf.verdict import HeldOutEvidence
 
 Array = NDArray[np.float64]
+BeforeAfter = dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]
 
+SHOWN = 4  # held-out views that are rendered with either rig, to be looked at
 # Differences that matter and are larger than chance: trainings on the same poses differ by less (docs/verdict.md).
 PSNR_MATTERS, SSIM_MATTERS = 0.5, 0.01  # dB, and 1
 
@@ -46,12 +48,17 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutComparison:
-    """Scores of the unseen `views` after two trainings."""
+    """Scores of the unseen `views` after two trainings.
+
+    Attributes:
+        renders: of some held-out views [h, w, 3] with either rig, by their index.
+    """
 
     views: list[int]
     before: TrialScores
     after: TrialScores
     evidence: HeldOutEvidence
+    renders: BeforeAfter
 
 
 def compare_on_unseen_views(
@@ -84,8 +91,9 @@ def compare_on_unseen_views(
     seen: list[int] = []
     for done, views in enumerate(rounds):
         trials = PoseTrials(images, views, rigs, options, steps, device, threads, should_stop)
+        shown = [] if done else [view for view in views if view in held_out][:SHOWN]
         for side, rig in zip(scores, pair, strict=True):
-            side.append(trials.score(rig.world_from_cam, rig.lenses(images)))
+            side.append(trials.score(rig.world_from_cam, rig.lenses(images), shown=shown))
             report(sum(map(len, scores)) / (2 * (done + 1)))
         seen += views
         old, new = (joined(side) for side in scores)
@@ -97,7 +105,8 @@ def compare_on_unseen_views(
         )
         if _decided(evidence):
             break
-    return HeldOutComparison(seen, old, new, evidence)
+    renders = {view: (old.renders[view], new.renders[view]) for view in old.renders}
+    return HeldOutComparison(seen, old, new, evidence, renders)
 
 
 def _decided(evidence: HeldOutEvidence) -> bool:
@@ -134,4 +143,7 @@ def compare_placed(
         (before.of(rows), after.of(rows)), images, held_out, options, optimiser.device, optimiser.threads,
         should_stop, report, rounds_most,
     )  # fmt: skip
-    return found and replace(found, views=rows[found.views].tolist())
+    if found is None:
+        return None
+    renders = {int(rows[view]): pair for view, pair in found.renders.items()}
+    return replace(found, views=rows[found.views].tolist(), renders=renders)

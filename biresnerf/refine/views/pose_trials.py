@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -41,15 +41,19 @@ def trial_views(count: int) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class TrialScores:
-    """PSNR (dB) and SSIM of each unseen view, float64 [views]."""
+    """PSNR (dB) and SSIM of each unseen view, float64 [views], and renders [h, w, 3] of some by their index."""
 
     psnr: NDArray[np.float64]
     ssim: NDArray[np.float64]
+    renders: dict[int, NDArray[np.float32]] = field(default_factory=dict)
 
 
 def joined(parts: Sequence[TrialScores]) -> TrialScores:
     """The scores of several trials, one after the other."""
-    return TrialScores(np.concatenate([p.psnr for p in parts]), np.concatenate([p.ssim for p in parts]))
+    renders = {view: render for part in parts for view, render in part.renders.items()}
+    return TrialScores(
+        np.concatenate([p.psnr for p in parts]), np.concatenate([p.ssim for p in parts]), renders
+    )
 
 
 class PoseTrials:
@@ -100,6 +104,7 @@ class PoseTrials:
         cameras: tuple[Camera, ...] | None = None,
         *,
         moving: bool = False,
+        shown: Sequence[int] = (),
     ) -> TrialScores:
         """Train a field on all but the unseen views, from these poses and lenses, and score it on the unseen.
 
@@ -107,6 +112,7 @@ class PoseTrials:
             world_from_cam: [n, 4, 4], in the frame of the rigs.
             cameras: of each image at working size; the photos' own where left out.
             moving: whether poses are optimised with the field.
+            shown: the unseen views to render whole, to be looked at.
 
         Raises:
             Interrupted: ``should_stop`` returned true.
@@ -122,7 +128,10 @@ class PoseTrials:
             if self._should_stop():
                 raise Interrupted("stopped while sets of poses were compared")
             optimiser.step()
-        return score_unseen(optimiser, images, self.unseen, self._stride)
+        scores = score_unseen(optimiser, images, self.unseen, self._stride)
+        matrices = optimiser.poses.matrices().detach()
+        renders = {v: render_view(optimiser, matrices[v], v, as_photo=True).colour for v in shown}
+        return replace(scores, renders=renders)
 
 
 def score_unseen(

@@ -1,4 +1,4 @@
-// A camera's photo against the field's render, difference and depth.
+// A camera's view before and after refinement, and its photo against the field's render, difference and depth.
 import { useMemo, useState } from "preact/hooks";
 import type { ShownPictures, ShownView } from "schemas";
 import { length, minus, type Triple } from "../result/poses";
@@ -18,16 +18,22 @@ interface ImageCompareProps {
 
 type PictureKind = keyof ShownPictures;
 const MODES = [
+  { value: "refined", text: "before | after" },
   { value: "swipe", text: "photo | render" },
   { value: "difference", text: "difference" },
   { value: "depth", text: "depth" },
 ] as const;
 type Mode = (typeof MODES)[number]["value"];
+/** The two pictures of a swipe, left and right. */
+const SWIPES = { refined: ["before", "after"], swipe: ["photo", "render"] } as const;
+const WORDS = { photo: "Photo", render: "Render of", before: "Render before refinement of", after: "Render after refinement of" };
 const NEAR = 3;
 
 export function ImageCompare({ names, views, centres, urlOf, selected, onSelect }: ImageCompareProps) {
-  const [mode, setMode] = useState<Mode>("swipe");
+  const [chosen, setMode] = useState<Mode>("refined");
   const view = views.find((one) => one.image === selected);
+  const modes = view?.pictures.before ? MODES : MODES.slice(1);
+  const mode = modes.some(({ value }) => value === chosen) ? chosen : "swipe";
   const shown = useMemo(() => views.map((one) => one.image).sort((a, b) => a - b), [views]);
   if (views.length === 0) {
     return (
@@ -39,7 +45,7 @@ export function ImageCompare({ names, views, centres, urlOf, selected, onSelect 
   return (
     <section class="compare" aria-label="Render against photo">
       <div class="compare-controls">
-        <Choice label="Show" value={mode} onChange={setMode} options={MODES} />
+        <Choice label="Show" value={mode} onChange={setMode} options={modes} />
       </div>
       {view ? (
         <Picture view={view} name={names[view.image] ?? ""} mode={mode} urlOf={urlOf} />
@@ -62,10 +68,12 @@ function Picture(props: { view: ShownView; name: string; mode: Mode; urlOf: Imag
   const { view, name, mode, urlOf } = props;
   const [at, setAt] = useState(0.5);
   const [missing, setMissing] = useState<string | null>(null);
+  const [left, right] = SWIPES[mode === "refined" ? "refined" : "swipe"];
   const frame = { aspectRatio: `${view.width} / ${view.height}`, maxWidth: `calc(62vh * ${view.width / view.height})` };
   const picture = (kind: PictureKind, alt: string, style?: Record<string, string>) => {
-    const source = urlOf(view.pictures[kind]);
-    return source === null ? (
+    const file = view.pictures[kind];
+    const source = file && urlOf(file);
+    return !source ? (
       <p class="notice compare-missing">The {kind} is not in this file; it is in the folder of the result.</p>
     ) : (
       <img key={kind} src={source} alt={alt} style={style} draggable={false} onError={() => setMissing(kind)} />
@@ -73,18 +81,18 @@ function Picture(props: { view: ShownView; name: string; mode: Mode; urlOf: Imag
   };
   return (
     <figure class="compare-figure">
-      {mode === "swipe" ? (
+      {mode === "swipe" || mode === "refined" ? (
         <div class="compare-frame" style={frame}>
-          {picture("render", `Render of ${name}`)}
-          {picture("photo", `Photo ${name}`, { clipPath: `inset(0 ${100 * (1 - at)}% 0 0)` })}
+          {picture(right, `${WORDS[right]} ${name}`)}
+          {picture(left, `${WORDS[left]} ${name}`, { clipPath: `inset(0 ${100 * (1 - at)}% 0 0)` })}
           <span class="compare-tag compare-left" aria-hidden="true">
-            photo
+            {left}
           </span>
           <span class="compare-tag compare-right" aria-hidden="true">
-            render
+            {right}
           </span>
           <span class="compare-edge" style={{ left: `${100 * at}%` }} aria-hidden="true" />
-          <Slider value={at} label="Swipe between photo and render" text={`${Math.round(100 * at)} % photo`} onChange={setAt} />
+          <Slider value={at} label={`Swipe between ${left} and ${right}`} text={`${Math.round(100 * at)} % ${left}`} onChange={setAt} />
         </div>
       ) : (
         <div class="compare-frame" style={frame}>
@@ -95,10 +103,14 @@ function Picture(props: { view: ShownView; name: string; mode: Mode; urlOf: Imag
       <figcaption>
         {mode === "difference" && <Key left="equal" right="a quarter of the full range or more" />}
         {mode === "depth" && <Key left="far" right="near" />}
-        <span>
-          PSNR <b>{fixed(view.psnr, 2)} dB</b> at {view.width} × {view.height} px,{" "}
-          {view.held_out ? "a held-out view" : "a training view"}
-        </span>
+        {mode === "refined" ? (
+          <span>A view that neither model saw in training, rendered with the poses before and after refinement.</span>
+        ) : (
+          <span>
+            PSNR <b>{fixed(view.psnr, 2)} dB</b> at {view.width} × {view.height} px,{" "}
+            {view.held_out ? "a held-out view" : "a training view"}
+          </span>
+        )}
       </figcaption>
     </figure>
   );

@@ -3,6 +3,7 @@ import { useMemo, useState } from "preact/hooks";
 import type { ImageRow, SheetCell } from "../result/widget_data";
 import { Pick } from "./controls";
 import { count, fixed, short, signed } from "./numbers";
+import { Thumb } from "./thumb";
 import { ALARMING, FLAGS, sourceWords } from "./words";
 
 export interface ImageTableProps {
@@ -150,7 +151,7 @@ export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }:
                 )}
                 <th scope="row">
                   <span class="images-name">
-                    {cellOf && <Thumb cell={cellOf(row.image)} />}
+                    {cellOf && <Thumb cell={cellOf(row.image)} size={THUMB_PX} />}
                     <button type="button" class="link" onClick={() => onSelect(row.image)}>
                       <bdi>{row.name}</bdi>
                     </button>
@@ -200,23 +201,5 @@ function Heading(props: {
         <span aria-hidden="true">{{ ascending: "▲", descending: "▼", none: "" }[props.order]}</span>
       </button>
     </th>
-  );
-}
-
-function Thumb({ cell }: { cell: SheetCell | null }) {
-  if (!cell) return null;
-  const scale = THUMB_PX / Math.max(cell.width, cell.height);
-  return (
-    <span
-      class="thumb"
-      aria-hidden="true"
-      style={{
-        width: `${cell.width * scale}px`,
-        height: `${cell.height * scale}px`,
-        backgroundImage: `url("${cell.url}")`,
-        backgroundPosition: `${-cell.x * scale}px ${-cell.y * scale}px`,
-        backgroundSize: `${cell.sheet_width * scale}px ${cell.sheet_height * scale}px`,
-      }}
-    />
   );
 }

@@ -1,75 +1,83 @@
-// The verdict in one sentence, with its evidence.
-import type { PairedDifference, Verdict } from "schemas";
+// The verdict in one sentence, and its evidence.
+import type { PairedDifference, Report, Verdict } from "schemas";
 import { VerdictChip } from "./controls";
 import { count, fixed, short, signed } from "./numbers";
 
-interface VerdictSentenceProps {
-  readonly verdict: Verdict | null;
-  readonly state: "complete" | "partial";
-  /** Whether the options request a verdict. */
-  readonly requested?: boolean;
-}
-
-export function VerdictSentence({ verdict, state, requested = true }: VerdictSentenceProps) {
-  if (!verdict) {
-    return (
-      <section class="verdict" aria-label="Verdict">
-        <p class="verdict-sentence">
+export function VerdictSentence({ report: { verdict, state, options } }: { report: Report }) {
+  return (
+    <p class="verdict-sentence">
+      {verdict ? (
+        <>
+          <VerdictChip verdict={verdict.verdict} /> {verdict.why[0]} {returnedWords(verdict)}
+        </>
+      ) : (
+        <>
           <span class="chip chip-plain">{state === "partial" ? "partial" : "no verdict"}</span>
           {state === "partial"
             ? "The run was stopped early: these are the best poses so far. They were not compared with the input's."
-            : requested
-              ? "No verdict was reached."
-              : "No verdict was requested: the result holds the refined poses."}
-        </p>
-      </section>
-    );
-  }
-  return (
-    <section class="verdict" aria-label="Verdict">
-      <p class="verdict-sentence">
-        <VerdictChip verdict={verdict.verdict} />
-        {verdict.why[0]} {RETURNED[verdict.returned]}
-      </p>
-      <div class="proofs">
-        {verdict.heldout && (
-          <Evidence
-            title={`${count(verdict.heldout.psnr.count, "unseen view")}, PSNR`}
-            difference={verdict.heldout.psnr}
-            unit="dB"
-            before={fixed(verdict.heldout.psnr.before, 2)}
-            after={fixed(verdict.heldout.psnr.after, 2)}
-            least={0.5}
-            note={`Two equal trainings of ${count(verdict.heldout.steps, "step")} with fixed poses.`}
-          />
-        )}
-        {verdict.epipolar && (
-          <Evidence
-            title={`${count(verdict.epipolar.matches, "feature match", "feature matches")}, epipolar error`}
-            difference={verdict.epipolar.error_px}
-            unit="octaves"
-            before={`${short(verdict.epipolar.error_px.before)} px`}
-            after={`${short(verdict.epipolar.error_px.after)} px`}
-            least={0.1}
-            note={
-              verdict.epipolar.independent
-                ? "These matches had no part in the initial poses; one octave halves the error."
-                : "The initial poses came from these matches, so they count only against the refined poses."
-            }
-          />
-        )}
-        {!verdict.heldout && !verdict.epipolar && (
-          <p class="soft">The scene's middle moved by {short(verdict.moved_px)} px in the photos (median).</p>
-        )}
-      </div>
-    </section>
+            : options.verdict === false
+              ? "No verdict was requested: the result holds the refined poses."
+              : "No verdict was reached."}
+        </>
+      )}
+    </p>
   );
 }
 
-const RETURNED: Readonly<Record<Verdict["returned"], string>> = {
-  refined: "The result holds the refined poses.",
-  input: "The result holds the input's poses; refined/ has the refined ones.",
-};
+/** Which poses are in the downloads. */
+function returnedWords({ returned, compared_with }: Verdict): string {
+  if (returned === "refined") return "The downloads contain the refined poses.";
+  const whose = { given: "your own poses", seeded: "the poses from feature matches", mixed: "the poses it started from" };
+  return `The downloads contain ${whose[compared_with]}; the refined ones are in refined/.`;
+}
+
+/** The two measurements behind a verdict, folded away. */
+export function Evidence({ verdict }: { verdict: Verdict | null }) {
+  if (!verdict) return null;
+  const { heldout, epipolar } = verdict;
+  return (
+    <details class="evidence">
+      <summary>How this was measured</summary>
+      <div class="proofs">
+        {heldout && (
+          <Measurement
+            title={`Before and after: PSNR of ${count(heldout.psnr.count, "unseen view")}`}
+            difference={heldout.psnr}
+            gain={`${signed(heldout.psnr.difference, 2)} dB`}
+            ends={(value) => `${signed(value, 2)} dB`}
+            before={fixed(heldout.psnr.before, 2)}
+            after={`${fixed(heldout.psnr.after, 2)} dB`}
+            least={0.5}
+            note={`Two identical models were trained for ${count(heldout.steps, "step")}, one with each set of poses held fixed.`}
+          />
+        )}
+        {epipolar && (
+          <Measurement
+            title={`Before and after: matching error of ${count(epipolar.matches, "feature match", "feature matches")}`}
+            difference={epipolar.error_px}
+            gain={timesWords(epipolar.error_px.difference)}
+            ends={timesWords}
+            before={short(epipolar.error_px.before)}
+            after={`${short(epipolar.error_px.after)} px`}
+            least={0.1}
+            note={
+              epipolar.independent
+                ? "No pose was estimated from these matches."
+                : "The initial poses came from these matches, so they count only as a warning, not as proof."
+            }
+          />
+        )}
+        {!heldout && !epipolar && <p class="soft">The scene's middle moved by {short(verdict.moved_px)} px in the photos (median).</p>}
+      </div>
+    </details>
+  );
+}
+
+/** A ratio given as its logarithm to base 2. */
+function timesWords(octaves: number): string {
+  const times = short(2 ** Math.abs(octaves), 2);
+  return `${times} times ${octaves < 0 ? "larger" : "smaller"}`;
+}
 
 const FINDING: Readonly<Record<PairedDifference["finding"], string>> = {
   better: "better",
@@ -78,16 +86,19 @@ const FINDING: Readonly<Record<PairedDifference["finding"], string>> = {
   open: "not certain",
 };
 
-function Evidence(props: {
+function Measurement(props: {
   title: string;
   difference: PairedDifference;
-  unit: string;
+  gain: string;
+  ends: (value: number) => string;
   before: string;
   after: string;
   least: number;
   note: string;
 }) {
-  const { difference: d, unit } = props;
+  const { difference: d, ends } = props;
+  const interval = d.low !== null && d.high !== null ? ` (95 % interval: ${ends(d.low)} to ${ends(d.high)})` : "";
+  const words = `${props.gain}${interval}`;
   return (
     <div class="proof">
       <div class="proof-title">{props.title}</div>
@@ -97,29 +108,24 @@ function Evidence(props: {
         </span>
         <span class={`proof-finding proof-${d.finding}`}>{FINDING[d.finding]}</span>
       </div>
-      <Interval difference={d} least={props.least} unit={unit} />
+      <Interval difference={d} least={props.least} label={words} />
       <div class="soft">
-        gain {gainOf(d, unit)}. {props.note}
+        {words}. {props.note}
       </div>
     </div>
   );
 }
 
-function gainOf({ difference, low, high }: PairedDifference, unit: string): string {
-  const interval = low !== null && high !== null ? `, 95 % interval ${signed(low, 2)} to ${signed(high, 2)}` : "";
-  return `${signed(difference, 2)} ${unit}${interval}`;
-}
-
 const WIDTH = 260;
 const HEIGHT = 26;
 
-/** The difference with its interval on an axis; differences within the grey band are negligible. */
-function Interval({ difference: d, least, unit }: { difference: PairedDifference; least: number; unit: string }) {
+/** The difference with its interval on an axis: better to the right; within the grey band it is negligible. */
+function Interval({ difference: d, least, label }: { difference: PairedDifference; least: number; label: string }) {
   const ends = [d.difference, d.low ?? d.difference, d.high ?? d.difference];
   const reach = 1.15 * Math.max(2 * least, ...ends.map(Math.abs));
   const x = (value: number) => WIDTH / 2 + (value / reach) * (WIDTH / 2 - 6);
   return (
-    <svg class="interval" viewBox={`0 0 ${WIDTH} ${HEIGHT}`} preserveAspectRatio="xMinYMid" role="img" aria-label={`Gain ${gainOf(d, unit)}`}>
+    <svg class="interval" viewBox={`0 0 ${WIDTH} ${HEIGHT}`} preserveAspectRatio="xMinYMid" role="img" aria-label={label}>
       <rect class="interval-band" x={x(-least)} width={x(least) - x(-least)} y={3} height={HEIGHT - 6} rx={2} />
       <line class="interval-axis" x1={0} x2={WIDTH} y1={HEIGHT / 2} y2={HEIGHT / 2} />
       <line class="interval-zero" x1={x(0)} x2={x(0)} y1={2} y2={HEIGHT - 2} />

@@ -1,6 +1,7 @@
 // The table of images; the job can be run again with the given poses of the ticked images kept fixed.
 import { useState } from "preact/hooks";
 import type { JobView } from "schemas";
+import type { ImageRow } from "../../../biresnerf/viewer/result/widget_data";
 import type { ImageTableProps } from "../../../biresnerf/viewer/widgets/image_table";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
 import { isOver } from "../jobs/state";
@@ -21,11 +22,7 @@ export function Images({ job, widgets, ...table }: Props) {
   };
   const chosen = table.rows.filter(({ image }) => ticked.has(image));
   const given = chosen.filter(({ source }) => source === "given");
-  const fix = () => {
-    const before = Array.isArray(job.options.fixed) ? job.options.fixed : [];
-    const fixed = [...new Set([...before, ...given.map(({ name }) => name)])];
-    runAgainRequest.set({ job: job.id, values: { fixed } });
-  };
+  const fix = () => runAgainFixed(job, given);
   return (
     <>
       <widgets.ImageTable {...table} {...(isOver(job) && { ticked, onTick: tick })} />
@@ -42,3 +39,17 @@ export function Images({ job, widgets, ...table }: Props) {
     </>
   );
 }
+
+/** Opens the dialog for another run that keeps the given poses of these images. */
+function runAgainFixed(job: JobView, rows: readonly ImageRow[]): void {
+  const before = Array.isArray(job.options.fixed) ? job.options.fixed : [];
+  runAgainRequest.set({ job: job.id, values: { fixed: [...new Set([...before, ...rows.map(({ name }) => name)])] } });
+}
+
+/** What the page offers for a photo that deserves a look. */
+export const holdActions = (job: JobView) => (row: ImageRow) =>
+  row.source === "given" && (
+    <button type="button" class="act small" onClick={() => runAgainFixed(job, [row])}>
+      Keep its given pose …
+    </button>
+  );

@@ -113,20 +113,12 @@ function Files({ live, seen }: { live: LiveJob; seen: LiveState }) {
 
 function Facts({ job, seen }: { job: JobView; seen: LiveState }) {
   const seconds = Object.entries(seen.report?.seconds ?? {});
-  const warnings = seen.report?.warnings ?? [];
   const options = Object.entries(job.resolved_options ?? job.options).sort(([a], [b]) => (a < b ? -1 : 1));
   return (
     <details class="panel">
       <summary>
         <h2>Options and times</h2>
       </summary>
-      {warnings.length > 0 && (
-        <ul class="warnings">
-          {warnings.map((warning) => (
-            <li key={warning}>{warning}</li>
-          ))}
-        </ul>
-      )}
       <dl class="facts">
         <Fact name="Job" value={job.id} />
         <Fact name="Image set" value={job.dataset_id} link={`#/datasets/${job.dataset_id}`} />

@@ -6,7 +6,7 @@ import { type UrlOf, useWidgetData } from "../../../biresnerf/viewer/result/widg
 import { once, useLoaded } from "../api/hooks";
 import { isOver } from "../jobs/state";
 import { ProblemBox } from "../parts/problem_box";
-import { Images } from "./images";
+import { holdActions, Images } from "./images";
 import type { LiveState } from "./live_job";
 import { Seeding } from "./seeding";
 
@@ -24,7 +24,9 @@ export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
   return (
     <>
       {widgets && report && over && (
-        <widgets.VerdictSentence verdict={report.verdict} state={report.state} requested={report.options.verdict !== false} />
+        <div class="panel">
+          <widgets.ResultSummary {...{ report, rows, cellOf }} onSelect={setChosen} actionsOf={holdActions(job)} />
+        </div>
       )}
       <div class="job-pictures">
         <Panel name="Cameras" kind="panel-scene">
@@ -34,7 +36,7 @@ export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
             <Placeholder job={job} for="cameras" />
           )}
         </Panel>
-        <Panel name={view ? "Photo and render" : job.stage === "seeding" ? "Feature matches" : "Preview"} kind="panel-compare">
+        <Panel name={view ? "Before and after" : job.stage === "seeding" ? "Feature matches" : "Preview"} kind="panel-compare">
           {widgets && view ? (
             <widgets.ImageCompare {...{ names, centres, urlOf, ...choice }} views={view.views} />
           ) : (

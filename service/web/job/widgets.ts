@@ -2,5 +2,5 @@
 export { Curves } from "../../../biresnerf/viewer/widgets/curves";
 export { ImageCompare } from "../../../biresnerf/viewer/widgets/image_compare";
 export { ImageTable } from "../../../biresnerf/viewer/widgets/image_table";
+export { ResultSummary } from "../../../biresnerf/viewer/widgets/result_summary";
 export { SceneView } from "../../../biresnerf/viewer/scene/scene_view";
-export { VerdictSentence } from "../../../biresnerf/viewer/widgets/verdict";

@@ -41,7 +41,12 @@ export function JobsPage() {
   };
   return (
     <>
-      <h1 class="unseen">Jobs</h1>
+      <div class="lead">
+        <h1>Fix your camera poses before you train a NeRF or a splat</h1>
+        <p class="soft">
+          Refined poses come back in your own frame, scale and file format, with a report that shows whether they really improved.
+        </p>
+      </div>
       <DropZone />
       {problem && <ProblemBox problem={problem} />}
       {!found && !problem && <div class="cards" aria-busy="true" />}

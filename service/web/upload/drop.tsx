@@ -1,6 +1,7 @@
 // Where image sets are dropped or chosen.
-import { useState } from "preact/hooks";
+import { useEffect, useRef, useState } from "preact/hooks";
 import { useAttempt } from "../api/hooks";
+import { request } from "../api/http";
 import formats from "../formats.json";
 import { percent } from "../parts/format";
 import { ProblemBox } from "../parts/problem_box";
@@ -28,29 +29,24 @@ export function DropZone({ onChosen, compact = false }: Props) {
     });
     if (!done) setStatus("");
   };
+  const latest = useRef(take);
+  latest.current = take;
+  useEffect(() => whileDragged(setOver, (data) => void latest.current(fromDrop(data))), []);
   return (
-    <section
-      class={`drop ${over ? "over" : ""} ${compact ? "compact" : ""}`}
-      aria-label="New image set"
-      onDragOver={(event) => {
-        event.preventDefault();
-        setOver(true);
-      }}
-      onDragLeave={() => setOver(false)}
-      onDrop={(event) => {
-        event.preventDefault();
-        if (event.dataTransfer) void take(fromDrop(event.dataTransfer));
-      }}
-    >
+    <section class={`drop ${over ? "over" : ""} ${compact ? "compact" : ""}`} aria-label="New image set">
       <div class="drop-words">
-        <p class="drop-lead">Drop a folder of images, a COLMAP model with its images, or an archive</p>
-        <p class="soft">
-          {formats.read}; zip, tar, tar.gz. Without poses, COLMAP finds them.
-        </p>
+        <p class="drop-lead">Drop photos here, or anywhere on this page: a folder, a COLMAP model with its photos, or an archive</p>
+        <p class="soft">Photos need no poses: COLMAP finds a start. Poses are read from {formats.read}. Archives: zip, tar, tar.gz.</p>
       </div>
       <div class="drop-buttons">
         <FileButton label="Choose a folder" folder onFiles={(files) => void take(fromInput(files))} />
         <FileButton label="Choose files" onFiles={(files) => void take(fromInput(files))} />
+        <FileButton label="Photo library" photos onFiles={(files) => void take(fromInput(files))} />
+        {!compact && !onChosen && (
+          <button type="button" class="act" onClick={() => void take(sample())}>
+            Try a sample set
+          </button>
+        )}
       </div>
       <p class="drop-status" role="status">
         {status}
@@ -60,13 +56,48 @@ export function DropZone({ onChosen, compact = false }: Props) {
   );
 }
 
-function FileButton({ label, folder = false, onFiles }: { label: string; folder?: boolean; onFiles: (files: FileList) => void }) {
-  const directory = { webkitdirectory: folder }; // not in the types of Preact
+/** The service's own image set. */
+async function sample(): Promise<Gathered> {
+  const archive = await (await request("GET", "v1/sample")).blob();
+  return { name: "sample", files: [{ path: "sample.zip", file: new File([archive], "sample.zip") }] };
+}
+
+/** Listens to files that are dragged over the window; returns how to stop listening. */
+function whileDragged(onOver: (over: boolean) => void, onDrop: (data: DataTransfer) => void): () => void {
+  const over = (event: DragEvent) => {
+    event.preventDefault();
+    onOver(true);
+  };
+  const leave = (event: DragEvent) => event.relatedTarget === null && onOver(false);
+  const drop = (event: DragEvent) => {
+    event.preventDefault();
+    if (event.dataTransfer) onDrop(event.dataTransfer);
+  };
+  addEventListener("dragover", over);
+  addEventListener("dragleave", leave);
+  addEventListener("drop", drop);
+  return () => {
+    removeEventListener("dragover", over);
+    removeEventListener("dragleave", leave);
+    removeEventListener("drop", drop);
+  };
+}
+
+interface FileButtonProps {
+  label: string;
+  folder?: boolean;
+  /** For phones and tablets, which offer their library and camera then. */
+  photos?: boolean;
+  onFiles: (files: FileList) => void;
+}
+
+function FileButton({ label, folder = false, photos = false, onFiles }: FileButtonProps) {
+  const kind = { webkitdirectory: folder, ...(photos && { accept: "image/*" }) }; // not in the types of Preact
   return (
-    <label class={folder ? "act primary" : "act"}>
+    <label class={`act ${folder ? "primary" : ""} ${photos ? "touch-only" : ""}`}>
       {label}
       <input
-        {...directory}
+        {...kind}
         class="unseen"
         type="file"
         multiple

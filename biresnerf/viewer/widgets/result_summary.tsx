@@ -1,0 +1,131 @@
+// The answer of a result: the verdict, its plain figures, warnings, and the photos that deserve a look.
+import type { ComponentChildren } from "preact";
+import type { Report } from "schemas";
+import type { ImageRow, SheetCell } from "../result/widget_data";
+import { count, fixed, short } from "./numbers";
+import { Thumb } from "./thumb";
+import { Evidence, VerdictSentence } from "./verdict";
+import { ADVICE, ALARMING, type Flag } from "./words";
+
+const CARDS_AT_FIRST = 6;
+
+export interface ResultSummaryProps {
+  readonly report: Report;
+  readonly rows: readonly ImageRow[];
+  readonly cellOf: (image: number) => SheetCell | null;
+  readonly onSelect: (image: number | null) => void;
+  /** What can be done about a photo, where anything can. */
+  readonly actionsOf?: (row: ImageRow) => ComponentChildren;
+}
+
+export function ResultSummary({ report, rows, cellOf, onSelect, actionsOf }: ResultSummaryProps) {
+  // What is true of most photos is said of the set, in the figures and warnings.
+  const rare = [...ALARMING].filter((flag) => 2 * rows.filter(({ flags }) => flags.includes(flag)).length <= rows.length);
+  const doubtful = rows.flatMap((row) => {
+    const flags = rare.filter((flag) => row.flags.includes(flag));
+    return flags.length ? [{ row, flags }] : [];
+  });
+  return (
+    <section class="verdict" aria-label="Verdict">
+      <VerdictSentence report={report} />
+      <dl class="figures">
+        {figuresOf(report, rows).map(({ name, value, note }) => (
+          <div key={name}>
+            <dt>{name}</dt>
+            <dd>{value}</dd>
+            <dd class="soft">{note}</dd>
+          </div>
+        ))}
+      </dl>
+      {report.warnings.length > 0 && (
+        <ul class="warnings" aria-label="Warnings">
+          {report.warnings.map((warning) => (
+            <li key={warning}>{warning}</li>
+          ))}
+        </ul>
+      )}
+      {doubtful.length > 0 && (
+        <div class="doubtful">
+          <h3>{count(doubtful.length, "photo")} to look at</h3>
+          <ul>
+            {doubtful.slice(0, CARDS_AT_FIRST).map(({ row, flags }) => (
+              <Doubtful key={row.image} {...{ row, flags, onSelect }} cell={cellOf(row.image)} actions={actionsOf?.(row)} />
+            ))}
+          </ul>
+          {doubtful.length > CARDS_AT_FIRST && (
+            <p class="soft">{doubtful.length - CARDS_AT_FIRST} more have a red flag in the table of images.</p>
+          )}
+        </div>
+      )}
+      <Evidence verdict={report.verdict} />
+    </section>
+  );
+}
+
+function Doubtful(props: {
+  row: ImageRow;
+  flags: readonly Flag[];
+  cell: SheetCell | null;
+  onSelect: (image: number) => void;
+  actions: ComponentChildren;
+}) {
+  const { row, flags, cell, onSelect, actions } = props;
+  return (
+    <li>
+      <Thumb cell={cell} size={64} />
+      <div>
+        <button type="button" class="link" onClick={() => onSelect(row.image)}>
+          <bdi>{row.name}</bdi>
+        </button>
+        {flags.map((flag) => (
+          <p key={flag}>{ADVICE[flag]}</p>
+        ))}
+        {actions}
+      </div>
+    </li>
+  );
+}
+
+interface Figure {
+  readonly name: string;
+  readonly value: string;
+  readonly note: string;
+}
+
+/** What a person asks first: how many, how far, how exact, how well it renders. */
+function figuresOf(report: Report, rows: readonly ImageRow[]): Figure[] {
+  const confirmed = rows.filter(({ flags }) => !flags.includes("uncertainty") && !flags.includes("contradicted")).length;
+  const turned = rows.map((row) => row.moved_deg);
+  const bounds = rows.flatMap(({ rotation_90 }) => (rotation_90 === null ? [] : [rotation_90]));
+  const positions = rows.flatMap(({ position_90 }) => (position_90 === null ? [] : [position_90]));
+  const error = report.verdict?.epipolar?.error_px;
+  const kept = report.verdict?.returned === "input";
+  return [
+    { name: "Photos confirmed", value: `${confirmed} of ${rows.length}`, note: "poses that photos or matches support" },
+    {
+      name: kept ? "Refined cameras differ by" : "Cameras turned by",
+      value: `${short(median(turned), 2)}°`,
+      note: `typical; ${short(Math.max(...turned), 2)}° at most`,
+    },
+    ...(error
+      ? [{ name: "Matching error", value: `${short(error.before, 2)} → ${short(error.after, 2)} px`, note: "typical, in full-size photos" }]
+      : []),
+    ...(bounds.length
+      ? [
+          {
+            name: "Poses exact to",
+            value: `± ${short(median(bounds), 2)}°`,
+            note: positions.length ? `and ± ${short(median(positions), 2)} units, nine times in ten` : "nine times in ten",
+          },
+        ]
+      : []),
+    ...(report.heldout
+      ? [{ name: "Final render", value: `${fixed(report.heldout.psnr, 1)} dB`, note: `PSNR of ${count(report.heldout.count, "unseen view")}` }]
+      : []),
+  ];
+}
+
+function median(values: readonly number[]): number | null {
+  const sorted = [...values].sort((a, b) => a - b);
+  return sorted[Math.floor(sorted.length / 2)] ?? null;
+}

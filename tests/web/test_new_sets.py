@@ -1,0 +1,102 @@
+"""Sets that a user sends for the first time: the sample, and sets that are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+from PIL import Image
+from playwright.sync_api import Page, expect
+
+from tests.service.conftest import LIMITS, Running
+from tests.web.conftest import Watched, check_row, drop, zip_of
+
+
+@pytest.fixture
+def page(tab: Watched) -> Page:
+    return tab.page
+
+
+def test_an_archive_that_cannot_be_taken_says_why_and_another_takes_its_place(
+    page: Page, service: Running, kitchen: Path, tmp_path: Path
+) -> None:
+    broken = zip_of(kitchen, tmp_path / "broken.zip")
+    broken.write_bytes(broken.read_bytes()[:-100])
+    page.goto(service.url)
+    page.locator("input[type=file]").nth(1).set_input_files(broken)
+    expect(page.get_by_role("alert")).to_contain_text("The archive was rejected")
+    expect(page.get_by_role("alert")).to_contain_text("archive_rejected")
+    page.locator("input[type=file]").nth(1).set_input_files(zip_of(kitchen, tmp_path / "whole.zip"))
+    expect(page.get_by_role("button", name="Refine the poses")).to_be_visible()
+
+
+def test_a_sample_set_is_one_click_away(page: Page, service: Running) -> None:
+    page.goto(service.url)
+    page.get_by_role("button", name="Try a sample set").click()
+    expect(check_row(page, "Images")).to_contain_text("24 images")
+    expect(page.get_by_role("button", name="Refine the poses")).to_be_visible()
+
+
+def a_pdf(folder: Path) -> None:
+    (folder / "slides.pdf").write_bytes(b"%PDF-1.7")
+
+
+def one_photo(folder: Path) -> None:
+    Image.effect_noise((40, 40), 50).save(folder / "only.png")
+
+
+def a_broken_transforms_file(folder: Path) -> None:
+    for number in range(4):
+        Image.effect_noise((40, 40), 50).save(folder / f"{number}.png")
+    (folder / "transforms.json").write_text('{"frames": [')
+
+
+def photos_of_a_phone_that_are_not_read(folder: Path) -> None:
+    (folder / "IMG_0001.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+
+
+@pytest.mark.parametrize(
+    "fill", [a_pdf, one_photo, a_broken_transforms_file, photos_of_a_phone_that_are_not_read]
+)
+def test_a_refused_set_says_why_and_takes_another_also_after_a_reload(
+    tab: Watched, service: Running, tmp_path: Path, fill: Callable[[Path], None]
+) -> None:
+    page, folder = tab.page, tmp_path / "set"
+    folder.mkdir()
+    fill(folder)
+    page.goto(service.url)
+    drop(page, folder)
+    for _ in range(2):
+        expect(page.get_by_role("alert")).to_contain_text("The image set was rejected")
+        expect(page.get_by_role("alert")).to_contain_text("What to do")
+        expect(page.get_by_text("rejected", exact=True)).to_be_visible()
+        expect(page.get_by_text("Choose a folder")).to_be_visible()
+        page.reload()
+    tab.screenshot(f"refused-{fill.__name__.replace('_', '-')}")
+    assert tab.serious_findings() == []
+    assert tab.complaints == []
+
+
+def test_a_fault_of_one_view_leaves_the_rest_of_the_page(page: Page, service: Running) -> None:
+    page.route("**/v1/jobs?*", lambda route: route.fulfill(json={"items": [{}], "next_cursor": None}))
+    page.goto(service.url)
+    expect(page.get_by_role("alert")).to_contain_text("This view cannot be shown")
+    expect(page.get_by_role("link", name="BiResNeRF")).to_be_visible()
+
+
+def test_files_that_are_too_large_are_named_before_anything_is_sent(
+    page: Page, service: Running, tmp_path: Path, api: httpx.Client
+) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "small.png").write_bytes(bytes(100))
+    (folder / "huge.png").write_bytes(bytes(LIMITS["max_file_bytes"] + 1))
+    before = api.get("/datasets").json()["items"]
+    page.goto(service.url)
+    drop(page, folder)
+    refusal = page.get_by_role("alert")
+    expect(refusal).to_contain_text("huge.png")
+    assert "small.png" not in refusal.inner_text()
+    assert [item["id"] for item in api.get("/datasets").json()["items"]] == [item["id"] for item in before]
