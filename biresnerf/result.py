@@ -25,8 +25,7 @@ from biresnerf.data.show.history import HISTORY, read_history
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.report import Report
-from biresnerf.verdict import Verdict
+from biresnerf.report import Report, Verdict
 from biresnerf.viewer.report_html import read_report
 
 if TYPE_CHECKING:
@@ -87,7 +86,7 @@ class Result:
         """Write the returned poses as a binary COLMAP model into `folder`, new or empty; returns it."""
         target = Path(folder)
         if target.is_dir() and any(target.iterdir()):
-            raise InputError("folder_not_empty", "holds files.", where=str(target), hint="Name a new folder.")
+            raise InputError("output_not_empty", "holds files.", where=str(target), hint="Name a new folder.")
         target.mkdir(parents=True, exist_ok=True)
         write_colmap_binary(read_result(self.folder).model, target)
         return target

@@ -21,6 +21,7 @@ LINT_IMPORTS = Path(sys.executable).with_name("lint-imports")
 IMPORTED_AS = {
     "opentelemetry-sdk": {"opentelemetry"},
     "pillow": {"PIL"},
+    "pydantic": {"pydantic", "pydantic_core"},  # its own, which it pins
     "psycopg": {"psycopg", "psycopg_pool"},  # by its extra `pool`
     "numba": {"numba", "llvmlite"},  # which pins its version
     "fastapi": {"fastapi", "starlette"},  # built on it, and documented so

@@ -16,9 +16,8 @@ from biresnerf.data.formats.result_formats import write_result_formats
 from biresnerf.data.show.history import HISTORY
 from biresnerf.errors import InputError
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.report import ImageReport, Report, SimilarityReport
+from biresnerf.report import ImageReport, Report, SimilarityReport, Verdict
 from biresnerf.uncertainty import PoseUncertainty
-from biresnerf.verdict import Verdict
 from tests.data.formats.random_sets import random_result
 
 EYE = ((1, 0, 0), (0, 1, 0), (0, 0, 1))

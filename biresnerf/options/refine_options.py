@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from biresnerf.options.formats import ExportName
 from biresnerf.options.option import Option, divided, lowered
 from biresnerf.options.presets import ComputeDevice, MethodName, PresetName, in_proportion, preset_values
-from biresnerf.options.validated_options import refuse_unknown, validated
+from biresnerf.options.validated_options import validated, with_near_names
 from biresnerf.stages import STAGES
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -205,11 +205,13 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         description="Further formats to write the result in; pinhole: undistorted photos with a PINHOLE model.",
     )
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _known(cls, values: Any) -> Any:
-        refuse_unknown(values, cls)
-        return values
+    def _known(cls, values: Any, validate: Callable[[Any], Self]) -> Self:
+        try:
+            return validate(values)
+        except ValidationError as error:
+            raise with_near_names(error, cls) from None
 
     @field_validator("fixed", "exports", mode="before")
     @classmethod

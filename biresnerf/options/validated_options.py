@@ -14,17 +14,21 @@ from biresnerf.errors import InputError
 Parsed = TypeVar("Parsed", bound=BaseModel)
 
 
-def refuse_unknown(values: Any, model: type[BaseModel]) -> None:
-    """Raises `ValidationError` if `values` is a mapping with keys that are no fields of `model`."""
-    if not isinstance(values, Mapping):
-        return
-    errors = [
-        InitErrorDetails(type=_error(name, list(model.model_fields)), loc=(name,), input=value)
-        for name, value in values.items()
-        if isinstance(name, str) and name not in model.model_fields
-    ]
-    if errors:
-        raise ValidationError.from_exception_data(model.__name__, errors)
+def with_near_names(error: ValidationError, model: type[BaseModel]) -> ValidationError:
+    """The same error, in which a key that is no field of `model` is answered with the nearest one."""
+    details = []
+    for item in error.errors():
+        detail = InitErrorDetails(
+            type=item["type"], loc=item["loc"], input=item["input"], ctx=item.get("ctx", {})
+        )
+        if item["type"] == "extra_forbidden":
+            detail = InitErrorDetails(
+                type=_error(str(item["loc"][-1]), list(model.model_fields)),
+                loc=item["loc"],
+                input=item["input"],
+            )
+        details.append(detail)
+    return ValidationError.from_exception_data(error.title, details)
 
 
 def _error(name: str, known: list[str]) -> PydanticCustomError:

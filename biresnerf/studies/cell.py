@@ -11,8 +11,7 @@ from pydantic import Field
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.pose_error import PoseError
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
-from biresnerf.report import CandidateName, SwitchReason
-from biresnerf.verdict import VerdictName
+from biresnerf.report import CandidateName, SwitchReason, VerdictName
 
 LOST_FROM_DEG = 1.0  # a camera this far off after a run counts as not found
 TEST_VIEWS = "test views"  # among the seconds

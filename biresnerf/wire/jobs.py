@@ -10,8 +10,8 @@ from pydantic import ConfigDict, Field
 
 from biresnerf.options.formats import ExportName
 from biresnerf.options.refine_options import RefineOptions
+from biresnerf.report import VerdictName
 from biresnerf.stages import ReusableStage, Stage
-from biresnerf.verdict import VerdictName
 from biresnerf.wire.base import NO_CONTROLS, Labels, Links, Page, Record
 from biresnerf.wire.datasets import dataset_url
 from biresnerf.wire.problems import JobError

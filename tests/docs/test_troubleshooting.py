@@ -6,7 +6,7 @@ import re
 from typing import get_args
 
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.verdict import VerdictName
+from biresnerf.report import VerdictName
 from tests.docs.codes import codes_in_use
 from tests.docs.documented import ROOT
 

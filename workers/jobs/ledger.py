@@ -15,8 +15,8 @@ from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
 
 from biresnerf.progress import Progress
+from biresnerf.report import VerdictName
 from biresnerf.stages import ReusableStage
-from biresnerf.verdict import VerdictName
 from biresnerf.wire.problems import JobError
 from workers.database.database import Connection, Database
 from workers.jobs.claim import Claim, Fenced

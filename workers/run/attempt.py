@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from biresnerf.options.refine_options import ResolvedOptions, parse_options
 from biresnerf.progress import Progress
-from biresnerf.verdict import Verdict, VerdictName
+from biresnerf.report import Verdict, VerdictName
 from biresnerf.wire.problems import JobError
 from workers.database.database import Database
 from workers.jobs.claim import Claim, Fenced

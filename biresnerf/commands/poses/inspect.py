@@ -10,6 +10,7 @@ import click
 
 from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.settings_option import settings_option
+from biresnerf.errors import InputError
 from biresnerf.options.presets import PRESETS, PresetName
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions, parse_options
 
@@ -96,7 +97,10 @@ def plan(dataset: Dataset, options: ResolvedOptions) -> dict[str, Any]:
 
 
 def expected_seconds(dataset: Dataset, asked: RefineOptions) -> dict[PresetName, float]:
-    """How long a run with each preset would take on this machine, by what earlier runs measured."""
+    """Seconds that a run with each preset would take on this machine, by what earlier runs measured.
+
+    Empty where one of the first photos, which show whether there is a background, cannot be decoded.
+    """
     from biresnerf.cores import usable_cores
     from biresnerf.field.backends import resolve_here
     from biresnerf.forecast import Forecast, remembered_rates
@@ -106,7 +110,10 @@ def expected_seconds(dataset: Dataset, asked: RefineOptions) -> dict[PresetName,
     for preset in PRESETS:
         options, device = resolve_here(asked.model_copy(update={"preset": preset}))
         forecast = Forecast(remembered_rates(device.type, options.threads or usable_cores()))
-        expect_run(forecast, dataset, options)
+        try:
+            expect_run(forecast, dataset, options)
+        except InputError:  # --pixels says of which photo
+            return {}
         found[preset] = forecast.left_s()
     return found
 
@@ -174,6 +181,8 @@ def _lines(found: dict[str, Any]) -> list[str]:
         f"  start from: {wanted['start']}",
         f"  take {wanted['steps']} steps on photos of up to {width} x {height} px"
         f" ({wanted['photo_bytes'] / 2**20:.0f} MiB of pixels)",
-        "  take about " + ", ".join(f"{in_minutes(s)} ({preset})" for preset, s in wanted["seconds"].items()),
     ]
+    if wanted["seconds"]:
+        times = (f"{in_minutes(s)} ({preset})" for preset, s in wanted["seconds"].items())
+        lines.append("  take about " + ", ".join(times))
     return lines + [f"warning: {warning}" for warning in found["warnings"]]

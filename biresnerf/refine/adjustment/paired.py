@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.verdict import Finding, PairedDifference
+from biresnerf.report import Finding, PairedDifference
 
 Array = NDArray[np.float64]
 

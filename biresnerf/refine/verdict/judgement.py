@@ -30,7 +30,7 @@ from biresnerf.refine.verdict.pose_evidence import (
 from biresnerf.refine.verdict.verdict import MEASURABLE_PX, Findings, decide, failed_checks, frame_doubt
 from biresnerf.refine.views.compare_rigs import BeforeAfter, HeldOutComparison, Rig, compare_placed
 from biresnerf.refine.views.held_out_views import ROUNDS_MOST
-from biresnerf.verdict import Verdict
+from biresnerf.report import Verdict
 
 logger = logging.getLogger(__name__)
 

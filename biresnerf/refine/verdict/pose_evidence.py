@@ -16,7 +16,7 @@ from biresnerf.refine.adjustment.paired import paired
 from biresnerf.refine.lost.own_matches import LEAST_PX, OwnMatches
 from biresnerf.refine.verdict.verdict import EPIPOLAR_MATTERS
 from biresnerf.refine.views.compare_rigs import Rig
-from biresnerf.verdict import EpipolarEvidence
+from biresnerf.report import EpipolarEvidence
 
 Array = NDArray[np.float64]
 

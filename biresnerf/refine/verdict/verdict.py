@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.verdict import EpipolarEvidence, HeldOutEvidence, PairedDifference, Verdict, VerdictName
+from biresnerf.report import EpipolarEvidence, HeldOutEvidence, PairedDifference, Verdict, VerdictName
 
 Array = NDArray[np.float64]
 

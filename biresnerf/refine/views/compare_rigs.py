@@ -17,7 +17,7 @@ from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.views.held_out_views import ROUNDS_MOST, unseen_rounds
 from biresnerf.refine.views.pose_trials import PoseTrials, TrialScores, joined
-from biresnerf.verdict import HeldOutEvidence
+from biresnerf.report import HeldOutEvidence
 
 Array = NDArray[np.float64]
 BeforeAfter = dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]

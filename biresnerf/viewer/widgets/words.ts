@@ -28,7 +28,7 @@ export const VERDICTS = {
   unchanged: { word: "unchanged", tone: "plain" },
   kept_input: { word: "not improved", tone: "plain" },
   inconclusive: { word: "inconclusive", tone: "unsure" },
-  failed_check: { word: "check failed", tone: "bad" },
+  failed_check: { word: "failed check", tone: "bad" },
 } as const satisfies Record<Verdict["verdict"], { word: string; tone: string }>;
 
 export const sourceWords = (source: string): string => source.replaceAll("-", " ");

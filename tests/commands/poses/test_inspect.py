@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -92,3 +93,12 @@ def test_bench_measures_both_stages() -> None:
     for stage in found["stages"]:
         assert 0 < stage["step_ms"] <= stage["step_ms_90"]
         assert stage["samples_per_s"] == pytest.approx(1000 * stage["samples"] / stage["step_ms"], rel=0.01)
+
+
+def test_the_time_of_each_preset_is_predicted_and_longer_ones_take_longer(tmp_path: Path) -> None:
+    trajectories.colmap_set(tmp_path)
+    seconds = inspected(tmp_path)["plan"]["seconds"]
+    assert 0 < seconds["fast"] < seconds["balanced"] < seconds["quality"]
+    assert re.search(
+        r"take about \d+ \w+ \(fast\), ", CliRunner().invoke(inspect_command, [str(tmp_path)]).output
+    )

@@ -119,7 +119,13 @@ finally:
 def test_every_wrong_option_is_named_with_what_is_wrong(scene, tmp_path):
     result = run(scene, tmp_path / "out", stepz=5, steps=3, pose_rate=-1)
     assert_refused(
-        result, "stepz: unknown option", "steps: ", "greater than or equal to 20", "pose_rate: ", "--help"
+        result,
+        "stepz: unknown option",
+        "steps: ",
+        "greater than or equal to 20",
+        "pose_rate: ",
+        "did you mean `steps`",
+        "docs/options.md",
     )
     assert not (tmp_path / "out").exists()
 
@@ -188,7 +194,12 @@ def test_the_same_command_goes_on_after_sigterm_and_is_then_finished(scene, term
     assert f"of {STEPS}" in result.stdout
     assert not (output / CHECKPOINT).exists()
     assert report.seconds["coarse"] >= before.seconds["coarse"]
-    assert_refused(run(scene, output), str(output), "holds a finished result", "another output folder")
+    assert_refused(run(scene, output), str(output), "holds a finished result", "--overwrite")
+    again = subprocess.run(
+        [*command(scene, output), "--overwrite"], capture_output=True, text=True, timeout=300
+    )
+    assert again.returncode == 0, again.stderr
+    assert f"report: {output / 'report.html'}" in again.stdout
 
 
 @pytest.mark.parametrize("changed", [{"seed": 3}, {"max_image_size": 20}])

@@ -17,7 +17,7 @@ from biresnerf.refine.verdict.pose_evidence import compare_on_matches, moved_px,
 from biresnerf.refine.views import pose_trials
 from biresnerf.refine.views.compare_rigs import Rig
 from biresnerf.refine.views.held_out_views import held_out_views, unseen_rounds, unseen_views
-from biresnerf.verdict import EpipolarEvidence
+from biresnerf.report import EpipolarEvidence
 from tests.refine.tiny_scene import CPU, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 pytestmark = pytest.mark.slow

@@ -19,7 +19,7 @@ from biresnerf.refine.verdict.verdict import (
     frame_doubt,
 )
 from biresnerf.refine.views.compare_rigs import PSNR_MATTERS, SSIM_MATTERS
-from biresnerf.verdict import EpipolarEvidence, HeldOutEvidence
+from biresnerf.report import EpipolarEvidence, HeldOutEvidence
 
 OPPOSITE = {"better": "worse", "worse": "better", "same": "same", "open": "open"}
 

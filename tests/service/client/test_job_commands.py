@@ -86,7 +86,10 @@ def test_people_read_lines(service: Running, done_job: dict[str, Any], tmp_path:
     assert "verdict: kept_input" in said
     assert run(service, "logs", job).stdout == "images read\nline 2\n"
     assert run(service, "logs", job, "--after", 1, "--follow").stdout == "line 2\n"
-    assert re.search(rf"{job}  succeeded +100 %  \d{{4}}-", run(service, "list", "--limit", 10_000).stdout)
+    assert re.search(
+        rf"(?m)^JOB.*\n(.*\n)*{job}  succeeded +100 %  \d+ \w+ ago +kept_input",
+        run(service, "list", "--limit", 10_000).stdout,
+    )
     assert run(service, "list", "--label", "no=such").stdout == "no jobs\n"
     assert "files in" in run(service, "download", job, "-o", tmp_path / "out").stdout
     assert (tmp_path / "out" / "colmap/sparse/0/images.bin").is_file()

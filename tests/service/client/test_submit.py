@@ -45,7 +45,8 @@ def test_a_scene_goes_there_and_the_results_come_back(
     done = submit(service, scene, *FAST, "--wait", "--output", output)
     assert done.returncode == 0, done.stderr
     url = done.stdout.splitlines()[0]
-    job = http.get(url).json()
+    assert url.startswith(f"{service.url}/#/jobs/")
+    job = http.get(f"/v1/jobs/{url.rpartition('/')[2]}").json()
     assert job["state"] == "succeeded"
     assert json.loads((output / "transforms.json").read_text()) == json.loads(
         (scene / "transforms.json").read_text()
@@ -151,7 +152,7 @@ def test_ctrl_c_ends_the_waiting_and_not_the_job(http: httpx.Client, service: Ru
     _, said = process.communicate(timeout=20)
     assert process.returncode == 130
     assert "Traceback" not in said
-    assert f"biresnerf wait {url}" in said
+    assert f"biresnerf wait '{url}'" in said
     assert finished(http, url.rsplit("/", 1)[1])["state"] == "succeeded"
 
 
