@@ -8,6 +8,7 @@ TEST_PROCESSES ?= $(shell cores=$$(nproc 2>/dev/null || echo 2); echo $$((cores 
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 TOOLS := $(VENV)/tools
+CONSUMERS := build/consumers
 # Pins for what is installed and, under the names that older and newer pips know, for what builds it.
 CONSTRAINTS ?= constraints.txt
 export PIP_CONSTRAINT := $(CONSTRAINTS)
@@ -16,7 +17,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Each process of the tests would compile all modules, and pytest rewrite all assertions, again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs fuzz audit sbom compose-check
+.PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs fuzz audit sbom compose-check consumers-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -79,6 +80,16 @@ sbom: setup $(TOOLS)  ## what is installed, as CycloneDX, in build/sbom.json
 
 compose-check:  ## build the image, run compose.yaml with podman, lose a worker in mid job (root; long)
 	tests/deploy/compose_check.sh
+
+consumers-check: setup $(CONSUMERS)/.installed  ## what other programs' own readers make of what is written; their environment is some 4 GB
+	$(BIN)/python -m pytest -n 0 tests/consumers $(PYTEST)
+
+# nerfstudio pins old versions of libraries that its parsers work without, and bpy an old NumPy.
+$(CONSUMERS)/.installed: tests/consumers/requirements.txt
+	$(PYTHON) -m venv --clear $(CONSUMERS)
+	grep -vE '^(#|nerfstudio|bpy)' $< | xargs -d '\n' $(CONSUMERS)/bin/python -m pip install --quiet -c constraints.txt
+	grep -E '^(nerfstudio|bpy)' $< | xargs -d '\n' $(CONSUMERS)/bin/python -m pip install --quiet --no-deps
+	@touch $@
 
 # Tools that need libraries of their own stay out of the environment that they look at.
 $(TOOLS): constraints.txt

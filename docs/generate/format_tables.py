@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import json
+import re
 from pathlib import Path
 
 from biresnerf.options.formats import Format, Loss, Need, formats
 from docs.generate.markdown import DASH, table
 
+_TESTS = Path(__file__).resolve().parents[2] / "tests"
+_NAMES = {"bpy": "Blender", "gaussian-splatting": "3D Gaussian Splatting", "open3d": "Open3D"}
 _END = "<!-- end -->"
 _LOSSES: dict[Loss, str] = {
     "poses": "poses",
@@ -32,7 +36,12 @@ _NEEDS: dict[Need, str] = {
 def format_page(path: Path) -> str:
     """docs/formats.md with its generated tables as they should be now."""
     text = path.read_text("utf-8")
-    for name, content in (("formats read", _read_table()), ("formats written", _write_table())):
+    tables = {
+        "formats read": _read_table(),
+        "formats proven": _proof_table(),
+        "formats written": _write_table(),
+    }
+    for name, content in tables.items():
         start = f"<!-- {name}: written by `make docs` -->\n\n"
         before, rest = text.split(start)
         text = before + start + content + "\n" + rest[rest.index(_END) :]
@@ -53,6 +62,53 @@ def _read_table() -> str:
     ]
     rows.append(("images alone", "the folder itself, `images/`", "sizes, EXIF", "`data/photos`", ""))
     return table(("format", "found as", "what it gives", "code", "checked against"), rows)
+
+
+def _proof_table() -> str:
+    """What tests prove of each format: whether it comes back, and which programs read it."""
+    back, readers = _come_back(), _readers()
+    rows = [
+        (
+            f"`{one.name}`",
+            "yes" if one.found_as or one.name in back else DASH,
+            "yes" if one.in_result else DASH,
+            "yes" if one.name in back else DASH,
+            ", ".join(readers.get(one.name, [])) or DASH,
+        )
+        for one in formats().values()
+    ]
+    return table(("format", "read", "written", "comes back", "read by the program itself"), rows)
+
+
+def _come_back() -> set[str]:
+    """The formats that the test of `convert` there and back goes through."""
+    tree = ast.parse((_TESTS / "commands/poses/test_convert.py").read_text("utf-8"))
+    [places] = [
+        node.value
+        for node in tree.body
+        if isinstance(node, ast.Assign)
+        and isinstance(node.targets[0], ast.Name)
+        and node.targets[0].id == "PLACES"
+    ]
+    return set(ast.literal_eval(places))
+
+
+def _readers() -> dict[str, list[str]]:
+    """By format the programs that read it in tests, as their marks say: ``opens(format, by=program)``."""
+    folder = _TESTS / "consumers"
+    versions = dict(
+        re.findall(r"^([\w-]+)==(\S+)", (folder / "requirements.txt").read_text("utf-8"), re.MULTILINE)
+    )
+    found: dict[str, list[str]] = {}
+    for node in ast.walk(ast.parse((folder / "test_consumers.py").read_text("utf-8"))):
+        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "opens"):
+            continue
+        [name], [by] = node.args, node.keywords
+        program = ast.literal_eval(by.value)
+        said = f"{_NAMES.get(program, program)} {versions.get(program, '(source)')}"
+        programs = found.setdefault(ast.literal_eval(name), [])
+        programs += [] if said in programs else [said]
+    return found
 
 
 def _folder_of(one: Format) -> str:

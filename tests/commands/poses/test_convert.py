@@ -35,6 +35,18 @@ PLACES = {
     "bundler": "bundle.out",
     "llff": "poses_bounds.npy",
 }
+WRITTEN_ONLY = (
+    "pinhole",
+    "poses",
+    "csv",
+    "scene",
+    "points",
+    "opensfm",
+    "meshroom",
+    "openmvg",
+    "realitycapture",
+    "neus",
+)
 FORMS = tuple(name for name, one in formats().items() if one.in_set)
 BOUNDS = ("--bounds", 0.5, 9)  # for sets without points
 
@@ -107,6 +119,8 @@ def test_every_form_that_is_read_becomes_every_form_that_is_written(tmp_path: Pa
     given_set = read_dataset(scene)
     # Bundler knows one focal length, in the middle of the image; LLFF that without distortion; no points are read.
     fitting = {"bundler": ("llff", "bundler"), "llff": ("llff",), "points": ()}
+    fitting |= dict.fromkeys(("meshroom", "openmvg", "realitycapture"), ("llff", "bundler", "metashape"))
+    fitting["neus"] = ("llff", "kitti")
     forms = [name for name in FORMS if form in fitting.get(name, (form,))]
     wanted = [word for name in forms for word in ("--to", name)]
     done = converted(scene, tmp_path / "all", *wanted, "--photos", "copy")
@@ -131,7 +145,7 @@ def test_the_folder_that_was_written_is_read_with_its_poses(tmp_path: Path, form
 
 def test_the_command_offers_every_form_there_is() -> None:
     [option] = [one for one in convert_command.params if one.name == "names"]
-    assert set(option.type.choices) == {*PLACES, "pinhole", "poses", "csv", "scene", "points"} == set(FORMS)
+    assert set(option.type.choices) == {*PLACES, *WRITTEN_ONLY} == set(FORMS)
 
 
 def test_a_form_that_cannot_hold_the_set_leaves_nothing_behind(tmp_path: Path) -> None:

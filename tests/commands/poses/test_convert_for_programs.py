@@ -21,29 +21,31 @@ def by_photo(dataset: Dataset) -> dict[Path, np.ndarray]:
     return dict(zip(photos, dataset.world_from_cam, strict=True))
 
 
-@pytest.mark.parametrize("places", [("train/{}.png", "train/{}.png"), ("left/{}.png", "right/{}.png")])
+# Photos of one folder; of two folders with the same file names; of two folders whose order is not that of file names.
+@pytest.mark.parametrize(
+    ("folders", "same_names"), [(("train",), False), (("left", "right"), True), (("b", "a"), False)]
+)
 def test_llff_has_its_photos_in_images_in_the_order_of_its_rows(
-    tmp_path: Path, places: tuple[str, str]
+    tmp_path: Path, folders: tuple[str, ...], same_names: bool
 ) -> None:
     write_set(tmp_path / "given", seed=1, count=6, k1=0.0)
     file = tmp_path / "given" / "transforms.json"
     document = json.loads(file.read_text())
     for index, frame in enumerate(document["frames"]):
-        number = index if places[0] == places[1] else index // 2
-        place = tmp_path / "given" / places[index % 2].format((5 * number) % 7)
+        number = index // 2 if same_names else index
+        place = tmp_path / "given" / folders[index % len(folders)] / f"{(5 * number) % 7}.png"
         place.parent.mkdir(exist_ok=True)
         (tmp_path / "given" / frame["file_path"]).rename(place)
         frame["file_path"] = place.relative_to(tmp_path / "given").as_posix()
     (tmp_path / "given/images").rmdir()
     file.write_text(json.dumps(document))
     truth = by_photo(read_dataset(tmp_path / "given"))
-    beside = [("beside", ("--to", "transforms", "--to", "kitti"))] if places[0] == places[1] else []
+    beside = [] if same_names else [("beside", ("--to", "transforms", "--to", "kitti"))]
     for name, more in [("alone", ()), *beside]:
         there = tmp_path / name
         converted(tmp_path / "given", there, "--to", "llff", *more, *BOUNDS)
-        assert sorted(path.name for path in there.iterdir() if path.is_dir()) == (
-            ["images", "train"] if more else ["images"]
-        )
+        own = folders if more else ()
+        assert sorted(path.name for path in there.iterdir() if path.is_dir()) == sorted({"images", *own})
         # As LLFF's readers pair them: the files of images/ by name, and the rows.
         photos = sorted((there / "images").iterdir())
         rows = np.load(there / "poses_bounds.npy")

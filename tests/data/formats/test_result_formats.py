@@ -293,5 +293,6 @@ def test_all_exports_are_written_and_those_that_cannot_be_say_why(tmp_path):
 
 def test_every_export_that_may_be_asked_for_has_a_writer():
     [allowed] = RefineOptions.model_fields["exports"].annotation.__args__[:1]
-    assert set(allowed.__args__) == {"colmap-text", "instant-ngp", "kitti", "bundler", "pinhole"}
+    asked = {"colmap-text", "instant-ngp", "kitti", "bundler", "pinhole"}
+    assert set(allowed.__args__) == asked | {"opensfm", "meshroom", "openmvg", "realitycapture", "neus"}
     assert all(ALL_CODECS[name].write is not None for name in allowed.__args__)

@@ -1,0 +1,1 @@
+"""Files of photogrammetry programs: OpenSfM, Meshroom, OpenMVG, RealityCapture."""

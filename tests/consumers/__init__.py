@@ -1,0 +1,1 @@
+"""What other programs read: their own readers, in an environment of their own."""
