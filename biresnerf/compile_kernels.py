@@ -9,6 +9,7 @@ import logging
 import time
 
 import numpy as np
+import torch
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.field.cpu.compile_kernels import compile_field_kernels
@@ -17,6 +18,9 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refine.adjustment.adjustment import adjust_poses, misfit
 from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PatchPhotos, PosePrior
 from biresnerf.refine.adjustment.patch_points import Surfaces, find_patches
+from biresnerf.refine.kernels.draw_pixels import draw_pixels
+from biresnerf.refine.optimise.cast_rays import cast_rays
+from biresnerf.refine.parameters.pose_parameters import PoseParameters
 
 logger = logging.getLogger(__name__)
 SLOW_S = 3.0  # loading from the cache takes a fraction of this
@@ -28,11 +32,24 @@ def compile_kernels(*, field: bool = True) -> float:
     started = time.monotonic()
     if field:
         compile_field_kernels()
+        _cast_one_ray()
     _adjust_two_cameras()
     seconds = time.monotonic() - started
     if seconds > SLOW_S:
         logger.info("compiled the CPU kernels in %.0f s; later runs load them from the cache", seconds)
     return seconds
+
+
+def _cast_one_ray() -> None:
+    """One pixel of one photo, on the way a step takes."""
+    one, nowhere = np.zeros(1, np.int64), np.zeros((1, 2), np.float32)
+    photo, colour = np.zeros((1, 3), np.uint8), np.zeros((1, 3), np.float32)
+    draw_pixels(
+        np.zeros(1, np.float32), nowhere, one, 1, np.ones((1, 2), np.int64), one, photo, one, nowhere, colour
+    )
+    poses = PoseParameters(torch.eye(4)[None], 1.0, torch.device("cpu"))
+    _, direction = cast_rays(poses.matrices(), torch.zeros(1, dtype=torch.int64), torch.ones(1, 3))
+    direction.sum().backward()
 
 
 def _adjust_two_cameras() -> None:

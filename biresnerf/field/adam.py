@@ -1,4 +1,4 @@
-"""Adam, by torch's own function."""
+"""Adam, by torch's own kernel."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.optim import adam
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -14,11 +13,11 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 class Adam:
     """Adam (Kingma and Ba 2015) on some parameters; the learning rate is given at each step.
 
-    `torch.optim.Adam` takes the same steps, but loads torch's compiler: two seconds of every process.
+    `torch.optim.Adam` takes the same steps, but loads torch's compiler: two seconds of every process. One kernel moves
+    all parameters: a quarter of the time of an operation for each product and root on a CPU, one launch on a GPU.
 
     Args:
         weight_decay: L2, added to the gradient.
-        fused: one kernel for all parameters.
     """
 
     def __init__(
@@ -27,11 +26,9 @@ class Adam:
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
         weight_decay: float = 0.0,
-        *,
-        fused: bool = False,
     ) -> None:
         self.parameters, self.betas, self.eps = list(parameters), betas, eps
-        self.weight_decay, self.fused = weight_decay, fused
+        self.weight_decay = weight_decay
         self._of_parameter: dict[int, dict[str, Tensor]] = {}
 
     @torch.no_grad()
@@ -44,19 +41,17 @@ class Adam:
                 gradients.append(parameter.grad)
                 histories.append(self._of_parameter.setdefault(i, self._fresh(parameter)))
         first, second, steps = ([history[name] for history in histories] for name in (*MOMENTS, "step"))
-        adam.adam(
-            parameters, gradients, first, second, [], steps, fused=self.fused or None, amsgrad=False,
-            beta1=self.betas[0], beta2=self.betas[1], lr=rate, weight_decay=self.weight_decay, eps=self.eps,
-            maximize=False,
+        if not parameters:
+            return
+        torch._foreach_add_(steps, 1)
+        torch._fused_adam_(
+            parameters, gradients, first, second, [], steps, lr=rate, beta1=self.betas[0], beta2=self.betas[1],
+            weight_decay=self.weight_decay, eps=self.eps, amsgrad=False, maximize=False,
         )  # fmt: skip
 
     def _fresh(self, parameter: Tensor) -> dict[str, Tensor]:
         moments = {name: torch.zeros_like(parameter) for name in MOMENTS}
-        return {"step": torch.zeros((), device=self._step_device(parameter)), **moments}
-
-    def _step_device(self, parameter: Tensor) -> torch.device:
-        """Where torch wants the count of steps."""
-        return parameter.device if self.fused else torch.device("cpu")
+        return {"step": torch.zeros((), device=parameter.device), **moments}
 
     def zero_grad(self) -> None:
         for parameter in self.parameters:
@@ -81,6 +76,6 @@ class Adam:
         self._of_parameter = {}
         for i, parameter in enumerate(self.parameters):
             if f"{name}_{i}_step" in state:
-                step = state[f"{name}_{i}_step"].clone().to(self._step_device(parameter))
+                step = state[f"{name}_{i}_step"].clone().to(parameter.device)
                 moments = {k: state[f"{name}_{i}_{k}"].clone().to(parameter.device) for k in MOMENTS}
                 self._of_parameter[i] = {"step": step, **moments}

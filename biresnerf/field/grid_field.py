@@ -78,8 +78,7 @@ class GridField(RadianceField):
         ]
 
     def _adam(self, parameters: list[Tensor]) -> Adam:
-        fused = self.device.type == "cuda"  # one launch instead of a dozen
-        return Adam(parameters, betas=(BETA1, BETA2), eps=EPSILON, fused=fused)
+        return Adam(parameters, betas=(BETA1, BETA2), eps=EPSILON)
 
     @property
     def modules(self) -> tuple[str, ...]:

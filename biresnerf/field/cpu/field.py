@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ class Buffers:
 
     def take(self, name: str, *shape: int, dtype: Any = f4) -> np.ndarray:
         """An uninitialised array of this shape; valid until the same name is requested again."""
-        size = int(np.prod(shape))
+        size = math.prod(shape)
         held = self._held.get(name)
         if held is None or held.size < size or held.dtype != dtype:
             held = self._held[name] = np.empty(int(size * 1.3) + 1024, dtype)
@@ -196,7 +197,9 @@ class CpuField(GridField):
         """Gradients to grid positions [3, n] and view harmonics [rays, 16]; keeps those to the field for `step`."""
         take, n, width = self._buffers.take, len(s.t), len(s.features)
         weights = self._weights()
-        sums = [np.zeros((max(1, s.learning), w.size), f4) for w in weights]
+        sums = [take(f"sums {k}", max(1, s.learning), w.size) for k, w in enumerate(weights)]
+        for layer in sums:
+            layer.fill(0)
         g_features, dx = take("g features", width, n), take("dx", 3, n)
         g_view = np.empty((len(opacity), VIEW_FEATURES), f4)
         longest = int(np.diff(s.offset[s.segment]).max(initial=0))

@@ -13,12 +13,13 @@ from torch import Tensor
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.field.backends import directions_for, make_occupancy
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
-from biresnerf.geometry.camera.camera import Intrinsics, directions_with_gradient
+from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refine.optimise.async_metrics import AsyncMetrics, StepResult
 from biresnerf.refine.optimise.camera_errors import CameraErrors
+from biresnerf.refine.optimise.cast_rays import cast_rays, turned, viewing_directions
 from biresnerf.refine.optimise.methods import find_method
 from biresnerf.refine.optimise.optimiser_state import Part, StepState, load_state_of, state_of
 from biresnerf.refine.optimise.photo_sampler import PhotoSampler, PixelBatch
@@ -137,12 +138,7 @@ class JointOptimiser:
         `matrix` [rays, 3, 4] is each ray's unit_from_cam; `intrinsics` are the run's images' where not given.
         """
         lenses = intrinsics or self.intrinsics
-        with torch.no_grad():
-            in_cam = self.directions(lenses, image, xy).float()
-        if lenses.fx.requires_grad:
-            in_cam = directions_with_gradient(lenses, image, xy, in_cam)
-        direction = (matrix[:, :, :3] @ in_cam[:, :, None])[:, :, 0]
-        return matrix[:, :, 3].contiguous(), direction.contiguous()
+        return turned(matrix, viewing_directions(self.directions, lenses, image, xy))
 
     def render(
         self,
@@ -183,7 +179,8 @@ class JointOptimiser:
             matrices = matrices.detach()
         if lens_rate > 0:
             matrices, lenses = self.lenses.with_gradient(matrices)
-        origin, direction = self.cast(matrices[batch.image], batch.image, batch.xy, lenses)
+        in_cam = viewing_directions(self.directions, lenses, batch.image, batch.xy)
+        origin, direction = cast_rays(matrices, batch.image, in_cam)
         rendering = self.render(
             origin, direction, batch.trained, schedule.interval(t, self.switch),
             schedule.position_gradient(t, self.switch), jitter=True,

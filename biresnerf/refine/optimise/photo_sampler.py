@@ -16,6 +16,7 @@ from torch import Tensor
 
 from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.images import ImageSet
+from biresnerf.refine.kernels.draw_pixels import draw_pixels
 
 PYRAMID_LEVELS = 5
 LEVEL_SIGMA = 0.5  # blur of level k, in px: 0.5 * 2**k (a box of 2**k px and the bilinear taps)
@@ -83,15 +84,38 @@ class PhotoSampler:
         self, rays: int, blur_px: float, generator: torch.Generator, *, held_out_only: bool = False
     ) -> PixelBatch:
         """`rays` pixels, spread evenly over all images or the held-out ones, blurred by a random share of `blur_px`."""
+        if self.device.type == "cpu" and self._counted is None and not held_out_only:
+            image, xy, sharp, trained = self._drawn_at_once(rays, generator)
+        else:
+            image, xy, sharp, trained = self._drawn(rays, generator, held_out_only=held_out_only)
+        sigma = blur_px * self._share(generator)
+        target = sharp if sigma <= LEVEL_SIGMA else self._blurred(image, xy, sigma)
+        return PixelBatch(image, xy, target, sharp, trained)
+
+    def _drawn(
+        self, rays: int, generator: torch.Generator, *, held_out_only: bool = False
+    ) -> tuple[Tensor, Tensor, Tensor, int]:
+        """Image, pixel centre and colour of each ray, and how many are of training views."""
         position, trained = self._positions(rays, generator, held_out_only)
         image = self.order[position]
         size = self.sizes[0][image]
         xy = self.random_pixels(image, generator)
         index = self.offsets[0][image] + (xy[:, 1].floor() * size[:, 0] + xy[:, 0].floor()).long()
-        sharp = self.pixels[index].float() / 255
-        sigma = blur_px * self._share(generator)
-        target = sharp if sigma <= LEVEL_SIGMA else self._blurred(image, xy, sigma)
-        return PixelBatch(image, xy, target, sharp, trained)
+        return image, xy, self.pixels[index].float() / 255, trained
+
+    def _drawn_at_once(self, rays: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, int]:
+        """The same from the same random numbers in one kernel, on a CPU and where all pixels count."""
+        where, share = torch.rand(rays, generator=generator), torch.rand(rays, 2, generator=generator)
+        image, xy, sharp = (
+            np.empty(rays, np.int64),
+            np.empty((rays, 2), np.float32),
+            np.empty((rays, 3), np.float32),
+        )
+        trained = draw_pixels(
+            where.numpy(), share.numpy(), self.order.numpy(), self.training, self.sizes[0].numpy(),
+            self.offsets[0].numpy(), self.pixels.numpy(), image, xy, sharp,
+        )  # fmt: skip
+        return torch.from_numpy(image), torch.from_numpy(xy), torch.from_numpy(sharp), trained
 
     def random_pixels(self, image: Tensor, generator: torch.Generator) -> Tensor:
         """The centre [rays, 2] (px) of a random pixel that counts, of each of the images `image` [rays]."""

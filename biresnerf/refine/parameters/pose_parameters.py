@@ -10,6 +10,7 @@ from torch import Tensor
 
 from biresnerf.field.adam import Adam
 from biresnerf.geometry.lie import se3_exp
+from biresnerf.refine.kernels.moved_poses import MovedPoses
 
 EPSILON = 1e-12
 SECOND_EPSILON, SECOND_DECAY = 1e-15, 1e-6  # BAA-NGP: its optimiser of the field moves the poses too
@@ -39,6 +40,7 @@ class PoseParameters:
         count = len(unit_from_cam) if body is None else int(body.max()) + 1
         # None where every camera is its own body.
         self.body = body.to(device) if body is not None and count < len(body) else None
+        self._row = torch.arange(count, device=device) if self.body is None else self.body
         self.length = length
         self.start = unit_from_cam[:, :3].to(torch.float32).to(device)
         self.rotation = torch.zeros(count, 3, device=device, requires_grad=True)
@@ -51,6 +53,13 @@ class PoseParameters:
 
     def matrices(self) -> Tensor:
         """unit_from_cam [n, 3, 4], differentiable."""
+        if self.start.device.type != "cpu":
+            return self.defined_matrices()
+        found: Tensor = MovedPoses.apply(self.rotation, self.translation, self._row, self.length, self.start)
+        return found
+
+    def defined_matrices(self) -> Tensor:
+        """The same by torch's operations, on any device."""
         rotation, translation = self.rotation, self.translation
         if self.body is not None:
             rotation, translation = rotation[self.body], translation[self.body]

@@ -67,6 +67,16 @@ def test_the_same_generator_draws_the_same_pixels():
     assert torch.equal(one.target, other.target)
 
 
+@pytest.mark.parametrize("rays", [1, 8, 4097])
+def test_the_kernel_draws_what_torch_draws(rays):
+    sampler = PhotoSampler(photos_set(noise_photos()), [1], CPU)
+    *ours, trained = sampler._drawn_at_once(rays, generator(6))
+    *theirs, of_training_views = sampler._drawn(rays, generator(6))
+    assert trained == of_training_views
+    for one, other in zip(ours, theirs, strict=True):
+        assert torch.equal(one, other)
+
+
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 2.0, 5.0, 50.0])
 def test_blur_leaves_a_constant_image_as_it_is(sigma):
     photo = np.full((33, 47, 3), (10, 100, 250), np.uint8)
