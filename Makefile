@@ -82,7 +82,7 @@ compose-check:  ## build the image, run compose.yaml with podman, lose a worker 
 	tests/deploy/compose_check.sh
 
 consumers-check: setup $(CONSUMERS)/.installed  ## what other programs' own readers make of what is written; their environment is some 4 GB
-	$(BIN)/python -m pytest -n 0 tests/consumers $(PYTEST)
+	BIRESNERF_CONSUMERS=$(abspath $(CONSUMERS)) $(BIN)/python -m pytest -n 0 tests/consumers $(PYTEST)
 
 # nerfstudio pins old versions of libraries that its parsers work without, and bpy an old NumPy.
 $(CONSUMERS)/.installed: tests/consumers/requirements.txt

@@ -27,7 +27,7 @@ EXPECTED_SKIPS = (
     r"torch finds none",
     r"set BIRESNERF_TEST_PYCOLMAPS",
     r"set BIRESNERF_TEST_DATA to the folder that holds it",
-    r"other programs are not installed: make consumers-check",
+    r"other programs' readers are run by make consumers-check",
     r"no source of .*: set BIRESNERF_CONSUMER_SOURCES",
     r"npm cannot install",
     r"no zip program writes",
