@@ -19,6 +19,8 @@ from pathlib import Path
 import psutil
 import psycopg
 import pytest
+from psycopg import sql
+from psycopg.conninfo import make_conninfo
 
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.jobs import JobView
@@ -82,6 +84,24 @@ def database_url(server: str) -> str:
     url = f"{server}&options=-csearch_path%3D{name}"
     migrate(url)
     return url
+
+
+@pytest.fixture
+def scaler(database_url: str) -> Iterator[psycopg.Connection]:
+    """A connection of a role with the right to read the view alone."""
+    role = f"scaler_{uuid.uuid4().hex[:12]}"
+    with psycopg.connect(database_url, autocommit=True) as owner:
+        schema = owner.execute("SELECT current_schema()").fetchone()[0]
+        for statement in (
+            "CREATE ROLE {role} LOGIN",
+            "GRANT USAGE ON SCHEMA {schema} TO {role}",
+            "GRANT SELECT ON queue_depth TO {role}",
+        ):
+            owner.execute(sql.SQL(statement).format(role=sql.Identifier(role), schema=sql.Identifier(schema)))
+        with psycopg.connect(make_conninfo(database_url, user=role), autocommit=True) as connection:
+            yield connection
+        for statement in ("DROP OWNED BY {role}", "DROP ROLE {role}"):
+            owner.execute(sql.SQL(statement).format(role=sql.Identifier(role)))
 
 
 @pytest.fixture

@@ -2,36 +2,13 @@
 
 from __future__ import annotations
 
-import uuid
-from collections.abc import Iterator
-
 import psycopg
 import pytest
-from psycopg import sql
-from psycopg.conninfo import make_conninfo
 
 from tests.workers.conftest import Counting, Slots
 from workers.settings.settings import Settings
 
 pytestmark = pytest.mark.anyio
-
-
-@pytest.fixture
-def scaler(database_url: str) -> Iterator[psycopg.Connection]:
-    """A connection of a role with the right to read the view alone."""
-    role = f"scaler_{uuid.uuid4().hex[:12]}"
-    with psycopg.connect(database_url, autocommit=True) as owner:
-        schema = owner.execute("SELECT current_schema()").fetchone()[0]
-        for statement in (
-            "CREATE ROLE {role} LOGIN",
-            "GRANT USAGE ON SCHEMA {schema} TO {role}",
-            "GRANT SELECT ON queue_depth TO {role}",
-        ):
-            owner.execute(sql.SQL(statement).format(role=sql.Identifier(role), schema=sql.Identifier(schema)))
-        with psycopg.connect(make_conninfo(database_url, user=role), autocommit=True) as connection:
-            yield connection
-        for statement in ("DROP OWNED BY {role}", "DROP ROLE {role}"):
-            owner.execute(sql.SQL(statement).format(role=sql.Identifier(role)))
 
 
 def depth(connection: psycopg.Connection, kind: str) -> tuple[int, int, int, float]:
