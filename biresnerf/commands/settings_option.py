@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from typing import Any
+from typing import Any, get_origin
 
 import click
 
 from biresnerf.errors import InputError
+from biresnerf.options.refine_options import RefineOptions
+
+LISTS = {name for name, field in RefineOptions.model_fields.items() if get_origin(field.annotation) is tuple}
 
 
 def parse_settings(texts: tuple[str, ...]) -> dict[str, Any]:
-    """Values by key; a value that is not valid JSON is text. Raises `InputError`."""
+    """Values by key; a value that is not valid JSON is text, and a list with commas. Raises `InputError`."""
     settings: dict[str, Any] = {}
     for text in texts:
         key, separator, value = text.partition("=")
@@ -24,7 +27,7 @@ def parse_settings(texts: tuple[str, ...]) -> dict[str, Any]:
         try:
             settings[key] = json.loads(value)
         except ValueError:
-            settings[key] = value
+            settings[key] = [part.strip() for part in value.split(",")] if key in LISTS else value
     return settings
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from biresnerf.stages import Stage
 
@@ -44,3 +47,21 @@ def divided(by: int, least: int) -> Callable[[int], int]:
 def lowered(by: int, least: int) -> Callable[[int], int]:
     """``value - by``, but not below `least`."""
     return lambda value: min(value, max(least, value - by))
+
+
+def _listed(names: Any) -> Any:
+    """As a tuple, which JSON does not have."""
+    if not isinstance(names, list | tuple):
+        raise ValueError("must be a list")
+    return tuple(names)
+
+
+def _named_once(names: Sequence[str]) -> Sequence[str]:
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise ValueError(f"{twice[0][:100]!r} is named twice")
+    return names
+
+
+# Of lists in which each name may occur once.
+ONCE = (BeforeValidator(_listed), AfterValidator(_named_once), Field(json_schema_extra={"uniqueItems": True}))

@@ -1,7 +1,7 @@
 """Options of a refinement: one declaration for the command line, the HTTP schema and config.json.
 
-Each option is declared once, in `_Options`. `RefineOptions` are the options as requested, where None leaves the value
-to the preset; `ResolvedOptions` are the same options with every value filled in.
+Each is declared once, in `_Options`. `RefineOptions` are those requested, None for the value of the preset;
+`ResolvedOptions` have every value filled in.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Generic, Literal, Never, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from biresnerf.options.formats import ExportName
-from biresnerf.options.option import Option, divided, lowered
+from biresnerf.options.option import ONCE, Option, divided, lowered
 from biresnerf.options.presets import ComputeDevice, MethodName, PresetName, in_proportion, preset_values
 from biresnerf.options.validated_options import validated, with_near_names
 from biresnerf.stages import STAGES
@@ -23,7 +23,8 @@ ExposureChoice = Literal["auto", "none", "on"]
 StartPoses = Literal["auto", "given", "colmap", "none", "turntable"]
 RefineIntrinsics = Literal["auto", "none", "focal", "all"]
 SeedingEffort = Literal["full", "low"]
-Exports = tuple[ExportName, ...]
+Names = Annotated[tuple[str, ...], *ONCE]
+Exports = Annotated[tuple[ExportName, ...], *ONCE]
 HeldOut = Annotated[int, Field(ge=0, le=200)] | Literal["auto"]
 
 # What a field may hold instead of a value: None while requested, nothing (Never) once resolved.
@@ -35,9 +36,9 @@ AUTO: Any = "auto"
 
 
 class _Options(BaseModel, Generic[Open, DeviceName]):
-    """The declarations of all options. Unknown keys are refused."""
+    """The declarations of all options. Unknown keys are refused, and so is text where a number is meant."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
     preset: Annotated[PresetName, Option("coarse", level="usual")] = Field(
         "balanced", description="Provides the value of every option that is left out."
@@ -87,7 +88,7 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         "full",
         description="low: fewer features from smaller photos in one thread: takes less memory, places fewer photos.",
     )
-    fixed: Annotated[tuple[str, ...], Option("coarse", "Photos to keep fixed", level="main")] = Field(
+    fixed: Annotated[Names, Option("coarse", "Photos to keep fixed", level="main")] = Field(
         (),
         max_length=10_000,
         description="Names of photos whose poses stay exactly as given; they define the result's frame.",
@@ -120,13 +121,13 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         description="Seconds the whole run may take: it does as many steps as fit; 0: no limit.",
     )
     coarse_steps_min: Annotated[int | Open, Option("coarse", "Shortest stage 1")] = Field(
-        OPEN, ge=10, description="Shortest stage 1, steps."
+        OPEN, ge=10, le=1_000_000, description="Shortest stage 1, steps."
     )
     coarse_steps_max: Annotated[int | Open, Option("coarse", "Longest stage 1")] = Field(
-        OPEN, ge=10, description="Longest stage 1, steps, even if the error is not stable by then."
+        OPEN, ge=10, le=1_000_000, description="Longest stage 1, steps, even if the error is not stable."
     )
     check_every: Annotated[int | Open, Option("coarse", "Steps between checks")] = Field(
-        OPEN, ge=5, description="Steps between two checks whether the error is stable."
+        OPEN, ge=5, le=1_000_000, description="Steps between two checks whether the error is stable."
     )
     samples_per_step: Annotated[
         int | Open, Option("coarse", "Samples per step", smaller=divided(4, 1024))
@@ -146,7 +147,10 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         OPEN, gt=0, le=0.5, description="Field learning rate at the end."
     )
     warmup_steps: Annotated[int | Open, Option("fine", level="research")] = Field(
-        OPEN, ge=1, description="Steps in which the reconstruction module's learning rate rises."
+        OPEN,
+        ge=1,
+        le=1_000_000,
+        description="Steps in which the reconstruction module's learning rate rises.",
     )
     double_pose_step: Annotated[bool | Open, Option("coarse", level="research")] = Field(
         OPEN,
@@ -187,7 +191,7 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     )
     checkpoint_every_s: Annotated[
         float, Option("coarse", "Seconds between checkpoints", changes_result=False)
-    ] = Field(20.0, gt=0, description="Seconds between checkpoints.")
+    ] = Field(20.0, ge=1, le=86_400, description="Seconds between checkpoints.")
     orbit_frames: Annotated[
         int | Open, Option("evaluating", "Frames of the orbit video", changes_result=False)
     ] = Field(OPEN, ge=0, le=600, description="Frames of the orbit video; 0: no video.")
@@ -212,12 +216,6 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
             return validate(values)
         except ValidationError as error:
             raise with_near_names(error, cls) from None
-
-    @field_validator("fixed", "exports", mode="before")
-    @classmethod
-    def _listed(cls, value: Any) -> Any:
-        """Lists may also be written with commas, as on a command line."""
-        return tuple(part.strip() for part in value.split(",")) if isinstance(value, str) else value
 
     @field_validator("holdout", mode="wrap")
     @classmethod

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 from urllib.parse import quote
 
 from pydantic import ConfigDict, Field
 
 from biresnerf.options.formats import ExportName
+from biresnerf.options.option import ONCE
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.report import VerdictName
 from biresnerf.stages import ReusableStage, Stage
@@ -211,7 +212,7 @@ class NewExport(Record):
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"formats": ["kitti", "pinhole"]}]})
 
-    formats: list[ExportName] = Field(min_length=1, max_length=20)
+    formats: Annotated[tuple[ExportName, ...], *ONCE] = Field(min_length=1, max_length=20)
 
 
 def job_url(job_id: str) -> str:

@@ -41,6 +41,10 @@ def test_an_error_is_followed_by_its_code() -> None:
 def test_a_setting_is_json_where_it_can_be_and_else_text() -> None:
     given = parse_settings(("steps=20", "fixed=[1]", "start=auto", "a=", 'b="1"', "c=x=y", "d=true"))
     assert given == {"steps": 20, "fixed": [1], "start": "auto", "a": "", "b": "1", "c": "x=y", "d": True}
+    assert parse_settings(("exports=kitti, bundler", "fixed=a")) == {
+        "exports": ["kitti", "bundler"],
+        "fixed": ["a"],
+    }
 
 
 @pytest.mark.parametrize("texts", [("steps",), ("=1",), ("a=1", "a=2")])

@@ -82,6 +82,32 @@ def test_a_wrong_count_of_held_out_views_is_one_error_at_its_own_place(value):
     assert "holdout: Value error, must be auto or a whole number from 0 to 200" in caught.value.detail
 
 
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"steps": "60"}, "steps: Input should be a valid integer"),
+        ({"pose_rate": "0.01"}, "pose_rate: Input should be a valid number"),
+        ({"verdict": "yes"}, "verdict: Input should be a valid boolean"),
+        ({"fixed": "a"}, "fixed: Value error, must be a list"),
+        ({"fixed": ["a", "b", "a"]}, "fixed: Value error, 'a' is named twice"),
+        ({"exports": ["kitti", "kitti"]}, "exports: Value error, 'kitti' is named twice"),
+        ({"checkpoint_every_s": 1e-9}, "checkpoint_every_s: Input should be greater than or equal to 1"),
+    ],
+)
+def test_a_value_of_another_type_or_a_name_given_twice_is_refused(values: dict[str, object], told: str):
+    with pytest.raises(InputError) as caught:
+        parse_options(values)
+    assert told in caught.value.detail
+
+
+def test_every_number_is_bounded_on_both_sides():
+    for name, field in RefineOptions.model_json_schema()["properties"].items():
+        for kind in field.get("anyOf", [field]):
+            if kind.get("type") in ("integer", "number"):
+                assert kind.keys() & {"minimum", "exclusiveMinimum"}, name
+                assert kind.keys() & {"maximum", "exclusiveMaximum"}, name
+
+
 def test_what_changes_no_result_may_change_on_resuming_and_what_comes_later_keeps_stage_1():
     assert set(OPTIONS) - RESULT_OPTIONS == {
         *("threads", "checkpoint_every_s", "orbit_frames", "shown_views", "exports")

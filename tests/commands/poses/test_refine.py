@@ -34,7 +34,7 @@ SETTINGS = {
     "table_size_log2": 10,
     "holdout": 0,
     "orbit_frames": 0,
-    "checkpoint_every_s": 0.2,
+    "checkpoint_every_s": 1,
 }
 
 

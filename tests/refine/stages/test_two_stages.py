@@ -110,7 +110,7 @@ def test_a_stable_error_begins_stage_2_before_the_cap(scene, tmp_path):
 
 def test_fractions_never_fall_and_checkpoints_are_told_when_they_exist(scene, tmp_path):
     told: list[Progress] = []
-    stages = start(scene, tmp_path, tiny_options(checkpoint_every_s=0.01), told=told)
+    stages = start(scene, tmp_path, tiny_options().model_copy(update={"checkpoint_every_s": 0.01}), told=told)
     stages.forecast.left["judging"] = 1e6
     assert finished(stages)
     fractions = [progress.fraction for progress in told]

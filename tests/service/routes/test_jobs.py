@@ -194,6 +194,8 @@ def test_a_form_that_breaks_off_is_refused(http: httpx.Client) -> None:
         ({"stepz": 100}, "#/options/stepz"),
         ({"steps": 1}, "#/options/steps"),
         ({"preset": "best"}, "#/options/preset"),
+        ({"steps": "60"}, "#/options/steps"),
+        ({"fixed": [1, ["a"]]}, "#/options/fixed/0"),
         ({"coarse_steps_min": 50, "coarse_steps_max": 40}, "#/options"),
         ("fast", "#/options"),
     ],
