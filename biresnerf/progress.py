@@ -62,9 +62,9 @@ class Monitor:
         fraction, eta_s = self.forecast.now()
         self.on_progress(progress.model_copy(update={"fraction": fraction, "eta_s": eta_s}))
 
-    def report_end(self) -> None:
-        """The run is complete."""
-        self.on_progress(Progress(stage="exporting", fraction=1.0, eta_s=0.0))
+    def report_end(self, steps: int) -> None:
+        """The run is complete, after so many steps."""
+        self.on_progress(Progress(stage="exporting", step=steps, steps_total=steps, fraction=1.0, eta_s=0.0))
 
     def raise_if_stopped(self, message: str) -> None:
         """Raise `Interrupted` with ``message`` if the run is to stop."""

@@ -78,7 +78,7 @@ def write_result(folder: OutputFolder, stages: TwoStages, evaluation: Evaluation
     write_text(path / REPORT, report.model_dump_json(indent=2))
     if complete:
         folder.clean_up()
-        stages.monitor.report_end()
+        stages.monitor.report_end(optimiser.schedule.steps)
     return report
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import JobKind
 from workers.database.database import Database
-from workers.jobs.job_states import finish, finish_cancelled, start_attempt
+from workers.jobs.job_states import finish, finish_cancelled, start_attempt, trash_attempts
 from workers.jobs.setbacks import crashed_too_often, used_up
 from workers.process.waiting import retry_while_unavailable
 from workers.settings.errors import NotFound
@@ -45,16 +45,18 @@ class Claim:
         return f"{self.attempt}-{self.token.hex[:8]}"
 
 
-async def claim_job(database: Database, job_id: str, max_attempts: int) -> Claim | None:
+async def claim_job(database: Database, job_id: str, max_attempts: int, stall_s: float) -> Claim | None:
     """Claim a job with a fresh token; none where there is nothing to run.
 
     A job whose cancellation was asked for ends ``cancelled``, one that has used up its attempts ends ``failed``.
     """
     token = uuid.uuid4()
-    return await retry_while_unavailable(lambda: _claim(database, job_id, max_attempts, token))
+    return await retry_while_unavailable(lambda: _claim(database, job_id, max_attempts, stall_s, token))
 
 
-async def _claim(database: Database, job_id: str, max_attempts: int, token: uuid.UUID) -> Claim | None:
+async def _claim(
+    database: Database, job_id: str, max_attempts: int, stall_s: float, token: uuid.UUID
+) -> Claim | None:
     async with database.transaction() as connection:
         row = await connection.row("SELECT * FROM jobs WHERE id = %s FOR UPDATE", job_id)
         if row is not None and row["run_token"] == token:
@@ -63,10 +65,11 @@ async def _claim(database: Database, job_id: str, max_attempts: int, token: uuid
         if row is None or row["state"] not in ("queued", "running"):
             return None
         if row["cancel_requested"]:
-            await finish_cancelled(connection, job_id)
+            await finish_cancelled(connection, job_id, stall_s)
             return None
         if used_up(row["attempt"], row["crashes"], max_attempts):
             await finish(connection, job_id, "failed", crashed_too_often(row["attempt"], row["setback"]))
+            await trash_attempts(connection, job_id, stall_s)
             return None
         return _claimed(await start_attempt(connection, job_id, token), token)
 

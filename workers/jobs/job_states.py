@@ -26,7 +26,6 @@ from workers.store.trash import discard
 log = logging.getLogger(__name__)
 
 End = Literal["succeeded", "failed", "cancelled"]
-STALL_S = 60.0
 
 
 async def add_event(
@@ -62,7 +61,7 @@ async def start_attempt(connection: Connection, job_id: str, token: uuid.UUID) -
         "UPDATE jobs SET state = 'running', attempt = attempt + 1, run_token = %s, fraction = 0,"
         " slot_kind = (SELECT slots.kind FROM queue_entries AS entry JOIN slots USING (worker_id)"
         " WHERE entry.id = jobs.queue_id),"
-        " step = 0, stage = NULL, eta_s = NULL, message = '',"
+        " step = 0, steps_total = 0, stage = NULL, eta_s = NULL, message = '',"
         " started_at = coalesce(started_at, clock_timestamp()) WHERE id = %s RETURNING *",
         token,
         job_id,
@@ -118,7 +117,7 @@ async def say_what_it_waits_for(connection: Connection, job_id: str, cause: Caus
         await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job_id,))
 
 
-async def take_back(connection: Connection, entry_id: int) -> None:
+async def take_back(connection: Connection, entry_id: int, stall_s: float) -> None:
     """Take a queue entry from a worker that is gone.
 
     The job goes back to the queue (its attempt stays counted); one that should be cancelled, or is final
@@ -137,7 +136,7 @@ async def take_back(connection: Connection, entry_id: int) -> None:
     log.warning("taking job %s back: its worker is gone", job["id"])
     if job["cancel_requested"]:
         await connection.execute("UPDATE jobs SET run_token = NULL WHERE id = %s", (job["id"],))
-        await finish_cancelled(connection, job["id"])
+        await finish_cancelled(connection, job["id"], stall_s)
         await job_queue.abort(connection, entry_id)
         return
     await requeue(
@@ -185,7 +184,7 @@ async def request_cancel(
         return
     await job_queue.cancel(connection, job["queue_id"])
     if job["state"] == "queued":  # perhaps after an attempt that has shown something
-        await finish_cancelled(connection, job_id, stall_s=stall_s)
+        await finish_cancelled(connection, job_id, stall_s)
     else:
         await add_event(connection, job_id, "cancel_requested")
 
@@ -205,11 +204,11 @@ async def finish(
     *,
     partial: bool = False,
 ) -> None:
-    """Write the end and its event. Previews are over."""
+    """Write the end and its event. Previews and checkpoints are over; `trash_attempts` has their files deleted."""
     await connection.execute(
         "UPDATE jobs SET state = %s, error = %s, artifacts = %s, finished_at = clock_timestamp(),"
         " eta_s = NULL, fraction = CASE WHEN %s = 'succeeded' THEN 1 ELSE fraction END,"
-        " partial = %s, previews = NULL WHERE id = %s",
+        " partial = %s, previews = NULL, checkpoint = NULL WHERE id = %s",
         (
             *(state, Jsonb(error.model_dump()) if error else None),
             *(Jsonb([item.model_dump() for item in artifacts]), state, partial, job_id),
@@ -224,18 +223,18 @@ async def finish(
 async def finish_cancelled(
     connection: Connection,
     job_id: str,
+    stall_s: float,
     artifacts: Sequence[Artifact] = (),
     keep: str | None = None,
-    stall_s: float = STALL_S,
 ) -> None:
     """End a job on request, with the files that its user wants: all there are, or the log alone.
 
     Where a partial result is wanted and the process did not come to write one, the last preview is it.
 
     Args:
+        stall_s: how long a worker may be silent; nothing is deleted before twice that.
         artifacts: what the attempt could store.
         keep: the attempt's name.
-        stall_s: how long a worker may be silent; nothing is deleted before twice that.
     """
     row = await connection.only_row("SELECT keep_partial, previews FROM jobs WHERE id = %s", job_id)
     logs = [item for item in artifacts if item.name == LOG_NAME]
@@ -248,7 +247,7 @@ async def finish_cancelled(
         ]
     partial = row["keep_partial"] and _is_whole(kept)
     await finish(connection, job_id, "cancelled", None, kept if partial else logs, partial=partial)
-    await trash_attempts(connection, job_id, keep, stall_s, preview=shown)
+    await trash_attempts(connection, job_id, stall_s, keep, preview=shown)
 
 
 def _is_whole(artifacts: Sequence[Artifact]) -> bool:
@@ -259,8 +258,8 @@ def _is_whole(artifacts: Sequence[Artifact]) -> bool:
 async def trash_attempts(
     connection: Connection,
     job_id: str,
-    keep: str | None,
-    stall_s: float = STALL_S,
+    stall_s: float,
+    keep: str | None = None,
     *,
     preview: str | None = None,
 ) -> None:

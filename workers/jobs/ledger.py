@@ -17,6 +17,7 @@ from psycopg.types.json import Jsonb
 from biresnerf.progress import Progress
 from biresnerf.report import VerdictName
 from biresnerf.stages import ReusableStage
+from biresnerf.wire.jobs import EventType
 from biresnerf.wire.problems import JobError
 from workers.database.database import Connection, Database
 from workers.jobs.claim import Claim, Fenced
@@ -27,9 +28,10 @@ from workers.store.trash import discard
 
 PREVIEW_KEPT_S = 60.0  # after another one took its place: it may be on its way to somebody
 LOG_LINES_MAX = 20_000  # of one job
+EVENTS_MAX = 10_000  # of one job, but for those of its attempts and its end, which are few
 _LOCKED = """
     SELECT id, run_token, state, stage, cancel_requested, keep_partial, log_lines, checkpoint, reusable, previews,
-    crashes
+    crashes, seq
     FROM jobs WHERE id = %s FOR UPDATE"""
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -88,7 +90,7 @@ class Ledger:
             ),
         )
         if now.stage != job["stage"]:
-            await add_event(connection, job["id"], "stage", {"stage": now.stage})
+            await _add_event(connection, job, "stage", {"stage": now.stage})
         else:
             await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job["id"],))
 
@@ -100,7 +102,7 @@ class Ledger:
         await _discard_replaced(connection, job["checkpoint"], prefix)
         await _set(connection, job, "checkpoint", {"prefix": prefix, "files": list(files)})
         await connection.execute("UPDATE jobs SET crashes = 0 WHERE id = %s", (job["id"],))
-        await add_event(connection, job["id"], "checkpoint", {"step": step})
+        await _add_event(connection, job, "checkpoint", {"step": step})
 
     @_fenced(None)
     async def reusable(
@@ -120,7 +122,7 @@ class Ledger:
         listed = [item.model_dump() for item in artifacts]
         await _set(connection, job, "previews", {"prefix": prefix, "artifacts": listed})
         data = {"stage": now.stage, "step": now.step, "files": [item.name for item in artifacts]}
-        await add_event(connection, job["id"], "preview", data)
+        await _add_event(connection, job, "preview", data)
 
     async def log(self, lines: Sequence[str]) -> None:
         """Append lines to the job's log; what is more than `LOG_LINES_MAX` is in its log file alone."""
@@ -171,7 +173,7 @@ class Ledger:
             return False
         await connection.execute("UPDATE jobs SET verdict = %s WHERE id = %s", (verdict, job["id"]))
         await finish(connection, job["id"], "succeeded", None, artifacts)
-        await trash_attempts(connection, job["id"], self.claim.name, self._stall_s)
+        await trash_attempts(connection, job["id"], self._stall_s, self.claim.name)
         return True
 
     @_fenced(True)
@@ -180,25 +182,36 @@ class Ledger:
     ) -> bool:
         """End the job as failed; False if it was cancelled instead."""
         if job["cancel_requested"]:
-            await finish_cancelled(connection, job["id"], artifacts, self.claim.name, self._stall_s)
+            await finish_cancelled(connection, job["id"], self._stall_s, artifacts, self.claim.name)
             return False
         await finish(connection, job["id"], "failed", error, artifacts)
-        await trash_attempts(connection, job["id"], self.claim.name, self._stall_s)
+        await trash_attempts(connection, job["id"], self._stall_s, self.claim.name)
         return True
 
     @_fenced(None)
     async def cancelled(self, connection: Connection, job: DictRow, artifacts: Sequence[Artifact]) -> None:
         """End the job as cancelled, with what is wanted of the files."""
-        await finish_cancelled(connection, job["id"], artifacts, self.claim.name, self._stall_s)
+        await finish_cancelled(connection, job["id"], self._stall_s, artifacts, self.claim.name)
 
     @_fenced(True)
     async def give_back(self, connection: Connection, job: DictRow, how: Requeue) -> bool:
         """Back to the queue; False if the job was cancelled instead."""
         if job["cancel_requested"]:
-            await finish_cancelled(connection, job["id"])
+            await finish_cancelled(connection, job["id"], self._stall_s)
             return False
         await requeue(connection, job["id"], how)
         return True
+
+
+async def _add_event(connection: Connection, job: DictRow, event: EventType, data: Mapping[str, Any]) -> None:
+    """As `add_event`; a job with `EVENTS_MAX` of them shows the change in its record alone."""
+    if job["seq"] < EVENTS_MAX:
+        await add_event(connection, job["id"], event, data)
+        return
+    await connection.execute(
+        "UPDATE jobs SET revision = revision + 1, updated_at = clock_timestamp() WHERE id = %s", (job["id"],)
+    )
+    await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job["id"],))
 
 
 async def _set(

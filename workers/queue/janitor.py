@@ -95,13 +95,13 @@ class Janitor:
 
     async def _release_stalled(self, connection: Connection) -> None:
         for entry_id in await job_queue.entries_of_silent_workers(connection, self._settings.stall_s):
-            await take_back(connection, entry_id)
+            await take_back(connection, entry_id, self._settings.stall_s)
         await job_queue.unregister_silent_workers(connection, self._settings.stall_s)
 
 
-async def release_worker(database: Database, worker_id: int | None) -> None:
+async def release_worker(database: Database, worker_id: int | None, stall_s: float) -> None:
     """Release all of a worker known to be dead, at once; none means every worker of this database."""
     async with database.transaction() as connection:
         for entry_id in await job_queue.entries_of_worker(connection, worker_id):
-            await take_back(connection, entry_id)
+            await take_back(connection, entry_id, stall_s)
         await job_queue.unregister_worker(connection, worker_id)

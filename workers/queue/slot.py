@@ -112,7 +112,9 @@ class Slot:
             answer_s=self._settings.answer_s,
         ) as database:
             if (predecessor := self._lock.predecessor) is not None:
-                await retry_while_unavailable(lambda: release_worker(database, predecessor))
+                await retry_while_unavailable(
+                    lambda: release_worker(database, predecessor, self._settings.stall_s)
+                )
             await require_same_store(database, self._files)
             async with self._registered(database) as worker_id:
                 listener = Listener(database, self._settings.poll_s, job_queue.CHANNEL, job_queue.subject_of)
@@ -190,7 +192,7 @@ class Slot:
             say = partial(say_what_it_waits_for, job_id=entry.job_id, cause="disk_full")
             await retry_while_unavailable(lambda: database.run(say))
             return Ending("setback", self._settings.stall_s / 4)
-        claim = await claim_job(database, entry.job_id, self._settings.max_attempts)
+        claim = await claim_job(database, entry.job_id, self._settings.max_attempts, self._settings.stall_s)
         if claim is None:
             return None
         log.info("attempt %s begins", claim.name)

@@ -86,7 +86,7 @@ async def supervise(
         if postgres is not None:
             # We hold the lock of the folder, and all workers died with our predecessor: no job runs.
             async with open_database(url, connections=1) as database:
-                await release_worker(database, None)
+                await release_worker(database, None, settings.stall_s)
         return await _Supervisor(settings, url, postgres, children).run(on_ready)
     finally:
         if postgres is not None:

@@ -32,7 +32,7 @@ def database(stores: Stores) -> Database:
 async def ledger(stores: Stores, database: Database) -> Ledger:
     dataset_id = await ready_dataset(stores, {"plan.json": b"{}"})
     job, _ = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"))
-    claim = await claim_job(database, job.id, max_attempts=3)
+    claim = await claim_job(database, job.id, max_attempts=3, stall_s=60.0)
     assert claim is not None
     return Ledger(database, claim, STALL_S)
 
@@ -105,6 +105,23 @@ async def test_lines_are_numbered_on_and_the_last_that_fits_says_where_the_rest_
     ]
 
 
+async def test_a_flood_of_checkpoints_does_not_fill_the_history(
+    stores: Stores, ledger: Ledger, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(ledgers, "EVENTS_MAX", 4)
+    before = await stores.jobs.get(ledger.claim.job_id)
+    for step in range(5):
+        await ledger.checkpoint(f"jobs/x/{step}", ["a"], step)
+    await ledger.preview("jobs/x/p", [FILE], Progress(stage="coarse"))
+    await ledger.progress(Progress(stage="coarse"))
+    seen = await stores.jobs.get(ledger.claim.job_id)
+    assert (seen.stage, seen.revision) == ("coarse", before.revision + 8), "clients see every change"
+    assert await events(stores, ledger) == ["queued", "started", "checkpoint", "checkpoint"]
+    assert await ledger.publish([FILE], None)
+    history = await stores.jobs.events(ledger.claim.job_id)
+    assert (history[-1].type, history[-1].seq) == ("succeeded", 5)
+
+
 async def test_what_got_through_though_its_answer_was_lost_is_written_once(
     stores: Stores, database: Database, ledger: Ledger, monkeypatch: pytest.MonkeyPatch
 ):
@@ -138,7 +155,7 @@ class _Losing:
 
 
 async def test_nothing_is_written_once_another_attempt_owns_the_job(database: Database, ledger: Ledger):
-    assert await claim_job(database, ledger.claim.job_id, max_attempts=3) is not None
+    assert await claim_job(database, ledger.claim.job_id, max_attempts=3, stall_s=60.0) is not None
     before = await database.fetch("SELECT * FROM jobs")
     for write in (
         ledger.progress(Progress(stage="coarse")),
@@ -173,13 +190,13 @@ async def test_a_job_given_back_starts_from_its_checkpoint_unless_that_is_forgot
 ):
     await ledger.checkpoint("jobs/x/1", ["a"], 10)
     assert await ledger.give_back(Requeue("requeued", {"why": "shutdown"}))
-    again = await claim_job(database, ledger.claim.job_id, max_attempts=3)
+    again = await claim_job(database, ledger.claim.job_id, max_attempts=3, stall_s=60.0)
     assert again is not None
     assert (again.attempt, again.checkpoint) == (1, {"prefix": "jobs/x/1", "files": ["a"]})
     smaller = {"max_image_size": 100}
     await Ledger(database, again, STALL_S).give_back(
         Requeue("retried_smaller", {}, "killed", forget_checkpoint=True, smaller=smaller)
     )
-    last = await claim_job(database, ledger.claim.job_id, max_attempts=3)
+    last = await claim_job(database, ledger.claim.job_id, max_attempts=3, stall_s=60.0)
     assert last is not None
     assert (last.attempt, last.checkpoint, last.smaller) == (2, None, smaller)

@@ -96,9 +96,9 @@ async def test_an_entry_that_is_put_back_for_later_is_not_offered_before(stores:
 
 async def test_a_job_whose_cancellation_was_answered_is_not_claimed_again(stores: Stores, database: Database):
     job_id = await queued(stores)
-    assert await claim_job(database, job_id, max_attempts=3) is not None
+    assert await claim_job(database, job_id, max_attempts=3, stall_s=60.0) is not None
     assert (await stores.jobs.cancel(job_id)).state == "running"
-    assert await claim_job(database, job_id, max_attempts=3) is None
+    assert await claim_job(database, job_id, max_attempts=3, stall_s=60.0) is None
     job = await stores.jobs.get(job_id)
     assert (job.state, job.attempt) == ("cancelled", 1)
 
@@ -117,7 +117,7 @@ async def test_a_claim_whose_acknowledgement_was_lost_counts_once(
         return answer
 
     monkeypatch.setattr(claims, "_claim", loses_the_first_answer)
-    assert await claim_job(database, job_id, 3) == lost[0]
+    assert await claim_job(database, job_id, 3, 60.0) == lost[0]
     assert (await stores.jobs.get(job_id)).attempt == 1
     assert [event.type for event in await stores.jobs.events(job_id)] == ["queued", "started"]
 
@@ -147,7 +147,7 @@ async def test_a_result_that_was_stored_in_vain_is_taken_away_again(
     stores: Stores, database: Database, settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """By who was frozen while storing it: the job has ended since, and its trash was taken out."""
-    claim = await claim_job(database, await queued(stores), 3)
+    claim = await claim_job(database, await queued(stores), 3, 60.0)
     assert claim is not None
     files, folder = stores.files, tmp_path / "job"
     attempt = Attempt(database, files, settings, claim, folder, {})
@@ -156,7 +156,7 @@ async def test_a_result_that_was_stored_in_vain_is_taken_away_again(
     async def another_worker_takes_the_job(_: Attempt) -> int:
         (folder / "output").mkdir(parents=True)
         (folder / "output" / "report.json").write_text("{}")
-        assert await claim_job(database, claim.job_id, 3) is not None
+        assert await claim_job(database, claim.job_id, 3, 60.0) is not None
         return 0
 
     async def published(ledger: Ledger, artifacts, *rest) -> bool:

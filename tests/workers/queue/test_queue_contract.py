@@ -121,9 +121,11 @@ async def test_two_janitors_at_once_release_a_job_once(database_url: str, tmp_pa
 
         async def clean(database) -> None:
             async with database.transaction() as connection:
-                await take_back(connection, entry.id)
+                await take_back(connection, entry.id, 60.0)
 
-        await asyncio.gather(clean(one), clean(other), release_worker(one, None), release_worker(other, None))
+        await asyncio.gather(
+            clean(one), clean(other), release_worker(one, None, 60.0), release_worker(other, None, 60.0)
+        )
         (job,) = await one.fetch("SELECT state, attempt, seq FROM jobs")
         assert (job["state"], job["attempt"], job["seq"]) == ("queued", 1, 2)
         (row,) = await one.fetch("SELECT state FROM queue_entries")

@@ -168,6 +168,7 @@ async def test_a_real_job_survives_the_kill_of_its_process(
         stages = [e.data["stage"] for e in events if e.type == "stage" and e.attempt == 2]
         assert stages[0] == "preparing"
         assert stages[-1] == "exporting"
+        assert done.progress.step == done.progress.steps_total > 0, "it shows all its steps at the end"
         names = {item.name for item in await stores.jobs.artifacts(job.id)}
         assert {
             "transforms.json",
