@@ -9,6 +9,7 @@ import uuid
 from typing import Any
 
 import h11
+from uvicorn.config import Config
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from service.http.problems import MEDIA_TYPE, ProblemError
@@ -23,11 +24,45 @@ READER_TIMEOUT_S = 120.0
 _TOO_LARGE = 431
 
 
+class _StrictHeads(h11.Connection):
+    """Refuses request heads that another program on the way may read differently, though RFC 9112 lets us take them.
+
+    These are lines that end without a carriage return (section 2.2), headers that go on in the next line (5.2), and a
+    length that is given twice, even if equal (6.3).
+    """
+
+    def next_event(self) -> Any:
+        """As the base class's. Raises `h11.RemoteProtocolError`."""
+        if self.their_state is h11.IDLE:
+            _refuse_ambiguous(self.trailing_data[0])
+        return super().next_event()
+
+
+def _refuse_ambiguous(received: bytes) -> None:
+    lengths, at = 0, 0
+    while (end := received.find(b"\n", at)) >= 0:
+        line, at = received[at:end], end + 1
+        if not line.endswith(b"\r"):
+            raise h11.RemoteProtocolError("a line of the head does not end with CR LF")
+        if line == b"\r":
+            return
+        if line[:1] in (b" ", b"\t"):
+            raise h11.RemoteProtocolError("a header goes on in the next line")
+        if line.lower().startswith(b"content-length:"):
+            lengths += 1 + line.count(b",")
+        if lengths > 1:
+            raise h11.RemoteProtocolError("Content-Length is given twice")
+
+
 class StrictHttp(H11Protocol):
     """One connection. The base class responds to malformed requests in plain text and has no time limits."""
 
     _headers_timer: asyncio.TimerHandle | None = None
     _reader_timer: asyncio.TimerHandle | None = None
+
+    def __init__(self, config: Config, *given: Any, **named: Any) -> None:
+        super().__init__(config, *given, **named)
+        self.conn = _StrictHeads(h11.SERVER, config.h11_max_incomplete_event_size or HEAD_BYTES_MAX)
 
     def connection_made(self, transport: Any) -> None:
         """Starts the time limit for the first request's headers."""

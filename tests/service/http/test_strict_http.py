@@ -61,6 +61,16 @@ MALFORMED = {
     "two lengths": b"POST /v1/datasets HTTP/1.1\r\n"
     + HOST
     + b"Content-Length: 2\r\nContent-Length: 40\r\n\r\n{}",
+    "two equal lengths": b"POST /v1/datasets HTTP/1.1\r\n"
+    + HOST
+    + b"Content-Length: 2\r\ncontent-length: 2\r\n\r\n{}",
+    "two equal lengths in one header": b"POST /v1/datasets HTTP/1.1\r\n"
+    + HOST
+    + b"Content-Length: 2, 2\r\n\r\n{}",
+    "line feeds alone": b"GET /livez HTTP/1.1\nHost: x\n\n",
+    "a line feed alone after a header": GET + b"Host: x\nX-A: b\r\n\r\n",
+    "a line feed alone at the end of the head": GET + HOST + b"\n",
+    "a header folded over two lines": GET + HOST + b"X-A: b\r\n c\r\n\r\n",
     "negative length": b"POST /v1/datasets HTTP/1.1\r\n" + HOST + b"Content-Length: -1\r\n\r\n",
     "signed length": b"POST /v1/datasets HTTP/1.1\r\n" + HOST + b"Content-Length: +2\r\n\r\n{}",
     "length in hexadecimal": b"POST /v1/datasets HTTP/1.1\r\n" + HOST + b"Content-Length: 0x2\r\n\r\n{}",
@@ -117,6 +127,14 @@ def test_a_body_with_two_lengths_is_refused_and_nothing_after_it_is_a_request(
 )
 def test_a_head_too_large_is_431(service: Running, http: httpx.Client, head: bytes) -> None:
     assert "32768" in refused(answers_to(service, head), 431, "headers_too_large")["detail"]
+
+
+def test_line_feeds_alone_are_refused_in_heads_only(http: httpx.Client) -> None:
+    body = b'{\n \n\n "name": "x"\n}\n'
+    assert (
+        http.post("/v1/datasets", content=body, headers={"Content-Type": "application/json"}).status_code
+        == 201
+    )
 
 
 def test_requests_in_a_row_on_one_connection_are_answered_in_turn(
