@@ -65,6 +65,21 @@ def refuse_names_outside(file: Path, names: Sequence[str], within: Path, field: 
             refuse_outside([file.parent / spelling], [name], within, f"{file.name} frames[{index}].{field}")
 
 
+def refuse_more_than_files(file: Path, names: Sequence[str], within: Path) -> None:
+    """Raises InputError ``image_missing`` where ``within`` has fewer files than there are frames, each with its own.
+
+    Looking for each would take a while, with a hundred thousand frames a minute.
+    """
+    files = sum(len(found) for _, _, found in os.walk(within))
+    if len(names) > files:
+        raise InputError(
+            "image_missing",
+            f"{len(names)} frames, but the set has only {files} files.",
+            where=f"{file.name} frames",
+            hint="Put an image there for each frame (paths are relative to the file), or remove frames.",
+        )
+
+
 def find_images(file: Path, names: Sequence[str]) -> list[Path]:
     """The images that the frames of ``file`` name.
 

@@ -22,6 +22,7 @@ from biresnerf.data.model.untrusted_file import invalid_file, read_json_object
 from biresnerf.data.photos.masks import dynamic_mask, named_mask
 from biresnerf.data.photos.named_images import (
     find_images,
+    refuse_more_than_files,
     refuse_names_outside,
     refuse_too_few,
     unused_image_notes,
@@ -85,6 +86,7 @@ def bind_transforms(parsed: ParsedPoses, root: Path, within: Path | None = None)
     refuse_too_few(len(parsed.entries), f"{path.name} frames")
     names = _names(parsed.entries)
     if within is not None:
+        refuse_more_than_files(path, names, within)
         refuse_names_outside(path, names, within, "file_path")
     paths = find_images(path, names)
     parsed = _with_older_transform(parsed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import time
 
 import numpy as np
 import pytest
@@ -232,3 +233,14 @@ def test_a_path_that_does_not_exist_is_refused(tmp_path):
     with pytest.raises(InputError) as caught:
         read_dataset(tmp_path / "nothing")
     assert_complete(caught.value, "input_missing", "nothing")
+
+
+def test_twenty_thousand_frames_for_a_few_files_are_refused_without_looking_for_each(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    document["frames"] = [{"file_path": f"images/{n}.jpg"} for n in range(20_000)]
+    path = save(tmp_path, document)
+    began = time.process_time()
+    with pytest.raises(InputError, match="20000 frames, but the set has only 5 files") as caught:
+        read_transforms(path, within=tmp_path)
+    assert caught.value.code == "image_missing"
+    assert time.process_time() - began < 2, "looking for each takes more than 4 s"
