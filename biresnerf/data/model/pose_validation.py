@@ -13,6 +13,7 @@ from biresnerf.errors import InputError
 ROTATION_REFUSED = 1e-2  # a singular value farther than this from 1 is a scaling or a shear, not rounding
 ROTATION_WARNED = 1e-4  # files with 5 to 6 digits stay below it
 MAX_COORDINATE = 1e9  # map coordinates in millimetres fit; beyond it float32 maths says nothing
+MAX_POINT_COORDINATE = 1e15  # points triangulated far away are no fault; their squares fit into float32
 _REFLECTION_HINT = "Flip whole axes of the world instead (a rotation), or export with another axis setting."
 
 

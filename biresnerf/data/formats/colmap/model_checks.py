@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model import colmap_scene as colmap
-from biresnerf.data.model.pose_validation import MAX_COORDINATE
+from biresnerf.data.model.pose_validation import MAX_COORDINATE, MAX_POINT_COORDINATE
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import COLMAP_MODELS, MODEL_IDS, MODEL_PARAMETERS, Camera
 from biresnerf.geometry.camera.lens import lens_problem
 
 MAX_SIDE_PX = 10**6
+MAX_FEATURE_PX = 1e7
 # COLMAP writes unit quaternions with 15 digits, others with 6; a length beyond this is no rounding.
 QUAT_LENGTH_ERROR = 1e-2
 _HINT = "Export the model again with COLMAP, or copy it again: it may be cut off."
@@ -114,6 +115,15 @@ def image_name(raw: bytes | str, where: str) -> str:
     return name
 
 
+def check_features(xy: NDArray[np.float64], where: str) -> None:
+    """Raises InputError unless the positions [n, 2] of features are finite and near their image."""
+    if not np.isfinite(xy).all():
+        raise broken(where, "a feature's position is no finite number", "pose_not_finite")
+    if len(xy) and np.abs(xy).max() > MAX_FEATURE_PX:
+        what = f"a feature is farther than {MAX_FEATURE_PX:g} px from the image"
+        raise broken(where, what, "pose_out_of_range", "Remove the image's features.")
+
+
 def rigid_pose(numbers: Sequence[float], where: str, hint: str = _HINT) -> colmap.RigidPose:
     """The pose of a quaternion (w, x, y, z) and a translation. Raises InputError unless it is rigid and finite."""
     values = np.array(numbers, dtype=np.float64)
@@ -146,6 +156,9 @@ def points_of_records(
         raise broken(file, "two points have the same id, or an id is out of range")
     if not (np.isfinite(xyz).all() and np.isfinite(errors).all()):
         raise broken(file, "a point's position or error is no finite number", "pose_not_finite")
+    if len(xyz) and max(np.abs(xyz).max(), np.abs(errors).max()) > MAX_POINT_COORDINATE:
+        what = f"a point's position or error is larger than {MAX_POINT_COORDINATE:g}"
+        raise broken(file, what, "pose_out_of_range", "Remove the point.")
     starts = np.concatenate([np.zeros(1, np.int64), np.cumsum(lengths)])
     return colmap.ColmapPoints(ids, xyz, rgb, errors, starts, elements[:, 0].copy(), elements[:, 1].copy())
 

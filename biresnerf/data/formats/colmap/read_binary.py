@@ -118,8 +118,7 @@ def parse_images(data: bytes, file: str) -> dict[int, colmap.ColmapImage]:
         where = f"{file} image {number}"
         name = checks.image_name(source.name(f"image {number}"), where)
         points = source.array(_POINT_2D, source.count(_U64, _POINT_2D.itemsize, f"points of image {number}"))
-        if not np.isfinite(points["xy"]).all():
-            raise checks.broken(where, "a feature's position is no finite number", code="pose_not_finite")
+        checks.check_features(points["xy"], where)
         ids = points["id"].astype(np.int64)  # COLMAP's mark of no point, 2^64 - 1, becomes NO_POINT
         xy = points["xy"].astype(np.float64)
         return number, colmap.ColmapImage(number, name, camera_id, checks.rigid_pose(pose, where), xy, ids)

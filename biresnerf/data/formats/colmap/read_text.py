@@ -18,6 +18,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 
 T = TypeVar("T")
 _MAX_ID = 2**63 - 1
+_MAX_SHORT_ID = 2**32 - 2  # of cameras, images, rigs, frames and sensors
 _NO_POINT_WORDS = ("-1", str(2**64 - 1))
 
 
@@ -38,6 +39,13 @@ class _Words:
         if not (word.isascii() and word.isdecimal() and len(word) < 20) or int(word) > _MAX_ID:
             raise checks.broken(self.where, f"{what} is {word[:40]!r}, not a whole number")
         return int(word)
+
+    def identifier(self, what: str) -> int:
+        """A whole number that COLMAP's binary tables can hold, in which the largest stands for none."""
+        number = self.integer(what)
+        if number > _MAX_SHORT_ID:
+            raise checks.broken(self.where, f"{what} is {number}, more than {_MAX_SHORT_ID}")
+        return number
 
     def numbers(self, count: int, what: str) -> list[float]:
         words = [self.word(what) for _ in range(count)]
@@ -88,7 +96,7 @@ def parse_cameras(text: str, file: str) -> dict[int, Camera]:
     """The cameras by id."""
 
     def camera(words: _Words) -> tuple[int, Camera]:
-        number = words.integer("the camera's id")
+        number = words.identifier("the camera's id")
         model = checks.supported_model(words.word("the camera's model"), words.where)
         width, height = words.integer("the width"), words.integer("the height")
         params = words.numbers(len(words.words) - words.at, "the parameters")
@@ -107,8 +115,8 @@ def parse_images(text: str, file: str) -> dict[int, colmap.ColmapImage]:
             continue
         parts = line.strip().split(maxsplit=9)
         words = _Words(" ".join(parts[:9]), where)
-        number, pose = words.integer("the image's id"), words.numbers(7, "the pose")
-        camera_id = words.integer("the camera's id")
+        number, pose = words.identifier("the image's id"), words.numbers(7, "the pose")
+        camera_id = words.identifier("the camera's id")
         if len(parts) < 10:
             raise checks.broken(where, "the line ends before the image's name")
         name = checks.image_name(parts[9], where)
@@ -128,8 +136,7 @@ def _features(line: str, where: str) -> tuple[NDArray[np.float64], NDArray[np.in
             hint="Write an empty line after each image that has no features.",
         )
     numbers = floats(words, where, "a feature").reshape(-1, 3)
-    if not np.isfinite(numbers).all():
-        raise checks.broken(where, "a feature's position is no finite number", "pose_not_finite")
+    checks.check_features(numbers[:, :2], where)
     ids = ["-1" if word in _NO_POINT_WORDS else word for word in words[2::3]]
     return numbers[:, :2].copy(), _integers(ids, where, "a point's id")
 
@@ -176,7 +183,7 @@ def _bounded(ids: list[int], file: str) -> NDArray[np.int64]:
 
 def _sensor(words: _Words) -> colmap.Sensor:
     name = words.word("a sensor's type")
-    number = words.integer("a sensor's id")
+    number = words.identifier("a sensor's id")
     kind = colmap.SENSOR_TYPES.index(name) if name in colmap.SENSOR_TYPES else -1
     return checks.sensor_type(kind, words.where), number
 
@@ -189,7 +196,7 @@ def parse_rigs(text: str, file: str) -> dict[int, colmap.ColmapRig]:
     """The rigs by id."""
 
     def rig(words: _Words) -> tuple[int, colmap.ColmapRig]:
-        number, sensors = words.integer("the rig's id"), words.integer("the number of sensors")
+        number, sensors = words.identifier("the rig's id"), words.integer("the number of sensors")
         listed: list[tuple[colmap.Sensor, colmap.RigidPose | None]] = (
             [(_sensor(words), None)] if sensors else []
         )
@@ -208,7 +215,7 @@ def parse_frames(text: str, file: str) -> dict[int, colmap.ColmapFrame]:
     """The frames by id."""
 
     def frame(words: _Words) -> tuple[int, colmap.ColmapFrame]:
-        number, rig_id = words.integer("the frame's id"), words.integer("the rig's id")
+        number, rig_id = words.identifier("the frame's id"), words.identifier("the rig's id")
         pose = _pose(words, "the frame's pose")
         count = words.integer("the number of images")
         if 3 * count > len(words.words):
