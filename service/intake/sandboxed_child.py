@@ -48,7 +48,7 @@ async def run_confined(module: str, request: BaseModel, limits: Limits) -> dict[
     """
     command = [sys.executable, "-P", "-m", module, limits.model_dump_json()]
     child = await asyncio.create_subprocess_exec(
-        *dying_with_parent(command, signal_number=signal.SIGKILL),
+        *dying_with_parent(command, signal_number=signal.SIGKILL, nice=5),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
@@ -108,7 +108,6 @@ def run_child(work: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
 
 
 def _confine(limits: Limits) -> None:
-    os.nice(5)
     for kind, amount in (
         (resource.RLIMIT_AS, limits.memory_bytes),
         (resource.RLIMIT_FSIZE, limits.file_bytes),

@@ -28,6 +28,8 @@ from workers.store.files import FileStore
 
 log = logging.getLogger(__name__)
 
+CHECK_NICE = 5  # more urgent than a job: somebody waits for it
+
 EXIT_INPUT_ERROR = 2
 CHECKS = "checks"
 IN_USE = "in-use"
@@ -152,7 +154,7 @@ def _sweep(parent: Path) -> None:
 
 async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[CheckReport | JobError, bool]:
     """The outcome, and whether a signal ended the program."""
-    child = await Child.start(settings.check_command, dataset, errors, {"OMP_NUM_THREADS": "1"})
+    child = await Child.start(settings.check_command, dataset, errors, {"OMP_NUM_THREADS": "1"}, CHECK_NICE)
     try:
         async with asyncio.timeout(settings.check_timeout_s):
             output = b"".join([line async for line in child.lines()])

@@ -146,7 +146,9 @@ class Attempt:
         self._oom_kills_before = self._oom_kills.count()
         # What a job that is killed leaves behind goes with its folder.
         variables = {**self._variables, "TMPDIR": str(self._folder / "tmp")}
-        child = await Child.start(self._settings.job_command, self._folder, self._log, variables)
+        child = await Child.start(
+            self._settings.job_command, self._folder, self._log, variables, nice=self._settings.job_nice
+        )
         courier = Courier(self._ledger, self._files, self._output, self._log)
         carrying = asyncio.create_task(courier.run())
         pumping = asyncio.create_task(self._pump(child, courier))

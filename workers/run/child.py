@@ -23,16 +23,19 @@ class Child:
 
     @classmethod
     async def start(
-        cls, command: Sequence[str], folder: Path, log: Path, variables: Mapping[str, str]
+        cls, command: Sequence[str], folder: Path, log: Path, variables: Mapping[str, str], nice: int = 0
     ) -> Child:
-        """Run ``command FOLDER`` inside ``folder`` with a clean environment; appends stderr to ``log``."""
+        """Run ``command FOLDER`` inside ``folder`` with a clean environment; appends stderr to ``log``.
+
+        ``nice``: how much it gives way to other processes, the API's above all.
+        """
         # The job reads strangers' files: it gets neither the database's address nor other settings of ours.
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("BIRESNERF_")}
         # ``python -m`` would look for modules in the folder first, where a stranger's json.py may lie.
         inherited["PYTHONSAFEPATH"] = "1"
         with log.open("ab") as errors:
             process = await asyncio.create_subprocess_exec(
-                *dying_with_parent([*command, str(folder)], signal_number=signal.SIGKILL),
+                *dying_with_parent([*command, str(folder)], signal_number=signal.SIGKILL, nice=nice),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=errors,

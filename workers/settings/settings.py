@@ -104,6 +104,12 @@ class Settings(BaseSettings):
     max_attempts: int = Field(
         3, ge=1, description="Crashes after which a job fails, if it stores no checkpoint between them."
     )
+    job_nice: int = Field(
+        10,
+        ge=0,
+        le=19,
+        description="How far jobs give way to other processes of the machine, as a nice value.",
+    )
     max_queued: int = Field(1000, ge=1, description="Jobs that may wait, of all tenants together.")
     tenant_max_running: int = Field(2, ge=0, description="Jobs of one tenant at the same time; 0: no limit.")
     tenant_max_queued: int = Field(100, ge=0, description="Jobs of one tenant that may wait; 0: no limit.")

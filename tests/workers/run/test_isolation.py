@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from tests.workers.conftest import ROOT
+from workers.run.child import Child
 
 HEAVY = ("torch", "numpy", "numba", "pycolmap", "PIL")
 
@@ -40,3 +43,16 @@ time.sleep(0.5)
             return
         psutil.wait_procs([psutil.Process(pid)], timeout=0.1)
     raise AssertionError("the program outlived its parent")
+
+
+@pytest.mark.anyio
+async def test_a_job_gives_way_to_the_service_also_where_each_session_is_scheduled_as_a_group(tmp_path: Path):
+    group = Path("/proc/self/autogroup")
+    said = "import os, pathlib; print(os.nice(0), pathlib.Path('/proc/self/autogroup').read_text())"
+    program = said if group.exists() else "import os; print(os.nice(0), 'nice 7')"
+    child = await Child.start((sys.executable, "-c", program), tmp_path, tmp_path / "log", {}, nice=7)
+    lines = [line.decode().split() async for line in child.lines()]
+    assert await child.wait() == 0
+    assert lines[0][0] == str(os.nice(0) + 7)
+    assert lines[0][-2:] == ["nice", "7"]
+    assert not group.exists() or group.read_text().split()[-1] == "0", "our own group stays as it was"
