@@ -68,6 +68,7 @@ class Kept:
     variables: dict[str, str] = field(default_factory=dict)
     process: asyncio.subprocess.Process | None = None
     starts: int = 0
+    wanted: bool = True
 
     @property
     def pid(self) -> int | None:
@@ -124,9 +125,17 @@ class Installation:
         self.workers.append(worker)
         self._keeping.append(asyncio.create_task(self._keep(worker)))
 
+    async def remove(self, worker: Kept) -> None:
+        """Stop a worker for good."""
+        self.workers.remove(worker)
+        worker.wanted = False
+        if worker.process is not None and worker.pid is not None:
+            os.kill(worker.pid, signal.SIGTERM)
+            await worker.process.wait()
+
     async def _keep(self, kept: Kept) -> None:
         log = self.folder / f"{kept.name}.log"
-        while not self._closing:
+        while kept.wanted and not self._closing:
             with log.open("ab") as output:
                 # Without a file for their standard input children would share the terminal.
                 kept.process = await asyncio.create_subprocess_exec(
