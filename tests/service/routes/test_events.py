@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -105,6 +106,29 @@ def test_following_goes_on_through_the_death_of_the_web_process(
     assert numbers == list(range(1, len(numbers) + 1))
     assert seen[-1].kind == "succeeded"
     until(http, job["id"], lambda found: found["attempt"] == 1)
+
+
+def test_a_stream_cut_off_by_kills_of_the_web_process_is_replayed_from_the_last_event_that_came(
+    http: httpx.Client, service: Running, dataset: str
+) -> None:
+    job = submit(http, dataset, steps=110, step_ms=50)
+    seen: list[dict[str, str]] = []
+    kills = 0
+    while not seen or seen[-1]["event"] != "succeeded":
+        headers = {"Last-Event-ID": seen[-1]["id"]} if seen else {}
+        with contextlib.suppress(httpx.TransportError):
+            for message in events(http, job, headers=headers):
+                if "id" in message:
+                    seen.append(message)
+                if kills < 2 and message["event"] == "progress" and json.loads(message["data"])["stage"]:
+                    os.kill(web_process(service).pid, signal.SIGKILL)
+                    kills += 1
+        with Client(service.url) as client:
+            until_ready(client)
+    assert kills == 2
+    assert [int(message["id"]) for message in seen] == list(range(1, len(seen) + 1)), "each event came once"
+    assert seen == [message for message in events(http, job) if "id" in message], "and as it is told later"
+    assert http.get(job["links"]["self"]).json()["attempt"] == 1, "the job noticed nothing"
 
 
 def web_process(service: Running) -> psutil.Process:
