@@ -67,7 +67,7 @@ bench: setup  ## the measurements; BENCH="arguments"
 docs: setup  ## write the generated pages, notebooks and schemas (docs/openapi.json) again
 	$(BIN)/python -m docs.generate
 
-fuzz: setup  ## thousands of made-up requests against a real service; FUZZ="arguments"
+fuzz: setup  ## a hundred thousand made-up requests against a real service; FUZZ="arguments"
 	$(BIN)/python -m tests.service.fuzzing $(FUZZ)
 
 audit: $(TOOLS)  ## known faults of the pinned libraries; AUDIT="-s osv" asks another database

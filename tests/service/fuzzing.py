@@ -1,17 +1,21 @@
-"""Made-up requests against a real service: `python -m tests.service.fuzzing --seconds 600`.
+"""Made-up requests against a real service: `python -m tests.service.fuzzing --seconds 600 --mutated 100000`.
 
 schemathesis reads the OpenAPI document and sends what fits it and what does not, in chains too (a dataset made
 here is filled there, deleted, asked for again). A server error, an answer that the document does not declare, or
-one that does not fit its schema ends the command with 1.
+one that does not fit its schema ends the command with 1. So does a server error, or a path of the server in an answer,
+among the many requests with hostile values that follow (`mutated_requests`).
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
 import os
+import random
 import subprocess
 import sys
+import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -27,6 +31,7 @@ from tests.service.conftest import (
     short_folder,
     submit,
 )
+from tests.service.mutated_requests import SHOWN, Generator, Seen, send_all
 
 ROOT = Path(__file__).parents[2]
 # Not ensure_resource_availability: it mistakes ids that an earlier phase has deleted for new ones.
@@ -118,15 +123,56 @@ def fuzzed(*arguments: str) -> tuple[subprocess.CompletedProcess[str], str]:
     return done, "\n".join(line for line in log.splitlines() if " INFO " not in line)
 
 
+def mutated(requests: int, seconds: float, seed: int) -> tuple[Seen, str]:
+    """Sends so many requests with hostile values to a service of its own; also what it found worth a warning."""
+    with (
+        TemporaryDirectory() as folder,
+        short_folder() as data,
+        running_service(data, job_command=(sys.executable, str(PROGRAM)), **UNLIMITED) as service,
+    ):
+        access = {"Authorization": f"Bearer {admin_key(service)}"}
+        write_synthetic_scene(Path(folder) / "scene", n_views=6, size=32, seed=1)
+        with httpx.Client(base_url=service.url, timeout=60.0, headers=access) as http:
+            dataset = ready_dataset(http, Path(folder) / "scene")
+            job = finished(http, submit(http, dataset)["id"])["id"]
+            open_one = http.post("/v1/datasets", json={}).json()["id"]
+            known = {
+                "dataset_id": [dataset, open_one],
+                "job_id": [job],
+                "name": ["report.json", "log.txt"],
+                "path": ["images/0.png", "transforms.json"],
+            }
+            document = http.get("/openapi.json").json()
+        generator = Generator(document, known, access["Authorization"], random.Random(seed))
+        secrets = (str(service.data_dir), "Traceback", "site-packages", "psycopg")
+        port = int(service.url.rsplit(":", 1)[1])
+        seen = asyncio.run(send_all(port, generator, secrets, requests=requests, seconds=seconds))
+        log = service.log.read_text()
+    return seen, "\n".join(line for line in log.splitlines() if " INFO " not in line)
+
+
 def main() -> int:
-    """Returns the exit status of schemathesis."""
+    """Returns the exit status of schemathesis, or 1 where a request with hostile values broke something."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=int, default=600)
+    parser.add_argument("--mutated", type=int, default=100_000, help="Requests with hostile values; 0: none.")
+    parser.add_argument("--mutated-seconds", type=float, default=3600.0, help="At most for these.")
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    done, log = fuzzed("--max-time", str(arguments.seconds), "--seed", str(arguments.seed))
-    sys.stdout.write(f"{log}\n{done.stdout}{done.stderr}")
-    return done.returncode
+    status = 0
+    if arguments.seconds:
+        done, log = fuzzed("--max-time", str(arguments.seconds), "--seed", str(arguments.seed))
+        sys.stdout.write(f"{log}\n{done.stdout}{done.stderr}")
+        status = done.returncode
+    if arguments.mutated:
+        began = time.monotonic()
+        seen, log = mutated(arguments.mutated, arguments.mutated_seconds, arguments.seed)
+        took = time.monotonic() - began
+        told = [log, f"{seen.sent} requests in {took:.0f} s to {len(seen.operations)} operations and heads"]
+        told += [f"answers: {dict(sorted(seen.statuses.items()))}", *seen.broken[:SHOWN]]
+        sys.stdout.write("\n".join(told) + "\n")
+        status = status or int(bool(seen.broken))
+    return status
 
 
 if __name__ == "__main__":
