@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import shutil
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ import torch
 from benchmarks.gpu import gpu_report
 from benchmarks.method import peers
 from benchmarks.speed import scene
+from benchmarks.speed.clock import timed
+from benchmarks.speed.set_step import Operations
 from benchmarks.speed.torch_forms import (
     UnrolledField,
     VectorisedField,
@@ -37,6 +40,30 @@ from tests.docs.forms_of_commands import check_shell
 pytestmark = pytest.mark.slow
 
 DENSE, HASHED = grid_levels(3, 8, 20, 14), grid_levels(4, 64, 200, 12)
+
+
+def test_time_within_another_part_counts_once_or_for_both():
+    class Parts:
+        def outer(self):
+            time.sleep(0.01)
+            self.inner()
+
+        def inner(self):
+            time.sleep(0.02)
+
+    parts = [(Parts, "outer", "outer"), (Parts, "inner", "inner")]
+    for outermost in (False, True):
+        with timed(parts, time.perf_counter, outermost=outermost) as spent:
+            Parts().outer()
+            Parts().inner()
+        assert spent["outer"] == pytest.approx(0.03, abs=0.015)
+        assert (spent["inner"] > 0.035) != outermost
+
+
+def test_operations_of_torch_are_counted_by_name():
+    with Operations() as operations:
+        (torch.ones(2) + torch.ones(2)).sum()
+    assert operations.count == {"ones": 2, "add": 1, "sum": 1}
 
 
 @pytest.mark.parametrize("encode", [encode_unrolled, encode_vectorised])

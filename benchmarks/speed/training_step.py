@@ -14,6 +14,7 @@ from benchmarks.speed.clock import Clock, interleave, peak_memory, ratio, summar
 from benchmarks.speed.torch_forms import UnrolledField, VectorisedField
 from biresnerf.field.cpu import field as cpu_field
 from biresnerf.field.reference.field import ReferenceField
+from biresnerf.refine.optimise import joint_optimiser
 from biresnerf.refine.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
 from biresnerf.refine.optimise.photo_sampler import PhotoSampler
 from biresnerf.refine.parameters.pose_parameters import PoseParameters
@@ -22,7 +23,8 @@ FORWARD, BACKWARD = "networks forward, composite", "composite and networks back,
 OPERATIONS = [
     (PhotoSampler, "draw", "draw pixels"),
     (PoseParameters, "matrices", "pose matrices"),
-    (JointOptimiser, "cast", "cast rays"),
+    (joint_optimiser, "viewing_directions", "cast rays"),
+    (joint_optimiser, "cast_rays", "cast rays"),
     (cpu_field, "harmonics", "view harmonics"),
     (cpu_field.march_kernels, "march", "march"),
     (cpu_field.march_kernels, "pack", "pack samples"),
@@ -35,6 +37,7 @@ OPERATIONS = [
     (cpu_field.encoding, "update_table", "table gradient and Adam"),
     (PoseParameters, "step", "Adam on poses"),
 ]
+BETWEEN_KERNELS = {"draw pixels", "pose matrices", "cast rays", "Adam on poses"}  # outside the field
 FORWARD_MACS = 64 * 16 + 32 * 64 + 64 * 64 + 64 * 4  # of both networks but for the first layer
 
 
