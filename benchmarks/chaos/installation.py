@@ -53,6 +53,8 @@ def quick_settings(data_dir: Path, database_url: str, **changes: object) -> Sett
         "upload_expiry_s": 15.0,
         # Innocent jobs are hit by faults again and again; those that die of themselves must still fail soon.
         "max_attempts": 12,
+        # Whatever else the machine does, somebody waits for these jobs.
+        "job_nice": 0,
         "job_command": (sys.executable, str(PROGRAM)),
         "check_command": (sys.executable, "-S", "-c", CHECK),
     }

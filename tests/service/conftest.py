@@ -74,6 +74,7 @@ def running_service(folder: Path, **settings: Any) -> Iterator[Running]:
         "poll_s": 0.3,
         "janitor_s": 0.5,
         "data_dir": folder / "data",
+        "job_nice": 0,  # tests wait for jobs, whatever else the machine does
         "log_level": "INFO",
         # Receivers of webhooks live on this machine.
         "expiry_s": 0.5,

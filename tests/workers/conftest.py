@@ -122,6 +122,7 @@ def quick_settings(data_dir: Path, **changes: object) -> Settings:
         "poll_s": 0.3,
         "janitor_s": 0.3,
         "stop_grace_s": 5.0,
+        "job_nice": 0,  # tests wait for jobs, whatever else the machine does
         "job_command": (sys.executable, str(PROGRAM)),
         "check_command": (sys.executable, "-c", ACCEPTED),
     }
