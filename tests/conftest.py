@@ -31,6 +31,7 @@ EXPECTED_SKIPS = (
     r"no source of .*: set BIRESNERF_CONSUMER_SOURCES",
     r"npm cannot install",
     r"no zip program writes",
+    r"promtool is not installed",
     r"all was sent before the signal came",
     r"the Kubernetes manifests are not rendered",
 )

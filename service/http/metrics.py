@@ -50,7 +50,7 @@ _QUEUE = (
 _FROM_ZERO: dict[str, tuple[str, ...]] = {
     "job_events": get_args(EventType),
     "job_failures": ("engine_error", "timeout", "too_many_crashes"),
-    "job_requeues": ("lost", "shutdown", "worker_lost"),
+    "job_requeues": ("disk_full", "lost", "shutdown", "store_away", "worker_lost"),
     "webhook_attempts": ("delivered", "failed"),
 }
 _DURATIONS = {
