@@ -5,6 +5,8 @@ VENV ?= .venv
 EXTRAS ?= service,otel,colmap,studies,dev
 # Test files side by side: more than there are cores, as many wait for servers. 0: one after the other, in this process.
 TEST_PROCESSES ?= $(shell cores=$$(nproc 2>/dev/null || echo 2); echo $$((cores + (cores + 1) / 2)))
+# Runs of `make promises`, of up to 50 steps each.
+INTERLEAVINGS ?= 1000
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 TOOLS := $(VENV)/tools
@@ -17,7 +19,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Each process of the tests would compile all modules, and pytest rewrite all assertions, again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs fuzz audit sbom compose-check consumers-check
+.PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs fuzz promises audit sbom compose-check consumers-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -69,6 +71,9 @@ docs: setup  ## write the generated pages, notebooks and schemas (docs/openapi.j
 
 fuzz: setup  ## a hundred thousand made-up requests against a real service; FUZZ="arguments"
 	$(BIN)/python -m tests.service.fuzzing $(FUZZ)
+
+promises: setup  ## thousands of interleavings of what works on the queue; INTERLEAVINGS=1000
+	BIRESNERF_TEST_INTERLEAVINGS=$(INTERLEAVINGS) $(BIN)/python -m pytest -s -n 0 --timeout 0 tests/workers/queue/promises
 
 audit: $(TOOLS)  ## known faults of the pinned libraries; AUDIT="-s osv" asks another database
 	$(TOOLS)/bin/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict $(AUDIT)

@@ -99,6 +99,8 @@ class Ledger:
         self, connection: Connection, job: DictRow, prefix: str, files: Sequence[str], step: int
     ) -> None:
         """Point the job at a new checkpoint and have the one before deleted."""
+        if job["checkpoint"] is not None and job["checkpoint"]["prefix"] == prefix:
+            return  # an earlier try got through, though its acknowledgement was lost
         await _discard_replaced(connection, job["checkpoint"], prefix)
         await _set(connection, job, "checkpoint", {"prefix": prefix, "files": list(files)})
         await connection.execute("UPDATE jobs SET crashes = 0 WHERE id = %s", (job["id"],))
@@ -118,6 +120,8 @@ class Ledger:
         self, connection: Connection, job: DictRow, prefix: str, artifacts: Sequence[Artifact], now: Progress
     ) -> None:
         """Let the job show these files, in the place of those before."""
+        if job["previews"] is not None and job["previews"]["prefix"] == prefix:
+            return
         await _discard_replaced(connection, job["previews"], prefix, after_s=PREVIEW_KEPT_S)
         listed = [item.model_dump() for item in artifacts]
         await _set(connection, job, "previews", {"prefix": prefix, "artifacts": listed})
