@@ -98,6 +98,11 @@ class Forecast:
             self.leave()
             self._phase, self._phase_began, self._done = phase, time.monotonic(), 0.0
 
+    def took(self, amount: float) -> None:
+        """The phase, which ends now, was so much work."""
+        if self._phase is not None:
+            self.left[self._phase] = amount
+
     def leave(self) -> None:
         """The phase is over."""
         if self._phase is None:

@@ -77,6 +77,15 @@ def test_a_phase_on_its_way_is_predicted_by_what_it_has_taken():
         assert found.left_s() == 0
 
 
+def test_a_phase_that_was_less_work_than_expected_teaches_the_rate_of_what_it_was():
+    found = forecast(judging=400.0)
+    with found.within("judging"):
+        time.sleep(0.2)
+        found.took(100.0)
+    assert found.left["judging"] == 0
+    assert found.measured()["trial step"] == pytest.approx(0.2 / 100, rel=0.3)
+
+
 def test_a_phase_that_takes_longer_than_expected_is_not_over_yet():
     found = forecast(evaluating=0.1 / RATES["evaluation"])
     with found.within("evaluating"):

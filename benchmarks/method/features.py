@@ -1,9 +1,9 @@
 """Which features place cameras best: ``python -m benchmarks.method.features SET... [--size 200] [--every 2]``.
 
 Each SET holds true poses, which get BARF's noise (0.15). Features are found with and without affine shapes and pooled
-scales, up to several numbers. Prints a JSON line for each: the seconds of seeding, how many cameras COLMAP placed and
-their errors, and those of all cameras adjusted to the tracks from the truth: rotation (deg) and centre (% of the
-cameras' distance) after alignment.
+scales, up to several numbers, and so many of each photo's pairs are matched, the likeliest. Prints a JSON line for
+each: the seconds of seeding, how many cameras COLMAP placed and their errors, and those of all cameras adjusted to the
+tracks from the truth: rotation (deg) and centre (% of the cameras' distance) after alignment.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import json
 import tempfile
 import time
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from unittest.mock import patch
 
@@ -25,6 +26,7 @@ from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.points.tracks import KEPT, Tracks
 from biresnerf.data.seeding import map_images
+from biresnerf.data.seeding.map_images import LIKELIEST
 from biresnerf.data.seeding.seed_poses import Seeding, seed_poses
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.perturb import perturb_poses
@@ -87,6 +89,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--noise", type=float, default=0.15)
     parser.add_argument("--numbers", default="2048,4096", help="Features of a photo, at most.")
+    parser.add_argument("--likeliest", default=f"{LIKELIEST}", help="Pairs that each photo chooses; 0: all.")
     parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()
     for path in asked.sets:
@@ -97,8 +100,12 @@ def main() -> None:
             if asked.size:
                 truth = shrunk(truth, asked.size, Path(folder))
             for number in map(int, asked.numbers.split(",")):
-                for thorough in (True, False):
-                    features = {"thorough": thorough, "most_features": number}
+                for thorough, likeliest in product((True, False), map(int, asked.likeliest.split(","))):
+                    features = {
+                        "thorough": thorough,
+                        "most_features": number,
+                        "likeliest": likeliest or None,
+                    }
                     line = measured(truth, features, asked.noise, asked.seed)
                     print(json.dumps({"set": path.name, **line}), flush=True)
 

@@ -27,6 +27,9 @@ SAYS = "seeding: "  # before lines meant for the job's log; all others are COLMA
 # Small photos have few features: faint ones count as well, and fewer matches than COLMAP asks for must do.
 FAINTEST_PEAK, LEAST_SEEN = 0.003, 10
 ENOUGH_PLACED = 0.8  # of the images: where all poses are given, no other way of mapping is tried then
+# Growth of a model after which all of it is adjusted, where poses are given: temple takes 7.8 s in place of 16.2 with
+# 1.1, fox 13.6 in place of 20.5, and both are as exact (0.191 and 0.053 deg).
+RARELY = 1.4
 INTRINSICS_FROM = 0.5  # of the images: a model of fewer does not say what the lens is
 
 
@@ -139,14 +142,18 @@ def map_incrementally(
     """Models by adding image to image, with position priors; few matches suffice, as images may be small."""
     import pycolmap
 
-    known = [number for number, c in zip(numbers, request["cameras"], strict=True) if c["known"]]
     options = pycolmap.IncrementalPipelineOptions()
+    options.extract_colors = False  # the photos would be read again
+    known = [number for number, c in zip(numbers, request["cameras"], strict=True) if c["known"]]
     options.random_seed, options.num_threads = request["seed"], request["mapping_threads"]
     options.min_model_size, options.min_num_matches = 3, 10
     options.ba_refine_focal_length = options.ba_refine_extra_params = len(known) < len(numbers)
     options.constant_cameras = set(known)
     guided = len(request["cam_from_world"]) >= 3
     options.use_prior_position = options.use_robust_loss_on_prior_position = guided
+    if request["likeliest"] is not None:  # all cameras are adjusted again at the end of a run
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = RARELY
+        options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
     mapper, scale = options.mapper, request["error_scale"]
     mapper.init_min_num_inliers, mapper.abs_pose_min_num_inliers = 3 * LEAST_SEEN, LEAST_SEEN
     mapper.init_min_tri_angle, mapper.max_reg_trials = 8.0, 6

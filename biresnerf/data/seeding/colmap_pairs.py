@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+COARSEST, NEAREST_TO_NEXT = (
+    256,
+    0.8,
+)  # features of a photo that tell which pairs are likely, and COLMAP's ratio
 LEAST_MATCHES = 12  # of a pair; small photos have few, COLMAP asks for more
 PAIR_OUTLIER = 3.0  # median disagreements beyond which a pair's matches are taken for repeated structure
 PAIR_OUTLIER_DEG = 30.0  # but not below this
 
 
 def match_features(request: dict[str, Any], database: Path, work: Path) -> None:
-    """Matches of all pairs, or of those listed, and the relative poses they support."""
+    """Matches of all pairs, or of those listed, and the relative poses they support.
+
+    Or of the likeliest of these, where the request says how many of each photo.
+    """
     import pycolmap
 
     matching = pycolmap.FeatureMatchingOptions()
@@ -21,16 +32,65 @@ def match_features(request: dict[str, Any], database: Path, work: Path) -> None:
     verification.min_num_inliers = LEAST_MATCHES
     verification.ransac.random_seed = request["seed"]
     verification.ransac.max_error *= request["error_scale"]
-    if request["pairs"] is None:
+    pairs = request["pairs"]
+    if request["likeliest"] is not None:
+        pairs = likeliest_pairs(database, pairs, request["likeliest"])
+    if pairs is None:
         pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification)
         return
     listed = work / "pairs.txt"
-    listed.write_text("".join(f"{a} {b}\n" for a, b in request["pairs"]), "utf-8")
+    listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), "utf-8")
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(listed)
     pycolmap.match_image_pairs(
         database, matching_options=matching, pairing_options=pairing, verification_options=verification
     )
+
+
+def likeliest_pairs(
+    database_path: Path, among: list[tuple[str, str]] | None, count: int
+) -> list[tuple[str, str]]:
+    """Of the pairs (all, if not given) the `count` of each photo whose coarsest features match best.
+
+    Poses have no say, as the given ones may be wrong. After preemptive matching (Wu, Towards linear-time incremental
+    structure from motion, 3DV 2013).
+    """
+    import pycolmap
+
+    with pycolmap.Database.open(database_path) as database:
+        images = sorted(database.read_all_images(), key=lambda image: image.name)
+        names = [image.name for image in images]
+        coarsest = [_coarsest_descriptors(database, image.image_id) for image in images]
+    index = {name: i for i, name in enumerate(names)}
+    pairs = combinations(range(len(names)), 2) if among is None else ((index[a], index[b]) for a, b in among)
+    matches = np.full((len(names), len(names)), -1)
+    for a, b in pairs:
+        matches[a, b] = matches[b, a] = _mutual_matches(coarsest[a] @ coarsest[b].T)
+    chosen = set()
+    for i, row in enumerate(matches):
+        best = np.argsort(-row, kind="stable")[:count]
+        chosen |= {(min(i, int(j)), max(i, int(j))) for j in best if row[j] >= 0}
+    return [(names[a], names[b]) for a, b in sorted(chosen)]
+
+
+def _coarsest_descriptors(database: Any, image: int) -> NDArray[np.float32]:
+    """Unit descriptors [k, 128] of an image's features of the largest scales."""
+    shapes = np.asarray(database.read_keypoints(image), np.float32)[:, 2:6]
+    descriptors = np.asarray(database.read_descriptors(image).data, np.float32)
+    areas = np.abs(shapes[:, 0] * shapes[:, 3] - shapes[:, 1] * shapes[:, 2])
+    found = descriptors[np.argsort(-areas, kind="stable")[:COARSEST]]
+    return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9), np.float32)
+
+
+def _mutual_matches(cosines: NDArray[np.float32]) -> int:
+    """How many features are each other's nearest, and nearer by Lowe's ratio than the next, by cosines [k, l]."""
+    if min(cosines.shape) < 2:
+        return 0
+    rows = np.arange(len(cosines))
+    nearest = cosines.argmax(1)
+    mutual = cosines.argmax(0)[nearest] == rows
+    angle, next_angle = np.arccos(np.clip(-np.partition(-cosines, 1, axis=1)[:, :2].T, -1, 1))
+    return int((mutual & (angle < NEAREST_TO_NEXT * next_angle)).sum())
 
 
 def matched_pairs(database_path: Path) -> list[tuple[str, str, int]]:
@@ -50,7 +110,6 @@ def matched_pairs(database_path: Path) -> list[tuple[str, str, int]]:
 
 def drop_contradicting_pairs(database_path: Path, cam_from_world: dict[str, Any]) -> None:
     """Remove pairs whose relative rotation by matches and by given poses differ by far more than most do."""
-    import numpy as np
     import pycolmap
 
     from biresnerf.geometry.pose_error import rotation_between_deg
@@ -76,7 +135,6 @@ def drop_contradicting_pairs(database_path: Path, cam_from_world: dict[str, Any]
 
 def write_position_priors(database_path: Path, cam_from_world: dict[str, Any], deviation: float) -> None:
     """Given camera centres as priors of this standard deviation."""
-    import numpy as np
     import pycolmap
 
     database = pycolmap.Database.open(database_path)

@@ -12,6 +12,7 @@ from biresnerf.data.seeding.map_images import (
     BY_NAME,
     GUIDED_ALL_PAIRS_UP_TO,
     NEIGHBOURS,
+    chosen_pairs,
     pair_count,
     thoroughness,
 )
@@ -24,16 +25,16 @@ from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.stages.two_stages import TwoStages
 from biresnerf.refine.start.choose_start import TRIAL_STEPS
 from biresnerf.refine.start.first_step import adjusts_cameras
-from biresnerf.refine.views.pose_trials import OPEN_STEPS
+from biresnerf.refine.views.pose_trials import LOOKS, OPEN_STEP, OPEN_STEPS
 
 # Shares of all steps: where cameras are adjusted first, and how long the field then learns at their poses. The first is
 # soon enough: on the demo scene cameras adjusted after half of the steps end as exact as after all (docs/estimator.md).
 FIRST_ROUND, LEARNING = 0.5, 0.25
-# As measured (docs/speed.md): a step or the rendering of a scene with a background against one without; an adjustment's
+# As measured (docs/speed.md): the rendering of a scene with a background against one without; an adjustment's
 # work in thousands of observations of tracks, how many a photo has, and the work without any.
-OPEN_STEP, OPEN_EVALUATION, OBSERVATIONS, ADJUSTMENT = 1.6, 3.0, 1200, 20.0
-# Features of a megapixel, the time for a small photo's, and how many of the pairs chosen are not chosen by both photos.
-FEATURES_OF_MEGAPIXEL, THOROUGH, CHOSEN_ONCE = 10_000, 4.0, 0.55
+OPEN_EVALUATION, OBSERVATIONS, ADJUSTMENT = 3.0, 1200, 20.0
+# Features of a megapixel, and the time for a small photo's.
+FEATURES_OF_MEGAPIXEL, THOROUGH = 10_000, 4.0
 PHOTOS_LOOKED_AT, SMALL = 3, 64  # to see whether there is a background, and px
 SAMPLES = 1 << 15  # of a step of weight 1, with 8 levels in stage 2
 
@@ -51,7 +52,7 @@ def expect_run(forecast: Forecast, dataset: Dataset, options: ResolvedOptions) -
     if matched:
         forecast.left |= _matching(dataset, options.seeding_effort)
     if matched and options.start == "auto" and dataset.posed.any():
-        forecast.left["trying"] = _trial(TRIAL_STEPS, unbounded=unbounded)
+        forecast.left["trying"] = LOOKS[0] * _trial(TRIAL_STEPS, unbounded=unbounded)
     each = ADJUSTMENT + matched * OBSERVATIONS * len(dataset) / 1000 if adjusts else 0.0
     forecast.left |= _after_steps(options, unbounded, adjusting=2 * each, checks=matched and adjusts)
 
@@ -100,9 +101,11 @@ def _matching(dataset: Dataset, effort: SeedingEffort) -> dict[Phase, float]:
     """What COLMAP has before it, as far as it is known before its features are."""
     count, guided = len(dataset), dataset.posed.all()
     all_up_to = GUIDED_ALL_PAIRS_UP_TO if guided else ALL_PAIRS_UP_TO
-    chosen = CHOSEN_ONCE * count * (NEIGHBOURS if guided else BY_NAME + BY_LIKENESS)
+    chosen = chosen_pairs(count, NEIGHBOURS if guided else BY_NAME + BY_LIKENESS)
     pairs = pair_count(dataset, None) if count <= all_up_to else chosen
     asked = thoroughness(dataset, effort, pairs)
+    if asked["likeliest"] is not None:
+        pairs = min(pairs, chosen_pairs(count, asked["likeliest"]))
     sizes = [dataset.camera_of(i) for i in range(count)]
     shrunk = [min(1.0, asked["widest_image"] / max(camera.width, camera.height)) for camera in sizes]
     pixels = sum(c.width * c.height * share**2 for c, share in zip(sizes, shrunk, strict=True)) / 1e6
@@ -127,7 +130,9 @@ def _after_steps(
         "adjusting": adjusting,
         "checking": TIMES * trial if checks else 0.0,
         "evaluating": OPEN_EVALUATION if unbounded else 1.0,
-        "judging": trial if options.verdict else 0.0,  # of several rounds the first decides mostly
+        "judging": LOOKS[0] * trial
+        if options.verdict
+        else 0.0,  # the first look of the first round decides mostly
     }
 
 

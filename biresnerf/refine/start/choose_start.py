@@ -18,7 +18,7 @@ from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refine.start.forward_facing import find_forward_facing
 from biresnerf.refine.start.turntable import start_on_turntable
-from biresnerf.refine.views.pose_trials import PoseTrials, trial_views
+from biresnerf.refine.views.pose_trials import LOOKS, PoseTrials, Trial, trial_views
 from biresnerf.report import TrialReport
 
 logger = logging.getLogger(__name__)
@@ -58,7 +58,9 @@ def find_start(
     message = f"trying {len(candidates)} sets of poses"
     monitor.report(Progress(stage="seeding", message=message))
     with monitor.forecast.within("trying"):
-        return choose_start(candidates, images, options, device, threads, monitor.should_stop)
+        return choose_start(
+            candidates, images, options, device, threads, monitor.should_stop, monitor.forecast.took
+        )
 
 
 def choose_start(
@@ -68,11 +70,13 @@ def choose_start(
     device: torch.device,
     threads: int,
     should_stop: Callable[[], bool],
+    did: Callable[[float], None] = lambda _work: None,
 ) -> InitialPoses:
     """The candidate whose poses let a field predict unseen views best, as they are or after some steps.
 
     Where none is clearly the best as they are, the poses move with the field: those near the truth improve, those of a
     wrong model do not. On a tie after that, too, the first one is kept. Cameras that all candidates guess have no say.
+    `did` is called with the work of all trainings.
 
     Raises:
         Interrupted: ``should_stop`` returned true.
@@ -83,14 +87,18 @@ def choose_start(
     rigs = [candidate.world_from_cam[placed] for candidate in candidates]
     unseen = trial_views(len(images))
 
-    def scored(steps: int, *, moving: bool) -> list[float]:
+    def begun(steps: int, *, moving: bool) -> list[Trial]:
         trials = PoseTrials(images, unseen, rigs, options, steps, device, threads, should_stop)
-        return [float(trials.score(rig, moving=moving).psnr.mean()) for rig in rigs]
+        return [trials.begin(rig, moving=moving) for rig in rigs]
 
-    scores = scored(TRIAL_STEPS, moving=False)
-    first, second = sorted(scores, reverse=True)[:2]
-    if first < second + CLEAR_DB:
-        scores = scored(MOVING_STEPS, moving=True)
+    running = begun(TRIAL_STEPS, moving=False)
+    scores = _scores_when_clear(running)
+    work = sum(trial.work for trial in running)
+    if not _clear(scores):
+        running = begun(MOVING_STEPS, moving=True)
+        scores = _scores_after(running, 1.0)
+        work += sum(trial.work for trial in running)
+    did(work)
     best = int(np.argmax(scores))
     if scores[best] < scores[0] + MARGIN_DB:
         best = 0
@@ -103,3 +111,23 @@ def choose_start(
     likeliest = candidates[max(matched, key=lambda i: scores[i])].world_from_cam if matched else None
     logger.info("start: %s of %s", chosen.source, ", ".join(f"{t.source} {t.psnr:.2f} dB" for t in trials))
     return replace(chosen, trials=trials, matched_poses=likeliest)
+
+
+def _scores_when_clear(running: Sequence[Trial]) -> list[float]:
+    """Mean PSNR of each at the first of the `LOOKS` at which one is clearly the best, else at the end."""
+    for look in LOOKS:
+        scores = _scores_after(running, look)
+        if _clear(scores):
+            break
+    return scores
+
+
+def _scores_after(running: Sequence[Trial], share: float) -> list[float]:
+    for trial in running:
+        trial.train(share)
+    return [float(trial.scores().psnr.mean()) for trial in running]
+
+
+def _clear(scores: Sequence[float]) -> bool:
+    first, second = sorted(scores, reverse=True)[:2]
+    return first >= second + CLEAR_DB

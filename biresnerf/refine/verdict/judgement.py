@@ -24,12 +24,12 @@ from biresnerf.refine.verdict import image_flags
 from biresnerf.refine.verdict.pose_evidence import (
     EpipolarComparison,
     compare_on_matches,
-    moved_px,
     working_share,
 )
 from biresnerf.refine.verdict.verdict import MEASURABLE_PX, Findings, decide, failed_checks, frame_doubt
-from biresnerf.refine.views.compare_rigs import BeforeAfter, HeldOutComparison, Rig, compare_placed
+from biresnerf.refine.views.compare_rigs import BeforeAfter, Effort, HeldOutComparison, Rig, compare_placed
 from biresnerf.refine.views.held_out_views import ROUNDS_MOST
+from biresnerf.refine.views.motion import moved_px
 from biresnerf.report import Verdict
 
 logger = logging.getLogger(__name__)
@@ -76,6 +76,7 @@ def judge(stages: TwoStages) -> Judgement | None:
         judgement = judge_poses(
             stages.scene, stages.optimiser, stages.monitor.should_stop,
             lambda share: stages.report_evaluation(share, message=message), _rounds(stages),
+            stages.forecast.took,
         )  # fmt: skip
     logger.info("verdict: %s", judgement.verdict.verdict)
     return judgement
@@ -94,10 +95,11 @@ def judge_poses(
     should_stop: Callable[[], bool] = lambda: False,
     report: Callable[[float], None] = lambda _share: None,
     rounds_most: int = ROUNDS_MOST,
+    took: Callable[[float], None] = lambda _work: None,
 ) -> Judgement:
     """Compare the optimised poses with the dataset's own; `report` is called with the share of work done.
 
-    Fields are trained in ``rounds_most`` rounds at most.
+    Fields are trained in ``rounds_most`` rounds at most. `took` is called with the work that it was.
 
     Raises:
         Interrupted: ``should_stop`` returned true.
@@ -126,8 +128,9 @@ def judge_poses(
         if moved >= MEASURABLE_PX:
             heldout = compare_placed(
                 before, after, scene, optimiser, placed | (not grounded),
-                should_stop, report, rounds_most=rounds_most,
+                should_stop, report, Effort(rounds_most=rounds_most),
             )  # fmt: skip
+    took(heldout.work if heldout else 0.0)
     verdict = decide(
         Findings(
             failed=failed,

@@ -16,7 +16,7 @@ from biresnerf.refine.adjustment.paired import paired
 from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refine.scene.scene import Scene
 from biresnerf.refine.views.held_out_views import ROUNDS_MOST, unseen_rounds
-from biresnerf.refine.views.pose_trials import PoseTrials, TrialScores, joined
+from biresnerf.refine.views.pose_trials import LOOKS, PoseTrials, TrialScores, joined
 from biresnerf.report import HeldOutEvidence
 
 Array = NDArray[np.float64]
@@ -25,6 +25,8 @@ BeforeAfter = dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]
 SHOWN = 4  # held-out views that are rendered with either rig, to be looked at
 # Differences that matter and are larger than chance: trainings on the same poses differ by less (docs/verdict.md).
 PSNR_MATTERS, SSIM_MATTERS = 0.5, 0.01  # dB, and 1
+# Before the end of a training chance is larger, as its rates have not fallen yet: 0.3 dB.
+EARLY = 2  # times what matters
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +48,27 @@ class Rig:
         )
 
 
+@dataclass(frozen=True)
+class Effort:
+    """How much is trained to compare two rigs.
+
+    Attributes:
+        times: the steps that the options say are taken so many times.
+        rounds_most: small sets are trained so often, with other views left out, unless the first ones decide.
+        looks: shares of a training after which fields are compared; the last is 1.
+    """
+
+    times: int = 1
+    rounds_most: int = ROUNDS_MOST
+    looks: tuple[float, ...] = LOOKS
+
+
 @dataclass(frozen=True, eq=False)
 class HeldOutComparison:
     """Scores of the unseen `views` after two trainings.
 
     Attributes:
+        work: of all trainings, see `Trial.work`.
         renders: of some held-out views [h, w, 3] with either rig, by their index.
     """
 
@@ -58,6 +76,7 @@ class HeldOutComparison:
     before: TrialScores
     after: TrialScores
     evidence: HeldOutEvidence
+    work: float
     renders: BeforeAfter
 
 
@@ -70,52 +89,70 @@ def compare_on_unseen_views(
     threads: int,
     should_stop: Callable[[], bool],
     report: Callable[[float], None] = lambda _share: None,
-    rounds_most: int = ROUNDS_MOST,
+    effort: Effort = Effort(),
 ) -> HeldOutComparison | None:
     """Train a field on either rig, held still, and score both on the same unseen views; None of too few images.
+
+    Trainings end at the first of the looks that decides.
 
     Args:
         held_out: views that the refinement never trained on; others join them where these are few.
         report: called with the share of work done, if the present round decides.
-        rounds_most: small sets are trained so often, with other views left out, unless the first ones decide.
 
     Raises:
         Interrupted: ``should_stop`` returned true.
     """
-    steps = options.trial_steps
-    rounds = unseen_rounds(len(images), held_out)[:rounds_most]
+    steps = effort.times * options.trial_steps
+    rounds = unseen_rounds(len(images), held_out)[: effort.rounds_most]
     if steps == 0 or not rounds[0]:
         return None
     rigs = [rig.world_from_cam for rig in pair]
-    scores: tuple[list[TrialScores], list[TrialScores]] = ([], [])
+    earlier: list[tuple[TrialScores, ...]] = []
     seen: list[int] = []
+    work = 0.0
+    renders: BeforeAfter = {}
     for done, views in enumerate(rounds):
         trials = PoseTrials(images, views, rigs, options, steps, device, threads, should_stop)
-        shown = [] if done else [view for view in views if view in held_out][:SHOWN]
-        for side, rig in zip(scores, pair, strict=True):
-            side.append(trials.score(rig.world_from_cam, rig.lenses(images), shown=shown))
-            report(sum(map(len, scores)) / (2 * (done + 1)))
-        seen += views
-        old, new = (joined(side) for side in scores)
-        evidence = HeldOutEvidence(
-            steps=trials.steps,
-            strictly=len(set(seen) & set(held_out)),
-            psnr=paired(old.psnr, new.psnr, PSNR_MATTERS),
-            ssim=paired(old.ssim, new.ssim, SSIM_MATTERS),
-        )
-        if _decided(evidence):
-            break
-    renders = {view: (old.renders[view], new.renders[view]) for view in old.renders}
-    return HeldOutComparison(seen, old, new, evidence, renders)
+        running = [trials.begin(rig.world_from_cam, rig.lenses(images)) for rig in pair]
+        seen = seen + views
+        for look in effort.looks:
+            for side, trial in enumerate(running):
+                trial.train(look)
+                report((done + look * (side + 1) / len(running)) / (done + look))
+            scores = tuple(trial.scores() for trial in running)
+            old, new = (joined(side) for side in zip(*earlier, scores, strict=True))
+            did = work + sum(trial.work for trial in running)
+            evidence = _evidence(old, new, running[0].optimiser.step_index, len(set(seen) & set(held_out)))
+            decided = _decided(evidence, EARLY if look < 1 else 1)
+            if not done and (decided or look == 1):
+                shown = [view for view in views if view in held_out][:SHOWN]
+                renders = {view: (running[0].render(view), running[1].render(view)) for view in shown}
+            found = HeldOutComparison(seen, old, new, evidence, did, renders)
+            if decided:
+                return found
+        earlier.append(scores)
+        work = did
+    return found
 
 
-def _decided(evidence: HeldOutEvidence) -> bool:
-    """Whether both intervals lie beyond what matters, on the same side: other views would hardly change that."""
+def _evidence(before: TrialScores, after: TrialScores, steps: int, strictly: int) -> HeldOutEvidence:
+    psnr, ssim = (
+        paired(before.psnr, after.psnr, PSNR_MATTERS),
+        paired(before.ssim, after.ssim, SSIM_MATTERS),
+    )
+    return HeldOutEvidence(steps=steps, strictly=strictly, psnr=psnr, ssim=ssim)
+
+
+def _decided(evidence: HeldOutEvidence, times: float) -> bool:
+    """Whether both intervals lie beyond so many times what matters, on the same side.
+
+    Other views, or more steps, would hardly change that.
+    """
     psnr, ssim = evidence.psnr, evidence.ssim
     if psnr.low is None or psnr.high is None or ssim.low is None or ssim.high is None:
         return False
-    better = psnr.low > PSNR_MATTERS and ssim.low > SSIM_MATTERS
-    worse = psnr.high < -PSNR_MATTERS and ssim.high < -SSIM_MATTERS
+    better = psnr.low > times * PSNR_MATTERS and ssim.low > times * SSIM_MATTERS
+    worse = psnr.high < -times * PSNR_MATTERS and ssim.high < -times * SSIM_MATTERS
     return better or worse
 
 
@@ -127,21 +164,15 @@ def compare_placed(
     placed: NDArray[np.bool_],
     should_stop: Callable[[], bool],
     report: Callable[[float], None] = lambda _share: None,
-    times: int = 1,
-    rounds_most: int = ROUNDS_MOST,
+    effort: Effort = Effort(),
 ) -> HeldOutComparison | None:
-    """`compare_on_unseen_views` of the images placed [n] alone: others would spoil the fields of both rigs.
-
-    Fields are trained ``times`` as long as the options say, in ``rounds_most`` rounds at most.
-    """
-    options = optimiser.options
-    options = options.model_copy(update={"trial_steps": times * options.trial_steps})
+    """`compare_on_unseen_views` of the images placed [n] alone: others would spoil the fields of both rigs."""
     rows = np.flatnonzero(placed)
     images = scene.images if placed.all() else scene.images.of(rows)
     held_out = np.flatnonzero(np.isin(rows, scene.held_out)).tolist()
     found = compare_on_unseen_views(
-        (before.of(rows), after.of(rows)), images, held_out, options, optimiser.device, optimiser.threads,
-        should_stop, report, rounds_most,
+        (before.of(rows), after.of(rows)), images, held_out, optimiser.options, optimiser.device, optimiser.threads,
+        should_stop, report, effort,
     )  # fmt: skip
     if found is None:
         return None

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -30,7 +30,10 @@ SAMPLES = 1 << 14  # a step
 # Until a field of an open scene has formed, good poses predict unseen views no better than bad ones (fountain-P11: no
 # difference after 200 steps, 4 dB after 400).
 OPEN_STEPS = 2  # times the steps of a scene with a background
+OPEN_STEP = 1.6  # times the work of a step of one, as measured (docs/speed.md)
 ONE_IN, VIEWS_MOST = 5, 16  # unseen views: one in so many, but no more than that
+# Shares of a training after which fields are compared. What differs clearly differs more and more (docs/verdict.md).
+LOOKS = (0.25, 0.5, 1.0)
 RAYS_PER_STEP = 100  # pixels of all unseen views that are rendered at the end, for each step of the training
 
 
@@ -41,19 +44,15 @@ def trial_views(count: int) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class TrialScores:
-    """PSNR (dB) and SSIM of each unseen view, float64 [views], and renders [h, w, 3] of some by their index."""
+    """PSNR (dB) and SSIM of each unseen view, float64 [views]."""
 
     psnr: NDArray[np.float64]
     ssim: NDArray[np.float64]
-    renders: dict[int, NDArray[np.float32]] = field(default_factory=dict)
 
 
 def joined(parts: Sequence[TrialScores]) -> TrialScores:
     """The scores of several trials, one after the other."""
-    renders = {view: render for part in parts for view, render in part.renders.items()}
-    return TrialScores(
-        np.concatenate([p.psnr for p in parts]), np.concatenate([p.ssim for p in parts]), renders
-    )
+    return TrialScores(np.concatenate([p.psnr for p in parts]), np.concatenate([p.ssim for p in parts]))
 
 
 class PoseTrials:
@@ -95,8 +94,6 @@ class PoseTrials:
         )
         self._device, self._threads, self._should_stop = device, threads, should_stop
         self._sampler = sampler or PhotoSampler(images, self.unseen, device)
-        pixels = int(sum(images.widths[v] * images.heights[v] for v in self.unseen))
-        self._stride = max(1, math.ceil(math.sqrt(pixels / (RAYS_PER_STEP * self.steps))))
 
     def score(
         self,
@@ -104,18 +101,28 @@ class PoseTrials:
         cameras: tuple[Camera, ...] | None = None,
         *,
         moving: bool = False,
-        shown: Sequence[int] = (),
     ) -> TrialScores:
         """Train a field on all but the unseen views, from these poses and lenses, and score it on the unseen.
+
+        Args and errors are those of `begin` and `Trial.train`.
+        """
+        trial = self.begin(world_from_cam, cameras, moving=moving)
+        trial.train(1.0)
+        return trial.scores()
+
+    def begin(
+        self,
+        world_from_cam: NDArray[np.float64],
+        cameras: tuple[Camera, ...] | None = None,
+        *,
+        moving: bool = False,
+    ) -> Trial:
+        """A field before its first step.
 
         Args:
             world_from_cam: [n, 4, 4], in the frame of the rigs.
             cameras: of each image at working size; the photos' own where left out.
             moving: whether poses are optimised with the field.
-            shown: the unseen views to render whole, to be looked at.
-
-        Raises:
-            Interrupted: ``should_stop`` returned true.
         """
         images = self.images if cameras is None else replace(self.images, cameras=cameras)
         poses = self.frame.unit_from_world.apply_to_poses(world_from_cam)
@@ -124,14 +131,45 @@ class PoseTrials:
             sampler=self._sampler,
         )  # fmt: skip
         optimiser.poses_held = not moving
-        for _ in range(self.steps):
-            if self._should_stop():
+        return Trial(optimiser, images, self.unseen, self.steps, self._should_stop)
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One set of poses in training: a field that takes so many `steps` in all."""
+
+    optimiser: JointOptimiser
+    images: ImageSet
+    unseen: Sequence[int]
+    steps: int
+    should_stop: Callable[[], bool]
+
+    def train(self, share: float) -> None:
+        """Step until this share of the training is done.
+
+        Raises:
+            Interrupted: ``should_stop`` returned true.
+        """
+        while self.optimiser.step_index < round(share * self.steps):
+            if self.should_stop():
                 raise Interrupted("stopped while sets of poses were compared")
-            optimiser.step()
-        scores = score_unseen(optimiser, images, self.unseen, self._stride)
-        matrices = optimiser.poses.matrices().detach()
-        renders = {v: render_view(optimiser, matrices[v], v, as_photo=True).colour for v in shown}
-        return replace(scores, renders=renders)
+            self.optimiser.step()
+
+    @property
+    def work(self) -> float:
+        """Of the steps so far, in steps of a scene with a background."""
+        return self.optimiser.step_index * (OPEN_STEP if self.optimiser.frame.unbounded else 1.0)
+
+    def scores(self) -> TrialScores:
+        """How well the field predicts the unseen views by now. The more steps, the more pixels are rendered."""
+        pixels = int(sum(self.images.widths[v] * self.images.heights[v] for v in self.unseen))
+        stride = max(1, math.ceil(math.sqrt(pixels / (RAYS_PER_STEP * self.optimiser.step_index))))
+        return score_unseen(self.optimiser, self.images, self.unseen, stride)
+
+    def render(self, view: int) -> NDArray[np.float32]:
+        """A view whole [h, w, 3], to be looked at."""
+        matrices = self.optimiser.poses.matrices().detach()
+        return render_view(self.optimiser, matrices[view], view, as_photo=True).colour
 
 
 def score_unseen(

@@ -11,6 +11,7 @@ from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.seeding.colmap_child import extract_features
+from biresnerf.data.seeding.colmap_pairs import likeliest_pairs
 from biresnerf.data.seeding.map_images import COMPARISONS, MOST_FEATURES, thoroughness
 from tests.data.scenes import nerfstudio_scene, save
 
@@ -50,3 +51,35 @@ def test_photos_are_numbered_in_their_order_however_long_each_takes(tmp_path):
     opened = pycolmap.Database.open(database)
     assert [image.name for image in sorted(opened.read_all_images(), key=lambda i: i.image_id)] == names
     opened.close()
+
+
+@pytest.fixture
+def strip(tmp_path):
+    """The features of photos along a strip of texture, in an order of names that is not theirs; their places."""
+    pycolmap = pytest.importorskip("pycolmap")
+    noise = np.random.default_rng(3).integers(0, 255, (60, 320, 3), dtype=np.uint8)
+    texture = np.asarray(Image.fromarray(noise).resize((1280, 240), Image.Resampling.BICUBIC))
+    places = [3, 0, 5, 1, 4, 2]
+    names = [f"{i}.png" for i in range(len(places))]
+    for name, place in zip(names, places, strict=True):
+        Image.fromarray(texture[:, 160 * place : 160 * place + 320]).save(tmp_path / name)
+    camera = {"names": names, "model": "SIMPLE_PINHOLE", "params": None}
+    database = tmp_path / "database.db"
+    options = pycolmap.FeatureExtractionOptions()
+    extract_features({"cameras": [camera], "masks": None}, database, tmp_path, options)
+    return database, dict(zip(names, places, strict=True))
+
+
+def test_the_likeliest_pairs_are_those_that_show_the_same_wherever_their_poses_are(strip):
+    database, place = strip
+    pairs = likeliest_pairs(database, None, 1)
+    assert len(pairs) < len(place)
+    assert all(abs(place[a] - place[b]) == 1 for a, b in pairs)
+    assert {name for pair in pairs for name in pair} == set(place)
+
+
+def test_only_pairs_that_may_be_are_chosen_among_and_enough_choices_take_them_all(strip):
+    database, place = strip
+    among = [("0.png", "2.png"), ("1.png", "3.png"), ("4.png", "5.png")]
+    assert likeliest_pairs(database, among, 1) == among
+    assert len(likeliest_pairs(database, None, 5)) == len(place) * (len(place) - 1) // 2

@@ -12,7 +12,7 @@ from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refine.adjustment.lens.corrected_camera import corrected_camera
 from biresnerf.refine.finish import adjust_cameras as module
-from biresnerf.refine.finish import choose_poses
+from biresnerf.refine.finish import choose_poses, photo_trial
 from biresnerf.refine.finish.adjust_cameras import adjust_cameras
 from biresnerf.refine.finish.given_poses import accuracy_report
 from biresnerf.refine.finish.photo_evidence import photo_patches
@@ -247,6 +247,16 @@ def test_fields_are_trained_only_where_patches_of_the_photos_have_not_spoken(
     (chosen,) = (each.name for each in adjust_cameras(run).candidates if each.chosen)
     assert chosen == name
     assert asked == (["adjusted-tracks"] if name == "adjusted-tracks" else [])
+
+
+def test_no_field_is_trained_where_cameras_moved_by_less_than_photos_show(tmp_path, rng, monkeypatch):
+    run, _ = stages(tmp_path, rng)
+    present, trained = run.optimiser.poses.poses().numpy(), []
+    monkeypatch.setattr(photo_trial, "compare_placed", lambda *_, effort: trained.append(effort.looks))
+    for deviation, expected in ((1e-4, []), (0.1, [(1.0,)])):
+        other = disturbed(present, rng, deviation, deviation)
+        assert not photo_trial.photos_object(run, other, run.scene.dataset.cameras)
+        assert trained == expected
 
 
 def test_the_accuracy_of_the_input_is_measured_where_poses_were_given(tmp_path, rng):

@@ -58,6 +58,16 @@ def test_good_matches_win_over_noisy_given_poses(scene):
     np.testing.assert_array_equal(pose_mobility(chosen), [[0.0] * VIEWS, [1.0] * VIEWS])
 
 
+def test_trials_end_once_one_is_clearly_better(scene, monkeypatch):
+    monkeypatch.setattr(start_module, "TRIAL_STEPS", 240)
+    dataset, images = scene
+    truth, works = dataset.world_from_cam, []
+    for other in (perturb_poses(truth, 0.3, seed=1), truth):
+        tried = candidates(dataset, other, truth)
+        choose_start(tried, images, tiny_options(), CPU, 2, lambda: False, works.append)
+    assert works == [2 * 240 / 4, 2 * (240 + 150)]
+
+
 def test_good_given_poses_win_over_wrong_matches(scene):
     dataset, images = scene
     wrong = perturb_poses(dataset.world_from_cam, 0.15, seed=2)

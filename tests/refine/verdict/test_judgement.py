@@ -13,10 +13,11 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.refine.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refine.verdict.judgement import Judgement, judge_poses
-from biresnerf.refine.verdict.pose_evidence import compare_on_matches, moved_px, working_share
+from biresnerf.refine.verdict.pose_evidence import compare_on_matches, working_share
 from biresnerf.refine.views import pose_trials
 from biresnerf.refine.views.compare_rigs import Rig
 from biresnerf.refine.views.held_out_views import held_out_views, unseen_rounds, unseen_views
+from biresnerf.refine.views.motion import moved_px
 from biresnerf.report import EpipolarEvidence
 from tests.refine.tiny_scene import CPU, given_scene, tiny_optimiser, tiny_options, tiny_set
 
@@ -83,6 +84,20 @@ def test_other_views_are_left_out_only_until_they_decide(scene):
     assert far.heldout.psnr.count == len(first)
     assert near.heldout.psnr.count == len(first) + len(second)
     assert far.heldout.psnr.low > 0.5
+
+
+def test_trainings_end_once_they_decide_and_the_work_they_were_is_told(scene):
+    dataset, images = scene
+    truth, steps = dataset.world_from_cam, 240
+    options = OPTIONS.model_copy(update={"trial_steps": steps})
+    optimiser = tiny_optimiser(dataset, images, options, held_out=[3])
+    for noise, expected in ((0.3, steps // 4), (0.02, steps)):
+        run = given_scene(with_poses(dataset, perturb_poses(truth, noise, seed=1)), images, [3])
+        works: list[float] = []
+        evidence = judge_poses(run, optimiser, took=works.append).verdict.heldout
+        assert evidence.steps == expected
+        rounds = 1 if expected < steps else 2
+        assert works == [2 * rounds * expected]
 
 
 def test_poses_that_a_broken_refinement_spoilt_are_not_returned(scene, noisy):
