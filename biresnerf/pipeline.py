@@ -80,7 +80,8 @@ def refine_poses(
         Path(output), options, on_progress, should_stop, keep_reusable=keep_reusable, overwrite=overwrite
     )
 
-    dataset = input if isinstance(input, Dataset) else read_dataset(Path(input))
+    strict = setup.options.bad_frames == "refuse"
+    dataset = input if isinstance(input, Dataset) else read_dataset(Path(input), strict=strict)
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
     keep_to_budget(stages, started, setup.options.steps)

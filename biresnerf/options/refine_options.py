@@ -88,6 +88,9 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         "full",
         description="low: fewer features from smaller photos in one thread: takes less memory, places fewer photos.",
     )
+    bad_frames: Annotated[Literal["leave_out", "refuse"], Option("seeding", "Bad frames")] = Field(
+        "leave_out", description="Frames whose photo, pose or lens is missing or broken, where most are good."
+    )
     fixed: Annotated[Names, Option("coarse", "Photos to keep fixed", level="main")] = Field(
         (),
         max_length=10_000,

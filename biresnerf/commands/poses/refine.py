@@ -143,7 +143,7 @@ def refine_command(
     stop = StopRequest()
     try:
         with ProgressPrinter() as printer:
-            dataset = read_dataset(input_path)
+            dataset = read_dataset(input_path, strict=options.bad_frames == "refuse")
             # Loads torch, which takes seconds: errors of the input come before.
             from biresnerf.pipeline import refine_poses
 

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import posixpath
-import unicodedata
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.formats.bad_frames import attempt, good_frames, said, tolerate
+from biresnerf.data.formats.match_names import match_files
 from biresnerf.data.model.dataset import Dataset, Frame, IntrinsicsSource, SourceFormat
 from biresnerf.data.model.pose_validation import refuse_coinciding
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
 from biresnerf.data.photos.image_files import ImageHeader, read_header
 from biresnerf.data.photos.masks import mask_beside
-from biresnerf.data.photos.named_images import (
-    few_names,
-    photos_beside,
-    refuse_no_images,
-    refuse_outside,
-    refuse_too_few,
-)
+from biresnerf.data.photos.named_images import refuse_outside, refuse_too_few
 from biresnerf.data.photos.orientation import (
     meant_orientations,
     orientation_notes,
@@ -32,10 +26,9 @@ from biresnerf.data.photos.orientation import (
     same_shape,
     turned_header,
 )
+from biresnerf.data.photos.photo_folders import all_photos, few_names, photos_beside, refuse_no_images
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
-
-_IMAGES = "images/"
 
 
 class FrameCamera(NamedTuple):
@@ -65,6 +58,7 @@ class PoseEntry:
         camera_id: the file's own number of the camera: cameras of different numbers stay apart even if equal.
         raw: the entry as a transforms.json has it.
         mask: the file of its mask, or None, and whether the mask is inverted; looked for in masks/ where left out.
+        problem: why the file's pose or lens for it cannot be used.
     """
 
     name: str
@@ -76,6 +70,7 @@ class PoseEntry:
     camera_id: int | None = None
     raw: dict[str, Any] = field(default_factory=dict)
     mask: tuple[Path | None, bool] | None = None
+    problem: InputError | None = None
 
 
 # Pairs of an image file's name and its entry, in the order of the dataset, and notes for the user.
@@ -93,6 +88,10 @@ class ParsedPoses:
             left out. Raises InputError where that cannot be decided.
         named: whether the file itself names the images of its poses.
         notes: for the user.
+        take_file_names: images are called as their files are from here on, as the pose file's names may lack the
+            extension.
+        photo_folders: where the format keeps its photos, relative to the root, the preferred one first.
+        strict: refuse the set for one bad frame.
     """
 
     source: SourceFormat
@@ -100,6 +99,27 @@ class ParsedPoses:
     assign: Callable[[Sequence[str]], Assignment] | None = None
     named: bool = True
     notes: tuple[str, ...] = ()
+    take_file_names: bool = False
+    photo_folders: tuple[str, ...] = ()
+    strict: bool = False
+
+
+def without_problems(parsed: ParsedPoses, *, strict: bool = False) -> ParsedPoses:
+    """The same with a note on the entries that have a problem; they stay, without pose.
+
+    Raises:
+        InputError: the first problem, where less than most of the entries, or fewer than three, are good.
+    """
+    bad = [entry for entry in parsed.entries if entry.problem is not None]
+    notes = parsed.notes
+    if bad and bad[0].problem is not None:
+        tolerate(len(bad), len(parsed.entries), bad[0].problem, strict=strict)
+        listed = few_names((said(entry.problem) for entry in bad if entry.problem is not None), 3)
+        notes = (
+            *notes,
+            f"{len(bad)} of {len(parsed.entries)} poses cannot be used and are left out: {listed}",
+        )
+    return replace(parsed, notes=notes, strict=strict)
 
 
 def bind_images(parsed: ParsedPoses, root: Path, within: Path | None = None) -> Dataset:
@@ -111,18 +131,37 @@ def bind_images(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
     Raises:
         InputError: ``no_images``, ``image_missing``, ``pose_count_mismatch`` or a code of `dataset_of`.
     """
-    files = photos_beside(root)
+    named = parsed.assign is None
+    files = photos_beside(root, parsed.photo_folders)
+    if named and not files:
+        files = all_photos(root)
     refuse_no_images(files, root)
     names = sorted(files)
-    pairs, notes = parsed.assign(names) if parsed.assign is not None else by_name(parsed.entries, names)
+    assign = parsed.assign or partial(by_name, parsed.entries, strict=parsed.strict)
+    pairs, notes = assign(names)
+    if parsed.take_file_names:
+        pairs = [(name, replace(entry, name=name)) for name, entry in pairs]
     images = [(files[name], entry) for name, entry in pairs]
-    return dataset_of(root, images, parsed.source, [*parsed.notes, *notes], within)
+    return dataset_of(root, images, parsed.source, [*parsed.notes, *notes], within, strict=parsed.strict)
 
 
-def by_name(entries: Sequence[PoseEntry], names: Sequence[str]) -> Assignment:
-    """Each entry with the image file of its name. Raises InputError ``image_missing``."""
-    found, notes = match_files([entry.name for entry in entries], names, lambda i: entries[i].where)
-    return list(zip(found, entries, strict=True)), notes
+def by_name(entries: Sequence[PoseEntry], names: Sequence[str], *, strict: bool = False) -> Assignment:
+    """Each entry with the image file of its name; those whose file is missing are left out where most are there.
+
+    Raises:
+        InputError: ``image_missing``.
+    """
+    found, notes = match_files([entry.name for entry in entries], names)
+    missing = [entry for entry in entries if entry.name not in found]
+    if missing:
+        listed = (
+            f"{len(missing)} of {len(entries)} images not found: {few_names(one.name for one in missing)}"
+        )
+        hint = "Put the images into images/ under the names that the poses are given for."
+        error = InputError("image_missing", f"{listed}.", where=missing[0].where, hint=hint)
+        tolerate(len(missing), len(entries), error, strict=strict)
+        notes.append(f"{listed}; they are left out")
+    return [(found[entry.name], entry) for entry in entries if entry.name in found], notes
 
 
 def in_order(entries: Sequence[PoseEntry], names: Sequence[str], file: str, hint: str) -> Assignment:
@@ -142,11 +181,15 @@ def dataset_of(
     within: Path | None,
     *,
     table: str = "",
+    strict: bool = False,
 ) -> Dataset:
     """The dataset of these images, in their order; reads their headers and looks for masks.
 
+    Images that cannot be read, or whose lens cannot be used, are left out where most are good.
+
     Args:
         table: the part of the pose file that lists the images, for messages.
+        strict: refuse the set for one bad image.
 
     Raises:
         InputError: ``too_few_images``, ``unsafe_path``, ``image_size_mismatch``, ``mixed_sizes``, ``poses_coincide``,
@@ -157,10 +200,19 @@ def dataset_of(
     names = [entry.name for _, entry in images]
     if within is not None:
         refuse_outside([path for path, _ in images], names, within, place)
-    stored = [read_header(path, entry.name) for path, entry in images]
+    read = [attempt(partial(read_header, path, entry.name)) for path, entry in images]
+    stored, kept, dropped = good_frames(read, names, strict=strict)
+    images = [images[index] for index in kept]
     orientations = meant_orientations(stored, [_declared_size(entry) for _, entry in images])
     headers = [turned_header(header, turn) for header, turn in zip(stored, orientations, strict=True)]
-    found = [_camera_of(entry, header) for (_, entry), header in zip(images, headers, strict=True)]
+    lenses = [
+        attempt(partial(_camera_of, entry, header))
+        for (_, entry), header in zip(images, headers, strict=True)
+    ]
+    found, kept, more = good_frames(lenses, [entry.name for _, entry in images], strict=strict)
+    images, stored = [images[i] for i in kept], [stored[i] for i in kept]
+    orientations = [orientations[i] for i in kept]
+    names = [entry.name for _, entry in images]
     _refuse_mixed_sizes(found, [entry for _, entry in images])
     cameras: dict[tuple[Camera, IntrinsicsSource, int | None], int] = {}
     frames = []
@@ -175,7 +227,13 @@ def dataset_of(
             )
         )  # fmt: skip
     refuse_coinciding([frame.world_from_cam for frame in frames if frame.world_from_cam is not None], place)
-    warnings = [*notes, *orientation_notes(stored, orientations, names), *page_notes(stored, names)]
+    warnings = [
+        *notes,
+        *dropped,
+        *more,
+        *orientation_notes(stored, orientations, names),
+        *page_notes(stored, names),
+    ]
     warnings += [note for lens in found for note in lens.notes]
     if source.files:  # a folder of images alone never has poses or intrinsics
         without = [frame.name for frame in frames if frame.world_from_cam is None]
@@ -239,60 +297,3 @@ def _refuse_mixed_sizes(found: Sequence[FrameCamera], entries: Sequence[PoseEntr
             where=b.where,
             hint="Give each frame its own fl_x, fl_y, cx, cy, w and h, or images of one size.",
         )
-
-
-def match_files(
-    names: Sequence[str], files: Sequence[str], where: Callable[[int], str]
-) -> tuple[list[str], list[str]]:
-    """The file that each name means, and notes.
-
-    The same path, below images/ or with it; else, where one name and one file alone share it, the same in another
-    Unicode form, then the same file name in another folder, then with letters of another case, then with another
-    extension.
-
-    Raises:
-        InputError: ``image_missing``.
-    """
-    found: dict[str, str] = {}
-    free = set(files)
-    spellings: tuple[Callable[[str], str], ...] = (
-        lambda name: name,
-        lambda name: name.replace("\\", "/"),
-        lambda name: name.removeprefix(_IMAGES),
-        lambda name: _IMAGES + name,
-    )
-    for key in spellings:
-        for name in names:
-            if name not in found and key(name) in free:
-                found[name] = key(name)
-                free.remove(key(name))
-    notes = []
-    for rule, key in (
-        ("by the same name in another Unicode form", lambda name: unicodedata.normalize("NFC", name)),
-        ("by file name alone", posixpath.basename),
-        ("by file name, whatever its case", lambda name: posixpath.basename(name).casefold()),
-        ("by file name without extension", lambda name: PurePosixPath(name).stem.casefold()),
-        ("by path without extension", lambda name: posixpath.splitext(name)[0]),
-    ):
-        open_names = _unique([name for name in names if name not in found], key)
-        open_files = _unique([file for file in files if file not in found.values()], key)
-        pairs = {name: open_files[shared] for shared, name in open_names.items() if shared in open_files}
-        if pairs:
-            example = next(iter(pairs.items()))
-            notes.append(f"{len(pairs)} images were found {rule} ({example[0]} is {example[1]})")
-        found |= pairs
-    missing = [index for index, name in enumerate(names) if name not in found]
-    if missing:
-        raise InputError(
-            "image_missing",
-            f"{len(missing)} of {len(names)} images not found: {few_names(names[i] for i in missing)}.",
-            where=where(missing[0]),
-            hint="Put the images into images/ under the names that the poses are given for.",
-        )
-    return [found[name] for name in names], notes
-
-
-def _unique(names: Sequence[str], key: Callable[[str], str]) -> dict[str, str]:
-    """The names by their key, without those that share one."""
-    counts = Counter(map(key, names))
-    return {key(name): name for name in names if counts[key(name)] == 1}

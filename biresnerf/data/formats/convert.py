@@ -20,7 +20,7 @@ from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet, refined_set
 from biresnerf.data.photos.masks import mask_beside
-from biresnerf.data.photos.named_images import IMAGE_FOLDER
+from biresnerf.data.photos.photo_folders import IMAGE_FOLDER
 from biresnerf.data.points.refined_points import with_given_points
 from biresnerf.data.show.renders import picture_stems
 from biresnerf.errors import InputError

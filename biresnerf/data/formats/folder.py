@@ -9,7 +9,14 @@ from pathlib import Path
 
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.registry import ALL_CODECS
-from biresnerf.data.photos.named_images import IMAGE_FOLDER, images_below, images_in, visible
+from biresnerf.data.photos.photo_folders import (
+    IMAGE_FOLDER,
+    few_names,
+    folders_of_photos,
+    no_images,
+    photos_beside,
+    visible,
+)
 from biresnerf.errors import InputError
 
 
@@ -31,12 +38,12 @@ class FolderContents:
 
 
 def look_into(folder: Path) -> FolderContents:
-    """Finds what to read in ``folder``: poses in the format of the first rank, else images in it or in images/.
+    """Finds what to read in ``folder``: poses in the format of the first rank, else the photos where they usually lie.
 
     A folder that holds nothing but one folder (an unpacked archive) stands for that one.
 
     Raises:
-        InputError: ``no_images`` where it holds neither.
+        InputError: ``no_images`` where it holds neither; says what it holds.
     """
     root = folder
     for _ in range(3):
@@ -49,15 +56,22 @@ def look_into(folder: Path) -> FolderContents:
         name, place = found[0]
         image_root = ALL_CODECS[name].image_root(place) if place == root else root
         return FolderContents(image_root, name, place, (), _notes(root, found))
-    images = images_in(root) or images_below(root / IMAGE_FOLDER)
+    images, notes = _photos_alone(root)
     if not images:
-        raise InputError(
-            "no_images",
-            "holds neither transforms.json nor images.",
-            where=str(folder),
-            hint="Put poses or images (PNG, JPEG, WebP, TIFF, BMP) there, or the images into images/.",
-        )
-    return FolderContents(root, None, None, tuple(images), ())
+        raise no_images(root, "holds no photo")
+    return FolderContents(root, None, None, tuple(images), notes)
+
+
+def _photos_alone(root: Path) -> tuple[list[Path], tuple[str, ...]]:
+    """The photos of a folder without poses, and a note on folders that they are not taken from."""
+    photos = list(photos_beside(root).values())
+    folders = folders_of_photos(root)
+    if not photos:
+        return [path for paths in folders.values() for path in paths], ()
+    taken = {path.relative_to(root).parts[0] for path in photos}
+    others = [f"{name}/ ({len(paths)})" for name, paths in folders.items() if name not in taken]
+    notes = (f"photos in other folders are left out: {few_names(others)}",) if others else ()
+    return photos, notes
 
 
 def look_at(file: Path) -> FolderContents:
@@ -98,7 +112,7 @@ def _pose_places(root: Path) -> Iterator[tuple[str, Path]]:
     for name, codec in ALL_CODECS.items():
         for pattern in codec.format.found_as:
             places = [root / pattern]
-            if "*" in pattern:
+            if set("*[") & set(pattern):
                 places = [path for path in visible(root) if fnmatch(path.name.lower(), pattern)]
             yield from ((name, place) for place in places if codec.recognises(place))
 

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, dataset_of
+from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, dataset_of, without_problems
 from biresnerf.data.formats.folder import FolderContents, look_at, look_into
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.photos.masks import refuse_unfit_mask
-from biresnerf.data.photos.named_images import photos_beside
+from biresnerf.data.photos.photo_folders import left_out_notes, photos_beside
 from biresnerf.errors import InputError
 
 
-def read_dataset(path: Path, within: Path | None = None) -> Dataset:
+def read_dataset(path: Path, within: Path | None = None, *, strict: bool = False) -> Dataset:
     """Reads poses in any format of docs/formats.md with their images, or a folder of images alone.
 
     Everything is validated but the pixels, which `photos.images.load_images` decodes. Frames may lack poses:
@@ -28,19 +28,21 @@ def read_dataset(path: Path, within: Path | None = None) -> Dataset:
     Args:
         path: a folder, or the file in it that has the poses.
         within: refuse files outside of this folder; for uploaded sets.
+        strict: refuse the set for one bad frame, else leave bad frames out where most are good.
 
     Raises:
         InputError: the input cannot be used; says the file, the field and a hint.
     """
     contents = find_input(Path(path))
     if contents.format is None or contents.poses is None:
-        dataset = _read_images(contents.root, contents.images, within)
+        dataset = _read_images(contents.root, contents.images, within, strict=strict)
     else:
         codec = ALL_CODECS[contents.format]
-        dataset = codec.bind(_parse(contents.format, contents.root, contents.poses), contents.root, within)
+        parsed = _parse(contents.format, contents.root, contents.poses)
+        dataset = codec.bind(without_problems(parsed, strict=strict), contents.root, within)
     for index, frame in enumerate(dataset.frames):
         refuse_unfit_mask(frame, dataset.camera_of(index))
-    return replace(dataset, warnings=contents.notes + dataset.warnings)
+    return replace(dataset, warnings=(*contents.notes, *left_out_notes(contents.root), *dataset.warnings))
 
 
 def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -71,7 +73,7 @@ def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
     poses: dict[str, NDArray[np.float64]] = {}
     seen: set[str] = set()
     try:
-        for entry in _named_entries(_parse(name, contents.root, place), contents.root):
+        for entry in _named_entries(_usable(name, contents.root, place), contents.root):
             if not entry.name:
                 where = f"{entry.where}.file_path"
                 raise InputError("pose_file_invalid", "names no image.", where=where, hint=hint)
@@ -98,23 +100,27 @@ def find_input(path: Path) -> FolderContents:
     )
 
 
+def _usable(name: str, root: Path, place: Path) -> ParsedPoses:
+    return without_problems(_parse(name, root, place))
+
+
 def _parse(name: str, root: Path, place: Path) -> ParsedPoses:
     parse = ALL_CODECS[name].parse
     assert parse is not None, "only formats that are read are found"
     return parse(root, place)
 
 
-def _read_images(root: Path, images: Sequence[Path], within: Path | None) -> Dataset:
+def _read_images(root: Path, images: Sequence[Path], within: Path | None, *, strict: bool) -> Dataset:
     """The images as frames without pose, named by their path relative to ``root``."""
     names = [path.relative_to(root).as_posix() for path in images]
     root = root.resolve()  # "." has no name
     entries = [(root / name, PoseEntry(name, None, name)) for name in names]
-    return dataset_of(root, entries, SourceFormat("images"), (), within)
+    return dataset_of(root, entries, SourceFormat("images"), (), within, strict=strict)
 
 
 def _named_entries(parsed: ParsedPoses, root: Path) -> Sequence[PoseEntry]:
     """The entries by names of their own, else by those of the images beside them, where these fit."""
-    beside = [] if parsed.named else sorted(photos_beside(root))
+    beside = [] if parsed.named else sorted(photos_beside(root, parsed.photo_folders))
     if beside and parsed.assign is not None:
         try:
             return [entry for _, entry in parsed.assign(beside)[0]]

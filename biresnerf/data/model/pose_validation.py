@@ -47,8 +47,8 @@ def _numbers(value: Any, where: str) -> NDArray[np.float64]:
 def rigid_matrix(value: Any, where: str) -> tuple[NDArray[np.float64], float]:
     """A rigid motion float64 [4, 4] from a JSON value of 3 or 4 rows of 4 numbers.
 
-    The rotation is projected to the nearest one. Returns also how far it was from one: the largest deviation
-    of a singular value from 1.
+    A last row of (0, 0, 0, s) divides the matrix by s. The rotation is projected to the nearest one. Returns also how
+    far it was from one: the largest deviation of a singular value from 1.
 
     Raises:
         InputError: ``pose_shape``, ``pose_not_finite`` or ``pose_not_rotation``; ``where`` names file and
@@ -62,6 +62,8 @@ def rigid_matrix(value: Any, where: str) -> tuple[NDArray[np.float64], float]:
             where=where,
             hint="Remove the frame or export it again.",
         )
+    if len(rows) == 4 and rows[3, 3] > 0.0 and not rows[3, :3].any():
+        rows = rows / rows[3, 3]  # homogeneous: any multiple of the matrix is the same motion
     if len(rows) == 4 and not np.allclose(rows[3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-6):
         raise InputError(
             "pose_shape",

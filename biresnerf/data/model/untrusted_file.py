@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -89,8 +90,35 @@ def first_non_finite(value: Any, path: str = "") -> str | None:
     return None
 
 
-def read_json_object(path: Path) -> dict[str, Any]:
+# A string, which may hold slashes, or a comment; an open one goes on to the end.
+_STRING_OR_COMMENT = re.compile(r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
+
+
+def _parsed(text: str) -> Any:
+    """The JSON value; with comments, which instant-ngp allows, only where it is none without."""
+    try:
+        return json.loads(text, object_pairs_hook=_object)
+    except json.JSONDecodeError as error:
+        if "//" not in text and "/*" not in text:
+            raise
+        first = error
+    try:
+        return json.loads(_STRING_OR_COMMENT.sub(_blank, text), object_pairs_hook=_object)
+    except json.JSONDecodeError:
+        raise first from None
+
+
+def _blank(match: re.Match[str]) -> str:
+    return match[0] if match[0].startswith('"') else re.sub(r"[^\n]", " ", match[0])
+
+
+def read_json_object(path: Path, *, apart: str | None = None) -> dict[str, Any]:
     """The object in the JSON file ``path``.
+
+    Comments (``//`` and ``/* */``) are left out.
+
+    Args:
+        apart: a key whose numbers the caller checks with `refuse_non_finite`.
 
     Raises:
         InputError: ``pose_file_invalid`` for a file that cannot be read, is larger than ``MAX_TEXT_BYTES``,
@@ -99,8 +127,7 @@ def read_json_object(path: Path) -> dict[str, Any]:
     """
     text = read_text(path)
     try:
-        document = json.loads(text, object_pairs_hook=_object)
-        not_finite = first_non_finite(document)
+        document = _parsed(text)
     except _DuplicateKeyError as error:
         raise invalid_file(path.name, str(error), "Remove one of the two.") from None
     except json.JSONDecodeError as error:
@@ -115,14 +142,20 @@ def read_json_object(path: Path) -> dict[str, Any]:
         raise invalid_file(
             path.name, what, "Give a transforms.json as nerfstudio, instant-ngp or Blender write it."
         )
-    if not_finite is not None:
+    refuse_non_finite({key: value for key, value in document.items() if key != apart}, path.name)
+    return document
+
+
+def refuse_non_finite(value: Any, file: str, place: str = "") -> None:
+    """Raises InputError ``pose_not_finite`` for NaN and infinite numbers in ``value``, which lies at ``place``."""
+    found = first_non_finite(value, place)
+    if found is not None:
         raise InputError(
             "pose_not_finite",
             "NaN or an infinite number.",
-            where=f"{path.name} {not_finite}",
+            where=f"{file} {found}",
             hint="Remove the frame, or its transform_matrix, or export it again.",
         )
-    return document
 
 
 def read_model(model: type[Model], path: Path, *, code: str, hint: str) -> Model:

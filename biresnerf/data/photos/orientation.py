@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.image_files import FocalPlane, ImageHeader
-from biresnerf.data.photos.named_images import few_names
+from biresnerf.data.photos.photo_folders import few_names
 
 T = TypeVar("T", bound=np.generic)
 # The orientation that undoes another.

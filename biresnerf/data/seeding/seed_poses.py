@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import GUESSES, Dataset
 from biresnerf.data.photos.image_likeness import likeness
-from biresnerf.data.photos.named_images import MIN_IMAGES, few_names
+from biresnerf.data.photos.named_images import MIN_IMAGES
+from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.data.photos.turning_object import turning_notes
 from biresnerf.data.seeding.cached_mapping import remembered_mapping
 from biresnerf.data.seeding.compare_models import adds_to, model_lens_problem, with_found_lenses

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.photos.named_images import few_names
+from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.field.backends import gpu_faults
 from biresnerf.refine.finish.given_poses import accuracy_report, accuracy_warnings

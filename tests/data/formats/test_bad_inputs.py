@@ -20,7 +20,7 @@ from tests.data.scenes import refused_at_once, write_image
 
 def refused(path: Path) -> InputError:
     """The error that the input gets, within bounds of time and memory."""
-    error = refused_at_once(lambda: read_dataset(path))
+    error = refused_at_once(lambda: read_dataset(path, strict=True))
     assert error.where
     return error
 

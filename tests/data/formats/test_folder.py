@@ -92,3 +92,31 @@ def test_a_file_in_no_form_that_is_read_is_refused(tmp_path, name):
     with pytest.raises(InputError) as caught:
         read_dataset(tmp_path / name)
     assert_complete(caught.value, "input_unsupported", name)
+
+
+@pytest.mark.parametrize("folders", [("rgb",), ("color", "other"), ("image_2", "image_3"), ("cam0", "cam1")])
+def test_photos_alone_are_found_where_people_keep_them_and_other_folders_are_said(tmp_path, folders):
+    for folder in folders:
+        for index in range(3):
+            write_image(tmp_path / folder / f"data/{index}.png", index)
+            write_image(tmp_path / "depth" / f"{index}.png", index)
+    contents = look_into(tmp_path)
+    every = folders[0].startswith(("cam", "image_"))
+    taken = folders if every else folders[:1]
+    assert {path.relative_to(tmp_path).parts[0] for path in contents.images} == set(taken)
+    assert contents.notes == (
+        ("photos in other folders are left out: other/ (3)",) if "other" in folders else ()
+    )
+
+
+def test_what_is_no_photo_that_is_read_is_counted_by_its_kind(tmp_path):
+    for name in ("a.HEIC", "b.heic", "c.dng", "d.gif", "e.MOV"):
+        (tmp_path / name).touch()
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path)
+    assert_complete(caught.value, "no_images", tmp_path.name)
+    for part in ("1 GIF (d.gif)", "2 HEIC (a.HEIC, b.heic)", "1 RAW (c.dng)", "1 video (e.MOV)"):
+        assert part in caught.value.detail
+    for index in range(3):
+        write_image(tmp_path / f"{index}.jpg", index)
+    assert any("2 HEIC files are not read" in text for text in read_dataset(tmp_path).warnings)

@@ -10,7 +10,7 @@ from biresnerf.data.formats.colmap.read_colmap import bind_colmap, parse_colmap
 from biresnerf.data.formats.colmap.read_model import model_file_formats
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.colmap.write_text import write_colmap_text
-from biresnerf.data.photos.named_images import IMAGE_FOLDER, images_in
+from biresnerf.data.photos.photo_folders import IMAGE_FOLDER, images_in
 from biresnerf.options.formats import Format
 
 COLMAP = Format(

@@ -124,6 +124,20 @@ def check_features(xy: NDArray[np.float64], where: str) -> None:
         raise broken(where, what, "pose_out_of_range", "Remove the image's features.")
 
 
+def listed_name(raw: str, where: str) -> str:
+    """A name as a list of another machine may have it: of an absolute path, what follows the root or the drive.
+
+    It is looked for among the files of the set only (`match_names.match_files`), never opened as a path.
+
+    Raises:
+        InputError: as `image_name` does.
+    """
+    name = raw.strip().replace("\\", "/")
+    if name[1:2] == ":":
+        name = name[2:]
+    return image_name(name.lstrip("/").removeprefix("./"), where)
+
+
 def rigid_pose(numbers: Sequence[float], where: str, hint: str = _HINT) -> colmap.RigidPose:
     """The pose of a quaternion (w, x, y, z) and a translation. Raises InputError unless it is rigid and finite."""
     values = np.array(numbers, dtype=np.float64)

@@ -10,9 +10,10 @@ from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, by_name, 
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.model.colmap_scene import ColmapModel
 from biresnerf.data.model.dataset import Dataset, SourceFormat
+from biresnerf.data.model.part_of_model import without_images
 from biresnerf.data.photos.image_files import read_header
-from biresnerf.data.photos.named_images import IMAGE_FOLDER, few_names, images_beside, refuse_no_images
 from biresnerf.data.photos.orientation import same_shape
+from biresnerf.data.photos.photo_folders import IMAGE_FOLDER, few_names, images_beside, refuse_no_images
 from biresnerf.errors import InputError
 
 
@@ -53,14 +54,16 @@ def bind_colmap(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
     elsewhere = {entry.name: root / entry.name for entry in parsed.entries if entry.name not in files}
     files |= {name: path for name, path in elsewhere.items() if path.is_file()}
     refuse_no_images(files, root)
-    pairs, notes = by_name(parsed.entries, list(files))
+    pairs, notes = by_name(parsed.entries, list(files), strict=parsed.strict)
+    model = without_images(model, {entry.name for entry in parsed.entries} - {one.name for _, one in pairs})
     images = [(files[name], entry) for name, entry in pairs]
     for name in sorted(files.keys() - {name for name, _ in pairs}):
         number = _likely_camera(model, files[name], name)
         lens = None if number is None else model.cameras[number]
         images.append((files[name], PoseEntry(name, None, name, lens, camera_id=number)))
     images.sort(key=lambda image: image[1].name)
-    dataset = dataset_of(root, images, parsed.source, [*parsed.notes, *notes], within)
+    dataset = dataset_of(root, images, parsed.source, [*parsed.notes, *notes], within, strict=parsed.strict)
+    model = without_images(model, {entry.name for _, entry in images} - set(dataset.names))
     fitted = _for_these_images(model, dataset, _images_table(model))
     return replace(dataset, source=replace(parsed.source, colmap=fitted))
 

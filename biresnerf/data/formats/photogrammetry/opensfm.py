@@ -20,7 +20,7 @@ from biresnerf.data.formats.photogrammetry.lens_limits import BROWN, FISHEYE, re
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.photos.named_images import IMAGE_FOLDER
+from biresnerf.data.photos.photo_folders import IMAGE_FOLDER
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.formats import Format
 

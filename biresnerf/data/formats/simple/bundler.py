@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import FrameCamera, ParsedPoses, PoseEntry, in_order
 from biresnerf.data.formats.codec import Codec
-from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
+from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, listed_name
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
@@ -44,7 +44,7 @@ BUNDLER = Format(
     downloads="bundler/",
 )
 
-LIST_NAMES = ("list.txt", "bundle/list.txt")
+LIST_NAMES = ("list.txt", "bundle/list.txt", "list.rd.txt", "bundle/list.rd.txt")
 MAX_CAMERAS = 100_000
 _HINT = "Export the bundle file (v0.3) again."
 _LINES_PER_CAMERA, _LINES_PER_POINT = 5, 3
@@ -55,7 +55,8 @@ _CENTRED_PX = 1e-6
 def parse_bundler(root: Path, file: Path) -> ParsedPoses:
     """The cameras of a bundle file; those with a focal length of 0 have no pose.
 
-    list.txt, beside the images or the file, says which image each camera is; without it their order by name does.
+    list.txt, beside the images or the file, says which image each camera is (bundle.rd.out goes with list.rd.txt, both
+    of undistorted images); without it their order by name does.
 
     Raises:
         InputError: codes as in docs/input.md.
@@ -129,28 +130,27 @@ def _listed_names(root: Path, file: Path, count: int) -> tuple[Path | None, list
     """The file that lists the images, and their names in the order of the cameras; None where there is no such file.
 
     Raises:
-        InputError: ``pose_count_mismatch``, ``duplicate_image``, or a code of `image_name`.
+        InputError: ``pose_count_mismatch``, ``duplicate_image``, or a code of `listed_name`.
     """
-    places = [file.parent / "list.txt", *(root / name for name in LIST_NAMES)]
+    undistorted = ".rd." in file.name
+    names = sorted(LIST_NAMES, key=lambda name: (".rd." in name) != undistorted)
+    places = [folder / name for name in names for folder in (file.parent, root)]
     table = next((path for path in places if path.is_file()), None)
     if table is None:
         return None, []
     # `name`, or `name 0 focal_length` as Bundler's own tools write it.
     lines = [_without_focal(line.strip()) for line in read_text(table).splitlines() if line.strip()]
-    names = [
-        image_name(line.removeprefix("./"), f"{table.name} line {number}")
-        for number, line in enumerate(lines, start=1)
-    ]
-    if len(set(names)) != len(names):
+    listed = [listed_name(line, f"{table.name} line {number}") for number, line in enumerate(lines, start=1)]
+    if len(set(listed)) != len(listed):
         raise InputError("duplicate_image", "names an image twice.", where=table.name, hint="Remove one.")
-    if len(names) != count:
+    if len(listed) != count:
         raise InputError(
             "pose_count_mismatch",
-            f"{len(names)} images for the {count} cameras of {file.name}.",
+            f"{len(listed)} images for the {count} cameras of {file.name}.",
             where=table.name,
             hint="Give list.txt as it was written with the bundle file: one image a line, in its order.",
         )
-    return table, names
+    return table, listed
 
 
 def _without_focal(line: str) -> str:

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import FrameCamera, LensOf
 from biresnerf.data.formats.colmap import read_text as colmap_text
@@ -10,24 +16,32 @@ from biresnerf.data.formats.colmap.model_checks import broken, camera_of_numbers
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.model.untrusted_file import read_json_object, read_text
 from biresnerf.data.photos.image_files import ImageHeader
+from biresnerf.data.photos.photo_folders import images_below
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 
 CAMERA_NAMES = ("camera.json", "cameras.txt", "calib.txt")
 
 
-def read_camera_file(root: Path) -> tuple[Camera | LensOf | None, tuple[Path, ...]]:
-    """The lens of the images, by their header, and the files that were read; None where there is no such file.
+_IMAGE_OF_KITTI = re.compile(r"image_0?([0-3])$")
+CameraFile: TypeAlias = tuple[Camera | LensOf | None, NDArray[np.float64], tuple[Path, ...]]
+
+
+def read_camera_file(root: Path, photo_folders: Sequence[str] = ()) -> CameraFile:
+    """The lens of the images, by their header; ``cam_from_pose`` [4, 4]; and the files that were read.
+
+    The lens is None where there is no such file. ``cam_from_pose`` is where the camera sits on what the poses are of.
 
     camera.json has the keys of a transforms.json's top (``w``, ``h``, ``fl_x``, ``k1``, ...), cameras.txt is COLMAP's
-    with one camera, calib.txt is KITTI's (its P0 belongs to the poses).
+    with one camera, calib.txt is KITTI's: of the camera that the folder of the photos (image_2/) is called after,
+    else P0. The poses are those of camera 0; the projection's last column says where the others are mounted.
 
     Raises:
         InputError: the first of `CAMERA_NAMES` that is there does not hold one camera.
     """
     present = [root / name for name in CAMERA_NAMES if (root / name).is_file()]
     if not present:
-        return None, ()
+        return None, np.eye(4), ()
     file = present[0]
     if file.suffix == ".json":
         document = read_json_object(file)
@@ -43,31 +57,43 @@ def read_camera_file(root: Path) -> tuple[Camera | LensOf | None, tuple[Path, ..
                 )
             return found
 
-        return of_json, (file,)
+        return of_json, np.eye(4), (file,)
     if file.name == "cameras.txt":
         cameras = list(colmap_text.parse_cameras(read_text(file), file.name).values())
         if len(cameras) != 1:
             raise broken(file.name, f"has {len(cameras)} cameras, and does not say which image is by which")
-        return cameras[0], (file,)
-    params = _kitti_projection(file)
+        return cameras[0], np.eye(4), (file,)
+    name, projection = _kitti_projection(file, root, photo_folders)
+    params = (projection[0, 0], projection[1, 1], projection[0, 2], projection[1, 2])
 
     def of_calibration(header: ImageHeader, _name: str) -> FrameCamera:
-        camera = camera_of_numbers("PINHOLE", header.width, header.height, params, f"{file.name} P0")
+        camera = camera_of_numbers("PINHOLE", header.width, header.height, params, f"{file.name} {name}")
         return FrameCamera(camera)
 
-    return of_calibration, (file,)
+    cam_from_pose = np.eye(4)
+    if np.isfinite(projection).all() and np.linalg.matrix_rank(projection[:, :3]) == 3:
+        cam_from_pose[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
+    return of_calibration, cam_from_pose, (file,)
 
 
-def _kitti_projection(file: Path) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy (px) of the line ``P0: `` and 12 numbers, by rows."""
+def _kitti_projection(
+    file: Path, root: Path, photo_folders: Sequence[str]
+) -> tuple[str, NDArray[np.float64]]:
+    """The projection [3, 4] of the photos' camera and its name: the line ``P2: `` and 12 numbers, by rows, or P0."""
+    rows = {}
     for line in read_text(file).splitlines():
         name, _, rest = line.partition(":")
-        if name.strip() != "P0":
+        rows[name.strip()] = rest
+    used = next((name for name in photo_folders if images_below(root / name)), "")
+    match = _IMAGE_OF_KITTI.match(used)
+    for name in ([f"P{match[1]}"] if match else []) + ["P0"]:
+        if name not in rows:
             continue
-        values = colmap_text.floats(rest.split(), f"{file.name} P0", "the projection")
+        where = f"{file.name} {name}"
+        values = colmap_text.floats(rows[name].split(), where, "the projection")
         if len(values) != 12:
-            raise broken(f"{file.name} P0", f"has {len(values)} numbers, not 12")
-        return float(values[0]), float(values[5]), float(values[2]), float(values[6])
+            raise broken(where, f"has {len(values)} numbers, not 12")
+        return name, np.array(values, dtype=np.float64).reshape(3, 4)
     raise broken(
         file.name, "has no line P0:", hint="Give KITTI's calib.txt, or a camera.json with fl_x, fl_y, cx, cy."
     )

@@ -6,15 +6,23 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntry, match_files
+from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntry
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import rigid_pose
+from biresnerf.data.formats.match_names import match_files
 from biresnerf.data.formats.simple.camera_file import read_camera_file
+from biresnerf.data.formats.simple.times_of_images import (
+    MAX_TIME_APART_S,
+    TIMES_OF_IMAGES,
+    nearest_poses,
+    number_of,
+    times_of_images,
+)
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.colmap_scene import matrix_of_pose
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation
@@ -22,6 +30,7 @@ from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.untrusted_file import finite_numbers, read_text
+from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 
@@ -37,6 +46,7 @@ TRAJECTORY = Format(
         "groundtruth.txt",
         "CameraTrajectory.txt",
         "KeyFrameTrajectory.txt",
+        "[0-9][0-9].txt",
     ),
     suffixes=(".txt",),
     gives="poses, TUM's times; a camera from the file beside it, KITTI's in `calib.txt`",
@@ -64,10 +74,9 @@ KITTI = Format(
     hint="A trajectory in KITTI format",
 )
 
-TIMES_OF_IMAGES = "rgb.txt"  # of TUM's sets
 _IMAGES_OF = "{stem}_images.txt"  # beside our KITTI files, which have no room for names: an image a line
 MAX_POSES = 100_000
-MAX_TIME_APART_S = 0.02  # between an image and its pose, as in TUM's own tools
+_PHOTO_FOLDERS = ("image_2", "image_0", "image_3", "image_1")  # KITTI's: the colour cameras first
 _HINT = "Give lines of `time x y z qx qy qz qw` (TUM), or of 12 numbers, [R | t] by rows (KITTI)."
 _HEAD = "# timestamp tx ty tz qx qy qz qw: camera to world, OpenCV axes (x right, y down, z forward), the input's frame"
 _COLUMNS: dict[int, str] = {8: "tum", 12: "kitti"}
@@ -91,6 +100,8 @@ class Trajectory:
                 self._note_name(line)
                 continue
             where = f"{file.name} line {number}"
+            if not columns and all(number_of(word) is None for word in words):
+                continue  # a header that is not marked as a comment
             columns = columns or len(words)
             if len(words) not in _COLUMNS or len(words) != columns:
                 raise _invalid(where, f"has {len(words)} numbers, not 8 (TUM) or 12 (KITTI) as every line.")
@@ -122,7 +133,7 @@ class Trajectory:
 
     def _note_name(self, line: str) -> None:
         match = _NAMED_TIME.match(line.strip())
-        time = _number(match[1]) if match else None
+        time = number_of(match[1]) if match else None
         if match and time is not None:
             self.name_of_time[time] = match[2]
 
@@ -140,16 +151,18 @@ def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
     (TUM) or in the list beside it that `write_kitti` writes;
     rgb.txt (times and names, as in TUM's sets) or images named by their time, nearest within 0.02 s; times that are the
     images' numbers from 0; as many poses as images, in order. The camera is that of `read_camera_file`, else a guess.
+    KITTI's poses are those of camera 0; its calib.txt says how the camera of image_2/ is mounted beside it.
 
     Raises:
         InputError: codes as in docs/input.md.
     """
     trajectory = Trajectory(file)
-    lens, camera_files = read_camera_file(root)
+    lens, cam_from_pose, camera_files = read_camera_file(root, _PHOTO_FOLDERS)
+    pose_from_cam = np.linalg.inv(cam_from_pose)
     times: Sequence[float | None] = trajectory.times_s or [None] * len(trajectory.poses)
     rows = zip(trajectory.names(), trajectory.poses, trajectory.lines, times, strict=True)
     entries = [
-        PoseEntry(name, pose, f"{file.name} line {line}", lens, timestamp_s=time)
+        PoseEntry(name, pose @ pose_from_cam, f"{file.name} line {line}", lens, timestamp_s=time)
         for name, pose, line, time in rows
     ]
 
@@ -165,7 +178,7 @@ def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
 
     table = [root / TIMES_OF_IMAGES] if (root / TIMES_OF_IMAGES).is_file() else []
     source = SourceFormat(trajectory.dialect, files=(*trajectory.files, *camera_files, *table))
-    return ParsedPoses(source, tuple(entries), assign, named=False)
+    return ParsedPoses(source, tuple(entries), assign, named=False, photo_folders=_PHOTO_FOLDERS)
 
 
 def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[dict[str, int], str]:
@@ -181,16 +194,21 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
     count, times = len(trajectory.poses), trajectory.times_s
     named = trajectory.image_names
     if named and all(named) and len(set(named)) == count:
-        try:
-            found, _ = match_files(named, names, lambda _: trajectory.file.name)
+        found, _ = match_files(named, names)
+        if len(found) == count:
             how = "in its comments" if times else "in the list beside it"
-            return {name: index for index, name in enumerate(found)}, f"by the names {how}"
-        except InputError:
-            if not times:
-                raise  # such a list names images, comments may be about something else
+            return {found[name]: index for index, name in enumerate(named)}, f"by the names {how}"
+        if not times:  # such a list names images, comments may be about something else
+            missing = [name for name in named if name not in found]
+            raise InputError(
+                "image_missing",
+                f"{len(missing)} of {count} images not found: {few_names(missing)}.",
+                where=trajectory.file.name,
+                hint="Put the images into images/ under the names that the list has.",
+            )
     if times:
-        taken, by = _times_of_images(names, root)
-        nearest = _nearest(taken, times)
+        taken, by = times_of_images(names, root)
+        nearest = nearest_poses(taken, times)
         numbers = all(time == math.floor(time) and 0 <= time < len(names) for time in times)
         # Whole numbers may be names, or count from 0 what names count from 1: then not all of them meet.
         if len(nearest) >= (count if numbers else min(count, len(names)) / 2):
@@ -208,49 +226,13 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
     )
 
 
-def _times_of_images(names: Sequence[str], root: Path) -> tuple[dict[str, float], str]:
-    """When each image was taken, s, as rgb.txt or its own name gives it."""
-    times: dict[str, float] = {}
-    table = root / TIMES_OF_IMAGES
-    if table.is_file():
-        by_base = {PurePosixPath(name).name: name for name in names}
-        for line in read_text(table).splitlines():
-            words = line.split(maxsplit=1)
-            if len(words) == 2 and not words[0].startswith("#"):
-                time, name = _number(words[0]), by_base.get(PurePosixPath(words[1].strip()).name)
-                if time is not None and name is not None:
-                    times[name] = time
-        return times, "by rgb.txt"
-    for name in names:
-        number = _number(PurePosixPath(name).stem)
-        if number is not None:
-            times[name] = number
-    return times, "by the images' names"
-
-
-def _number(word: str) -> float | None:
-    try:
-        number = float(word)
-    except ValueError:
-        return None
-    return number if math.isfinite(number) else None
-
-
-def _nearest(taken: dict[str, float], times: Sequence[float]) -> dict[str, int]:
-    """The pose nearest in time to each image, where one is near enough; each pose for the image nearest to it."""
-    order = np.argsort(times)
-    ordered = np.array(times)[order]
-    best: dict[int, tuple[float, str]] = {}
-    for name, time in taken.items():
-        right = int(np.searchsorted(ordered, time))
-        for k in (right - 1, right):
-            if 0 <= k < len(ordered) and abs(ordered[k] - time) <= MAX_TIME_APART_S:
-                index = int(order[k])
-                best[index] = min(best.get(index, (math.inf, "")), (abs(float(ordered[k]) - time), name))
-    found: dict[str, tuple[float, int]] = {}
-    for index, (apart, name) in best.items():
-        found[name] = min(found.get(name, (math.inf, -1)), (apart, index))
-    return {name: index for name, (_, index) in found.items()}
+def _is_trajectory(file: Path) -> bool:
+    """Whether it is called as trajectories are, or a number alone (KITTI's sequences) and begins as one of KITTI's."""
+    if not file.is_file() or not file.stem.isdecimal():
+        return file.is_file()
+    with file.open("rb") as opened:
+        words = opened.readline(4096).split()
+    return len(words) == 12 and all(number_of(word.decode("latin-1")) is not None for word in words)
 
 
 def _invalid(where: str, what: str, code: str = "pose_file_invalid") -> InputError:
@@ -290,7 +272,7 @@ def _write_lines(path: Path, lines: list[str]) -> None:
 
 
 CODECS = (
-    Codec(TRAJECTORY, parse=parse_trajectory),
+    Codec(TRAJECTORY, parse=parse_trajectory, recognises=_is_trajectory),
     Codec(TUM, write=lambda refined, path, _: write_tum(refined, path)),
     Codec(
         KITTI,

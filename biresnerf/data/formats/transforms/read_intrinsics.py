@@ -24,6 +24,7 @@ from biresnerf.geometry.camera.lens import lens_problem
 _UNSUPPORTED = "camera_model_unsupported"
 # Keys of instant-ngp that mean a lens of neither family.
 _OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
+_FOCAL_DIFFERS = 0.01  # angles in files have few digits
 _MODEL_HINT = (
     f"Supported are {', '.join(MODEL_IDS)}; undistort the images to one of them "
     "(for example with COLMAP's image_undistorter)."
@@ -81,7 +82,7 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
         raise fields.invalid("k1", problem, hint)
     model, params = smallest_model(full, preferred)
     camera = Camera(model, width, height, params).resized(header.width, header.height)
-    shared = not any(fields.own(key) for key in ("fl_x", "fl_y", "camera_angle_x", "x_fov"))
+    shared = not any(fields.own(key) for key in ("fl_x", "fl_y", "camera_angle_x", "x_fov", "w", "h"))
     return FrameCamera(camera, "given", shared, (*notes, *more))
 
 
@@ -197,6 +198,11 @@ def _parameters(
     assert fy is not None
     cx, cy = fields.get("cx"), fields.get("cy")
     notes = []
+    pixels = fields.get("fl_x")
+    if key_x == "x_fov" and pixels is not None and abs(pixels - fx) > _FOCAL_DIFFERS * fx:
+        notes.append(
+            f"x_fov and fl_x differ; x_fov was taken, as instant-ngp does ({fx:.6g} px, not {pixels:g})"
+        )
     if key_x == "fl_x" and (cx is None or cy is None):
         notes.append("cx or cy is not given; the image centre was taken")
     cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
@@ -208,8 +214,9 @@ def _parameters(
 
 def _focal(fields: Fields, keys: tuple[str, str, str], size: int) -> tuple[float | None, str | None]:
     """Focal length (px) and the key it came from: pixels, an angle in radians, or instant-ngp's degrees."""
-    # What the frame says goes before what the file says, whichever way it is put.
-    ordered = sorted(keys, key=lambda key: not fields.own(key))
+    # What the frame says goes before what the file says, whichever way it is put. Within one, instant-ngp's order
+    # (read_focal_length in its nerf_loader.cu): degrees, pixels, radians; no other program knows the degrees.
+    ordered = sorted((keys[2], keys[0], keys[1]), key=lambda key: not fields.own(key))
     for key in ordered:
         value = fields.get(key)
         if value is None:

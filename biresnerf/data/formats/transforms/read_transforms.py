@@ -12,21 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, dataset_of
+from biresnerf.data.formats.bad_frames import attempt, good_frames
+from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, dataset_of, without_problems
 from biresnerf.data.formats.colmap.read_model import model_file_formats, read_colmap_model
+from biresnerf.data.formats.transforms.find_photos import find_photos
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.model.conventions import world_from_cam_of_file
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.model.pose_validation import ROTATION_WARNED, rigid_matrix
-from biresnerf.data.model.untrusted_file import invalid_file, read_json_object
+from biresnerf.data.model.untrusted_file import invalid_file, read_json_object, refuse_non_finite
 from biresnerf.data.photos.masks import dynamic_mask, named_mask
-from biresnerf.data.photos.named_images import (
-    find_images,
-    refuse_more_than_files,
-    refuse_names_outside,
-    refuse_too_few,
-    unused_image_notes,
-)
+from biresnerf.data.photos.named_images import refuse_more_than_files, refuse_too_few
+from biresnerf.data.photos.photo_folders import unused_image_notes
 from biresnerf.errors import InputError
 
 _NGP_KEYS = frozenset(
@@ -50,26 +47,32 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
     Raises:
         InputError: with the file, the field and a hint; codes as in docs/input.md.
     """
-    return bind_transforms(parse_transforms(path.parent, path), path.parent, within)
+    return bind_transforms(without_problems(parse_transforms(path.parent, path)), path.parent, within)
 
 
 def parse_transforms(_root: Path, path: Path) -> ParsedPoses:
     """Names and poses of the frames; a frame that names no image has an empty name. Raises InputError."""
-    document = read_json_object(path)
+    document = read_json_object(path, apart="frames")
     rows = _frame_objects(document, path.name)
     source = _source_format(document, path)
     entries: list[PoseEntry] = []
     worst, worst_name = 0.0, ""
     for index, row in enumerate(rows):
-        where, pose = f"{path.name} frames[{index}]", None
+        where, pose, problem = f"{path.name} frames[{index}]", None, None
         name = row["file_path"] if isinstance(row.get("file_path"), str) else ""
         if row.get("transform_matrix") is not None:
-            matrix, deviation = rigid_matrix(row["transform_matrix"], f"{where}.transform_matrix")
-            pose = world_from_cam_of_file(matrix, source.applied_transform, source.applied_scale)
-            if deviation > worst:
-                worst, worst_name = deviation, name
+            try:
+                refuse_non_finite(row, path.name, f"frames[{index}]")
+                matrix, deviation = rigid_matrix(row["transform_matrix"], f"{where}.transform_matrix")
+            except InputError as error:
+                problem = error
+            else:
+                pose = world_from_cam_of_file(matrix, source.applied_transform, source.applied_scale)
+                if deviation > worst:
+                    worst, worst_name = deviation, name
         lens = partial(camera_of_frame, Fields(row, source.document, path.name, index))
-        entries.append(PoseEntry(name, pose, where, lens, _named_size(row, document), raw=row))
+        size = _named_size(row, document)
+        entries.append(PoseEntry(name, pose, where, lens, size, raw=row, problem=problem))
     notes: tuple[str, ...] = ()
     if worst > ROTATION_WARNED:
         notes = (f"rotations were made orthonormal; the worst was off by {worst:.1e} ({worst_name})",)
@@ -84,25 +87,26 @@ def bind_transforms(parsed: ParsedPoses, root: Path, within: Path | None = None)
     """
     path = parsed.source.files[0]
     refuse_too_few(len(parsed.entries), f"{path.name} frames")
-    names = _names(parsed.entries)
     if within is not None:
-        refuse_more_than_files(path, names, within)
-        refuse_names_outside(path, names, within, "file_path")
-    paths = find_images(path, names)
-    parsed = _with_older_transform(parsed)
-    images = [
-        (image, replace(entry, mask=_mask(path, entry, image, within)))
-        for image, entry in zip(paths, parsed.entries, strict=True)
+        refuse_more_than_files(path, len(parsed.entries), within)
+    pairs, found = find_photos(path, parsed.entries, within, strict=parsed.strict)
+    parsed = _with_older_transform(replace(parsed, entries=tuple(entry for _, entry in pairs)))
+    masked = [
+        attempt(partial(_with_mask, path, entry, image, within))
+        for (image, _), entry in zip(pairs, parsed.entries, strict=True)
     ]
-    notes = list(parsed.notes)
+    images, _, lacking = good_frames(masked, [entry.name for _, entry in pairs], strict=parsed.strict)
+    notes = [*parsed.notes, *found, *lacking]
     if any(
         place.get("rolling_shutter")
         for place in (parsed.source.document, *(row.raw for row in parsed.entries))
     ):
         notes.append("rolling_shutter is not modelled")
-    dataset = dataset_of(root, images, parsed.source, notes, within, table="frames")
+    dataset = dataset_of(root, images, parsed.source, notes, within, table="frames", strict=parsed.strict)
     masks = [frame.mask for frame in dataset.frames if frame.mask is not None]
-    return replace(dataset, warnings=(*dataset.warnings, *unused_image_notes(paths, masks)))
+    return replace(
+        dataset, warnings=(*dataset.warnings, *unused_image_notes([image for image, _ in images], masks))
+    )
 
 
 def _named_size(row: dict[str, Any], document: dict[str, Any]) -> tuple[float | None, float | None]:
@@ -167,7 +171,8 @@ def _with_older_transform(parsed: ParsedPoses) -> ParsedPoses:
         else replace(entry, world_from_cam=world_from_file @ entry.world_from_cam)
         for entry in parsed.entries
     )
-    return ParsedPoses(replace(source, applied_transform=older), entries, notes=(note, *parsed.notes))
+    source = replace(source, applied_transform=older)
+    return replace(parsed, source=source, entries=entries, notes=(note, *parsed.notes))
 
 
 def _older_transform(file: Path, entries: Sequence[PoseEntry]) -> NDArray[np.float64] | None:
@@ -194,21 +199,9 @@ def _older_transform(file: Path, entries: Sequence[PoseEntry]) -> NDArray[np.flo
     return _OLDER_TRANSFORM if found and off <= _EQUAL * size else None
 
 
-def _names(entries: Sequence[PoseEntry]) -> list[str]:
-    for entry in entries:
-        if not entry.name:
-            raise InputError(
-                "frame_without_image",
-                "the frame names no image.",
-                where=f"{entry.where}.file_path",
-                hint="Give the image's path relative to this file, or remove the frame.",
-            )
-    return [entry.name for entry in entries]
-
-
-def _mask(file: Path, entry: PoseEntry, image: Path, within: Path | None) -> tuple[Path | None, bool]:
-    """The frame's own mask, or instant-ngp's beside the image, and whether it is black where pixels count."""
+def _with_mask(file: Path, entry: PoseEntry, image: Path, within: Path | None) -> tuple[Path, PoseEntry]:
+    """The image and its entry with the frame's own mask, or with instant-ngp's beside the image."""
     name = entry.raw.get("mask_path")
     if name is None:
-        return dynamic_mask(image, within)
-    return named_mask(file, name, f"{entry.where}.mask_path", within), False
+        return image, replace(entry, mask=dynamic_mask(image, within))
+    return image, replace(entry, mask=(named_mask(file, name, f"{entry.where}.mask_path", within), False))

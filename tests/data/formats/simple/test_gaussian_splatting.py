@@ -78,7 +78,7 @@ def test_a_bad_camera_is_named(tmp_path, key, value, code):
     rows[0][key] = value
     file.write_text(json.dumps(rows))
     with pytest.raises(InputError) as caught:
-        read_dataset(tmp_path)
+        read_dataset(tmp_path, strict=True)
     assert_complete(caught.value, code, "cameras.json")
 
 

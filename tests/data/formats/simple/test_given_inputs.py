@@ -95,8 +95,10 @@ def test_tums_own_layout_is_read_and_its_table_of_times_belongs_to_it(tmp_path):
     assert_at_truth(dataset)
     assert list(dataset.file_names) == [f"rgb/{name}" for name in NAMES]
     assert [path.name for path in dataset.source.files] == ["groundtruth.txt", "rgb.txt"]
-    write_image(tmp_path / "left" / NAMES[0], 0)  # which folder is meant is not guessed
-    with pytest.raises(InputError, match="no images"):
+    write_image(tmp_path / "left" / NAMES[0], 0)
+    assert_at_truth(read_dataset(tmp_path))  # rgb/ is what photos are called
+    (tmp_path / "rgb").rename(tmp_path / "first")
+    with pytest.raises(InputError, match=r"first/, left/, and which are meant is not clear"):
         read_dataset(tmp_path)
 
 
@@ -200,3 +202,26 @@ def test_metashapes_tangential_terms_move_a_point_as_its_manual_says(tmp_path):
     r2 = x * x + y * y
     moved = (x + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y, y + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y)
     assert pixel == pytest.approx([10.25 + 18.5 * moved[0], 7.75 + 18.5 * moved[1]], abs=1e-5)
+
+
+def test_kittis_colour_camera_is_placed_beside_the_one_that_its_poses_are_of(tmp_path):
+    trajectories.kitti_set(tmp_path)
+    (tmp_path / "poses.txt").rename(tmp_path / "07.txt")
+    (tmp_path / "images").rename(tmp_path / "image_2")
+    write_image(tmp_path / "image_3/0.png")
+    left = "P0: 18 0 10.25 0 0 18.5 7.75 0 0 0 1 0\n"
+    # P2 = K [I | t]: camera 2 lies half a unit to the left of camera 0, and 0.1 behind it.
+    (tmp_path / "calib.txt").write_text(
+        left + f"P2: 20 0 11 {20 * 0.5 + 11 * 0.1} 0 20 7 {7 * 0.1} 0 0 1 0.1\n"
+    )
+    dataset = read_dataset(tmp_path)
+    expected = truth()
+    expected[:, :3, 3] -= expected[:, :3, :3] @ [0.5, 0.0, 0.1]
+    assert_at_truth(dataset, expected)
+    assert dataset.cameras == (Camera("PINHOLE", WIDTH, HEIGHT, (20.0, 20.0, 11.0, 7.0)),)
+
+
+def test_a_header_of_a_trajectory_without_a_mark_is_read_over(tmp_path):
+    file = trajectories.tum_set(tmp_path, ["0", "1", "2", "3"])
+    file.write_text("timestamp tx ty tz qx qy qz qw\n" + file.read_text())
+    assert_at_truth(read_dataset(tmp_path))

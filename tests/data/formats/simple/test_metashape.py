@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.data.formats.simple.metashape import parse_metashape
+from biresnerf.data.formats.photogrammetry.metashape import parse_metashape
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera import Intrinsics, project
 from tests.data.formats.simple.trajectories import metashape_xml

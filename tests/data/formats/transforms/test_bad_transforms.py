@@ -85,7 +85,7 @@ BAD = {
     "flat matrix": ("pose_shape", "frames[0].transform_matrix", _frame(0, transform_matrix=[1.0] * 16)),
     "two rows": ("pose_shape", "frames[0].transform_matrix", _frame(0, transform_matrix=[[1, 0, 0, 0]] * 2)),
     "short rows": ("pose_shape", "frames[0].transform_matrix", _frame(0, transform_matrix=[[1, 0, 0]] * 3)),
-    "last row": ("pose_shape", "frames[0].transform_matrix", _matrix(0, 3, 3, 2.0)),
+    "last row": ("pose_not_rotation", "frames[0].transform_matrix", _matrix(0, 3, 3, 2.0)),
     "transposed": ("pose_shape", "frames[3].transform_matrix", _transposed),
     "sheared": ("pose_not_rotation", "frames[0].transform_matrix", _matrix(0, 0, 0, 3.0)),
     "zeros": ("pose_not_rotation", "frames[0]", _frame(0, transform_matrix=[[0] * 4] * 3 + [[0, 0, 0, 1]])),
@@ -166,7 +166,7 @@ def test_bad_files_are_refused_with_file_field_and_hint(tmp_path, case):
     read_dataset(save(tmp_path, copy.deepcopy(document)))  # good before the change
     change(document)
     with pytest.raises(InputError) as caught:
-        read_dataset(save(tmp_path, document))
+        read_dataset(save(tmp_path, document), strict=True)
     assert_complete(caught.value, code, "transforms.json", place)
 
 
@@ -186,7 +186,7 @@ def test_files_that_are_no_images_are_refused(tmp_path, content):
     document = nerfstudio_scene(tmp_path)
     (tmp_path / "images/001.jpg").write_bytes(content)
     with pytest.raises(InputError) as caught:
-        read_dataset(save(tmp_path, document))
+        read_dataset(save(tmp_path, document), strict=True)
     assert_complete(caught.value, "not_an_image", "images/001.jpg")
 
 
@@ -195,7 +195,7 @@ def test_an_image_that_would_unpack_to_gigabytes_is_refused_from_its_header(tmp_
     Image.new("1", (30_000, 20_000)).save(tmp_path / "images/001.png")
     document["frames"][1]["file_path"] = "images/001.png"
     with pytest.raises(InputError) as caught:
-        read_dataset(save(tmp_path, document))
+        read_dataset(save(tmp_path, document), strict=True)
     assert_complete(caught.value, "image_too_large", "images/001.png")
 
 

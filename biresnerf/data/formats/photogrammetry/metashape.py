@@ -7,21 +7,19 @@ from __future__ import annotations
 
 import xml.parsers.expat
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntry, by_name
+from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry
 from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
-from biresnerf.data.photos.named_images import few_names
+from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.formats import Format
@@ -75,14 +73,7 @@ def parse_metashape(_root: Path, file: Path) -> ParsedPoses:
             f"{len(apart)} images belong to another component; their poses were not taken: {few_names(apart)}"
         )
     source = SourceFormat("metashape", files=(file,))
-    return ParsedPoses(
-        source, tuple(entries), assign=lambda names: _assign(entries, names), notes=tuple(notes)
-    )
-
-
-def _assign(entries: list[PoseEntry], names: Sequence[str]) -> Assignment:
-    pairs, _ = by_name(entries, names)
-    return [(name, replace(entry, name=name)) for name, entry in pairs], []
+    return ParsedPoses(source, tuple(entries), notes=tuple(notes), take_file_names=True)
 
 
 class _Builder(ElementTree.TreeBuilder):

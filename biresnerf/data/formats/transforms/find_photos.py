@@ -1,0 +1,120 @@
+"""The photos that the frames of a transforms.json name."""
+
+from __future__ import annotations
+
+import posixpath
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from biresnerf.data.formats.bad_frames import attempt, good_frames, tolerate
+from biresnerf.data.formats.bind_images import PoseEntry
+from biresnerf.data.formats.match_names import ENDS, SAME_PATH, match_files
+from biresnerf.data.photos.image_files import find_image
+from biresnerf.data.photos.named_images import lies_in, refuse_outside
+from biresnerf.data.photos.photo_folders import by_path, few_names, images_below
+from biresnerf.errors import InputError
+
+
+def find_photos(
+    file: Path, entries: Sequence[PoseEntry], within: Path | None, *, strict: bool
+) -> tuple[list[tuple[Path, PoseEntry]], list[str]]:
+    """The entries with the photos that they name, and notes; those whose photo is missing are left out.
+
+    A path is looked for as it is written, relative to the file. If nothing is there: for a path inside the file's
+    folder the same in another case or Unicode form; for one that leads out of it, as paths of another machine do, a
+    photo of the same end, if one alone has it.
+
+    Args:
+        within: look at no path outside of this folder; for uploaded sets.
+
+    Raises:
+        InputError: ``frame_without_image``, ``unsafe_path``, ``image_missing`` or ``duplicate_image``.
+    """
+    outcomes = [attempt(partial(_with_name, entry)) for entry in entries]
+    entries, _, nameless = good_frames(outcomes, ["a frame"] * len(entries), strict=strict)
+    outside = {entry.name for entry in entries if within is not None and _leads_out(file, entry.name, within)}
+    found = {
+        entry.name: path
+        for entry in entries
+        if entry.name not in outside and (path := find_image(file.parent, entry.name)) is not None
+    }
+    notes = _find_elsewhere(file, [entry.name for entry in entries], found, within)
+    if outside and not outside & found.keys():
+        first = next(entry for entry in entries if entry.name in outside)
+        assert within is not None
+        for spelling in (first.name, first.name.replace("\\", "/")):
+            refuse_outside([file.parent / spelling], [first.name], within, f"{first.where}.file_path")
+    missing = [entry for entry in entries if entry.name not in found]
+    if missing:
+        listed = (
+            f"{len(missing)} of {len(entries)} images not found: {few_names(one.name for one in missing)}"
+        )
+        hint = "Put the images there (paths are relative to the file), or remove their frames."
+        error = InputError("image_missing", f"{listed}.", where=f"{missing[0].where}.file_path", hint=hint)
+        tolerate(len(missing), len(entries), error, strict=strict)
+        notes.append(f"{listed}; their frames are left out")
+    pairs = [(found[entry.name], entry) for entry in entries if entry.name in found]
+    places: dict[str, PoseEntry] = {}
+    first_uses = [attempt(partial(_used_once, pair, places)) for pair in pairs]
+    once, _, twice = good_frames(first_uses, [entry.name for _, entry in pairs], strict=strict)
+    return once, [*nameless, *notes, *twice]
+
+
+def _with_name(entry: PoseEntry) -> PoseEntry:
+    if not entry.name:
+        raise InputError(
+            "frame_without_image",
+            "the frame names no image.",
+            where=f"{entry.where}.file_path",
+            hint="Give the image's path relative to this file, or remove the frame.",
+        )
+    return entry
+
+
+def _leads_out(file: Path, name: str, within: Path) -> bool:
+    limit = within.resolve()
+    return not all(lies_in(file.parent / spelling, limit) for spelling in (name, name.replace("\\", "/")))
+
+
+def _find_elsewhere(
+    file: Path, names: Sequence[str], found: dict[str, Path], within: Path | None
+) -> list[str]:
+    """Adds what other spellings find to ``found``; returns notes."""
+    missing = [name for name in names if name not in found]
+    if not missing:
+        return []
+    used = {path.resolve() for path in found.values()}
+    limit = None if within is None else within.resolve()
+    files = by_path(file.parent, images_below(file.parent))
+    free = [
+        name
+        for name, path in files.items()
+        if path.resolve() not in used and (limit is None or lies_in(path, limit))
+    ]
+    far = [name for name in missing if _of_another_machine(name)]
+    notes = []
+    for some, rules in ((far, ENDS), ([name for name in missing if name not in far], SAME_PATH)):
+        matched, said = match_files(some, free, rules)
+        found |= {name: files[path] for name, path in matched.items()}
+        notes += said
+    return notes
+
+
+def _of_another_machine(name: str) -> bool:
+    path = name.replace("\\", "/")
+    return path.startswith("/") or path[1:2] == ":" or posixpath.normpath(path).startswith("..")
+
+
+def _used_once(pair: tuple[Path, PoseEntry], places: dict[str, PoseEntry]) -> tuple[Path, PoseEntry]:
+    """``pair``, unless an earlier one in ``places`` has its photo."""
+    path, entry = pair
+    first = places.setdefault(str(path.resolve()), entry)
+    if first is not entry:
+        raise InputError(
+            "duplicate_image",
+            f"{entry.name!r} is the same file as {first.name!r} in {first.where.rpartition(' ')[2]}.",
+            where=f"{entry.where}.file_path",
+            hint="Remove one of the two frames.",
+        )
+    return pair

@@ -1,0 +1,189 @@
+"""Where the photos of a set lie, and what else lies there that is no photo that is read."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from biresnerf.data.photos.image_files import is_image_name
+from biresnerf.errors import InputError
+
+IMAGE_FOLDER = "images"
+# Folders of the photos themselves where others hold something else of the same views; the preferred one first.
+_USUAL = ("rgb", "color", "colour", "image", "image_2", "image_0", "train")
+# Folders whose pictures are not the set's photos; `biresnerf convert` writes pinhole/.
+_NO_PHOTOS = frozenset(
+    {"mask", "masks", "depth", "depths", "confidence", "normal", "normals", "semantic", "semantics", "label"}
+    | {"labels", "pinhole", "mask_visib", "sparse", "sparse_txt", "thumbnails", "__macosx"}
+)
+# Maps of something else beside a photo, as 7-Scenes, sdfstudio and instant-ngp name them.
+_NO_PHOTO = re.compile(
+    r"^(dynamic_mask_.*|.*[._-](depth|normal|mask|sensor_depth|confidence)\.(png|tiff?))$", re.I
+)
+# What holds pictures, but none that is read: the kind by the extension.
+_KINDS = {
+    "HEIC": (".heic", ".heif"),
+    "AVIF": (".avif",),
+    "RAW": (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"),
+    "GIF": (".gif",),
+    "EXR or HDR": (".exr", ".hdr"),
+    "video": (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"),
+}
+_KIND_OF = {suffix: kind for kind, suffixes in _KINDS.items() for suffix in suffixes}
+_MOST_ENTRIES = 100_000  # looked at for a message
+
+
+def few_names(names: Iterable[str], limit: int = 5) -> str:
+    """A short list for a message: the first ``limit`` names and how many more."""
+    listed = list(names)
+    more = f" and {len(listed) - limit} more" if len(listed) > limit else ""
+    return ", ".join(listed[:limit]) + more
+
+
+def photos_beside(root: Path, folders: Sequence[str] = ()) -> dict[str, Path]:
+    """The photos beside poses, by path with forward slashes; empty where there are none, or none can be chosen.
+
+    Those in the first of ``folders`` that has some, which the poses' program uses; else those of `images_beside`; else
+    those in the one other folder that has some; of several, in the first that is called as folders of photos usually
+    are (rgb/, color/, image_2/), or in all of them where only a number tells their names apart (cam0/, cam1/).
+    """
+    for name in folders:
+        paths = images_below(root / name)
+        if paths:
+            return by_path(root, paths)
+    beside = images_beside(root)
+    if beside:
+        return beside
+    found = folders_of_photos(root)
+    if len({re.sub(r"\d+", "", name) for name in found}) == 1:
+        return by_path(root, [path for paths in found.values() for path in paths])
+    usual = next((name for name in _USUAL if name in found), None)
+    return by_path(root, found[usual]) if usual else {}
+
+
+def all_photos(root: Path) -> dict[str, Path]:
+    """The photos of `photos_beside`, else those in all folders of ``root``: for poses that name their photos."""
+    return photos_beside(root) or by_path(
+        root, [path for paths in folders_of_photos(root).values() for path in paths]
+    )
+
+
+def folders_of_photos(root: Path) -> dict[str, list[Path]]:
+    """The photos below each folder of ``root``, but folders that hold no photos."""
+    folders = [path for path in visible(root) if path.is_dir() and path.name.lower() not in _NO_PHOTOS]
+    return {folder.name: paths for folder in folders if (paths := images_below(folder))}
+
+
+def by_path(root: Path, paths: Iterable[Path]) -> dict[str, Path]:
+    """The files by their path in ``root``, with forward slashes."""
+    return {path.relative_to(root).as_posix(): path for path in paths}
+
+
+def images_beside(root: Path) -> dict[str, Path]:
+    """The images in ``root``/images, else in ``root``, by their path there; empty where there are none."""
+    paths = images_below(root / IMAGE_FOLDER)
+    return by_path(root / IMAGE_FOLDER, paths) if paths else by_path(root, images_in(root))
+
+
+def visible(folder: Path) -> list[Path]:
+    """What a folder holds but hidden files, sorted. Raises InputError ``input_unreadable``."""
+    try:
+        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    except OSError as error:
+        raise InputError(
+            "input_unreadable",
+            f"cannot be read: {error.strerror}.",
+            where=str(folder),
+            hint="Check the path and its permissions.",
+        ) from None
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The photos in ``folder`` itself, sorted; masks and depth maps that are called so are none."""
+    return [path for path in visible(folder) if is_photo_name(path.name) and path.is_file()]
+
+
+def images_below(folder: Path) -> list[Path]:
+    """The photos in ``folder`` and its folders, sorted, as for `images_in`."""
+    return sorted(path for path in _files_below(folder) if is_photo_name(path.name))
+
+
+def is_photo_name(name: str) -> bool:
+    """Whether a file is a photo that is read, by its name."""
+    return not name.startswith(".") and is_image_name(Path(name)) and not _NO_PHOTO.match(name)
+
+
+def _files_below(folder: Path) -> Iterator[Path]:
+    for parent, folders, files in os.walk(folder):
+        folders[:] = sorted(
+            name for name in folders if not name.startswith(".") and name.lower() not in _NO_PHOTOS
+        )
+        yield from (Path(parent, name) for name in files if not name.startswith("."))
+
+
+def pictures_left_out(folder: Path) -> dict[str, list[str]]:
+    """The names of pictures and videos in or below ``folder`` that are not read, by their kind."""
+    found: dict[str, list[str]] = defaultdict(list)
+    for count, path in enumerate(_files_below(folder)):
+        kind = _KIND_OF.get(path.suffix.lower())
+        if kind is not None:
+            found[kind].append(path.relative_to(folder).as_posix())
+        if count > _MOST_ENTRIES:
+            break
+    return {kind: sorted(names) for kind, names in sorted(found.items())}
+
+
+def left_out_notes(folder: Path) -> tuple[str, ...]:
+    """A note for each kind of picture in or below ``folder`` that is not read."""
+    return tuple(
+        f"{len(names)} {kind} {'file is' if len(names) == 1 else 'files are'} not read and left out: "
+        f"{few_names(names, 3)}"
+        for kind, names in pictures_left_out(folder).items()
+    )
+
+
+def unused_image_notes(paths: Sequence[Path], others: Iterable[Path] = ()) -> list[str]:
+    """A note on images that lie beside the used ones and are none of ``others`` (masks) either."""
+    used = {path.resolve() for path in (*paths, *others)}
+    suffixes = {path.suffix.lower() for path in paths}
+    unused = []
+    for folder in sorted({path.parent.absolute() for path in paths}):
+        for path in sorted(folder.iterdir()):
+            image = path.suffix.lower() in suffixes and is_photo_name(path.name)
+            if image and path.is_file() and path.resolve() not in used:
+                unused.append(path.name)
+    if not unused:
+        return []
+    return [
+        f"{len(unused)} images beside the used ones have no frame and are left out: {few_names(unused, 3)}"
+    ]
+
+
+def refuse_no_images(files: dict[str, Path], root: Path) -> None:
+    """Raises InputError ``no_images`` where there are none, which says what there is instead."""
+    if not files:
+        raise no_images(root, "there are poses, but no photos")
+
+
+def no_images(root: Path, what: str) -> InputError:
+    """The error for a folder in which no photos were found, with what was seen there."""
+    folders = list(folders_of_photos(root))
+    if folders:
+        seen = f"photos lie in {few_names(f'{name}/' for name in folders)}, and which are meant is not clear"
+        hint = "Put the photos into images/."
+        return InputError("no_images", f"{what} in the usual places: {seen}.", where=str(root), hint=hint)
+    kinds = pictures_left_out(root)
+    if kinds:
+        seen = "; ".join(f"{len(names)} {kind} ({few_names(names, 3)})" for kind, names in kinds.items())
+        hint = "Save them as PNG or JPEG, at full size; from a video, save sharp frames that overlap."
+        return InputError("no_images", f"{what} that is read: {seen}.", where=str(root), hint=hint)
+    seen = few_names((path.name + "/" * path.is_dir() for path in visible(root)), 8)
+    return InputError(
+        "no_images",
+        f"{what} that is read: it holds {seen or 'nothing'}.",
+        where=str(root),
+        hint="Put photos (PNG, JPEG, WebP, TIFF, BMP) there or into images/, and poses in a form of docs/formats.md.",
+    )
