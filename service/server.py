@@ -1,11 +1,16 @@
-"""The web process: `python -m service.server`, settings from the environment."""
+"""The web process: `python -m service.server`, settings from the environment.
+
+The supervisor of several gives each the socket they share (`service.processes`).
+"""
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import logging
 import socket
 import sys
+import time
 from types import FrameType
 
 import uvicorn
@@ -15,6 +20,7 @@ from pydantic import ValidationError
 from service.app import create_app
 from service.http.request_context import HEAD_BYTES_MAX
 from service.http.strict_http import StrictHttp
+from service.processes import listen
 from workers.settings.errors import SetupError
 from workers.settings.logs import set_up_logging
 from workers.settings.settings import Settings
@@ -23,12 +29,14 @@ from workers.settings.traces import set_up_traces
 logger = logging.getLogger(__name__)
 # Long downloads may use it; event streams end at once (see `_Server`).
 _SHUTDOWN_GRACE_S = 5
+# For clients that send one request after the other: their next response says that the connection ends.
+FAREWELL_S = 1.0
 # Longer than proxies keep idle connections, which would otherwise send into one that we are closing.
 KEEP_ALIVE_S = 75
 
 
 class _Server(uvicorn.Server):
-    """Ends event streams when asked to stop; uvicorn alone would wait for them."""
+    """Ends event streams when asked to stop, for which uvicorn alone would wait, and no connection in mid request."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
         super().__init__(config)
@@ -40,29 +48,31 @@ class _Server(uvicorn.Server):
             asyncio.get_running_loop().call_soon_threadsafe(service.closing.set)
         super().handle_exit(sig, frame)
 
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Leaves the socket to others, and lets idle connections end with their next response.
 
-def listen(settings: Settings) -> socket.socket:
-    """The bound socket; raises `SetupError` where the address cannot be had."""
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    bound = socket.socket(family, socket.SOCK_STREAM)
-    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        bound.bind((settings.host, settings.port))
-    except OSError as error:
-        bound.close()
-        raise SetupError(
-            "address_unavailable",
-            f"Cannot listen on {settings.host}:{settings.port} ({error.strerror}). "
-            "Set BIRESNERF_PORT to a free port.",
-        ) from None
-    return bound
+        Closed at once, they would lose the requests that are on their way.
+        """
+        for server in self.servers:
+            server.close()
+        self.server_state.default_headers = [
+            *self.server_state.default_headers,
+            (b"connection", b"close"),
+        ]
+        end = time.monotonic() + FAREWELL_S
+        while self.server_state.connections and not self.force_exit and time.monotonic() < end:
+            await asyncio.sleep(0.02)
+        await super().shutdown(sockets)
 
 
-def serve(settings: Settings) -> None:
-    """Serves until SIGINT or SIGTERM; raises `SetupError`."""
+def serve(settings: Settings, bound: socket.socket | None = None) -> None:
+    """Serves until SIGINT or SIGTERM, on the socket that the parent bound or else on one of its own.
+
+    Raises `SetupError`.
+    """
     settings.require_database_url()
     set_up_traces("api", settings)
-    bound = listen(settings)
+    bound = bound or listen(settings)
     app = create_app(settings)
     config = uvicorn.Config(
         app,
@@ -86,10 +96,15 @@ def serve(settings: Settings) -> None:
 
 def main() -> int:
     """Returns the exit status: 0 stopped, 2 the operator has to change something."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--name", default="api", help="In the lines of the log.")
+    parser.add_argument("--listen-fd", type=int, help="Number of the inherited socket.")
+    arguments = parser.parse_args()
     try:
         settings = Settings()
-        set_up_logging("api", settings)
-        serve(settings)
+        set_up_logging(arguments.name, settings)
+        fd = arguments.listen_fd
+        serve(settings, None if fd is None else socket.socket(fileno=fd))
     except (SetupError, ValidationError) as error:
         sys.stderr.write(f"{error}\n")
         return 2

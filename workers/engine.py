@@ -19,6 +19,7 @@ from workers.store.files import FileStore, open_files
 from workers.store.store_identity import require_same_store
 from workers.tenants.api_keys import KeyStore
 from workers.tenants.tenants import TenantStore
+from workers.tenants.token_buckets import TokenBuckets
 from workers.upkeep.monitor import Monitor
 from workers.webhooks.webhooks import WebhookStore
 
@@ -35,6 +36,7 @@ class Stores:
     files: FileStore
     uploads: UploadStore
     keys: KeyStore
+    buckets: TokenBuckets
     tenants: TenantStore
     monitor: Monitor
     webhooks: WebhookStore
@@ -67,7 +69,10 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
             webhooks = WebhookStore(database, settings)
             keys = KeyStore(database)
             janitor = Janitor(database, files, settings)
-            yield Stores(jobs, datasets, files, uploads, keys, tenants, monitor, webhooks, janitor, share_key)
+            buckets = TokenBuckets(database)
+            yield Stores(
+                jobs, datasets, files, uploads, keys, buckets, tenants, monitor, webhooks, janitor, share_key
+            )
         finally:
             listening.cancel()
 

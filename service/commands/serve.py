@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,12 +17,11 @@ if TYPE_CHECKING:
     from workers.settings.settings import Settings
 
 
-def free_port() -> int:
-    """A free port."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+processes_option = click.option(
+    "--processes",
+    type=click.IntRange(1, 16),
+    help="Web processes that share the port. Default: BIRESNERF_PROCESSES, else 1.",
+)
 
 
 @click.command("up")
@@ -34,6 +32,7 @@ def free_port() -> int:
 @click.option(
     "--slots", type=click.IntRange(0, 64), help="Jobs at the same time. Default: BIRESNERF_SLOTS, else 1."
 )
+@processes_option
 @data_dir_option
 @click.option(
     "--open/--no-open", "open_page", default=None, help="Open the page in a browser. Default: on a desktop."
@@ -43,6 +42,7 @@ def up_command(
     host: str | None,
     port: int | None,
     slots: int | None,
+    processes: int | None,
     data_dir: Path | None,
     open_page: bool | None,
     verbose: bool,
@@ -54,23 +54,22 @@ def up_command(
     """
     import asyncio
 
+    from service.processes import web_processes
     from workers.settings.logs import set_up_logging
-    from workers.upkeep.supervise import ChildSpec, dispatcher_spec, slot_specs, supervise
+    from workers.upkeep.supervise import dispatcher_spec, slot_specs, supervise
 
     os.environ.setdefault("BIRESNERF_LOG_LEVEL", "INFO" if verbose else "WARNING")  # of the children, too
     if open_page is None:
         open_page = sys.stdout.isatty() and ("DISPLAY" in os.environ or sys.platform == "darwin")
     with setup_problems():
-        settings = settings_with(host=host, port=port, slots=slots, data_dir=data_dir)
+        settings = settings_with(host=host, port=port, slots=slots, processes=processes, data_dir=data_dir)
         set_up_logging("up", settings)
-        if settings.port == 0:
-            settings = settings.model_copy(update={"port": free_port()})
-        variables = {"BIRESNERF_HOST": settings.host, "BIRESNERF_PORT": str(settings.port)}
-        api = ChildSpec("api", (sys.executable, "-m", "service.server"), variables)
-        children = [api, dispatcher_spec(settings), *slot_specs(settings)]
-        sys.exit(
-            asyncio.run(supervise(settings, children, on_ready=lambda _: _announce(settings, open_page)))
-        )
+        with web_processes(settings) as web:
+            children = [*web.children, dispatcher_spec(settings), *slot_specs(settings)]
+            bound = settings.model_copy(update={"port": web.port})
+            sys.exit(
+                asyncio.run(supervise(settings, children, on_ready=lambda _: _announce(bound, open_page)))
+            )
 
 
 async def _announce(settings: Settings, open_page: bool) -> None:
@@ -92,18 +91,29 @@ async def _announce(settings: Settings, open_page: bool) -> None:
 @click.command("api")
 @click.option("--host", help="Address to listen on.")
 @click.option("--port", type=click.IntRange(0, 65535), help="0: a free one.")
-def api_command(host: str | None, port: int | None) -> None:
-    """Run only the web process.
+@processes_option
+def api_command(host: str | None, port: int | None, processes: int | None) -> None:
+    """Run only the web process, or several that share the port.
 
     Needs BIRESNERF_DATABASE_URL, and a database brought up to date by `biresnerf migrate`.
     """
-    from service.server import serve
+    import asyncio
+
+    from service.processes import web_processes
     from workers.settings.logs import set_up_logging
+    from workers.upkeep.supervise import keep_running
 
     with setup_problems():
-        settings = settings_with(host=host, port=port)
+        settings = settings_with(host=host, port=port, processes=processes)
         set_up_logging("api", settings)
-        serve(settings)
+        settings.require_database_url()
+        if settings.processes == 1:
+            from service.server import serve
+
+            serve(settings)
+        else:
+            with web_processes(settings) as web:
+                sys.exit(asyncio.run(keep_running(settings, web.children)))
 
 
 @click.command("worker")

@@ -24,7 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.dependencies import Service, service_of
 from service.http.problems import ProblemError, problem_of
-from service.http.rate_limits import Allowance, Buckets
+from service.http.rate_limits import Allowance, RateLimit
 from workers.datasets.datasets import DatasetStore
 from workers.datasets.uploads import UploadStore
 from workers.jobs.jobs import JobStore
@@ -94,22 +94,21 @@ class Access:
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self._app, self._settings = app, settings
-        self._keys = Buckets("key", settings.key_requests_per_s, settings.key_requests_burst)
-        self._unidentified = Buckets("address", UNIDENTIFIED_PER_S, UNIDENTIFIED_BURST)
+        self._keys = RateLimit("key", settings.key_requests_per_s, settings.key_requests_burst)
+        self._unidentified = RateLimit("address", UNIDENTIFIED_PER_S, UNIDENTIFIED_BURST)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or OPEN.fullmatch(scope["path"]):
             await self._app(scope, receive, send)
             return
         request = Request(scope)
-        request.state.identity = identity = await self._identified(request)
-        anonymous = None if on_loopback(self._settings.host) else _address(request)
-        request.state.client = client = identity.key_id or anonymous
-        if client is None:
+        try:
+            allowance = await self._allowance(request)
+        except Unavailable as error:  # above the routes: no exception handler responds with 503
+            raise problem_of(error) from None
+        if allowance is None:
             await self._app(scope, receive, send)
             return
-        allowance = self._keys.take(client)
-        _require_allowed(allowance)
 
         async def send_with_allowance(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -118,25 +117,32 @@ class Access:
 
         await self._app(scope, receive, send_with_allowance)
 
+    async def _allowance(self, request: Request) -> Allowance | None:
+        """What the client, who is identified here, has left; none where it has no limit."""
+        request.state.identity = identity = await self._identified(request)
+        anonymous = None if on_loopback(self._settings.host) else _address(request)
+        request.state.client = client = identity.key_id or anonymous
+        return None if client is None else await _take(self._keys, request, client)
+
     async def _identified(self, request: Request) -> Identity:
         try:
             return await identify(service_of(request), request)
-        except Unavailable as error:  # above the routes: no exception handler responds with 503
-            raise problem_of(error) from None
         except ProblemError as refusal:
             # A valid key is never limited by what others send from the same address.
             if refusal.status == 401:
-                _require_allowed(self._unidentified.take(_address(request)))
+                await _take(self._unidentified, request, _address(request))
             raise
 
 
-def _require_allowed(allowance: Allowance) -> None:
+async def _take(limit: RateLimit, request: Request, client: str) -> Allowance:
+    allowance = await limit.take(service_of(request).stores.buckets, client)
     if allowance.wait_s:
         raise ProblemError(
             "rate_limited",
             f"At most {allowance.limit} requests are taken at once.",
             headers={**allowance.headers(), "Retry-After": str(allowance.wait_s)},
         )
+    return allowance
 
 
 def _address(request: Request) -> str:

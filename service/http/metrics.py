@@ -1,6 +1,6 @@
 """Metrics for Prometheus.
 
-Requests and streams are counted in the memory of each web process: each replica is a scrape target of its own.
+Requests and streams are counted by the web processes of one port (`process_metrics`), which is one scrape target.
 Queue, jobs, stages and slots belong to the whole installation and are read from the database at each scrape; every
 replica reports the same, and workers need no port of their own.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, get_args
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import (
     CounterMetricFamily,
     GaugeMetricFamily,
@@ -23,6 +23,7 @@ from prometheus_client.registry import Collector
 
 from biresnerf import __version__
 from biresnerf.wire.jobs import EventType
+from service.http import process_metrics
 from workers.database.statistics import Statistics, Tally
 
 _ANSWER_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
@@ -64,8 +65,8 @@ class WebMetrics:
     """The metrics that one web process counts."""
 
     def __init__(self) -> None:
+        process_metrics.prepare()
         self.registry = CollectorRegistry()
-        ProcessCollector(registry=self.registry)
         at = ("method", "route")
         self.requests = self._counter("biresnerf_http_requests", "Requests answered.", *at, "status")
         self.received = self._counter("biresnerf_http_request_bytes", "Bytes of bodies received.", *at)
@@ -77,19 +78,20 @@ class WebMetrics:
             buckets=_ANSWER_S,
             registry=self.registry,
         )
-        self.under_way = Gauge(
-            "biresnerf_http_requests_under_way", "Requests not answered in full yet.", registry=self.registry
+        self.under_way = self._gauge(
+            "biresnerf_http_requests_under_way", "Requests not answered in full yet."
         )
-        self.listeners = Gauge(
-            "biresnerf_event_listeners", "Clients that follow a job's events.", registry=self.registry
-        )
+        self.listeners = self._gauge("biresnerf_event_listeners", "Clients that follow a job's events.")
 
     def _counter(self, name: str, help_text: str, *labels: str) -> Counter:
         return Counter(name, help_text, labels, registry=self.registry)
 
+    def _gauge(self, name: str, help_text: str) -> Gauge:
+        return Gauge(name, help_text, registry=self.registry, multiprocess_mode=process_metrics.LIVING)
+
 
 class Exposition(Collector):
-    """One scrape: the metrics of the process, and of the installation while the database answers."""
+    """One scrape: the metrics of the web processes, and of the installation while the database answers."""
 
     def __init__(self, web: WebMetrics, installation: Statistics | None) -> None:
         self._web, self._installation = web, installation
@@ -97,7 +99,7 @@ class Exposition(Collector):
     def collect(self) -> Iterable[Metric]:
         """All metric families."""
         yield InfoMetricFamily("biresnerf_build", "What runs here.", {"version": __version__})
-        yield from self._web.registry.collect()
+        yield from process_metrics.collected(self._web.registry)
         answers = self._installation is not None
         yield GaugeMetricFamily(
             "biresnerf_database_up", "1 while the database answers this process.", answers

@@ -1,19 +1,11 @@
-"""Rate limits: a token bucket per client, in the memory of each web process.
-
-With n replicas behind a proxy a client may send n times as much. Limits that must be exact (jobs, bytes) are
-counted in the database.
-"""
+"""Rate limits: what a client may still send, as the headers of a response tell it."""
 
 from __future__ import annotations
 
 import math
-import time
-from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import dataclass
 
-# Beyond this the clients that were silent longest are forgotten; they start again with a full bucket.
-CLIENTS_MAX = 10_000
+from workers.tenants.token_buckets import TokenBuckets
 
 
 @dataclass(frozen=True)
@@ -35,30 +27,21 @@ class Allowance:
         }
 
 
-class Buckets:
-    """A bucket of ``burst`` tokens for each client, refilled at ``rate`` a second; a request takes one."""
+@dataclass(frozen=True)
+class RateLimit:
+    """At most ``burst`` requests of one client at once, and ``rate`` a second on average, in all web processes."""
 
-    def __init__(
-        self, policy: str, rate: float, burst: int, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._policy, self._rate, self._burst, self._clock = policy, rate, burst, clock
-        self._levels: OrderedDict[str, tuple[float, float]] = OrderedDict()
+    policy: str
+    rate: float
+    burst: int
 
-    def take(self, client: str) -> Allowance:
-        """Takes a token, if there is one."""
-        now = self._clock()
-        level, at = self._levels.get(client, (float(self._burst), now))
-        level = min(float(self._burst), level + (now - at) * self._rate)
-        passes = level >= 1
-        level -= passes
-        self._levels[client] = (level, now)
-        self._levels.move_to_end(client)
-        if len(self._levels) > CLIENTS_MAX:
-            self._levels.popitem(last=False)
+    async def take(self, buckets: TokenBuckets, client: str) -> Allowance:
+        """Counts a request, if it is allowed; raises `Unavailable`."""
+        level = await buckets.take(self.policy, client, self.rate, self.burst)
         return Allowance(
-            policy=self._policy,
-            limit=self._burst,
-            remaining=int(level),
-            full_in_s=math.ceil((self._burst - level) / self._rate),
-            wait_s=0 if passes else math.ceil((1 - level) / self._rate),
+            policy=self.policy,
+            limit=self.burst,
+            remaining=int(level.tokens),
+            full_in_s=math.ceil(level.full_in_s),
+            wait_s=math.ceil(level.wait_s),
         )

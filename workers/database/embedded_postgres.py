@@ -42,7 +42,6 @@ NETWORK_FILE_SYSTEMS = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "9p", "fuse.sshf
 SERVER_OPTIONS = {
     "listen_addresses": "",
     "unix_socket_permissions": "0700",  # authentication is trust: the socket's rights are the guard
-    "max_connections": "100",
     "shared_buffers": "32MB",
     "max_parallel_workers": "0",
     "dynamic_shared_memory_type": "mmap",  # containers often have a tiny /dev/shm
@@ -54,16 +53,17 @@ class EmbeddedPostgres:
     """One PostgreSQL cluster under ``root``, run by at most one process at a time.
 
     ``start`` it again after it died; ``stop`` it at the end. It shuts down by itself when this process dies.
+    It lets ``connections`` in at the same time.
     """
 
-    def __init__(self, root: Path, *, pg_bin: Path | None = None) -> None:
+    def __init__(self, root: Path, *, pg_bin: Path | None = None, connections: int = 100) -> None:
         self.user = unprivileged_user()
         self.root = self._reachable_root(root)
         self.data = self.root / "data"
         self.sockets = self._socket_folder()
         self.url = f"postgresql://postgres@/postgres?host={quote(str(self.sockets), safe='')}"
         self.process: subprocess.Popen[bytes] | None = None
-        self._pg_bin = pg_bin
+        self._pg_bin, self._connections = pg_bin, connections
         self._lock: IO[str] | None = None
 
     def start(self, *, timeout_s: float = 60.0) -> str:
@@ -78,7 +78,8 @@ class EmbeddedPostgres:
         self._create_cluster(binaries)
         self._check_version(binaries)
         self._clear_remains()
-        options = [part for name, value in SERVER_OPTIONS.items() for part in ("-c", f"{name}={value}")]
+        chosen = {**SERVER_OPTIONS, "max_connections": str(self._connections)}
+        options = [part for name, value in chosen.items() for part in ("-c", f"{name}={value}")]
         command = [str(binaries / "postgres"), "-D", str(self.data), "-k", str(self.sockets), *options]
         with self._open_log() as output:
             self.process = subprocess.Popen(

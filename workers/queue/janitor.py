@@ -20,6 +20,7 @@ from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
 from workers.store.trash import empty_trash
+from workers.tenants.token_buckets import forget_full_buckets
 
 log = logging.getLogger(__name__)
 
@@ -72,6 +73,7 @@ class Janitor:
                 await requeue_lost(connection, self._settings.stall_s)
                 await offer_held_jobs(connection)
                 await fold_tallies(connection)
+                await forget_full_buckets(connection)
         if time.monotonic() >= self._upkeep_at:
             self._upkeep_at = time.monotonic() + UPKEEP_S
             await self._database.run(job_queue.delete_old_entries)

@@ -37,6 +37,9 @@ class Settings(BaseSettings):
     pg_bin: Path | None = Field(None, description="Folder with initdb and postgres for the private database.")
     host: str = Field("127.0.0.1", description="Address that the web process listens on.")
     port: int = Field(8000, ge=0, le=65535, description="Its port; 0 takes a free one.")
+    processes: int = Field(
+        1, ge=1, le=16, description="Web processes that `up` and `api` start; they share the port."
+    )
     auth: Literal["auto", "required", "off"] = Field(
         "auto",
         description="Who needs an API key. auto: no caller while the service listens on loopback only and no key "
@@ -44,7 +47,7 @@ class Settings(BaseSettings):
     )
 
     key_requests_per_s: float = Field(
-        50.0, gt=0, description="Requests with one API key, on average, that each web process takes."
+        50.0, gt=0, description="Requests a second with one API key, on average, that all web processes take."
     )
     key_requests_burst: int = Field(500, ge=1, description="Requests with one API key at once.")
     key_uploads: int = Field(

@@ -69,7 +69,10 @@ async def make_backup(settings: Settings, url: str, folder: Path) -> BackupIndex
             files=tuple(saved[key] for key in sorted(saved)),
             gone=tuple(sorted(named - saved.keys())),
         )
-        options = ("--format=custom", "--no-owner", "--no-privileges", f"--snapshot={moment}")
+        options = (
+            *("--format=custom", "--no-owner", "--no-privileges", "--no-unlogged-table-data"),
+            f"--snapshot={moment}",
+        )
         target = f"--file={folder / index.database}"
         await asyncio.to_thread(run_postgres_program, settings, url, "pg_dump", *options, target)
     _write_whole(folder / INDEX_NAME, index.model_dump_json(indent=1).encode())

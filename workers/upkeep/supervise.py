@@ -34,12 +34,18 @@ KILL_AFTER_S = 5.0
 
 @dataclass(frozen=True)
 class ChildSpec:
-    """A process to keep running. ``stop_grace_s`` is how long it may take to end after SIGTERM."""
+    """A process to keep running.
+
+    Attributes:
+        stop_grace_s: how long it may take to end after SIGTERM.
+        descriptors: open files that it inherits, under the same numbers.
+    """
 
     name: str
     command: Sequence[str]
     variables: Mapping[str, str] = field(default_factory=dict)
     stop_grace_s: float = 10.0
+    descriptors: tuple[int, ...] = ()
 
 
 def slot_specs(settings: Settings) -> list[ChildSpec]:
@@ -78,7 +84,9 @@ async def supervise(
     """
     postgres = None
     if settings.database_url is None:
-        postgres = EmbeddedPostgres(settings.postgres_dir, pg_bin=settings.pg_bin)
+        postgres = EmbeddedPostgres(
+            settings.postgres_dir, pg_bin=settings.pg_bin, connections=_connections(settings)
+        )
         postgres.start()
     try:
         url = postgres.url if postgres is not None else settings.require_database_url()
@@ -91,6 +99,16 @@ async def supervise(
     finally:
         if postgres is not None:
             postgres.stop()
+
+
+async def keep_running(settings: Settings, children: Sequence[ChildSpec]) -> int:
+    """The same for children alone, on a database that is there and migrated."""
+    return await _Supervisor(settings, settings.require_database_url(), None, children).run(None)
+
+
+def _connections(settings: Settings) -> int:
+    """What all processes of this machine open at most, and some for the operator's commands."""
+    return max(100, 20 + 10 * settings.processes + 8 * settings.slots)
 
 
 class _Supervisor:
@@ -144,6 +162,7 @@ class _Supervisor:
                     stdin=asyncio.subprocess.DEVNULL,
                     env={**self._environment, **spec.variables},
                     start_new_session=True,
+                    pass_fds=spec.descriptors,
                 )
             except OSError as error:  # too many processes, or no memory for one more: that passes
                 log.error("%s cannot be started (%s); again in %.1f s", spec.name, error, LONGEST_PAUSE_S)

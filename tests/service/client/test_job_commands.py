@@ -36,8 +36,8 @@ from biresnerf.commands.jobs.jobs import (
 )
 from biresnerf.commands.jobs.service_options import exit_code_of
 from biresnerf.commands.jobs.submit import submit_command
-from service.commands.serve import free_port
 from tests.service.conftest import Running, Tenant, finished, submit, until
+from tests.service.free_port import free_port
 
 pytestmark = pytest.mark.server
 

@@ -22,8 +22,8 @@ import pytest
 
 from biresnerf.client import Client, ServiceError
 from biresnerf.wire.results import ArtifactView
-from service.commands.serve import free_port
 from tests.service.conftest import Running, dataset_ids, finished
+from tests.service.free_port import free_port
 
 pytestmark = pytest.mark.server
 

@@ -9,8 +9,8 @@ from click.testing import CliRunner
 
 from biresnerf.commands.machine.doctor import doctor_command
 from service.commands.doctor_checks import database, page
-from service.commands.serve import free_port
 from service.web_page import FOLDER
+from tests.service.free_port import free_port
 
 pytestmark = pytest.mark.server
 

@@ -10,7 +10,6 @@ import pytest
 
 from biresnerf.client import Client, ServiceError
 from service.http.access import UNIDENTIFIED_BURST
-from service.http.rate_limits import Buckets
 from tests.service.conftest import (
     Running,
     Tenant,
@@ -132,18 +131,6 @@ def test_metrics_are_open_only_where_everything_is(service: Running, closed: Run
     for key, status in ((None, 401), (reader, 401), (admin, 200)):
         with client_with(closed, key) as http:
             assert http.get("/metrics").status_code == status
-
-
-def test_a_bucket_lets_its_burst_through_and_then_its_rate() -> None:
-    now = 0.0
-    buckets = Buckets("key", 2.0, 3, clock=lambda: now)
-    assert [buckets.take("a").wait_s for _ in range(4)] == [0, 0, 0, 1]
-    assert buckets.take("b").wait_s == 0
-    now = 0.6
-    assert [buckets.take("a").wait_s for _ in range(2)] == [0, 1]
-    now = 100.0
-    left = buckets.take("a")
-    assert (left.remaining, left.headers()["RateLimit-Policy"]) == (2, '"key";q=3')
 
 
 def test_a_keyed_answer_tells_what_is_left(tenants: tuple[Tenant, Tenant]):

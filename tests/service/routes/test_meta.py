@@ -16,8 +16,8 @@ import pytest
 from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from service.app import create_app
-from service.commands.serve import free_port
 from tests.service.conftest import LIMITS, Running, problem, short_folder
+from tests.service.free_port import free_port
 from workers.database.embedded_postgres import EmbeddedPostgres
 from workers.database.migrate import migrate
 from workers.settings.settings import Settings
