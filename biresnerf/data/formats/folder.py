@@ -9,6 +9,7 @@ from pathlib import Path
 
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.registry import ALL_CODECS
+from biresnerf.data.formats.unread_poses import refuse_unread
 from biresnerf.data.photos.photo_folders import (
     IMAGE_FOLDER,
     few_names,
@@ -43,7 +44,8 @@ def look_into(folder: Path) -> FolderContents:
     A folder that holds nothing but one folder (an unpacked archive) stands for that one.
 
     Raises:
-        InputError: ``no_images`` where it holds neither; says what it holds.
+        InputError: ``no_images`` where it holds neither; says what it holds; ``poses_not_read`` where it holds poses of
+            a program whose form is not read.
     """
     root = folder
     for _ in range(3):
@@ -56,6 +58,7 @@ def look_into(folder: Path) -> FolderContents:
         name, place = found[0]
         image_root = ALL_CODECS[name].image_root(place) if place == root else root
         return FolderContents(image_root, name, place, (), _notes(root, found))
+    refuse_unread(root)
     images, notes = _photos_alone(root)
     if not images:
         raise no_images(root, "holds no photo")

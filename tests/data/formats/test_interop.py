@@ -61,6 +61,22 @@ def test_a_case_that_cannot_be_read_is_refused_by_its_name(name):
     assert caught.value.hint.endswith(".")
 
 
+UNREAD = sorted(
+    case.relative_to(CASES).as_posix()
+    for kind in ("05_poses_silently_ignored", "06_says_no_images_where_there_are")
+    for case in (CASES / kind).glob("*")
+    if case.name != "3dgs_cameras"
+)
+
+
+@pytest.mark.parametrize("name", UNREAD)
+def test_poses_in_a_form_that_is_not_read_are_refused_by_the_programs_name(name):
+    with pytest.raises(InputError) as caught:
+        read_dataset(CASES / name)
+    assert caught.value.code == "poses_not_read"
+    assert (CASES / name / caught.value.where).is_file()
+
+
 def test_no_case_is_without_an_expectation():
     apart = {
         "README.md",

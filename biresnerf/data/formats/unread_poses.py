@@ -1,0 +1,61 @@
+"""Poses in forms that are not read: recognised by name and first bytes, so that no set is taken for photos alone."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from biresnerf.errors import InputError
+
+FIRST_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class UnreadForm:
+    """What a program calls its files, as globs from the set's folder, and what the first bytes match."""
+
+    program: str
+    names: tuple[str, ...]
+    begins: bytes = b""
+
+
+_FOUR_NUMBERS = rb"\s*([-+]?[\d.]+(e[-+]?\d+)?\s+){4}"
+UNREAD = (
+    UnreadForm("OpenSfM or OpenDroneMap", ("reconstruction.json", "opensfm/reconstruction.json"), rb"\s*\["),
+    UnreadForm("Meshroom", ("cameras.sfm", "sfm.sfm"), rb"\s*\{"),
+    UnreadForm("OpenMVG", ("sfm_data.json",), rb"\s*\{"),
+    UnreadForm("RealityCapture", ("*.csv",), rb"#name,x,y,alt"),
+    UnreadForm("RealityCapture", ("*.xmp", "images/*.xmp"), rb"(?s).*\bxcr:"),
+    UnreadForm("Tanks and Temples", ("*.log",), rb"\s*\d+\s+\d+\s+\d+\s*\n" + _FOUR_NUMBERS),
+    UnreadForm("7-Scenes or 3DMatch", ("frame-*.pose.txt", "*/frame-*.pose.txt"), _FOUR_NUMBERS),
+    UnreadForm("ScanNet or NSVF", ("pose/*.txt", "poses/*.txt"), _FOUR_NUMBERS),
+    UnreadForm("MVSNet", ("cams/*_cam.txt",), rb"\s*extrinsic"),
+    UnreadForm("sdfstudio", ("meta_data.json",), rb'(?s).*"camtoworld"'),
+    UnreadForm("NeuS or IDR", ("cameras_sphere.npz", "cameras.npz"), rb"PK"),
+    UnreadForm("BOP", ("scene_camera.json",), rb'(?s).*"cam_K"'),
+    UnreadForm("EuRoC", ("*/data.csv",), rb"#timestamp.*p_RS_R"),
+    UnreadForm("Nerfies", ("camera/*.json",), rb'(?s).*"orientation"'),
+    UnreadForm("Polycam", ("keyframes/corrected_cameras/*.json", "keyframes/cameras/*.json"), rb'(?s).*"t_00"'),
+    UnreadForm("Record3D", ("metadata.json", "metadata"), rb'(?s).*"poses"'),
+)  # fmt: skip
+
+
+def refuse_unread(root: Path) -> None:
+    """Raise `InputError` ``poses_not_read`` if the folder holds poses of a program whose form is not read."""
+    for form in UNREAD:
+        for name in form.names:
+            for path in sorted(root.glob(name)):
+                if path.is_file() and _begins(path, form.begins):
+                    raise InputError(
+                        "poses_not_read",
+                        f"holds camera poses of {form.program}, a form that is not read.",
+                        where=path.relative_to(root).as_posix(),
+                        hint="Convert them to one of the formats of docs/formats.md, or move them out of the folder to "
+                        "have the poses found from the photos alone.",
+                    )
+
+
+def _begins(path: Path, pattern: bytes) -> bool:
+    with path.open("rb") as file:
+        return re.match(pattern, file.read(FIRST_BYTES)) is not None

@@ -1,0 +1,58 @@
+"""Poses of other programs that are not read are named, and what only looks like them is not."""
+
+from __future__ import annotations
+
+import pytest
+from PIL import Image
+
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.formats.unread_poses import UNREAD
+from biresnerf.errors import InputError
+
+MATRIX = "1 0 0 0\n0 1.5e-3 0 0\n0 0 1 0\n0 0 0 1\n"
+# The beginning of a file as each program's documentation shows it.
+FILES = {
+    "reconstruction.json": '[{"cameras": {}}]',
+    "cameras.sfm": '{"version": ["1"]}',
+    "sfm_data.json": '{"sfm_data_version": "0.3"}',
+    "cameras.csv": "#name,x,y,alt,heading,pitch,roll,f\n",
+    "images/0.xmp": '<x:xmpmeta><rdf:Description xcr:Version="3">',
+    "Ignatius.log": f"0 0 0\n{MATRIX}",
+    "frame-000000.pose.txt": MATRIX,
+    "pose/0.txt": MATRIX,
+    "cams/00000000_cam.txt": f"extrinsic\n{MATRIX}",
+    "meta_data.json": '{"frames": [{"camtoworld": []}]}',
+    "cameras_sphere.npz": "PK\x03\x04",
+    "scene_camera.json": '{"0": {"cam_K": []}}',
+    "mav0/data.csv": "#timestamp, p_RS_R_x [m]\n",
+    "camera/0.json": '{"orientation": []}',
+    "keyframes/corrected_cameras/0.json": '{"t_00": 1}',
+    "metadata.json": '{"K": [], "poses": []}',
+}
+
+
+@pytest.fixture
+def photos(tmp_path):
+    (tmp_path / "images").mkdir()
+    for number in range(4):
+        Image.new("RGB", (32, 32), (number, 0, 0)).save(tmp_path / "images" / f"{number}.png")
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_form_is_named(photos, name):
+    (photos / name).parent.mkdir(parents=True, exist_ok=True)
+    (photos / name).write_text(FILES[name])
+    with pytest.raises(InputError) as caught:
+        read_dataset(photos)
+    assert (caught.value.code, caught.value.where) == ("poses_not_read", name)
+
+
+def test_every_form_is_tried():
+    assert len(UNREAD) == len(FILES)
+
+
+def test_other_files_of_such_names_are_left_alone(photos):
+    for name in ("notes.csv", "images/0.xmp", "run.log", "metadata.json"):
+        (photos / name).write_text('{"of": "another program"}')
+    assert len(read_dataset(photos)) == 4
