@@ -36,7 +36,7 @@ UNREAD = (
     UnreadForm("BOP", ("scene_camera.json",), rb'(?s).*"cam_K"'),
     UnreadForm("EuRoC", ("*/data.csv",), rb"#timestamp.*p_RS_R"),
     UnreadForm("Nerfies", ("camera/*.json",), rb'(?s).*"orientation"'),
-    UnreadForm("Polycam", ("keyframes/corrected_cameras/*.json", "keyframes/cameras/*.json"), rb'(?s).*"t_00"'),
+    UnreadForm("Polycam", ("*/corrected_cameras/*.json", "corrected_cameras/*.json"), rb'(?s).*"t_00"'),
     UnreadForm("Record3D", ("metadata.json", "metadata"), rb'(?s).*"poses"'),
 )  # fmt: skip
 
