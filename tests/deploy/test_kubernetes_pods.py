@@ -19,9 +19,9 @@ import httpx
 import psycopg
 import pytest
 
-from service.commands.serve import free_port
 from tests.deploy.keda_schemas import workers_to_start
 from tests.deploy.manifests import ROOT, Manifest, container, only, pod_templates, rendered
+from tests.service.free_port import free_port
 from tests.workers.buckets import environment_of, fresh_bucket, moto_server
 from tests.workers.conftest import PATIENCE_S, Counting, Slots, environment, quick_settings
 from workers.process.exit_status import ExitStatus

@@ -154,6 +154,7 @@ def test_wrong_flags_are_refused_by_name(scene, tmp_path, flags, parts):
 def test_a_broken_transforms_file_is_named_with_the_field(scene, tmp_path):
     broken = shutil.copytree(scene, tmp_path / "scene")
     document = json.loads((broken / "transforms.json").read_text())
+    document["frames"] = document["frames"][:3]
     document["frames"][2]["transform_matrix"][0][0] = "one"
     (broken / "transforms.json").write_text(json.dumps(document))
     assert_refused(run(broken, tmp_path / "out"), "transforms.json", "frames[2].transform_matrix")

@@ -15,6 +15,7 @@ import httpx
 import pytest
 
 from tests.service.conftest import Running, new_dataset, problem, scene_files, upload, zip_of
+from tests.service.spare_frames import three_frames
 
 JSON = {"Content-Type": "application/json"}
 DEEP = '{"name": ' + '{"a":' * 50_000 + "1" + "}" * 50_000 + "}"
@@ -110,7 +111,7 @@ BAD_IMAGE: dict[str, Callable[[], bytes]] = {
 def test_a_hostile_image_is_a_problem_before_it_is_a_picture(
     http: httpx.Client, scene: Path, case: str
 ) -> None:
-    files = {**scene_files(scene), "train/r_2.png": BAD_IMAGE[case]()}
+    files = {**three_frames(scene_files(scene)), "train/r_2.png": BAD_IMAGE[case]()}
     dataset = new_dataset(http)
     assert upload(http, dataset, zip_of(files)).status_code == 200
     answer = http.post(f"/v1/datasets/{dataset}/finalize")

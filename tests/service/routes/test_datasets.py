@@ -4,6 +4,7 @@ import base64
 import hashlib
 import io
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from tests.service.conftest import (
     upload,
     zip_of,
 )
+from tests.service.spare_frames import three_frames
 
 Files = dict[str, bytes]
 
@@ -47,6 +49,9 @@ def test_files_sent_one_by_one_make_a_ready_dataset(http: httpx.Client, scene: P
     assert (found["state"], found["files"]) == ("ready", 7)
     assert found["report"]["images"] == 6
     assert found["report"]["poses"] == "given"
+    while found["expires_at"] is None:  # the next round of the dispatcher gives it a date
+        time.sleep(0.05)
+        found = http.get(f"/v1/datasets/{dataset}").json()
     again = http.post(f"/v1/datasets/{dataset}/finalize").json()
     # Who asks again keeps it for longer.
     assert again.pop("expires_at") >= found.pop("expires_at")
@@ -169,7 +174,11 @@ BAD: dict[str, tuple[Callable[[Files], object], str | None, str]] = {
     "text called png": (lambda f: f.update({"train/r_2.png": b"hello"}), "not_an_image", "r_2"),
     "another size": (lambda f: f.update({"train/r_2.png": picture(size=(40, 32))}), None, "r_2"),
     "image missing": (lambda f: f.pop("train/r_2.png"), None, "r_2"),
-    "no images at all": (lambda f: [f.pop(name) for name in list(f) if name.endswith("png")], None, "r_0"),
+    "no images at all": (
+        lambda f: [f.pop(name) for name in list(f) if name.endswith("png")],
+        None,
+        "transforms.json",
+    ),
     "two images only": (edited(lambda d: d.update(frames=d["frames"][:2])), None, "transforms.json"),
     "same name twice": (with_frame(file_path="./train/r_1"), None, "r_1"),
     "frame without name": (edited(lambda d: d["frames"][2].pop("file_path")), None, "transforms.json"),
@@ -189,7 +198,7 @@ BAD: dict[str, tuple[Callable[[Files], object], str | None, str]] = {
 @pytest.mark.parametrize("case", BAD)
 def test_a_bad_scene_is_422_with_the_file_and_the_hint(http: httpx.Client, scene: Path, case: str) -> None:
     change, code, names = BAD[case]
-    files = scene_files(scene)
+    files = three_frames(scene_files(scene))
     change(files)
     dataset = new_dataset(http)
     assert upload(http, dataset, zip_of(files)).status_code == 200
@@ -205,8 +214,16 @@ def test_a_bad_scene_is_422_with_the_file_and_the_hint(http: httpx.Client, scene
     problem(http.post("/v1/jobs", json={"dataset_id": dataset}), 409, "dataset_not_ready")
 
 
+def test_a_bad_photo_among_good_ones_is_left_out_and_named(http: httpx.Client, scene: Path) -> None:
+    dataset = new_dataset(http)
+    assert upload(http, dataset, zip_of({**scene_files(scene), "train/r_2.png": b"hello"})).status_code == 200
+    found = http.post(f"/v1/datasets/{dataset}/finalize").json()
+    assert (found["state"], found["report"]["images"]) == ("ready", 5)
+    assert any("r_2" in warning for warning in found["report"]["warnings"])
+
+
 def test_the_same_bad_scene_in_one_request_is_the_same_problem(http: httpx.Client, scene: Path) -> None:
-    files = scene_files(scene)
+    files = three_frames(scene_files(scene))
     files["train/r_2.png"] = b"hello"
     before = dataset_ids(http)
     body = problem(http.post("/v1/jobs", files={"archive": zip_of(files)}), 422, "not_an_image")
@@ -217,7 +234,8 @@ def test_the_same_bad_scene_in_one_request_is_the_same_problem(http: httpx.Clien
 def test_another_datasets_files_cannot_be_named(http: httpx.Client, service: Running, scene: Path) -> None:
     ready_dataset(http, scene)
     victim = next((service.data_dir / "files" / "datasets").rglob("r_2.png"))
-    files = scene_files(scene)
+    files = three_frames(scene_files(scene))
+    files.pop("train/r_2.png")
     with_frame(file_path=str(victim))(files)
     dataset = new_dataset(http)
     upload(http, dataset, zip_of(files))

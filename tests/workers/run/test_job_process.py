@@ -132,7 +132,8 @@ def test_the_check_names_the_broken_image(tmp_path: Path, scene: Path):
     good = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     assert good.returncode == 0
     assert json.loads(good.stdout)["report"]["images"] == 6
-    (folder / "train" / "r_2.png").write_bytes(b"no image")
+    for number in range(2, 6):
+        (folder / "train" / f"r_{number}.png").write_bytes(b"no image")
     bad = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     assert bad.returncode == 2
     error = json.loads(bad.stdout)["error"]
