@@ -1,4 +1,4 @@
-"""Values that services fall over: of the findings, and made like them."""
+"""Values that services fall over, in bodies, paths and headers."""
 
 from __future__ import annotations
 
