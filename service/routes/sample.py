@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import shutil
 import signal
 import sys
@@ -16,8 +17,9 @@ from biresnerf.errors import BiresnerfError
 from service.http.access import ReadCaller
 from workers.process.die_with_parent import dying_with_parent
 
+logger = logging.getLogger(__name__)
 router = APIRouter(tags=["service"])
-# Made in 4 s of one core, refined by the preset `fast` in about a minute of two.
+# Small, so that it is made and refined while one waits.
 SAMPLE = ("--kind", "phone", "--views", "24", "--size", "96", "--seed", "1")
 _making = asyncio.Lock()
 
@@ -59,7 +61,8 @@ async def _make(path: Path) -> None:
         )
         _, said = await child.communicate()
         if child.returncode != 0:
-            raise BiresnerfError(f"The sample could not be made: {said.decode(errors='replace')[-500:]}")
+            logger.error("the sample could not be made: %s", said.decode(errors="replace")[-2000:])
+            raise BiresnerfError("The sample could not be made.")  # clients read no paths of the server
         archive = await asyncio.to_thread(shutil.make_archive, str(folder / "set"), "zip", folder / "set")
         Path(archive).replace(path)
     finally:
