@@ -15,12 +15,12 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.field.cpu.compile_kernels import compile_field_kernels
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.refine.adjustment.adjustment import adjust_poses, misfit
-from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PatchPhotos, PosePrior
-from biresnerf.refine.adjustment.patch_points import Surfaces, find_patches
-from biresnerf.refine.kernels.draw_pixels import draw_pixels
-from biresnerf.refine.optimise.cast_rays import cast_rays
-from biresnerf.refine.parameters.pose_parameters import PoseParameters
+from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
+from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PatchPhotos, PosePrior
+from biresnerf.refinement.adjustment.patch_points import Surfaces, find_patches
+from biresnerf.refinement.kernels.draw_pixels import draw_pixels
+from biresnerf.refinement.optimise.cast_rays import cast_rays
+from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
 logger = logging.getLogger(__name__)
 SLOW_S = 3.0  # loading from the cache takes a fraction of this

@@ -21,21 +21,21 @@ from biresnerf.field.backends import resolve_here, use_threads
 from biresnerf.forecast import Forecast, remember_rates, remembered_rates
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import Monitor, OnProgress, Progress
-from biresnerf.refine.finish.rounds import run_stage_2
-from biresnerf.refine.finish.time_budget import keep_to_budget
-from biresnerf.refine.finish.work_ahead import expect_rest, expect_run
-from biresnerf.refine.parameters.rigid_bodies import rigid_bodies
-from biresnerf.refine.scene.scene import Scene
-from biresnerf.refine.stages.checkpoint import SEEDING, TRACKS, Checkpoint, RunOrigin
-from biresnerf.refine.stages.observer import Observer
-from biresnerf.refine.stages.two_stages import TwoStages
-from biresnerf.refine.start.choose_start import find_start
-from biresnerf.refine.start.first_step import first_step, stage_lengths
-from biresnerf.refine.verdict.evaluate import Evaluation, evaluate
-from biresnerf.refine.verdict.judgement import judge
-from biresnerf.refine.verdict.pose_uncertainty import pose_uncertainty
-from biresnerf.refine.verdict.run_report import run_report
-from biresnerf.refine.views.held_out_views import held_out_views
+from biresnerf.refinement.finish.rounds import run_stage_2
+from biresnerf.refinement.finish.time_budget import keep_to_budget
+from biresnerf.refinement.finish.work_ahead import expect_rest, expect_run
+from biresnerf.refinement.parameters.rigid_bodies import rigid_bodies
+from biresnerf.refinement.scene.scene import Scene
+from biresnerf.refinement.stages.checkpoint import SEEDING, TRACKS, Checkpoint, RunOrigin
+from biresnerf.refinement.stages.observer import Observer
+from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.start.choose_start import find_start
+from biresnerf.refinement.start.first_step import first_step, stage_lengths
+from biresnerf.refinement.verdict.evaluate import Evaluation, evaluate
+from biresnerf.refinement.verdict.judgement import judge
+from biresnerf.refinement.verdict.pose_uncertainty import pose_uncertainty
+from biresnerf.refinement.verdict.run_report import run_report
+from biresnerf.refinement.views.held_out_views import held_out_views
 from biresnerf.report import Report
 from biresnerf.resume import earlier_work, refuse_other_run, reusable_seeding, run_origin
 from biresnerf.write.output_folder import OutputFolder

@@ -12,7 +12,7 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import InputError
 from biresnerf.options.refine_options import RESULT_OPTIONS, STAGE_1_OPTIONS, ResolvedOptions
-from biresnerf.refine.stages.checkpoint import (
+from biresnerf.refinement.stages.checkpoint import (
     COARSE,
     OTHER_FOLDER,
     SEEDING,

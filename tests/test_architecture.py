@@ -51,7 +51,7 @@ def test_contracts_hold():
 VIOLATIONS = [
     ("biresnerf/geometry/focus.py", "import workers.records", "service -> workers -> biresnerf"),
     ("workers/records.py", "import service.app", "service -> workers -> biresnerf"),
-    ("biresnerf/geometry/focus.py", "import biresnerf.refine.verdict.verdict", "inside the library"),
+    ("biresnerf/geometry/focus.py", "import biresnerf.refinement.verdict.verdict", "inside the library"),
     ("biresnerf/data/model/dataset.py", "import biresnerf.field.backends", "inside the library"),
     (
         "biresnerf/data/model/dataset.py",
@@ -69,18 +69,18 @@ VIOLATIONS = [
         "inside the formats",
     ),
     (
-        "biresnerf/refine/scene/scene_frame.py",
-        "import biresnerf.refine.optimise.schedule",
+        "biresnerf/refinement/scene/scene_frame.py",
+        "import biresnerf.refinement.optimise.schedule",
         "inside the optimiser",
     ),
     (
-        "biresnerf/refine/stages/stability.py",
-        "import biresnerf.refine.verdict.verdict",
+        "biresnerf/refinement/stages/stability.py",
+        "import biresnerf.refinement.verdict.verdict",
         "inside the optimiser",
     ),
     (
-        "biresnerf/refine/adjustment/evidence.py",
-        "import biresnerf.refine.scene.scene",
+        "biresnerf/refinement/adjustment/evidence.py",
+        "import biresnerf.refinement.scene.scene",
         "inside the optimiser",
     ),
     ("workers/store/files.py", "import workers.jobs.jobs", "inside the job engine"),

@@ -7,12 +7,12 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from biresnerf.compile_kernels import compile_kernels
-from biresnerf.refine.adjustment.adjustment import adjust_poses, misfit
-from biresnerf.refine.adjustment.evidence import Evidence, NoiseLevels, PosePrior
-from biresnerf.refine.adjustment.kernels import patches, tracks
-from biresnerf.refine.adjustment.lens.lenses import Lenses
-from tests.refine.adjustment.rig import disturbed, observed
-from tests.refine.adjustment.test_patch_adjustment import Plane
+from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
+from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refinement.adjustment.kernels import patches, tracks
+from biresnerf.refinement.adjustment.lens.lenses import Lenses
+from tests.refinement.adjustment.rig import disturbed, observed
+from tests.refinement.adjustment.test_patch_adjustment import Plane
 
 pytestmark = pytest.mark.slow
 

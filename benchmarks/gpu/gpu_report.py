@@ -20,7 +20,7 @@ PYTHON = (sys.executable, "-m")
 def commands(work: Path) -> list[tuple[str, ...]]:
     """What is run, in this order."""
     scene, biresnerf = work / "scene", (str(Path(sys.executable).parent / "biresnerf"),)
-    gpu_tests = ("tests/field/cuda", "tests/field/test_device_occupancy.py", "tests/refine/optimise")
+    gpu_tests = ("tests/field/cuda", "tests/field/test_device_occupancy.py", "tests/refinement/optimise")
     return [
         ("nvidia-smi",),
         (*biresnerf, "doctor"),

@@ -25,7 +25,7 @@ from benchmarks.speed import scene
 from biresnerf.field.occupancy import DeviceOccupancyGrid
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
 from biresnerf.geometry.camera.camera import Intrinsics
-from biresnerf.refine.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
+from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
 
 GPU = torch.device("meta")
 LIBRARY = str(Path(biresnerf.__file__).parent)

@@ -24,8 +24,8 @@ from biresnerf.data.photos.images import load_images
 from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.options.refine_options import parse_options
-from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refine.scene.scene_frame import scene_frame
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.studies.baselines.methods import BARF_HIDDEN, BARF_SAMPLES
 from biresnerf.studies.baselines.mlp_field import LAYERS, POSITION_BANDS, SKIP, VIEW_BANDS, MlpField
 

@@ -32,9 +32,9 @@ from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
-from biresnerf.refine.adjustment.adjustment import adjust_poses
-from biresnerf.refine.adjustment.evidence import PosePrior
-from biresnerf.refine.finish.candidates import PRIOR
+from biresnerf.refinement.adjustment.adjustment import adjust_poses
+from biresnerf.refinement.adjustment.evidence import PosePrior
+from biresnerf.refinement.finish.candidates import PRIOR
 from biresnerf.studies.scenes import with_poses
 
 Array = NDArray[np.float64]

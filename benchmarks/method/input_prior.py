@@ -29,11 +29,11 @@ from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
-from biresnerf.refine.adjustment.adjustment import adjust_poses
-from biresnerf.refine.adjustment.evidence import PosePrior
-from biresnerf.refine.finish import given_poses as room
-from biresnerf.refine.finish.candidates import PRIOR
-from biresnerf.refine.finish.gather_evidence import MOST_OBSERVATIONS
+from biresnerf.refinement.adjustment.adjustment import adjust_poses
+from biresnerf.refinement.adjustment.evidence import PosePrior
+from biresnerf.refinement.finish import given_poses as room
+from biresnerf.refinement.finish.candidates import PRIOR
+from biresnerf.refinement.finish.gather_evidence import MOST_OBSERVATIONS
 
 Array = NDArray[np.float64]
 

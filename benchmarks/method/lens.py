@@ -25,11 +25,11 @@ from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
-from biresnerf.refine.adjustment.adjustment import adjust_poses
-from biresnerf.refine.adjustment.evidence import PosePrior
-from biresnerf.refine.adjustment.lens.corrected_camera import corrected_camera
-from biresnerf.refine.finish.candidates import PRIOR
-from biresnerf.refine.finish.lens_evidence import lenses_before
+from biresnerf.refinement.adjustment.adjustment import adjust_poses
+from biresnerf.refinement.adjustment.evidence import PosePrior
+from biresnerf.refinement.adjustment.lens.corrected_camera import corrected_camera
+from biresnerf.refinement.finish.candidates import PRIOR
+from biresnerf.refinement.finish.lens_evidence import lenses_before
 
 DISTURBED = 0.01  # rad, and shares of the cameras' distance
 

@@ -23,8 +23,8 @@ from biresnerf.data.formats.read_dataset import read_poses
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.options.refine_options import parse_options
 from biresnerf.pipeline import refine_poses
-from biresnerf.refine.optimise import methods
-from biresnerf.refine.optimise.methods import Loss, half_squared_error
+from biresnerf.refinement.optimise import methods
+from biresnerf.refinement.optimise.methods import Loss, half_squared_error
 from biresnerf.studies.cell import Perturbation, Scene
 from biresnerf.studies.scenes import find_scene, read_scene, starting_rig, with_poses
 

@@ -21,9 +21,9 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
-from biresnerf.refine.adjustment.adjustment import adjust_poses
-from biresnerf.refine.adjustment.evidence import Evidence, PosePrior
-from biresnerf.refine.finish.candidates import PRIOR
+from biresnerf.refinement.adjustment.adjustment import adjust_poses
+from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
+from biresnerf.refinement.finish.candidates import PRIOR
 from biresnerf.studies.run_cell import peak_memory_bytes
 
 Array = NDArray[np.float64]

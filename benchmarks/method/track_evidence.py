@@ -5,9 +5,9 @@ from __future__ import annotations
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
-from biresnerf.refine.adjustment.evidence import Evidence
-from biresnerf.refine.adjustment.ideal import ideal_cameras, straight_tracks
-from biresnerf.refine.finish.gather_evidence import MOST_OBSERVATIONS
+from biresnerf.refinement.adjustment.evidence import Evidence
+from biresnerf.refinement.adjustment.ideal import ideal_cameras, straight_tracks
+from biresnerf.refinement.finish.gather_evidence import MOST_OBSERVATIONS
 
 
 def fitted_tracks(dataset: Dataset, tracks: Tracks | None, most: int = MOST_OBSERVATIONS) -> Evidence:

@@ -24,10 +24,10 @@ from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
-from biresnerf.refine.adjustment.adjustment import adjust_poses
-from biresnerf.refine.adjustment.evidence import PosePrior
-from biresnerf.refine.finish.candidates import PRIOR
-from biresnerf.refine.finish.expected_errors import expected_errors
+from biresnerf.refinement.adjustment.adjustment import adjust_poses
+from biresnerf.refinement.adjustment.evidence import PosePrior
+from biresnerf.refinement.finish.candidates import PRIOR
+from biresnerf.refinement.finish.expected_errors import expected_errors
 
 Array = NDArray[np.float64]
 

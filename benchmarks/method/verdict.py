@@ -21,9 +21,9 @@ from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.refine.views.compare_rigs import Rig, compare_on_unseen_views
-from biresnerf.refine.views.held_out_views import held_out_views
-from biresnerf.refine.views.motion import moved_px
+from biresnerf.refinement.views.compare_rigs import Rig, compare_on_unseen_views
+from biresnerf.refinement.views.held_out_views import held_out_views
+from biresnerf.refinement.views.motion import moved_px
 
 
 def poses_of(text: str, dataset: Dataset) -> np.ndarray:

@@ -19,10 +19,10 @@ from biresnerf.field.backends import resolve_here, use_threads
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.options.refine_options import parse_options
-from biresnerf.refine.adjustment.paired import paired
-from biresnerf.refine.views.compare_rigs import PSNR_MATTERS, SSIM_MATTERS
-from biresnerf.refine.views.held_out_views import held_out_views, unseen_rounds
-from biresnerf.refine.views.pose_trials import PoseTrials
+from biresnerf.refinement.adjustment.paired import paired
+from biresnerf.refinement.views.compare_rigs import PSNR_MATTERS, SSIM_MATTERS
+from biresnerf.refinement.views.held_out_views import held_out_views, unseen_rounds
+from biresnerf.refinement.views.pose_trials import PoseTrials
 from biresnerf.report import PairedDifference
 
 SHARES = (0.125, 0.25, 0.5, 1.0)

@@ -11,8 +11,8 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.synthetic.scene import render_synthetic, synthetic_cameras, synthetic_focal
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.refine.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
-from biresnerf.refine.scene.scene_frame import scene_frame
+from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
+from biresnerf.refinement.scene.scene_frame import scene_frame
 
 CPU = torch.device("cpu")
 VIEWS, SEED = 25, 1  # that differ; of more photos, some are the same

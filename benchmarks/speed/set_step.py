@@ -23,8 +23,8 @@ from biresnerf.compile_kernels import compile_kernels
 from biresnerf.data.photos.images import load_images
 from biresnerf.field.backends import use_threads
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.refine.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
-from biresnerf.refine.scene.scene_frame import scene_frame
+from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
+from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.studies.scenes import find_scene, read_scene
 
 CPU = torch.device("cpu")

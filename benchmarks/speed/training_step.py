@@ -14,10 +14,10 @@ from benchmarks.speed.clock import Clock, interleave, peak_memory, ratio, summar
 from benchmarks.speed.torch_forms import UnrolledField, VectorisedField
 from biresnerf.field.cpu import field as cpu_field
 from biresnerf.field.reference.field import ReferenceField
-from biresnerf.refine.optimise import joint_optimiser
-from biresnerf.refine.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
-from biresnerf.refine.optimise.photo_sampler import PhotoSampler
-from biresnerf.refine.parameters.pose_parameters import PoseParameters
+from biresnerf.refinement.optimise import joint_optimiser
+from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
+from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
+from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
 FORWARD, BACKWARD = "networks forward, composite", "composite and networks back, position gradient"
 OPERATIONS = [

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from biresnerf.data.synthetic.true_depth import is_made, true_distance
 from biresnerf.geometry.similarity import align_robust
-from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refine.scene.scene import Scene
-from biresnerf.refine.views.evaluation import render_view
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.scene.scene import Scene
+from biresnerf.refinement.views.evaluation import render_view
 
 
 def depth_error(optimiser: JointOptimiser, scene: Scene, truth: NDArray[np.float64]) -> float | None:

@@ -18,10 +18,10 @@ from biresnerf.data.photos.images import load_images
 from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.similarity import align_robust
-from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refine.parameters.pose_parameters import PoseParameters
-from biresnerf.refine.views.evaluation import FIT_RATE, FIT_STEPS, fit_rays, render_view
-from biresnerf.refine.views.floaters import unshared_opacity
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.parameters.pose_parameters import PoseParameters
+from biresnerf.refinement.views.evaluation import FIT_RATE, FIT_STEPS, fit_rays, render_view
+from biresnerf.refinement.views.floaters import unshared_opacity
 
 # torchvision's name of the file. The package would download it, which a measurement must not do.
 VGG_WEIGHTS = "vgg16-397923af.pth"

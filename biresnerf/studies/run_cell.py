@@ -23,11 +23,11 @@ from biresnerf.errors import Interrupted
 from biresnerf.geometry.pose_error import PoseError, camera_errors, pose_error
 from biresnerf.geometry.similarity import align_by_spread, align_robust
 from biresnerf.pipeline import refine_poses
-from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refine.stages.checkpoint import CHECKPOINT
-from biresnerf.refine.stages.observer import Observer
-from biresnerf.refine.stages.two_stages import TwoStages
-from biresnerf.refine.views.image_metrics import psnr, ssim
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.stages.checkpoint import CHECKPOINT
+from biresnerf.refinement.stages.observer import Observer
+from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.views.image_metrics import psnr, ssim
 from biresnerf.report import Report
 from biresnerf.studies.cell import (
     CELL,

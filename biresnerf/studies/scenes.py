@@ -14,7 +14,7 @@ from biresnerf.data.formats.transforms.read_transforms import read_transforms
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.named_images import refuse_too_few
 from biresnerf.errors import InputError
-from biresnerf.refine.views.held_out_views import evenly_spread
+from biresnerf.refinement.views.held_out_views import evenly_spread
 from biresnerf.studies.cell import Perturbation, Scene
 
 TRAIN_NAME, TEST_NAME = "transforms_train.json", "transforms_test.json"

@@ -11,7 +11,7 @@ from biresnerf.data.show.history import HISTORY
 from biresnerf.data.show.view_file import CONTACT_SHEET, THUMBNAIL, VIEW
 from biresnerf.errors import InputError
 from biresnerf.options.formats import formats
-from biresnerf.refine.stages.checkpoint import CHECKPOINT, OTHER_FOLDER
+from biresnerf.refinement.stages.checkpoint import CHECKPOINT, OTHER_FOLDER
 from biresnerf.viewer.report_html import REPORT_HTML
 
 REPORT, PREVIEW, CONFIG = "report.json", "preview", "config.json"

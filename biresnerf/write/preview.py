@@ -17,10 +17,10 @@ from biresnerf.data.show.view_file import THUMBNAIL
 from biresnerf.data.show.view_pictures import write_thumbnail
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.progress import Monitor, Progress
-from biresnerf.refine.stages.two_stages import TwoStages
-from biresnerf.refine.start.first_step import poses_in_input_frame
-from biresnerf.refine.verdict.run_report import run_report
-from biresnerf.refine.views.evaluation import render_view
+from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.start.first_step import poses_in_input_frame
+from biresnerf.refinement.verdict.run_report import run_report
+from biresnerf.refinement.views.evaluation import render_view
 from biresnerf.write.output_folder import PREVIEW, REPORT, OutputFolder
 from biresnerf.write.result import described, write_rendered
 

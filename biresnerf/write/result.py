@@ -22,13 +22,13 @@ from biresnerf.data.show.view_file import THUMBNAIL, ShownPictures, ShownView, V
 from biresnerf.data.show.view_pictures import write_contact_sheet, write_points, write_thumbnail
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.progress import Monitor, Progress
-from biresnerf.refine.scene.scene import Scene
-from biresnerf.refine.stages.two_stages import TwoStages
-from biresnerf.refine.start.first_step import poses_in_input_frame
-from biresnerf.refine.verdict.evaluate import Evaluation
-from biresnerf.refine.views.compare_rigs import BeforeAfter
-from biresnerf.refine.views.evaluation import RenderedView, ViewScore
-from biresnerf.refine.views.shown_views import Points
+from biresnerf.refinement.scene.scene import Scene
+from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.start.first_step import poses_in_input_frame
+from biresnerf.refinement.verdict.evaluate import Evaluation
+from biresnerf.refinement.views.compare_rigs import BeforeAfter
+from biresnerf.refinement.views.evaluation import RenderedView, ViewScore
+from biresnerf.refinement.views.shown_views import Points
 from biresnerf.report import PointsReport, Report
 from biresnerf.viewer.report_html import write_report_html
 from biresnerf.write.output_folder import CONFIG, ORBIT, RENDERS, REPORT, OutputFolder

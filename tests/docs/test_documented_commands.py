@@ -33,7 +33,7 @@ NOT_RUN = {
     "biresnerf study": "takes hours; tests/studies/commands/test_compare.py runs a small one",
     "biresnerf up": "the service that all other commands here ask is it, on a free port",
     "biresnerf restore": "wants an empty installation; tests/workers/upkeep/test_backup.py restores one",
-    "biresnerf refine fern_without_poses": "photos from nearly one place, as tests/refine/start has some",
+    "biresnerf refine fern_without_poses": "photos from nearly one place, as tests/refinement/start has some",
     "ns-train ": "nerfstudio is not installed",
     "cp OUT/points.ply ": "after so few steps nothing in the field is solid, so there are no points",
     "./instant-ngp ": "instant-ngp is not installed",

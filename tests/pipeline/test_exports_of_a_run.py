@@ -18,7 +18,7 @@ from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.pipeline import refine_poses
 from tests.data.points.test_refined_points import seen_model
-from tests.refine.tiny_scene import tiny_run
+from tests.refinement.tiny_scene import tiny_run
 
 pytestmark = pytest.mark.slow
 

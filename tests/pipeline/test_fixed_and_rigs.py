@@ -25,7 +25,7 @@ from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.pipeline import refine_poses
-from tests.refine.tiny_scene import tiny_run
+from tests.refinement.tiny_scene import tiny_run
 
 pytestmark = pytest.mark.slow
 

@@ -26,7 +26,7 @@ from biresnerf.options.formats import formats
 from biresnerf.pipeline import refine_poses
 from tests.data.formats.readers import glb_parts
 from tests.pipeline.hostile_sets import EXTREMES, FORMATS, SCALES, change, plain_set
-from tests.refine.tiny_scene import tiny_run
+from tests.refinement.tiny_scene import tiny_run
 
 EXPORTS = tuple(name for name, one in formats().items() if one.on_request)
 # The shortest run there is, all formats, and no verdict, which would take most of the time.

@@ -10,10 +10,10 @@ import pytest
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import InputError
-from biresnerf.refine.stages.checkpoint import COARSE, SEEDING, TRACKS, RunOrigin, save_checkpoint
+from biresnerf.refinement.stages.checkpoint import COARSE, SEEDING, TRACKS, RunOrigin, save_checkpoint
 from biresnerf.resume import earlier_work, refuse_other_run, reusable_seeding, run_origin
-from tests.refine.stages.test_checkpoint import checkpoint
-from tests.refine.tiny_scene import tiny_options, tiny_set
+from tests.refinement.stages.test_checkpoint import checkpoint
+from tests.refinement.tiny_scene import tiny_options, tiny_set
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from biresnerf.errors import Interrupted
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
 from biresnerf.report import Report
-from tests.refine.tiny_scene import tiny_run
+from tests.refinement.tiny_scene import tiny_run
 
 pytestmark = pytest.mark.slow
 

@@ -12,8 +12,8 @@ from biresnerf.data.synthetic.scene import SHAPES, write_synthetic_scene
 from biresnerf.data.synthetic.true_depth import is_made, true_distance
 from biresnerf.studies.depth_error import depth_error
 from tests.data.synthetic.test_scene import signed_distance
-from tests.refine.analytic_field import AnalyticField
-from tests.refine.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
+from tests.refinement.analytic_field import AnalyticField
+from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
 
 SIZE = 32
 

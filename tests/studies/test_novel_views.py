@@ -8,13 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import Similarity
-from biresnerf.refine.views import evaluation
-from biresnerf.refine.views.evaluation import render_view
-from biresnerf.refine.views.image_metrics import psnr
+from biresnerf.refinement.views import evaluation
+from biresnerf.refinement.views.evaluation import render_view
+from biresnerf.refinement.views.image_metrics import psnr
 from biresnerf.studies import novel_views
 from biresnerf.studies.novel_views import render_test_views
 from biresnerf.studies.scenes import with_poses
-from tests.refine.tiny_scene import tiny_optimiser, tiny_options, tiny_set
+from tests.refinement.tiny_scene import tiny_optimiser, tiny_options, tiny_set
 
 TRUE_FROM_UNIT = Similarity(
     7.0, Rotation.from_euler("xyz", [20, 50, -30], degrees=True).as_matrix(), np.array([5.0, 6, 7])

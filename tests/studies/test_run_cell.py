@@ -8,13 +8,13 @@ import pytest
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.perturb import perturb_poses
-from biresnerf.refine.stages.checkpoint import CHECKPOINT
+from biresnerf.refinement.stages.checkpoint import CHECKPOINT
 from biresnerf.report import Report
 from biresnerf.studies.cell import CELL, RUN, Cell, Perturbation
 from biresnerf.studies.run_cell import matched_error, run_cell
 from biresnerf.studies.scenes import find_scene
 from tests.geometry.rigs import dome
-from tests.refine.tiny_scene import tiny_run
+from tests.refinement.tiny_scene import tiny_run
 
 pytestmark = pytest.mark.slow
 

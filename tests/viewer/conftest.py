@@ -18,7 +18,7 @@ from biresnerf.data.synthetic.scene import synthetic_cameras, write_synthetic_sc
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
-from biresnerf.refine.verdict import evaluate
+from biresnerf.refinement.verdict import evaluate
 from biresnerf.report import Report
 from biresnerf.viewer.report_html import BUNDLE
 

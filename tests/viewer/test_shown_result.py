@@ -12,7 +12,7 @@ from biresnerf.data.show.view_file import read_view_file
 from biresnerf.data.synthetic.scene import synthetic_cameras
 from biresnerf.errors import Interrupted
 from biresnerf.pipeline import refine_poses
-from biresnerf.refine.views.shown_views import spread_views
+from biresnerf.refinement.views.shown_views import spread_views
 from biresnerf.viewer import report_html
 from biresnerf.viewer.report_html import read_report, write_report_html
 from tests.viewer.conftest import BUILT, OPTIONS, SHOWN

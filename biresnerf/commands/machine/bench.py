@@ -65,8 +65,8 @@ def measured(options: RefineOptions, folder: Path, steps: int, views: int, size:
     from biresnerf.data.synthetic.scene import write_synthetic_scene
     from biresnerf.field.backends import resolve_here, use_threads
     from biresnerf.geometry.perturb import perturb_poses
-    from biresnerf.refine.optimise.joint_optimiser import JointOptimiser
-    from biresnerf.refine.scene.scene_frame import scene_frame
+    from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+    from biresnerf.refinement.scene.scene_frame import scene_frame
 
     resolved, device = resolve_here(options)
     threads = use_threads(options.threads)

@@ -104,7 +104,7 @@ def expected_seconds(dataset: Dataset, asked: RefineOptions) -> dict[PresetName,
     from biresnerf.cores import usable_cores
     from biresnerf.field.backends import resolve_here
     from biresnerf.forecast import Forecast, remembered_rates
-    from biresnerf.refine.finish.work_ahead import expect_run
+    from biresnerf.refinement.finish.work_ahead import expect_run
 
     found: dict[PresetName, float] = {}
     for preset in PRESETS:

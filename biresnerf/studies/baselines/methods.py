@@ -12,7 +12,7 @@ from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldRates, FieldShape, PositionGradient, RadianceField
 from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.refine.optimise.methods import (
+from biresnerf.refinement.optimise.methods import (
     BuildField,
     Method,
     half_squared_error,
@@ -20,8 +20,14 @@ from biresnerf.refine.optimise.methods import (
     squared_error,
     two_grids,
 )
-from biresnerf.refine.optimise.schedule import EMPTY_LOOKED_AT, NEAR_SHARES, POSE_DIP, Schedule, smooth_ramp
-from biresnerf.refine.scene.scene_frame import SceneFrame
+from biresnerf.refinement.optimise.schedule import (
+    EMPTY_LOOKED_AT,
+    NEAR_SHARES,
+    POSE_DIP,
+    Schedule,
+    smooth_ramp,
+)
+from biresnerf.refinement.scene.scene_frame import SceneFrame
 from biresnerf.studies.baselines.mlp_field import MlpField
 
 # Steps that update all cells of the occupancy grid, as shares: 256 of BAA-NGP's 40 000, of NerfAcc-BARF's 200 000.

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from biresnerf.data.synthetic.scene import write_synthetic_scene
-from biresnerf.refine.stages.checkpoint import CHECKPOINT, load_checkpoint
+from biresnerf.refinement.stages.checkpoint import CHECKPOINT, load_checkpoint
 from biresnerf.report import Report
 
 pytestmark = pytest.mark.slow

@@ -28,7 +28,7 @@ from biresnerf.geometry.similarity import Similarity
 from biresnerf.geometry.triangulation import parallax_deg, triangulate
 from tests.data.formats.random_sets import random_camera, random_poses
 from tests.data.test_real_sets import ROOT
-from tests.refine.tiny_scene import photos_set
+from tests.refinement.tiny_scene import photos_set
 
 
 def seen_model(

@@ -6,10 +6,10 @@ import json
 
 from biresnerf.data.show.history import HISTORY, History, read_history
 from biresnerf.progress import Monitor
-from biresnerf.refine.stages.checkpoint import load_checkpoint
-from biresnerf.refine.stages.observer import Observer
-from biresnerf.refine.stages.two_stages import TwoStages
-from tests.refine.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
+from biresnerf.refinement.stages.checkpoint import load_checkpoint
+from biresnerf.refinement.stages.observer import Observer
+from biresnerf.refinement.stages.two_stages import TwoStages
+from tests.refinement.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 
 def test_each_check_leaves_a_line_and_a_continued_run_has_them_once(tmp_path):

@@ -15,7 +15,7 @@ from biresnerf.field.cuda import device_check
 from biresnerf.field.cuda.field import CudaField
 from biresnerf.field.reference.field import ReferenceField
 from biresnerf.geometry.camera.camera import directions_in_cam
-from biresnerf.refine.verdict import run_report
+from biresnerf.refinement.verdict import run_report
 from tests.field.cuda.fields import DEVICE, HAS_GPU, SHAPES
 
 pytestmark = pytest.mark.slow

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.refine.optimise.methods import find_method
-from biresnerf.refine.optimise.schedule import Schedule
-from biresnerf.refine.parameters.pose_parameters import PoseParameters
+from biresnerf.refinement.optimise.methods import find_method
+from biresnerf.refinement.optimise.schedule import Schedule
+from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
 pytestmark = pytest.mark.slow
 

@@ -1,0 +1,120 @@
+"""The choice between sets of poses, by evidence that none of them was fitted to."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.refinement.adjustment.lens.lenses import Lenses
+from biresnerf.refinement.adjustment.paired import student_quantile
+from biresnerf.report import CandidateName, CandidateReport
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+# Cameras that a kind of evidence must know with both sets of poses, else it says nothing of them.
+LEAST_JUDGED = 3
+_LEAST = 1e-6  # of a misfit, in squared noise levels: nothing fits better than that
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Poses that a result could hold.
+
+    Attributes:
+        world_from_cam: [n, 4, 4], in the frame and scale of the others.
+        lenses: None: as the evidence has them.
+    """
+
+    name: CandidateName
+    world_from_cam: Array
+    lenses: Lenses | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The candidate chosen, and how all of them did."""
+
+    chosen: Candidate
+    reports: tuple[CandidateReport, ...]
+
+
+def choose(
+    candidates: Sequence[Candidate],
+    misfits: Mapping[str, Array],
+    alike: Mapping[str, NDArray[np.bool_]] | None = None,
+    first: int = 0,
+) -> Choice:
+    """The candidate that evidence left out speaks for.
+
+    A candidate is beaten by one that fits some kind of evidence better and none worse, beyond chance over cameras. The
+    first is kept unless something beats it: then the first one that beats it, and that nothing beats, is taken.
+
+    Args:
+        candidates: in the order in which they are kept on a tie.
+        misfits: of each kind of evidence (``tracks``, ``patches``), [candidates, n]: each camera's mean robust square
+            in noise levels; NaN where it does not know the camera.
+        alike: bool [candidates] by kind: candidates that such evidence does not tell from each other, whatever it fits.
+        first: index of the candidate that is kept on a tie.
+    """
+    reports = tuple(
+        CandidateReport(
+            name=candidate.name,
+            track_misfit=_median(misfits.get("tracks"), i),
+            patch_misfit=_median(misfits.get("patches"), i),
+        )
+        for i, candidate in enumerate(candidates)
+    )
+    count = range(len(candidates))
+    beats = np.array([[_beats(misfits, alike or {}, i, j) for j in count] for i in count])
+    better = np.flatnonzero(beats[:, first] & ~beats.any(0))
+    best = int(better[0]) if len(better) else first
+    logger.info(
+        "poses: %s of %s", candidates[best].name,
+        ", ".join(f"{r.name} ({r.track_misfit}, {r.patch_misfit})" for r in reports),
+    )  # fmt: skip
+    reports = tuple(r.model_copy(update={"chosen": i == best}) for i, r in enumerate(reports))
+    return Choice(candidates[best], reports)
+
+
+def _beats(
+    misfits: Mapping[str, Array], alike: Mapping[str, NDArray[np.bool_]], one: int, other: int
+) -> bool:
+    """Whether a candidate fits some kind of evidence better than another one, and none worse."""
+    signs = [
+        0 if kind in alike and alike[kind][[one, other]].all() else _sign(_gains(misfit, one, other))
+        for kind, misfit in misfits.items()
+    ]
+    return 1 in signs and -1 not in signs
+
+
+def fits_better(one: Array, other: Array) -> bool:
+    """Whether misfits [n] are less than others beyond chance."""
+    return _sign(_gains(np.stack([one, other]), 0, 1)) > 0
+
+
+def _gains(misfit: Array, one: int, other: int) -> Array:
+    """log2 of how much less a candidate's errors are than another's, of each camera that is known with both."""
+    known = np.isfinite(misfit[one]) & np.isfinite(misfit[other])
+    ours, theirs = (np.maximum(misfit[i][known], _LEAST) for i in (one, other))
+    return np.asarray(np.log2(theirs / ours) / 2)
+
+
+def _sign(gains: Array) -> int:
+    """1 where they are positive beyond chance, -1 where they are negative: Student's interval at 95 %."""
+    if len(gains) < LEAST_JUDGED:
+        return 0
+    half = student_quantile(len(gains) - 1) * float(gains.std(ddof=1)) / len(gains) ** 0.5
+    mean = float(gains.mean())
+    return int(mean > half) - int(mean < -half)
+
+
+def _median(misfit: Array | None, candidate: int) -> float | None:
+    """Over cameras; None where none is known."""
+    known = np.zeros(0) if misfit is None else misfit[candidate][np.isfinite(misfit[candidate])]
+    return float(np.median(known)) if len(known) else None

@@ -1,0 +1,160 @@
+"""What cameras are adjusted to, and how well they are known before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.points.tracks import Tracks
+from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.rigid_bodies import RigidBodies
+from biresnerf.refinement.adjustment.lens.lenses import Lenses
+from biresnerf.refinement.adjustment.splines import blurred, spline_coefficients
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Small patches of photos on the surface that the field sees there, and the photos that should show them as well.
+
+    Attributes:
+        host: int64 [p], the photo that each patch was taken from.
+        rays: float64 [p, k, 3], of its pixels in the host camera's axes, z = 1.
+        inverse_depth: float64 [p, k], along z, in the inverse of the poses' unit; its scale is estimated anew.
+        point: int64 [m], ascending: the patch of each comparison.
+        target: int64 [m], the photo that it is compared with.
+        photos: the photos, see `PatchPhotos`.
+    """
+
+    host: NDArray[np.int64]
+    rays: Array
+    inverse_depth: Array
+    point: NDArray[np.int64]
+    target: NDArray[np.int64]
+    photos: PatchPhotos
+
+    def __len__(self) -> int:
+        return len(self.host)
+
+    def of(self, chosen: NDArray[np.bool_]) -> Patches:
+        """The chosen [p] patches alone."""
+        kept = chosen[self.point]
+        number = np.cumsum(chosen) - 1
+        return Patches(
+            self.host[chosen], self.rays[chosen], self.inverse_depth[chosen],
+            number[self.point[kept]], self.target[kept], self.photos,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class PatchPhotos:
+    """Photos of an ideal pinhole camera, row by row, one after the other.
+
+    Attributes:
+        values: float32 [total_px, channels], 0 to 1.
+        offsets: int64 [n + 1], where each begins.
+        widths, heights: int64 [n], px.
+    """
+
+    values: NDArray[np.float32]
+    offsets: NDArray[np.int64]
+    widths: NDArray[np.int64]
+    heights: NDArray[np.int64]
+    _smoothed: dict[float, tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=dict)
+
+    @classmethod
+    def stacked(cls, photos: list[NDArray[np.float32]]) -> PatchPhotos:
+        """From photos [h, w, channels], one by one."""
+        heights, widths = np.array([photo.shape[:2] for photo in photos], np.int64).T
+        offsets = np.concatenate(([0], np.cumsum(heights * widths))).astype(np.int64)
+        return cls(np.concatenate([p.reshape(-1, p.shape[2]) for p in photos]), offsets, widths, heights)
+
+    def smoothed(self, blur_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """All photos blurred, and the coefficients of the cubic B-splines through them; computed once."""
+        if blur_px not in self._smoothed:
+            smooth, coefficients = np.empty_like(self.values), np.empty_like(self.values)
+            for i in range(len(self.widths)):
+                rows, photo = slice(self.offsets[i], self.offsets[i + 1]), blurred(self.of(i), blur_px)
+                smooth[rows] = photo.reshape(-1, photo.shape[2])
+                coefficients[rows] = spline_coefficients(photo).reshape(-1, photo.shape[2])
+            self._smoothed[blur_px] = smooth, coefficients
+        return self._smoothed[blur_px]
+
+    def of(self, image: int) -> NDArray[np.float32]:
+        """One photo [h, w, channels], a view."""
+        rows = self.values[self.offsets[image] : self.offsets[image + 1]]
+        return rows.reshape(int(self.heights[image]), int(self.widths[image]), -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the poses are adjusted to.
+
+    Attributes:
+        intrinsics: of all images at full size, without distortion but for fisheyes:
+            `biresnerf.refinement.adjustment.ideal` makes them.
+        tracks: None where there are none.
+        patches: None where there are none.
+        lenses: how the lenses differ from the intrinsics, and how well that is known; None: not at all.
+    """
+
+    intrinsics: Intrinsics
+    tracks: Tracks | None = None
+    patches: Patches | None = None
+    lenses: Lenses | None = None
+
+    def __post_init__(self) -> None:
+        if bool(self.intrinsics.distortion[~self.intrinsics.fisheye].any()):
+            raise ValueError("evidence is of ideal cameras: straighten photos and tracks first")
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """Poses that are known before, with the standard deviations of their errors.
+
+    Attributes:
+        world_from_cam: [n, 4, 4].
+        rotation: rad [n], of each component of the rotation vector. Infinite: not known. Zero: the camera is fixed.
+        position: [n], of each coordinate, in the poses' unit.
+        bodies: cameras that move as one, and cameras that are fixed as well; None where each moves independently.
+    """
+
+    world_from_cam: Array
+    rotation: Array
+    position: Array
+    bodies: RigidBodies | None = None
+
+    @classmethod
+    def equal(
+        cls, world_from_cam: Array, rotation: float, position: float, bodies: RigidBodies | None = None
+    ) -> PosePrior:
+        """All cameras known equally well."""
+        n = len(world_from_cam)
+        return cls(world_from_cam, np.full(n, rotation), np.full(n, position), bodies)
+
+    @property
+    def fixed(self) -> NDArray[np.bool_]:
+        """Cameras [n] that are known exactly, or move as one with such a camera."""
+        exact = (self.rotation <= 0) | (self.position <= 0)
+        if self.bodies is None:
+            return exact
+        return np.isin(self.bodies.of, self.bodies.of[exact | self.bodies.fixed])
+
+    @property
+    def fixed_bodies(self) -> RigidBodies | None:
+        """The bodies with all cameras fixed that cannot move."""
+        return None if self.bodies is None else RigidBodies(self.bodies.of, self.fixed)
+
+
+@dataclass(frozen=True)
+class NoiseLevels:
+    """How far residuals are from zero at poses without error.
+
+    Attributes:
+        track_px: standard deviation of either coordinate of an observation.
+    """
+
+    track_px: float = 1.0

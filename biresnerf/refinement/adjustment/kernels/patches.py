@@ -1,0 +1,280 @@
+"""Patches of photos compared with other photos: residuals, and the cameras' normal equations without the depths.
+
+The definitions are in `biresnerf.refinement.adjustment.reference`. Cameras and their increments are those of `tracks`.
+Photos are cubic B-splines: coefficients [total_px, channels], photo after photo, row by row, with `frames` [n, 3]:
+first row of the coefficients, width and height. A patch i has rays [k, 3] (z = 1) in its host's axes, and inverse
+depths [k] times its one unknown, the scale s[i]; its comparisons lie one after the other. Rays are those of the lens as
+it is, so that they turn with an increment of the host's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from biresnerf.refinement.adjustment.kernels.compiled import KERNEL
+from biresnerf.refinement.adjustment.kernels.photo_samples import sample
+
+SCAN, HALVINGS = 6, 5  # steps to either side of a scan, and how often the last one's length is halved
+UNSEEN = 1e9  # squared error of a comparison that leaves the photo
+
+
+@njit(**KERNEL)
+def compare(rotation, centre, lens, photos, values, host, target, rays, rho, s, floor, slope, jac, r, work):
+    """Mean square of one comparison in the noise expected of its pixels, and that noise's variance.
+
+    Args:
+        jac: [k, channels, 13 or 19], filled with derivatives by the host's increment, the target's and the scale; or
+            empty. Of 19, each increment ends with that of the lens.
+        r: [k, channels], filled with the residuals.
+        values: [k, channels], of the host photo.
+        floor, slope: standard deviation of a pixel, and what its gradient adds to it.
+    """
+    coefficients, frames = photos
+    out, wx, dx, wy, dy, a, v, q, g = work
+    channels = coefficients.shape[1]
+    k1, k2 = lens[target, 5], lens[target, 6]
+    squares, steep = 0.0, 0.0
+    for k in range(len(rho)):
+        depth = s * rho[k]
+        for x in range(3):
+            a[x] = (
+                rotation[host, x, 0] * rays[k, 0]
+                + rotation[host, x, 1] * rays[k, 1]
+                + rotation[host, x, 2] * rays[k, 2]
+            )
+            v[x] = a[x] + depth * (centre[host, x] - centre[target, x])
+        for x in range(3):
+            q[x] = (
+                rotation[target, 0, x] * v[0] + rotation[target, 1, x] * v[1] + rotation[target, 2, x] * v[2]
+            )
+        if not q[2] > 1e-3:
+            return UNSEEN, 1.0
+        z = 1.0 / q[2]
+        ux, uy = q[0] * z, q[1] * z
+        off = ux * ux + uy * uy
+        radial = 1 + off * (k1 + off * k2)
+        x, y = (
+            lens[target, 0] * radial * ux + lens[target, 2],
+            lens[target, 1] * radial * uy + lens[target, 3],
+        )
+        if not sample(coefficients, frames, target, x, y, out, wx, dx, wy, dy):
+            return UNSEEN, 1.0
+        for c in range(channels):
+            r[k, c] = out[c, 0] - values[k, c]
+            squares += r[k, c] * r[k, c]
+            steep += out[c, 1] * out[c, 1] + out[c, 2] * out[c, 2]
+            if len(jac) == 0:
+                continue
+            differentiate(
+                rotation, centre, lens, host, target, rays[k], rho[k], depth, a, v, z, ux, uy, radial,
+                out[c, 1] * lens[target, 0], out[c, 2] * lens[target, 1], g, jac[k, c],
+            )  # fmt: skip
+    count = len(rho) * channels
+    variance = floor * floor + slope * slope * steep / count
+    return squares / count / variance, variance
+
+
+@njit(inline="always", **KERNEL)
+def differentiate(
+    rotation, centre, lens, host, target, ray, rho, depth, a, v, z, ux, uy, radial, gx, gy, g, row
+):  # fmt: skip
+    """Fill row [13 or 19], see `compare`: derivatives of one channel of one pixel.
+
+    Args:
+        a, v: the pixel's direction from the host and from the target, in the world; g: room for three numbers.
+        z, ux, uy, radial: one over its depth in the target, its slopes there, and the lens's factor of them.
+        gx, gy: gradient of the target's colour in focal lengths.
+    """
+    width = len(row) // 2
+    off, along = ux * ux + uy * uy, gx * ux + gy * uy
+    bent = (2 * lens[target, 5] + 4 * off * lens[target, 6]) * along
+    gx, gy = (radial * gx + bent * ux) * z, (radial * gy + bent * uy) * z
+    gz = -(gx * ux + gy * uy)
+    row[2 * width] = 0
+    for x in range(3):
+        g[x] = rotation[target, x, 0] * gx + rotation[target, x, 1] * gy + rotation[target, x, 2] * gz
+        row[3 + x] = depth * g[x]
+        row[width + 3 + x] = -depth * g[x]
+        row[2 * width] += rho * (centre[host, x] - centre[target, x]) * g[x]
+    row[0], row[1], row[2] = a[1] * g[2] - a[2] * g[1], a[2] * g[0] - a[0] * g[2], a[0] * g[1] - a[1] * g[0]
+    row[width] = v[2] * g[1] - v[1] * g[2]
+    row[width + 1] = v[0] * g[2] - v[2] * g[0]
+    row[width + 2] = v[1] * g[0] - v[0] * g[1]
+    if width > 6:
+        row[width + 6], row[width + 7], row[width + 8] = radial * along, off * along, off * off * along
+        host_lens(rotation, lens, host, ray, a, g, row)
+
+
+@njit(inline="always", **KERNEL)
+def host_lens(rotation, lens, host, ray, a, g, row):
+    """Columns 6 to 8 of row: derivative by the host's lens, which changes the direction of its pixels."""
+    k1, k2 = lens[host, 5], lens[host, 6]
+    off = ray[0] * ray[0] + ray[1] * ray[1]
+    across = 0.0
+    for x in range(3):
+        across += g[x] * (a[x] - rotation[host, x, 2])
+    across /= 1 + off * (3 * k1 + 5 * off * k2)
+    row[6], row[7], row[8] = -across * (1 + off * (k1 + off * k2)), -across * off, -across * off * off
+
+
+@njit(**KERNEL)
+def work_space(channels):
+    """Room for `compare`."""
+    return (
+        np.empty((channels, 3)), np.empty(4), np.empty(4), np.empty(4), np.empty(4),
+        np.empty(3), np.empty(3), np.empty(3), np.empty(3),
+    )  # fmt: skip
+
+
+@njit(**KERNEL)
+def patch_errors(
+    rotation, centre, lens, photos, values, host, rays, rho, start, target, s, floor, slope, squared
+):
+    """Mean square [m] of each comparison."""
+    pixels, channels = values.shape[1], values.shape[2]
+    work, r, none = work_space(channels), np.empty((pixels, channels)), np.empty((0, channels, 13))
+    for i in range(len(host)):
+        for e in range(start[i], start[i + 1]):
+            squared[e], _ = compare(
+                rotation, centre, lens, photos, values[i], host[i], target[e], rays[i], rho[i], s[i], floor, slope,
+                none, r, work,
+            )  # fmt: skip
+
+
+@njit(**KERNEL)
+def settle_scales(
+    rotation,
+    centre,
+    lens,
+    photos,
+    values,
+    host,
+    rays,
+    rho,
+    start,
+    target,
+    s,
+    floor,
+    slope,
+    scale,
+    deviation,
+    reach,
+):
+    """Move each patch's scale to the least cost that a scan of s (1 - reach .. 1 + reach) leads to, in place."""
+    pixels, channels = values.shape[1], values.shape[2]
+    work, r, none = work_space(channels), np.empty((pixels, channels)), np.empty((0, channels, 13))
+    s2, first = scale * scale, s.copy()
+    for i in range(len(host)):
+        best, step = np.inf, reach / SCAN
+        middle = first[i]
+        for t in range(2 * SCAN + 1 + 2 * HALVINGS):
+            if t <= 2 * SCAN:
+                tried = first[i] * (1 + step * (t - SCAN))
+            else:
+                half = (t - 2 * SCAN - 1) // 2
+                if (t - 2 * SCAN) % 2 == 1:
+                    middle = s[i]
+                tried = middle + (1 - 2 * (t % 2)) * first[i] * step * 0.5 ** (half + 1)
+            cost = ((tried - 1) / deviation) ** 2
+            for e in range(start[i], start[i + 1]):
+                e2, _ = compare(
+                    rotation, centre, lens, photos, values[i], host[i], target[e], rays[i], rho[i], tried, floor, slope,
+                    none, r, work,
+                )  # fmt: skip
+                cost += s2 * e2 / (s2 + e2) * pixels * channels
+            if cost < best:
+                best, s[i] = cost, tried
+
+
+@njit(**KERNEL)
+def patch_system(
+    rotation, centre, lens, photos, values, host, rays, rho, start, target, s, host_rows, target_rows, floor, slope,
+    scale, deviation, noise, damping, system, right, of_target,
+):  # fmt: skip
+    """Add the normal equations without the scales to system [u, u] and right [u], which is half the gradient.
+
+    Args:
+        host_rows, target_rows: [patches, w], [m, w], where the w = 6 or 9 unknowns of each one's camera, and those of
+            its lens, are among all u.
+
+    Returns of each patch the inverse of its own entry and its gradient, and the mixed row of its host. Fills that of
+    each target [m, w].
+    """
+    patches, pixels, channels = len(host), values.shape[1], values.shape[2]
+    width = host_rows.shape[1]
+    last = 2 * width
+    work, r, jac = (
+        work_space(channels),
+        np.empty((pixels, channels)),
+        np.empty((pixels, channels, last + 1)),
+    )
+    inverses, gradients, of_host = np.zeros(patches), np.zeros(patches), np.zeros((patches, width))
+    block, force = np.empty((last + 1, last + 1)), np.empty(last + 1)
+    s2 = scale * scale
+    for i in range(patches):
+        own = 1.0 / (deviation * deviation)
+        gradients[i] = (s[i] - 1) * own
+        h = host_rows[i]
+        for e in range(start[i], start[i + 1]):
+            e2, variance = compare(
+                rotation, centre, lens, photos, values[i], host[i], target[e], rays[i], rho[i], s[i], floor, slope,
+                jac, r, work,
+            )  # fmt: skip
+            if e2 >= UNSEEN:
+                continue
+            f = s2 / (s2 + e2)
+            weighted_squares(jac, r, f * f / variance / (noise * noise), block, force)
+            j = target_rows[e]
+            for a in range(width):
+                right[h[a]] += force[a]
+                right[j[a]] += force[width + a]
+                of_host[i, a] += block[a, last]
+                of_target[e, a] = block[width + a, last]
+                for b in range(width):
+                    system[h[a], h[b]] += block[a, b]
+                    system[j[a], j[b]] += block[width + a, width + b]
+                    system[h[a], j[b]] += block[a, width + b]
+                    system[j[a], h[b]] += block[width + a, b]
+            own += block[last, last]
+            gradients[i] += force[last]
+        inverses[i] = 1.0 / (own * (1 + damping))
+        _eliminate(
+            h, of_host[i], gradients[i], inverses[i], start[i], start[i + 1], target_rows, of_target, system, right
+        )  # fmt: skip
+    return inverses, gradients, of_host
+
+
+@njit(inline="always", **KERNEL)
+def weighted_squares(jac, r, w, block, force):
+    """block = w J^T J and force = w J^T r of jac [k, channels, d] and r [k, channels]."""
+    size = len(force)
+    block[:] = 0
+    force[:] = 0
+    for k in range(jac.shape[0]):
+        for c in range(jac.shape[1]):
+            row = jac[k, c]
+            for a in range(size):
+                force[a] += w * row[a] * r[k, c]
+                for b in range(a, size):
+                    block[a, b] += w * row[a] * row[b]
+    for a in range(size):
+        for b in range(a):
+            block[a, b] = block[b, a]
+
+
+@njit(inline="always", **KERNEL)
+def _eliminate(host_rows, of_host, gradient, inverse, first, last, target_rows, of_target, system, right):
+    """Take one patch's scale out of the equations of cameras and lenses."""
+    width = len(of_host)
+    for e in range(first - 1, last):
+        for a in range(width):
+            x = inverse * (of_host[a] if e < first else of_target[e, a])
+            if x == 0:
+                continue
+            one = host_rows[a] if e < first else target_rows[e, a]
+            right[one] -= x * gradient
+            for g in range(first - 1, last):
+                for b in range(width):
+                    other = host_rows[b] if g < first else target_rows[g, b]
+                    system[one, other] -= x * (of_host[b] if g < first else of_target[g, b])

@@ -1,0 +1,161 @@
+"""Levenberg-Marquardt over cameras and lenses: terms without their own unknowns, and what is known before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.geometry.rigid_bodies import RigidBodies
+from biresnerf.refinement.adjustment.cameras import POSE, Cameras
+from biresnerf.refinement.adjustment.evidence import PosePrior
+from biresnerf.refinement.adjustment.lens.lenses import Lenses
+from biresnerf.refinement.adjustment.solver.body_motions import body_columns, rigid_motion
+from biresnerf.refinement.adjustment.solver.term import Linearised, Term
+
+Array = NDArray[np.float64]
+
+ROUNDS = 8  # of measuring the noise; it falls with the residuals, and with it what counts as wrong
+STEPS = 10  # of each round, at most
+DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e6
+CONVERGED = 1e-7  # a lower relative gain ends a round
+SETTLED = 1e-3  # a lower relative change of all noise levels ends the rounds
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """The prior as a quadratic cost of cameras and lenses.
+
+    Attributes:
+        mean: the cameras before.
+        weight: inverse variances [u]; zero where nothing is known.
+        free: which of the u = 6n + 3g unknowns may move.
+        bodies: of the cameras, where some are fixed or move as one.
+    """
+
+    mean: Cameras
+    weight: Array
+    free: NDArray[np.bool_]
+    bodies: RigidBodies | None = None
+
+    @classmethod
+    def of(cls, prior: PosePrior, lenses: Lenses | None = None) -> Prior:
+        deviation = np.repeat(np.stack([prior.rotation, prior.position], 1), 3, axis=1).reshape(-1)
+        free = ~np.repeat(prior.fixed, POSE)
+        if lenses is not None:
+            deviation = np.concatenate([deviation, lenses.deviation.reshape(-1)])
+            free = np.concatenate([free, lenses.free.reshape(-1)])
+        usable = np.isfinite(deviation) & (deviation > 0)
+        weight = np.where(usable, 1 / np.where(usable, deviation, 1.0) ** 2, 0.0)
+        return cls(Cameras.of(prior.world_from_cam, lenses), weight, free, prior.fixed_bodies)
+
+    def cost(self, cameras: Cameras) -> float:
+        return float((self.weight * cameras.apart(self.mean) ** 2).sum())
+
+    def right(self, cameras: Cameras) -> Array:
+        """Half the gradient [u], to first order in the rotations' distance."""
+        return np.asarray(self.weight * cameras.apart(self.mean))
+
+    def directions(self, cameras: Cameras) -> Array | None:
+        """Increments [u, k] of cameras and lenses that k free numbers make; None where each is free for itself."""
+        if self.bodies is None or not self.bodies.shared:
+            return None
+        columns, (_, lenses) = body_columns(cameras, self.bodies), np.split(self.free, [POSE * len(cameras)])
+        found = np.zeros((len(self.free), columns.shape[1] + int(lenses.sum())))
+        found[: len(columns), : columns.shape[1]] = columns
+        found[len(columns) + np.flatnonzero(lenses), columns.shape[1] + np.arange(lenses.sum())] = 1.0
+        return found
+
+    def rigid(self, cameras: Cameras, motion: Array) -> Array:
+        """An increment [u] along `directions`, with bodies rigid to more than first order."""
+        if self.bodies is None or not self.bodies.shared:
+            return motion
+        poses, lenses = cameras.split(motion)
+        return np.concatenate([rigid_motion(cameras, self.bodies, poses).reshape(-1), lenses.reshape(-1)])
+
+
+def minimise(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> Cameras:
+    """Cameras of the least robust cost that is found from here; the terms' unknowns and noise levels follow."""
+    for round in range(ROUNDS):
+        changes = [term.measure(cameras) for term in terms]
+        if round > 0 and max(changes, default=0.0) < SETTLED:
+            break
+        cameras = _descend(cameras, terms, prior)
+    return cameras
+
+
+def _descend(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> Cameras:
+    """Steps at fixed noise levels."""
+    damping, cost = DAMPING, total_cost(cameras, terms, prior)
+    for _ in range(STEPS):
+        linear = [term.linearise(cameras, damping) for term in terms]
+        better = None
+        while better is None and damping < MOST_DAMPING:
+            better = _step(cameras, terms, prior, linear, damping, cost)
+            damping = damping * 10 if better is None else max(damping / 10, LEAST_DAMPING)
+        if better is None:
+            break
+        gain = cost - better[1]
+        cameras, cost = better
+        if gain < CONVERGED * cost:
+            break
+    return cameras
+
+
+def _step(
+    cameras: Cameras,
+    terms: Sequence[Term],
+    prior: Prior,
+    linear: Sequence[Linearised],
+    damping: float,
+    cost: float,
+) -> tuple[Cameras, float] | None:
+    """Cameras and cost after a step that lowers it, the terms' unknowns moved along; None where it does not."""
+    system, right = normal_equations(cameras, linear, prior)
+    directions = prior.directions(cameras)
+    if directions is None:
+        motion = _damped(system, right, prior.free, damping)
+    else:
+        along = _damped(directions.T @ system @ directions, directions.T @ right, None, damping)
+        motion = None if along is None else prior.rigid(cameras, directions @ along)
+    if motion is None:
+        return None
+    moved = cameras.moved(motion)
+    unknowns = [term.stepped(at, motion) for term, at in zip(terms, linear, strict=True)]
+    after = prior.cost(moved) + sum(t.cost(moved, u) for t, u in zip(terms, unknowns, strict=True))
+    if not after < cost:
+        return None
+    for term, found in zip(terms, unknowns, strict=True):
+        term.unknowns = found
+    return moved, after
+
+
+def _damped(system: Array, right: Array, free: NDArray[np.bool_] | None, damping: float) -> Array | None:
+    """The damped step of the unknowns that are free and that anything is known of; None where there is none."""
+    free = (np.diagonal(system) > 0) & (True if free is None else free)
+    if not free.any():
+        return None
+    part = torch.from_numpy(system if free.all() else system[np.ix_(free, free)]).clone()
+    part.diagonal().mul_(1 + damping)
+    factor, failed = torch.linalg.cholesky_ex(part)
+    if failed:  # not positive definite: damped more, it will be
+        return None
+    step = np.zeros(len(right))
+    step[free] = -torch.cholesky_solve(torch.from_numpy(right[free])[:, None], factor)[:, 0].numpy()
+    return step if np.isfinite(step).all() else None
+
+
+def total_cost(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> float:
+    """The robust cost of all terms and of leaving the prior."""
+    return prior.cost(cameras) + sum(term.cost(cameras, term.unknowns) for term in terms)
+
+
+def normal_equations(cameras: Cameras, linear: Sequence[Linearised], prior: Prior) -> tuple[Array, Array]:
+    """Of cameras and lenses alone: matrix [u, u] and half the gradient [u]."""
+    system, right = np.diag(prior.weight), prior.right(cameras)
+    for at in linear:
+        system, right = system + at.system, right + at.right
+    return system, right

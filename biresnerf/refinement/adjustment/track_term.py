@@ -1,0 +1,118 @@
+"""Tracks as a term of the adjustment: reprojections of points that are eliminated."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.data.points.tracks import Tracks
+from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
+from biresnerf.geometry.triangulation import triangulate
+from biresnerf.refinement.adjustment.cameras import Cameras, lens_rows
+from biresnerf.refinement.adjustment.kernels.tracks import (
+    settle_points,
+    track_cost,
+    track_errors,
+    track_system,
+)
+from biresnerf.refinement.adjustment.solver.term import Linearised
+from biresnerf.refinement.adjustment.tangent_views import TangentViews
+
+Array = NDArray[np.float64]
+
+# Residuals of this many noise levels have lost three quarters of their weight: what is beyond is taken to be wrong.
+ROBUST_SCALE = 3.0
+RAYLEIGH_MEDIAN = 1.1774  # of the length of two normal deviates
+FINEST_PX = 1e-3  # no feature is as exact: a lower noise level only makes the numbers worse
+SETTLING = 30
+
+
+class TrackTerm:
+    """Reprojection residuals in px of the full-size photos, as if lenses had no distortion.
+
+    Args:
+        cameras: where points are triangulated first.
+        noise_px: where it is known; else it is measured.
+
+    Attributes:
+        unknowns: the points [p, 3] in the world.
+        noise_px: standard deviation of either coordinate of an observation.
+    """
+
+    def __init__(
+        self, tracks: Tracks, intrinsics: Intrinsics, cameras: Cameras, noise_px: float | None = None
+    ) -> None:
+        self.image = np.ascontiguousarray(tracks.image, dtype=np.int64)
+        self.xy = np.ascontiguousarray(tracks.xy, dtype=np.float64)
+        self.point = np.asarray(tracks.point, dtype=np.int64)
+        count = int(self.point[-1]) + 1 if len(self.point) else 0
+        self.start = np.searchsorted(self.point, np.arange(count + 1)).astype(np.int64)
+        self.lens = lens_rows(intrinsics, cameras)
+        self._given_noise = noise_px
+        self.noise_px = 1.0 if noise_px is None else noise_px
+        rays = directions_in_cam(intrinsics, torch.from_numpy(self.image), torch.from_numpy(self.xy)).numpy()
+        flat = ~intrinsics.fisheye.numpy()[self.image]
+        rays[flat] = cameras.rays_of(self.image[flat], rays[flat] / rays[flat, 2:])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        self._views: TangentViews | None = None
+        if intrinsics.some_fisheye:
+            self._views = TangentViews.looking_at(rays, self.xy, self.image, intrinsics, self.lens[:, 4])
+        world = np.einsum("mij,mj->mi", cameras.rotation[self.image], rays)
+        focal = np.sqrt(self.lens[:, 0] * self.lens[:, 1])[self.image]
+        self.unknowns = triangulate(cameras.centre[self.image], world, focal, self.point, count)
+
+    def errors_px(self, cameras: Cameras) -> Array:
+        """Length of the residual of each observation [m], px; infinite where it is not in front."""
+        squared = np.empty(len(self.image))
+        track_errors(*self._seen(cameras, self.unknowns), squared)
+        return np.sqrt(squared)
+
+    def inliers(self, cameras: Cameras) -> NDArray[np.bool_]:
+        """Which observations [m] are within the robust scale."""
+        return np.asarray(self.errors_px(cameras) < ROBUST_SCALE * self.noise_px)
+
+    def measure(self, cameras: Cameras) -> float:
+        self.settle(cameras)
+        if self._given_noise is not None:
+            return 0.0
+        before, self.noise_px = self.noise_px, self._measured_noise(cameras)
+        self.settle(cameras)
+        return abs(self.noise_px / before - 1)
+
+    def settle(self, cameras: Cameras) -> None:
+        """Points to where they fit best for cameras that stay."""
+        settle_points(*self._seen(cameras, self.unknowns), self.noise_px, ROBUST_SCALE, SETTLING)
+
+    def _measured_noise(self, cameras: Cameras) -> float:
+        """From the median residual; points and cameras have taken their share of the degrees of freedom."""
+        errors = self.errors_px(cameras)
+        known = 2 * len(errors)
+        free = known - 3 * len(self.unknowns) - 6 * len(np.unique(self.image)) + 7
+        if free <= 0:
+            return self.noise_px
+        noise = float(np.median(errors)) / RAYLEIGH_MEDIAN * (known / free) ** 0.5
+        return max(noise, FINEST_PX) if np.isfinite(noise) else self.noise_px
+
+    def cost(self, cameras: Cameras, unknowns: Array) -> float:
+        return float(track_cost(*self._seen(cameras, unknowns), self.noise_px, ROBUST_SCALE))
+
+    def linearise(self, cameras: Cameras, damping: float) -> Linearised:
+        size, rows = cameras.unknowns, cameras.rows(self.image)
+        system, right = np.zeros((size, size)), np.zeros(size)
+        seen = self._seen(cameras, self.unknowns)
+        back = track_system(*seen, rows, self.noise_px, ROBUST_SCALE, damping, system, right)
+        return Linearised(system, right, (*back, rows))
+
+    def stepped(self, linearised: Linearised, motion: Array) -> Array:
+        inverses, gradients, mixed, rows = linearised.back
+        force = gradients.copy()
+        np.add.at(force, self.point, np.einsum("mab,ma->mb", mixed, motion[rows]))
+        return self.unknowns - np.einsum("pab,pb->pa", inverses, force)
+
+    def _seen(self, cameras: Cameras, points: Array) -> tuple[NDArray[np.generic], ...]:
+        lens = cameras.lens_rows(self.lens)
+        if self._views is None:
+            return cameras.rotation, cameras.centre, lens, points, self.start, self.image, self.xy
+        rotation, centre, lens, view = self._views.seen(cameras, lens)
+        return rotation, centre, lens, points, self.start, view, self._views.xy

@@ -1,0 +1,155 @@
+"""The choice of the poses that a run returns: candidates from all evidence, judged by what none was fitted to."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.geometry.rigid_bodies import RigidBodies
+from biresnerf.refinement.adjustment.adjustment import NOTHING_FITS, Adjustment, adjust_poses, misfit
+from biresnerf.refinement.adjustment.choice import Candidate, choose
+from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refinement.finish.candidates import (
+    BY_TRACKS,
+    ORDER,
+    PRIOR,
+    adjust,
+    as_candidate,
+    without_adjustment,
+)
+from biresnerf.refinement.finish.expected_errors import expected_errors
+from biresnerf.refinement.finish.gather_evidence import SplitEvidence, gather_evidence
+from biresnerf.refinement.finish.given_poses import input_accuracy
+from biresnerf.refinement.finish.lens_evidence import contradicted_focals, focal_certainty, given_focals
+from biresnerf.refinement.finish.outcome import Finish, fit_of, heeded, most_heeded
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.scene.scene import Scene
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+# Of tracks, in px or in shares of the photos' size. Sets have 0.1 to 0.5 px.
+MOST_NOISE_PX, MOST_NOISE = 2.0, 0.002
+# Poses nearer than this to those that tracks prefer, in standard deviations of a camera's pose, may be the true ones.
+TOLD_APART = 2.0
+
+
+def choose_poses(
+    scene: Scene, optimiser: JointOptimiser, announce: Callable[[], None]
+) -> tuple[Candidate, Finish] | None:
+    """The best candidate, in the unit frame, and how it was found; None where no evidence can tell.
+
+    What the evidence says of the lenses goes to the optimiser's.
+    """
+    split = gather_evidence(scene, optimiser)
+    refined = optimiser.poses.poses().numpy()
+    if not np.isfinite(refined).all():
+        return None
+    prior = PosePrior.equal(refined, PRIOR, PRIOR * optimiser.frame.distance, optimiser.bodies)
+    results = adjust(refined, split.fitted, prior, announce)
+    noise = results["adjusted-tracks"].noise if "adjusted-tracks" in results else NoiseLevels()
+    if noise.track_px > _most_noise_px(split.fitted):
+        logger.info("tracks say nothing: their noise is %.1f px", noise.track_px)
+        split = split.without_tracks()
+        results = {name: each for name, each in results.items() if name == "adjusted-patches"}
+    given = input_accuracy(scene.dataset, most_heeded(results), split.fitted, optimiser.options)
+    if given is not None and given.tells(prior):
+        prior = given.prior(prior)
+        patched = results.get("adjusted-patches")
+        results = adjust(refined, split.fitted, prior, announce, patched.halves if patched else None)
+    cameras = optimiser.lenses.refined(scene.dataset).cameras
+    adjusted = [as_candidate(name, each, split.fitted, cameras) for name, each in results.items()]
+    found = [Candidate("refined", refined), *without_adjustment(scene, refined, optimiser.bodies)]
+    candidates = sorted([*found, *filter(None, adjusted)], key=lambda candidate: ORDER.index(candidate.name))
+    # Fixed cameras are the same in all candidates: theirs tell only whose points fit them.
+    misfits = _misfits(candidates, split, noise, ~prior.fixed & split.placed, announce)
+    if not misfits:
+        return None
+    by_tracks = results.get("adjusted-tracks")
+    alike = {} if by_tracks is None else {"tracks": _within(candidates, by_tracks, split, optimiser.bodies)}
+    choice = choose(candidates, misfits, alike, _kept_on_a_tie(candidates, set(misfits), alike))
+    announce()
+    chosen, evidence = choice.chosen, dict.fromkeys(results, split.fitted)
+    if chosen.name in BY_TRACKS:  # nothing has to be judged any more
+        heeded_now = evidence[chosen.name] = replace(split.fitted, tracks=split.tracks)
+        result = adjust_poses(refined, heeded_now, prior, results[chosen.name].halves)
+        results[chosen.name] = result
+        chosen = as_candidate(chosen.name, result, heeded_now, cameras) or chosen
+    best = results.get(chosen.name) or next(iter(results.values()), None)
+    kept = given_focals(scene.dataset, optimiser.options.refine_intrinsics)
+    optimiser.lenses.certainty = focal_certainty(
+        best, split.fitted, contradicted_focals(refined, split.fitted, split.left_out, prior, noise, kept)
+    )
+    return chosen, Finish(choice.reports, fit_of(candidates, results, evidence), given)
+
+
+def _kept_on_a_tie(
+    candidates: Sequence[Candidate], kinds: set[str], alike: Mapping[str, NDArray[np.bool_]]
+) -> int:
+    """The input's poses; the refined ones where no kind of evidence tells these apart: the verdict will, by photos."""
+    names = [candidate.name for candidate in candidates]
+    both = [names.index("input"), names.index("refined")] if "input" in names else [0, 0]
+    told_apart = any(kind not in alike or not alike[kind][both].all() for kind in kinds)
+    return both[0] if told_apart else both[1]
+
+
+def _misfits(
+    candidates: Sequence[Candidate],
+    split: SplitEvidence,
+    noise: NoiseLevels,
+    judging: NDArray[np.bool_],
+    announce: Callable[[], None],
+) -> dict[str, Array]:
+    """Of the judging cameras [candidates, m], to what was left out of each kind of evidence that can tell."""
+    found: dict[str, Array] = {}
+    for kind, left_out in (
+        ("tracks", replace(split.left_out, patches=None)),
+        ("patches", replace(split.left_out, tracks=None)),
+    ):
+        if left_out.tracks is not None or left_out.patches is not None:
+            announce()
+            misfits = np.stack([_misfit(each, left_out, noise) for each in candidates])[:, judging]
+            if _tells(misfits):
+                found[kind] = misfits
+    return found
+
+
+def _within(
+    candidates: Sequence[Candidate], by_tracks: Adjustment, split: SplitEvidence, bodies: RigidBodies
+) -> NDArray[np.bool_]:
+    """Candidates [c] that are as near to what tracks prefer as the truth may be.
+
+    Tracks that were left out share some errors with those that were adjusted to (of lenses, of features that lie beside
+    the surface), and so prefer poses that were fitted to such errors, even to the true ones.
+    """
+    evidence = heeded("adjusted-tracks", by_tracks, split.fitted)
+    found = (
+        expected_errors(each.world_from_cam, by_tracks.world_from_cam, evidence, bodies=bodies)
+        for each in candidates
+    )
+    return np.array([each.deviations < TOLD_APART for each in found])
+
+
+def _misfit(candidate: Candidate, evidence: Evidence, noise: NoiseLevels) -> Array:
+    """Of its own poses and lenses."""
+    return misfit(candidate.world_from_cam, replace(evidence, lenses=candidate.lenses), noise)
+
+
+def _tells(misfits: Array) -> bool:
+    """Whether evidence [candidates, n] knows half of the cameras, and fits them with the best candidate."""
+    known = np.isfinite(misfits).all(0)
+    if not known.any() or known.mean() < 0.5:
+        return False
+    return bool(np.median(misfits[:, known], axis=1).min() < NOTHING_FITS / 2)
+
+
+def _most_noise_px(evidence: Evidence) -> float:
+    """More is no feature's noise: the tracks are wrong."""
+    size = torch.maximum(evidence.intrinsics.width, evidence.intrinsics.height).double().median()
+    return max(MOST_NOISE_PX, MOST_NOISE * float(size))

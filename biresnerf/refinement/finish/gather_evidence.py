@@ -1,0 +1,72 @@
+"""The evidence of a run that all cameras are adjusted to, and what of it is left out to judge by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.points.tracks import Tracks
+from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.refinement.adjustment.evidence import Evidence
+from biresnerf.refinement.adjustment.ideal import ideal_cameras, straight_tracks
+from biresnerf.refinement.finish.lens_evidence import lenses_before
+from biresnerf.refinement.finish.photo_evidence import photo_patches
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.scene.scene import Scene
+
+# Of tracks: in candidates, and in what is returned. On scarf 21,000 of 133,000 leave 0.090 deg, all of them 0.048.
+MOST_OBSERVATIONS, MOST_IN_THE_END = 40_000, 200_000
+LEFT_OUT_ONE_IN = 5  # patches
+
+
+@dataclass(frozen=True, eq=False)
+class SplitEvidence:
+    """Evidence in two parts.
+
+    Attributes:
+        fitted, left_out: what candidates are adjusted to, and what they are judged by.
+        tracks: those of both parts, and those that were too many; what is returned is adjusted to them.
+        placed: bool [n], cameras that are not at a guess still; the evidence is of their photos alone.
+    """
+
+    fitted: Evidence
+    left_out: Evidence
+    tracks: Tracks | None
+    placed: NDArray[np.bool_]
+
+    def without_tracks(self) -> SplitEvidence:
+        fitted, left_out = (replace(each, tracks=None) for each in (self.fitted, self.left_out))
+        return SplitEvidence(fitted, left_out, None, self.placed)
+
+
+def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
+    """Tracks and patches for ideal cameras, without cameras that are at a guess still.
+
+    Photos of another scene match each other, and could outweigh the scene's own.
+    """
+    placed = ~optimiser.camera_errors.doubted.cpu().numpy()
+    dataset = optimiser.lenses.refined(scene.dataset)
+    intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
+    ideal = ideal_cameras(intrinsics)
+    before = lenses_before(scene.dataset, optimiser.options.refine_intrinsics)
+    lenses = before if before.free.any() else None
+    fitted: Tracks | None = None
+    judging: Tracks | None = None
+    tracks = scene.tracks and scene.tracks.where(placed[scene.tracks.image])
+    if tracks is not None:
+        tracks = straight_tracks(tracks, intrinsics, ideal)
+        fitted, judging = tracks.split()
+        tracks = tracks.thinned(MOST_IN_THE_END, len(dataset))
+        fitted = fitted and fitted.thinned(MOST_OBSERVATIONS, len(dataset))
+    patches = photo_patches(scene, optimiser, intrinsics, ideal, placed)
+    if patches is None:
+        return SplitEvidence(Evidence(ideal, fitted, None, lenses), Evidence(ideal, judging), tracks, placed)
+    spared = np.arange(len(patches)) % LEFT_OUT_ONE_IN == 0
+    return SplitEvidence(
+        Evidence(ideal, fitted, patches.of(~spared), lenses),
+        Evidence(ideal, judging, patches.of(spared)),
+        tracks,
+        placed,
+    )

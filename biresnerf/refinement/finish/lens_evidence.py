@@ -1,0 +1,121 @@
+"""What is known of a set's lenses before all cameras are adjusted, and what is made of the answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import Dataset, IntrinsicsSource
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.camera.lens import lens_problem
+from biresnerf.options.refine_options import RefineIntrinsics
+from biresnerf.refinement.adjustment.adjustment import Adjustment, adjust_poses, misfit
+from biresnerf.refinement.adjustment.choice import fits_better
+from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refinement.adjustment.lens.corrected_camera import corner, corrected_camera, radial_names
+from biresnerf.refinement.adjustment.lens.lenses import LENS, Lenses
+from biresnerf.refinement.parameters.intrinsics_parameters import FocalCertainty
+
+Array = NDArray[np.float64]
+
+# Standard deviation of a focal length, as a share of it, by who found it. Guesses: over 13 sets of photos of all kinds,
+# the logarithm of the focal length over the guess (1.2 of the long side) has 0.4. What COLMAP found says nothing
+# before: it is of the same matches. EXIF: whole millimetres of 35 mm film, and what stabilisation cuts off.
+FOCAL_DEVIATION: dict[IntrinsicsSource, float] = {"given": 0.02, "exif": 0.05, "colmap": 0.4, "guessed": 0.4}
+# Of either radial coefficient, as it moves the image's corner, as a share of its distance.
+RADIAL_DEVIATION = 0.1
+# A given focal length is contradicted if another one is preferred by more than so many standard deviations of what is
+# known before and of what the evidence says together.
+CONTRADICTED = 2.0
+
+
+def lenses_before(dataset: Dataset, option: RefineIntrinsics) -> Lenses:
+    """What may move of the lenses, and how well it is known: all that was not given, or as the option asks."""
+    deviation = np.zeros((len(dataset.cameras), LENS))
+    for i, camera in enumerate(dataset.cameras):
+        source = dataset.source_of_intrinsics(i)
+        if option == "none" or (option == "auto" and source == "given"):
+            continue
+        deviation[i, 0] = FOCAL_DEVIATION[source]
+        if option != "focal":
+            for column, name in enumerate(("k1", "k2"), 1):
+                if name in radial_names(camera):
+                    deviation[i, column] = RADIAL_DEVIATION / corner(camera) ** (2 * column)
+    return _lenses(dataset, deviation)
+
+
+def given_focals(dataset: Dataset, option: RefineIntrinsics) -> Lenses:
+    """The focal lengths that are to stay as they were given, as if they might move."""
+    given = [dataset.source_of_intrinsics(i) == "given" for i in range(len(dataset.cameras))]
+    deviation = np.zeros((len(given), LENS))
+    deviation[given if option == "auto" else [], 0] = FOCAL_DEVIATION["given"]
+    return _lenses(dataset, deviation)
+
+
+def _lenses(dataset: Dataset, deviation: Array) -> Lenses:
+    deviation[[camera.full().fisheye for camera in dataset.cameras]] = 0.0  # corrections are of pinholes
+    of_image = np.array([frame.camera for frame in dataset.frames], np.int64)
+    return Lenses(of_image, np.zeros_like(deviation), deviation)
+
+
+def corrected_cameras(cameras: Sequence[Camera], correction: Array) -> tuple[Camera, ...] | None:
+    """Cameras after corrections [g, 3]; None where one would be no lens."""
+    found = tuple(corrected_camera(c, row) for c, row in zip(cameras, correction, strict=True))
+    problems = (lens_problem(camera.full(), camera.width, camera.height) for camera in found)
+    return None if any(problem is not None for problem in problems) else found
+
+
+def focal_certainty(
+    found: Adjustment | None, evidence: Evidence, contradicted: Sequence[FocalCertainty | None]
+) -> tuple[FocalCertainty | None, ...]:
+    """What an adjustment to the evidence says of each camera's focal length; None where it is not to move.
+
+    Args:
+        contradicted: what is said of those that are not to move.
+    """
+    if found is None or found.lenses is None or evidence.lenses is None:
+        return tuple(contradicted)
+    deviation, observable = found.lenses.deviation[:, 0], found.lenses.observable[:, 0]
+    return tuple(
+        FocalCertainty(_known(deviation[i]), bool(observable[i])) if free else contradicted[i]
+        for i, free in enumerate(evidence.lenses.free[:, 0].tolist())
+    )
+
+
+def contradicted_focals(
+    world_from_cam: Array,
+    fitted: Evidence,
+    left_out: Evidence,
+    prior: PosePrior,
+    noise: NoiseLevels,
+    kept: Lenses,
+) -> list[FocalCertainty | None]:
+    """What tracks say of focal lengths that are `kept` as they were given, by letting them go; None of the others.
+
+    They are contradicted where tracks that were left out agree.
+    """
+    said: list[FocalCertainty | None] = [None] * len(kept.deviation)
+    if fitted.tracks is None or left_out.tracks is None or not kept.free.any():
+        return said
+    fitted, left_out = replace(fitted, patches=None, lenses=None), replace(left_out, patches=None)
+    held = adjust_poses(world_from_cam, fitted, prior)
+    freed = adjust_poses(held.world_from_cam, replace(fitted, lenses=kept), prior)
+    if freed.lenses is None:
+        return said
+    with_lens = replace(left_out, lenses=kept.known(freed.lenses.correction))
+    better = fits_better(
+        misfit(freed.world_from_cam, with_lens, noise), misfit(held.world_from_cam, left_out, noise)
+    )
+    for i in np.flatnonzero(kept.free[:, 0]).tolist():
+        off, deviation = freed.lenses.correction[i, 0], freed.lenses.deviation[i, 0]
+        observable = bool(freed.lenses.observable[i, 0])
+        clear = observable and better and abs(off) > CONTRADICTED * np.hypot(kept.deviation[i, 0], deviation)
+        said[i] = FocalCertainty(_known(deviation), observable, float(np.exp(off)) if clear else None)
+    return said
+
+
+def _known(deviation: float) -> float | None:
+    return float(deviation) if np.isfinite(deviation) else None

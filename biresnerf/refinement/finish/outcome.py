@@ -1,0 +1,88 @@
+"""What came of the adjustment of all cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.refinement.adjustment.adjustment import Adjustment
+from biresnerf.refinement.adjustment.choice import Candidate
+from biresnerf.refinement.adjustment.evidence import Evidence
+from biresnerf.refinement.finish.candidates import ORDER, usable
+from biresnerf.refinement.finish.given_poses import GivenPoses
+from biresnerf.report import CandidateName, CandidateReport
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Poses [n, 4, 4] in the unit frame that were adjusted to evidence, and the level of its patches' noise."""
+
+    world_from_cam: Array
+    evidence: Evidence
+    patch_noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class Finish:
+    """What came of the adjustment.
+
+    Attributes:
+        candidates: the poses that were compared, and how they did.
+        fit: of the poses to all evidence that is to be trusted; None where there is none.
+        given: how accurate the input's poses are; None where that is not known.
+    """
+
+    candidates: tuple[CandidateReport, ...] = ()
+    fit: Fit | None = None
+    given: GivenPoses | None = None
+
+    @property
+    def kept(self) -> bool:
+        """Whether nothing was better than the poses as they were."""
+        return any(each.chosen and each.name == "refined" for each in self.candidates)
+
+    @property
+    def heeds_photos(self) -> bool:
+        """Whether patches of the photos were to be trusted."""
+        return self.fit is not None and self.fit.evidence.patches is not None
+
+    def refused(self) -> Finish:
+        """The same where the chosen poses are not taken, and the evidence that prefers them is not believed."""
+        kept = (each.model_copy(update={"chosen": each.name == "refined"}) for each in self.candidates)
+        return Finish(tuple(kept))
+
+
+def most_heeded(results: Mapping[CandidateName, Adjustment]) -> Adjustment | None:
+    """The adjustment to most kinds of evidence that is to be believed."""
+    return next((results[name] for name in ORDER if name in results and usable(results[name])), None)
+
+
+def heeded(name: CandidateName, found: Adjustment, evidence: Evidence) -> Evidence:
+    """What of the evidence an adjustment was to, with the lenses that it found."""
+    lenses = evidence.lenses
+    if lenses is not None and found.lenses is not None:
+        lenses = replace(lenses, correction=found.lenses.correction)
+    return Evidence(
+        evidence.intrinsics,
+        evidence.tracks if name != "adjusted-patches" else None,
+        evidence.patches if name != "adjusted-tracks" else None,
+        lenses,
+    )
+
+
+def fit_of(
+    candidates: Sequence[Candidate],
+    results: Mapping[CandidateName, Adjustment],
+    evidence: Mapping[CandidateName, Evidence],
+) -> Fit | None:
+    """The adjusted poses that heed most, and what each was adjusted to; None where none was to be believed."""
+    name = next((each.name for each in candidates if each.name in results), None)
+    if name is None:
+        return None
+    found, to = results[name], heeded(name, results[name], evidence[name])
+    return Fit(found.world_from_cam, to, found.patch_noise if to.patches else 1.0)

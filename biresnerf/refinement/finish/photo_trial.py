@@ -1,0 +1,56 @@
+"""What photos say of poses that cameras were adjusted to."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.views.compare_rigs import Effort, Rig, compare_placed
+from biresnerf.refinement.views.motion import moved_px
+
+logger = logging.getLogger(__name__)
+
+# Trials as long as the verdict's, or that end early, cannot tell wrong poses that agree with each other from bent ones
+# (docs/estimator.md).
+TIMES = 2
+# In px at working size. Poses nearer to the truth than this predict unseen photos as well as it does (docs/verdict.md).
+UNSEEN_PX = 0.5
+
+
+def photos_object(stages: TwoStages, unit_from_cam: NDArray[np.float64], cameras: Sequence[Camera]) -> bool:
+    """Whether fields trained at other poses [n, 4, 4] predict unseen views less well than at the present ones.
+
+    The feature matches of a symmetric thing may agree on poses that are wrong. SSIM has no say: small photos like poses
+    that were fitted to them better than true ones. Nothing is trained where the poses are too near for photos to tell.
+
+    Args:
+        cameras: of the dataset, that the other poses see through.
+
+    Raises:
+        Interrupted: stopped.
+    """
+    scene, optimiser = stages.scene, stages.optimiser
+    refined = optimiser.lenses.refined(scene.dataset)
+    present = Rig(optimiser.poses.poses().numpy(), tuple(refined.camera_of(i) for i in range(len(refined))))
+    other = Rig(unit_from_cam, tuple(cameras[frame.camera] for frame in refined.frames))
+    moved = moved_px(present, other, scene.images)
+    if moved < UNSEEN_PX:
+        logger.info("the adjusted cameras moved by %.2f px, which photos do not show", moved)
+        return False
+    stages.announce("checking the adjusted cameras by the photos")
+    with stages.timed("adjusting", "checking"):
+        found = compare_placed(
+            present, other, scene, optimiser, ~scene.start.guessed, stages.monitor.should_stop,
+            effort=Effort(TIMES, rounds_most=1, looks=(1.0,)),
+        )  # fmt: skip
+        stages.forecast.took(found.work if found else 0.0)
+    if found is None:
+        return False
+    psnr = found.evidence.psnr
+    logger.info("unseen views: %.2f dB, adjusted by %.2f px %.2f dB", psnr.before, moved, psnr.after)
+    return psnr.finding == "worse"

@@ -1,0 +1,56 @@
+"""Stage 2 in two rounds of steps, each followed by the adjustment of all cameras."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+from biresnerf.forecast import Phase
+from biresnerf.refinement.finish.adjust_cameras import adjust_cameras
+from biresnerf.refinement.finish.outcome import Finish
+from biresnerf.refinement.finish.work_ahead import FIRST_ROUND, LEARNING, work_ahead
+from biresnerf.refinement.stages.two_stages import TwoStages
+
+AFTER: tuple[Phase, ...] = ("evaluating", "judging")  # phases of the run that follow
+
+
+def run_stage_2(stages: TwoStages) -> Finish:
+    """Steps of stage 2, twice with the adjustment of all cameras after them; what came of the last one.
+
+    Where the first adjustment finds better poses than the field's, they stand still from then on, and the field learns
+    at them for a while. It would only bend them. They are adjusted again only if patches of the photos had no say yet:
+    the surface of a young field may have been too rough for them; and if the run's time allows.
+
+    Raises:
+        Interrupted: stopped; a continued run goes on from there.
+        RefinementError: ``diverged``.
+    """
+    first = None
+    if not stages.record.adjusted:
+        stages.run_stage_2(FIRST_ROUND)
+        first = adjust_cameras(stages)
+        if stages.optimiser.poses_held:
+            stages.optimiser.end_after(LEARNING)
+        stages.record = stages.record.model_copy(update={"adjusted": True})
+        stages.forecast.left |= work_ahead(stages)
+        if _is_over(stages, first):
+            stages.forecast.left["adjusting"] = 0.0
+        stages.replan()
+    stages.run_stage_2()
+    held = stages.optimiser.poses_held
+    if first is not None and (_is_over(stages, first) or not _time_to_adjust_again(stages)):
+        return first
+    last = adjust_cameras(stages)
+    # The poses that are held are what the first adjustment made of the field's.
+    return replace(last, candidates=first.candidates) if first is not None and held and last.kept else last
+
+
+def _is_over(stages: TwoStages, first: Finish) -> bool:
+    """Whether cameras need not be adjusted again."""
+    return stages.optimiser.poses_held and first.heeds_photos
+
+
+def _time_to_adjust_again(stages: TwoStages) -> bool:
+    """Whether a second adjustment, as long as the first, leaves time for what follows it."""
+    after_s = sum(stages.forecast.seconds(phase) for phase in AFTER)
+    return time.monotonic() + stages.record.seconds.get("adjusting", 0.0) + after_s < stages.ends

@@ -1,0 +1,64 @@
+"""Chooses the number of steps so that a run ends in time, from the time that its steps take on this machine."""
+
+from __future__ import annotations
+
+import logging
+import time
+from functools import partial
+
+from biresnerf.refinement.finish.work_ahead import work_ahead
+from biresnerf.refinement.stages.two_stages import TwoStages
+
+logger = logging.getLogger(__name__)
+
+LEAST = 0.1  # of the steps asked for: with fewer, poses move but do not improve
+WRITING = 0.03  # of the budget, for the files of the result
+OVERDRAWN = 1.1  # times the budget: the report warns of more
+
+
+def keep_to_budget(stages: TwoStages, started: float, steps_asked: int) -> None:
+    """Let a run that started at this `time.monotonic` end within its budget, if it has one.
+
+    What it took before it was interrupted counts.
+    """
+    seconds = stages.optimiser.options.time_budget_s
+    if seconds:
+        stages.ends = started + (1 - WRITING) * seconds - sum(stages.record.seconds.values())
+        stages.plan = partial(choose_steps, most=steps_asked)
+
+
+def budget_warnings(stages: TwoStages) -> tuple[str, ...]:
+    """A warning where a run took longer than it was to."""
+    seconds, spent = stages.optimiser.options.time_budget_s, stages.record.seconds
+    total = sum(spent.values())
+    if not seconds or total <= OVERDRAWN * seconds:
+        return ()
+    return (
+        f"The run took {total:.0f} s of a budget of {seconds:g} s, {spent.get('preparing', 0.0):.0f} s of them "
+        "before the first step. Give it more time, or fewer or smaller photos.",
+    )
+
+
+def choose_steps(stages: TwoStages, most: int) -> None:
+    """Leave a run as many steps as there is time for, `most` in all."""
+    optimiser = stages.optimiser
+    before = optimiser.schedule.steps
+    high = before if optimiser.poses_held else most
+    low = min(high, max(optimiser.step_index, round(LEAST * most)))
+    left_s = stages.ends - time.monotonic()
+    while low < high:
+        steps = (low + high + 1) // 2
+        if _needed_s(stages, steps) <= left_s:
+            low = steps
+        else:
+            high = steps - 1
+    if low != before:
+        logger.info("%d steps in place of %d: %.0f s left", low, before, left_s)
+        optimiser.set_steps(low)
+        stages.forecast.left |= work_ahead(stages)
+
+
+def _needed_s(stages: TwoStages, steps: int) -> float:
+    optimiser = stages.optimiser
+    options = optimiser.options.with_steps(steps) if optimiser.switch is None else optimiser.options
+    return stages.forecast.left_s(work_ahead(stages, options.model_copy(update={"steps": steps})))

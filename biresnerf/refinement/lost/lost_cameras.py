@@ -1,0 +1,291 @@
+"""Repair of lost cameras: other poses are tried against the frozen field.
+
+A camera that starts too far off ends in a local minimum, or sees nothing and gets no gradient at all. The error
+over its pose has many minima, but the field that the other cameras have formed tells them apart: many poses are
+scored, the best optimised for some steps, and the winner kept if it is clearly better.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
+from biresnerf.frozen_model import FrozenModel
+from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.refinement.lost.matched_repair import MatchedRepair
+from biresnerf.refinement.lost.own_matches import OwnMatches
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.pose_hypotheses import pose_hypotheses
+from biresnerf.refinement.parameters.pose_parameters import PoseParameters
+from biresnerf.refinement.scene.shared_views import shared_shares
+
+logger = logging.getLogger(__name__)
+
+SCORE_SIDE = 20  # a pose is scored on 20 x 20 pixels spread over the photo
+REFERENCES = 16  # cameras that stand for all others in the acceptance
+CHUNK = 4096  # rays rendered at once
+SCORED_AT_ONCE = 10  # poses
+ROUNDS = ((6, 48, 40), (2, 128, 50))  # poses kept, rays a step of each, steps
+RATES = (1e-2, 1e-3)  # pose learning rate of the first and the last step
+DISTINCT_DEG = 8.0  # poses nearer than this to a better one are not tried beside it
+LEAST_INTERVAL = 1.2e-2  # unit lengths: scoring needs no finer samples
+# A pose is accepted below these shares of the old error, and of the others' median; or below the third one of the old
+# error alone (docs/studies.md).
+BETTER, NEAR_MEDIAN, FAR_BETTER = 0.7, 1.5, 0.25
+ALONE = 0.2  # sharing less of its view than this, a camera of an open scene must go elsewhere, however small its error
+ALONE_SIDE = 8  # as seen by 8 x 8 pixels
+ALONE_MOST = 0.2  # of all cameras: where more are alone, the photos were taken so
+FIRST_SHARE = 0.5  # of the least length of stage 1: the field has formed (open scenes: all of it)
+LAST_SHARE = 0.6  # of all steps: the repair within stage 2
+SETTLED_SHARE = 1 / 3  # of stage 2, at the least before that
+RUN_SHARE, EVENT_SHARE = 0.1, 0.04  # of the run's samples: what all repairs may cost, and those of one time
+GUESSED_TIMES = 2  # that much where poses are guesses: more cameras need it
+FORWARD_COST = 0.4  # of a sample without its backward pass
+
+
+class RepairState(FrozenModel):
+    """What a checkpoint keeps: images repaired, fixed points passed, samples spent."""
+
+    repaired: tuple[int, ...] = ()
+    times: int = 0
+    spent: float = 0.0
+
+
+class LostCameraRepair:
+    """Looks for lost cameras at fixed points of the run and gives them other poses.
+
+    Attributes:
+        repaired: images whose pose was replaced.
+    """
+
+    def __init__(self, optimiser: JointOptimiser, own: OwnMatches | None = None) -> None:
+        self.optimiser, self._matches = optimiser, MatchedRepair(optimiser, own)
+        self.repaired: list[int] = []
+        self._marching = optimiser.marching(optimiser.schedule.fine_interval)
+        self._given = optimiser.poses.poses().numpy()
+        self._times = 0  # how many of the fixed points have passed
+        self._spent = 0.0  # samples
+
+    def due(self) -> bool:
+        """Whether one of the fixed points has been reached. The switch runs a repair without asking."""
+        optimiser, options = self.optimiser, self.optimiser.options
+        if not optimiser.method.robust_extensions:
+            return False
+        if optimiser.switch is None:
+            least = float(options.coarse_steps_min)
+            points = [least] if optimiser.frame.unbounded else [FIRST_SHARE * least, least]
+            return self._times < len(points) and optimiser.step_index >= points[self._times]
+        steps = optimiser.schedule.steps
+        late = max(LAST_SHARE * steps, optimiser.switch + SETTLED_SHARE * (steps - optimiser.switch))
+        return self._times < 4 and optimiser.step_index >= late
+
+    def run(self, *, switching: bool = False) -> None:
+        """Try to repair all lost cameras, the worst first, as far as the budget goes."""
+        optimiser = self.optimiser
+        if not optimiser.method.robust_extensions:
+            return
+        self._times = 3 if switching else self._times + 1 if optimiser.switch is None else 4
+        total = float(optimiser.schedule.samples(optimiser.schedule.steps, 0)) * optimiser.schedule.steps
+        total *= GUESSED_TIMES if bool(optimiser.camera_errors.doubted.any()) else 1
+        allowance = min(self._spent + EVENT_SHARE * total, RUN_SHARE * total)
+        self._marching = self._coarse_marching()
+        self.place_by_matches()
+        alone = self._alone()
+        # Matches are better evidence than the error of a young field: cameras they placed stay (on dtu these were 2 deg
+        # off, and 7 to 9 deg after a repair).
+        suspects = (optimiser.camera_errors.suspects | alone) & (optimiser.mobility[0] > 0)
+        relative = torch.where(suspects, optimiser.camera_errors.relative, -torch.inf)
+        worst_first = relative.argsort(descending=True, stable=True)[: int(suspects.sum())].tolist()
+        median = self._reference_error(suspects) if worst_first else 0.0
+        for camera in worst_first:
+            if self._spent >= allowance:
+                logger.info("no budget left to repair camera %d", camera)
+                break
+            self._repair(camera, median, ~suspects, alone=bool(alone[camera]))
+
+    def place_by_matches(self) -> None:
+        """Give cameras that their own matches contradict the poses that those support."""
+        self.repaired = sorted({*self.repaired, *self._matches.place()})
+
+    @torch.no_grad()
+    def _alone(self) -> Tensor:
+        """Mask [n] of training cameras that look where almost no other does: their error cannot show it."""
+        optimiser = self.optimiser
+        alone = torch.zeros(len(optimiser.poses), dtype=torch.bool, device=optimiser.device)
+        if not optimiser.frame.unbounded:
+            return alone  # the scene ends at its box, and a camera that looks elsewhere sees nothing
+        cameras = torch.arange(len(alone), device=optimiser.device)
+        unshared = self._shared(optimiser.poses.matrices(), cameras) < ALONE
+        unshared &= ~optimiser.camera_errors.held_out
+        return unshared if float(unshared.float().mean()) <= ALONE_MOST else alone
+
+    @torch.no_grad()
+    def _shared(self, matrices: Tensor, image: Tensor) -> Tensor:
+        """How much [k] of what cameras of photos `image` [k] would see from poses [k, 3, 4] others see, too."""
+        optimiser, points = self.optimiser, []
+        for part in torch.arange(len(image), device=optimiser.device).split(CHUNK // ALONE_SIDE**2):
+            owner = part.repeat_interleave(ALONE_SIDE**2)
+            xy = self._grid(image[owner], ALONE_SIDE)
+            origin, direction = optimiser.cast(matrices[owner], image[owner], xy)
+            rendering = self._render(matrices[owner], image[owner], xy, PositionGradient())
+            self._spent += FORWARD_COST * rendering.samples
+            points.append((origin + rendering.depth[:, None] * direction).reshape(len(part), -1, 3))
+        return shared_shares(torch.cat(points), image, optimiser.poses.matrices(), optimiser.intrinsics)
+
+    def _grid(self, image: Tensor, side: int) -> Tensor:
+        """Centres [rays, 2] of `side` x `side` pixels spread over each photo; `image` [rays] names it that often."""
+        along = (torch.arange(side, device=image.device) + 0.5) / side
+        grid = torch.stack(torch.meshgrid(along, along, indexing="xy"), -1).reshape(-1, 2)
+        size = self.optimiser.sampler.sizes[0][image]
+        return (grid.repeat(len(image) // len(grid), 1) * size).floor() + 0.5
+
+    @torch.no_grad()
+    def _reference_error(self, suspects: Tensor) -> float:
+        """Median score of cameras that are not lost."""
+        trusted = torch.nonzero(~suspects & ~self.optimiser.camera_errors.held_out)[:, 0]
+        if len(trusted) == 0:
+            return 0.0
+        chosen = trusted[torch.linspace(0, len(trusted) - 1, min(REFERENCES, len(trusted))).long()]
+        return float(self._scores(self.optimiser.poses.matrices()[chosen], chosen).median())
+
+    def _repair(self, camera: int, median: float, trusted: Tensor, *, alone: bool) -> None:
+        optimiser = self.optimiser
+        now = optimiser.poses.poses().numpy()
+        hypotheses = pose_hypotheses(
+            self._given, now, camera, trusted.cpu().numpy(), optimiser.photo_distances[camera]
+        )
+        tried = torch.from_numpy(np.concatenate([now[camera : camera + 1], hypotheses])[:, :3])
+        tried = tried.float().to(optimiser.device)
+        image = torch.full((len(tried),), camera, device=optimiser.device)
+        scores = self._scores(tried, image)
+        old = float(scores[0])
+        # A guess need not be clearly beaten.
+        better = 1.0 if bool(optimiser.camera_errors.doubted[camera]) else BETTER
+        bound = min(better * old, max(NEAR_MEDIAN * median, FAR_BETTER * old))
+        if alone:  # its own error says nothing, nor does that of another pose that shares no view
+            bound = NEAR_MEDIAN * median
+            shared = self._shared(tried, image) >= ALONE
+            if not bool(shared.any()):
+                return
+            tried, scores = tried[shared], scores[shared]
+        for keep, rays, steps in ROUNDS:
+            chosen = _distinct(tried, scores, keep)
+            tried = self._optimised(tried[chosen], camera, rays, steps)
+            scores = self._scores(tried, image[: len(tried)])
+            best = int(scores.argmin())
+            error = float(scores[best])
+            accepted = error < bound and not self._matches.object_to(camera, tried[best])
+            if accepted and (optimiser.switch is None or error < median):
+                break  # the run itself optimises the rest
+        logger.info(
+            "camera %d stands out (error %.3g, others %.3g): best pose found has %.3g, %s",
+            camera, old, median, error, "accepted" if accepted else "rejected",
+        )  # fmt: skip
+        if accepted:
+            optimiser.replace_pose(camera, tried[best])
+            self.repaired = sorted({*self.repaired, camera})
+        elif old < NEAR_MEDIAN * median and not alone:
+            optimiser.camera_errors.believe(camera)  # nothing better was found than where it stands
+
+    @torch.no_grad()
+    def _scores(self, matrices: Tensor, image: Tensor) -> Tensor:
+        """Mean squared error [k] of photos `image` [k] seen from poses [k, 3, 4], on a fixed grid of pixels."""
+        optimiser = self.optimiser
+        owner = torch.arange(len(image), device=optimiser.device).repeat_interleave(SCORE_SIDE**2)
+        rays = image[owner]
+        xy = self._grid(rays, SCORE_SIDE)
+        target = optimiser.sampler.colours(rays, xy, self._blur())
+        counting = optimiser.sampler.counting(rays, xy)
+        errors = []
+        for part in torch.arange(len(rays), device=optimiser.device).split(SCORED_AT_ONCE * SCORE_SIDE**2):
+            rendering = self._render(matrices[owner[part]], rays[part], xy[part], PositionGradient())
+            self._spent += FORWARD_COST * rendering.samples
+            colour = optimiser.exposure.refitted(
+                rendering,
+                target[part],
+                None if counting is None else counting[part],
+                len(part) // SCORE_SIDE**2,
+            )
+            errors.append(((colour - target[part]) ** 2).mean(1))
+        squared = torch.cat(errors).reshape(len(image), -1)
+        if counting is None:
+            mean = squared.mean(1)
+        else:
+            counting = counting.reshape(squared.shape)
+            mean = (squared * counting).sum(1) / counting.sum(1).clamp(min=1)
+        return mean / optimiser.camera_errors.shares[image]
+
+    def _optimised(self, matrices: Tensor, camera: int, rays: int, steps: int) -> Tensor:
+        """Poses [k, 3, 4] after some steps of Adam on the photometric error alone, all in one batch."""
+        optimiser = self.optimiser
+        bottom = matrices.new_tensor([0.0, 0, 0, 1]).expand(len(matrices), 1, 4)
+        poses = PoseParameters(torch.cat([matrices, bottom], 1), optimiser.poses.length, optimiser.device)
+        count = len(matrices) * rays
+        owner = torch.arange(len(matrices), device=optimiser.device).repeat_interleave(rays)
+        image = torch.full((count,), camera, device=optimiser.device)
+        first, last = RATES
+        for step in range(steps):
+            xy = optimiser.sampler.random_pixels(image, optimiser.generator)
+            target = optimiser.sampler.colours(image, xy, self._blur())
+            rendering = self._render(
+                poses.matrices()[owner], image, xy, PositionGradient(1.0, 1.0, 1.0), jitter=True
+            )
+            self._spent += rendering.samples
+            colour = optimiser.exposure.refitted(rendering, target, None, len(matrices))
+            optimiser.method.loss(colour, target).sum().backward()
+            poses.step(first * (last / first) ** (step / steps))
+        return poses.matrices().detach()
+
+    def _blur(self) -> float:
+        """Blur of recent targets (px): half of the schedule's width, of which batches draw a random share."""
+        optimiser = self.optimiser
+        sampler = optimiser.sampler
+        return optimiser.schedule.blur(optimiser.step_index, optimiser.switch, sampler.long_side) / 2
+
+    def _render(
+        self, matrix: Tensor, image: Tensor, xy: Tensor, gradient: PositionGradient, *, jitter: bool = False
+    ) -> Rendering:
+        optimiser = self.optimiser
+        origin, direction = optimiser.cast(matrix, image, xy)
+        start = torch.full((len(xy),), 0.5)
+        if jitter:
+            start = torch.rand(len(xy), generator=optimiser.generator)
+        background = optimiser.background.expand(len(xy), 3).contiguous()
+        rays = Rays(origin, direction, background, start.to(optimiser.device), 0)
+        return optimiser.field.render(rays, self._marching, gradient)
+
+    def _coarse_marching(self) -> Marching:
+        """Coarser samples than the run's, and one more cell around occupied ones: gradients begin there."""
+        optimiser = self.optimiser
+        interval = optimiser.schedule.interval(optimiser.step_index, optimiser.switch)
+        marching = optimiser.marching(max(interval, LEAST_INTERVAL))
+        occupied = torch.nn.functional.max_pool3d(
+            marching.occupied[None, None].float(), 3, stride=1, padding=1
+        )
+        return dataclasses.replace(marching, occupied=occupied[0, 0].to(torch.uint8).contiguous())
+
+    def state(self) -> RepairState:
+        return RepairState(repaired=tuple(self.repaired), times=self._times, spent=self._spent)
+
+    def load_state(self, state: RepairState) -> None:
+        self.repaired, self._times, self._spent = list(state.repaired), state.times, state.spent
+        for camera in self.repaired:
+            self.optimiser.mobility[:, self.optimiser.poses.members(camera)] = 1.0
+
+
+def _distinct(matrices: Tensor, scores: Tensor, keep: int) -> Tensor:
+    """Indices of the `keep` best poses [k, 3, 4] of which no two are turned by less than `DISTINCT_DEG`."""
+    rotations = matrices[:, :, :3].double().cpu().numpy()
+    chosen: list[int] = []
+    for i in scores.argsort(stable=True).tolist():
+        apart = rotation_between_deg(rotations[chosen], rotations[i])
+        if bool((apart >= DISTINCT_DEG).all()):
+            chosen.append(i)
+        if len(chosen) == keep:
+            break
+    return torch.tensor(chosen, device=matrices.device)

@@ -1,0 +1,297 @@
+"""The joint optimisation of poses and radiance field: one object holding all state, one method taking a step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.field.backends import directions_for, make_occupancy
+from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
+from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.perturb import RIG_DISTANCE
+from biresnerf.geometry.rigid_bodies import RigidBodies
+from biresnerf.options.refine_options import ResolvedOptions
+from biresnerf.refinement.optimise.async_metrics import AsyncMetrics, StepResult
+from biresnerf.refinement.optimise.camera_errors import CameraErrors
+from biresnerf.refinement.optimise.cast_rays import cast_rays, turned, viewing_directions
+from biresnerf.refinement.optimise.methods import find_method
+from biresnerf.refinement.optimise.optimiser_state import Part, StepState, load_state_of, state_of
+from biresnerf.refinement.optimise.photo_sampler import PhotoSampler, PixelBatch
+from biresnerf.refinement.optimise.pose_hypotheses import photo_distances
+from biresnerf.refinement.parameters.exposure import Exposure
+from biresnerf.refinement.parameters.intrinsics_parameters import IntrinsicsParameters
+from biresnerf.refinement.parameters.pose_parameters import PoseParameters
+from biresnerf.refinement.scene.scene_frame import SceneFrame
+
+MOST_SAMPLES = 768  # per ray
+RAYS_MOST = 1 << 15
+FIRST_SAMPLES = 64  # per ray, as guessed for the first step
+OCCUPANCY_PERIOD = 16
+
+
+class JointOptimiser:
+    """Poses, field, occupancy and their schedules.
+
+    Args:
+        images: photos at working size.
+        frame: the unit frame.
+        unit_from_cam: start poses [n, 4, 4].
+        held_out: images that move their own pose but never the field.
+        mobility: each camera's factor of the pose rate [2, n] in stage 1 and stage 2; default 1.
+        bodies: which cameras move together, and which not at all; by default each moves independently.
+        lenses: the intrinsics, where they may move; by default those of the images.
+        sampler: of the same images and held-out views, if another optimiser has one already.
+    """
+
+    def __init__(
+        self,
+        images: ImageSet,
+        frame: SceneFrame,
+        unit_from_cam: np.ndarray,
+        options: ResolvedOptions,
+        held_out: list[int],
+        device: torch.device,
+        threads: int,
+        mobility: np.ndarray | None = None,
+        bodies: RigidBodies | None = None,
+        lenses: IntrinsicsParameters | None = None,
+        sampler: PhotoSampler | None = None,
+    ) -> None:
+        self.frame, self.options, self.device, self.threads = frame, options, device, threads
+        self.bodies = bodies or RigidBodies.free(len(images))
+        self.method = find_method(options.method)
+        self.field = self.method.build_field(options, frame, device, threads)
+        self.lenses = lenses or IntrinsicsParameters.held(images.cameras, device)
+        self.poses = self._pose_parameters(torch.from_numpy(unit_from_cam))
+        self.schedule = self.method.schedule(options, frame.pixel, frame.unbounded, frame.distance)
+        self._images = images
+        self.sampler = sampler or PhotoSampler(images, held_out, device)
+        self.camera_errors = CameraErrors(images, held_out, device)
+        self.directions, self.metrics = directions_for(device), AsyncMetrics(device)
+        self.occupancy = make_occupancy(self.method.occupancy_side(options), device)
+        self.generator = torch.Generator().manual_seed(options.seed)
+        # Steps draw random numbers on the device, as draws of the host would have to be waited for.
+        on_device = None if device.type == "cpu" else torch.Generator(device).manual_seed(options.seed)
+        self.draws = on_device or self.generator
+        seen = images.pixels if images.counts is None else images.pixels[images.counts]
+        behind = frame.background if frame.background is not None else seen.mean(0) / 255
+        self.background = torch.as_tensor(behind, dtype=torch.float32, device=device)
+        around = self.background if frame.background is not None else None
+        self.exposure = Exposure(images, options.exposure, held_out, around, device)
+        self.step_index = 0
+        # The step at which stage 2 began. A method of one stage is in its last from the first step.
+        self.switch: int | None = None if self.method.two_stages else 0
+        self.poses_held = False  # whether poses and lenses stay as they are
+        self.mobility = (
+            torch.ones(2, len(self.poses), device=device)
+            if mobility is None or not self.method.robust_extensions
+            else torch.tensor(mobility, dtype=torch.float32, device=device)
+        )
+        self.mobility[:, torch.from_numpy(self.bodies.fixed).to(device)] = 0.0
+        guess = self.schedule.samples(0, None) // (self.field.stratified or FIRST_SAMPLES)
+        self.rays = max(self.method.rays_least, guess)
+
+    @cached_property
+    def photo_distances(self) -> NDArray[np.float32]:
+        """How unlike the photos are, see `photo_distances`; computed when a lost camera first needs it."""
+        return photo_distances(self._images)
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Every image's intrinsics at working size, as they are now."""
+        return self.lenses.intrinsics
+
+    def _pose_parameters(self, unit_from_cam: Tensor) -> PoseParameters:
+        return PoseParameters(
+            unit_from_cam,
+            self.frame.distance / RIG_DISTANCE,
+            self.device,
+            betas=self.method.pose_betas,
+            double_step=self.options.double_pose_step,
+            body=torch.from_numpy(self.bodies.of),
+        )
+
+    def replace_pose(self, camera: int, unit_from_cam: Tensor) -> None:
+        """Restart one camera at another pose [3, 4], as free as any and with no history."""
+        self.poses.replace(camera, unit_from_cam)
+        self.camera_errors.forget(camera)
+        self.exposure.forget(camera)
+        self.mobility[:, self.poses.members(camera)] = 1.0
+
+    def marching(self, interval: float) -> Marching:
+        near, far = self.schedule.near(self.step_index, self.switch), self.schedule.far(self.frame.far)
+        near = self.frame.distance * (max(near, self.frame.near) if self.method.robust_extensions else near)
+        merging = self.method.merging if self.switch is not None else None  # stage 1 needs every sample
+        return Marching(interval, near, far, MOST_SAMPLES, self.occupancy.occupied, merging)
+
+    def cast(
+        self, matrix: Tensor, image: Tensor, xy: Tensor, intrinsics: Intrinsics | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Origin and direction [rays, 3] in the unit frame of pixels `xy` [rays, 2] seen by cameras of images.
+
+        `matrix` [rays, 3, 4] is each ray's unit_from_cam; `intrinsics` are the run's images' where not given.
+        """
+        lenses = intrinsics or self.intrinsics
+        return turned(matrix, viewing_directions(self.directions, lenses, image, xy))
+
+    def render(
+        self,
+        origin: Tensor,
+        direction: Tensor,
+        trained: int,
+        interval: float,
+        gradient: PositionGradient,
+        *,
+        jitter: bool,
+    ) -> Rendering:
+        """Render rays over the scene's background; `jitter` randomises where sampling starts."""
+        count = len(origin)
+        shape = (count,) if self.field.stratified is None else (count, self.field.stratified)
+        start = (
+            torch.rand(shape, generator=self.draws, device=self.device)
+            if jitter
+            else torch.full(shape, 0.5, device=self.device)
+        )
+        background = self.background.expand(count, 3).contiguous()
+        rays = Rays(origin, direction, background, start, trained)
+        return self.field.render(rays, self.marching(interval), gradient)
+
+    def step(self) -> StepResult:
+        """One step of the joint optimisation."""
+        t, schedule = self.step_index, self.schedule
+        self.field.reach(t / schedule.steps)
+        if t % OCCUPANCY_PERIOD == 0 and self.method.pruned:
+            self._update_occupancy(t)
+        batch = self.sampler.draw(
+            self.rays, schedule.blur(t, self.switch, self.sampler.long_side), self.draws
+        )
+        rate = self.pose_rate()
+        held = self.poses_held or not self.lenses.moving
+        lens_rate = 0.0 if held else schedule.lens_rate(t, self.switch)
+        matrices, lenses = self.poses.matrices(), self.intrinsics
+        if rate == 0:
+            matrices = matrices.detach()
+        if lens_rate > 0:
+            matrices, lenses = self.lenses.with_gradient(matrices)
+        in_cam = viewing_directions(self.directions, lenses, batch.image, batch.xy)
+        origin, direction = cast_rays(matrices, batch.image, in_cam)
+        rendering = self.render(
+            origin, direction, batch.trained, schedule.interval(t, self.switch),
+            schedule.position_gradient(t, self.switch), jitter=True,
+        )  # fmt: skip
+        colour = self.exposure.shown(rendering, batch.image)
+        loss = self._loss(self.exposure.forgiven(colour, batch.target), batch)
+        loss.backward()
+        rates = schedule.field_rates(t, self.switch)
+        self.field.step(rates)
+        self.exposure.step(rates.networks)
+        if rate > 0:
+            mobility = self.mobility[0 if self.switch is None else 1]
+            self.poses.step(rate, mobility, field_rate=rates.networks)
+            if lens_rate > 0:
+                self.poses.dolly(self.lenses.step(lens_rate, focal=schedule.focal_moves(self.switch)))
+        self.step_index += 1
+        self._adapt_rays(rendering.samples, schedule.samples(t, self.switch))
+        shown = colour.detach().clamp(max=1)
+        self.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach())
+        error = ((shown - batch.sharp) ** 2)[: batch.trained].mean()
+        # A pose that is not finite sees nothing, so the loss stays finite.
+        loss_value, error_value = self.metrics.read(loss.detach() + self.poses.zero_if_finite(), error)
+        return StepResult(loss_value, error_value, len(origin), rendering.samples)
+
+    def _loss(self, colour: Tensor, batch: PixelBatch) -> Tensor:
+        loss, weights = self.method.loss(colour, batch.target), self.camera_errors.weights
+        if weights is not None and self.method.robust_extensions:
+            loss = loss * weights[batch.image][:, None]
+        return loss.mean()
+
+    def pose_rate(self) -> float:
+        """Learning rate of the poses at this step."""
+        return 0.0 if self.poses_held else self.schedule.pose_rate(self.step_index, self.switch)
+
+    def end_after(self, share: float) -> None:
+        """The run ends after so large a share of the steps that it was asked for, if not sooner."""
+        self._end_at(min(self.step_index + round(share * self.options.steps), self.schedule.steps))
+
+    def set_steps(self, steps: int) -> None:
+        """The run takes so many steps in all: what is left of its schedule is compressed or stretched."""
+        if self.switch is None:
+            self._plan(steps)
+        else:
+            self._end_at(steps)
+
+    def _plan(self, steps: int) -> None:
+        self.options = self.options.with_steps(steps)
+        self.schedule = replace(self.schedule, options=self.options)
+
+    def _end_at(self, steps: int) -> None:
+        options = self.schedule.options.model_copy(update={"steps": steps})
+        self.schedule = replace(self.schedule, options=options)
+
+    def start_reconstruction(self) -> None:
+        """Switch to stage 2 at this step."""
+        self.switch = self.step_index
+        self.field.start_reconstruction()
+
+    def _update_occupancy(self, step: int) -> None:
+        self.occupancy.update(
+            self.field,
+            self.schedule.fine_interval,
+            self.draws,
+            looked_at=self.schedule.empty_cells_looked_at(step, self.switch),
+            prune=self.schedule.pruned(step),
+            dilate=self.schedule.dilated(self.switch),
+        )
+
+    def _adapt_rays(self, samples: int, budget: int) -> None:
+        wanted = self.rays * budget / max(1, samples)
+        wanted = min(max(wanted, self.rays / 1.5), self.rays * 1.5)
+        self.rays = int(min(max(wanted, self.method.rays_least), RAYS_MOST))
+
+    def coarse_state(self) -> dict[str, Tensor]:
+        """The tensors of stage 1: all but the reconstruction module, which has not moved."""
+        return {name: tensor for name, tensor in self.state().items() if "reconstruction" not in name}
+
+    def state(self) -> dict[str, Tensor]:
+        """All tensors of the run (shared, not copied)."""
+        return {"generator": self.generator.get_state(), **state_of(self._parts())}
+
+    def _parts(self) -> dict[str, Part]:
+        return {
+            "field": self.field,
+            "poses": self.poses,
+            "lenses": self.lenses,
+            "occupancy": self.occupancy,
+            "camera_errors": self.camera_errors,
+            "exposure": self.exposure,
+        }
+
+    def step_state(self) -> StepState:
+        """The state that is not in tensors."""
+        return StepState(
+            step_index=self.step_index,
+            switch=self.switch,
+            rays=self.rays,
+            poses_held=self.poses_held,
+            planned_steps=self.options.steps,
+            steps=self.schedule.steps,
+        )
+
+    def load_state(self, tensors: dict[str, Tensor], numbers: StepState) -> None:
+        """Restore what `state` and `step_state` returned; the next step is then the one that would have come."""
+        self.generator.set_state(tensors["generator"])
+        load_state_of(self._parts(), tensors)
+        self.step_index, self.switch, self.rays = numbers.step_index, numbers.switch, numbers.rays
+        self.poses_held = numbers.poses_held
+        if numbers.planned_steps != self.options.steps:
+            self._plan(numbers.planned_steps)
+        self._end_at(numbers.steps)
+        if self.draws is not self.generator:
+            self.draws.manual_seed(self.options.seed + self.step_index)  # its state is not kept
+        self.field.reach(self.step_index / self.schedule.steps)

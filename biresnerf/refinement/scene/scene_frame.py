@@ -1,0 +1,137 @@
+"""The unit frame: where the scene lies, how large it is, and what lies around it.
+
+One rule for all rigs: the inner box [-1, 1]^3 is centred on the point the cameras look at and as large as what a
+camera sees at that distance. A scene with a known background colour is assumed to end there; any other
+continues outside, contracted.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.focus import focus_point, rms_spread
+from biresnerf.geometry.similarity import Similarity
+from biresnerf.refinement.scene.shared_views import nearest_shared
+
+logger = logging.getLogger(__name__)
+
+# Below this mean squared sine the axes are too parallel to say where they meet (a spread of about 6 degrees).
+CONVERGING = 0.01
+FORWARD_FACING_DEPTH = 6.0  # in spreads of the camera centres, where nothing better is known
+ALPHA_MARGIN = 1.15  # poses are noisy: the silhouettes' box is widened by this
+# Half an angle of view counts as no more than this tangent (56 deg): fisheyes see to their sides.
+WIDEST_SLOPE = 1.5
+FAR_BOXES = 60.0  # unbounded rays end this many inner boxes away (contracted to 1.98 of 2)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFrame:
+    """`unit_from_world` with what sampling needs to know; lengths are in units of the unit frame.
+
+    Attributes:
+        distance: mean distance of the cameras from the centre.
+        pixel: what one pixel of the working size spans at that distance.
+        background: colour [3], 0 to 1, behind the scene; None where the scene has surroundings.
+        near: nothing nearer to a camera is sampled; a share of `distance`.
+    """
+
+    unit_from_world: Similarity
+    unbounded: bool
+    distance: float
+    pixel: float
+    far: float
+    background: np.ndarray | None
+    near: float = 0.0
+
+
+def _slopes(images: ImageSet, image: int, pixel_xy: np.ndarray) -> np.ndarray:
+    """x/z and y/z [n, 2] of the directions that pixels [n, 2] of an image look in, within `WIDEST_SLOPE`."""
+    intrinsics = Intrinsics.from_cameras([images.cameras[image]])
+    index = torch.zeros(len(pixel_xy), dtype=torch.int64)
+    ray = directions_in_cam(intrinsics, index, torch.from_numpy(pixel_xy.astype(np.float64))).numpy()
+    across, ahead = ray[:, :2], ray[:, 2:]
+    beyond = np.abs(across) >= WIDEST_SLOPE * ahead
+    return np.where(beyond, WIDEST_SLOPE * np.sign(across), across / np.where(beyond, 1.0, ahead))
+
+
+def _half_angle_tangent(images: ImageSet) -> float:
+    """Tangent of half the angle of view along the longer side, of most cameras."""
+    tangents: dict[Camera, float] = {}
+    for i, camera in enumerate(images.cameras):
+        if camera not in tangents:
+            full, w, h = camera.full(), camera.width, camera.height
+            x, y = min(max(full.cx, 0.0), float(w)), min(max(full.cy, 0.0), float(h))
+            slopes = _slopes(images, i, np.array([[0, y], [w, y], [x, 0], [x, h]]))
+            tangents[camera] = float(max(slopes[1, 0] - slopes[0, 0], slopes[3, 1] - slopes[2, 1])) / 2
+    return float(np.median([tangents[camera] for camera in images.cameras]))
+
+
+def _silhouette_tangent(images: ImageSet) -> float | None:
+    """How far from the optical axis silhouettes reach, as a tangent; None without alpha."""
+    reach = []
+    for i in range(len(images.cameras)):
+        alpha = images.alpha_image(i)
+        if alpha is None:
+            return None
+        seen = alpha > 127
+        counts = images.counts_image(i)
+        rows, columns = np.nonzero(seen if counts is None else seen & counts)
+        if len(rows):
+            x, y = np.meshgrid([columns.min(), columns.max()], [rows.min(), rows.max()])
+            corners = np.stack([x, y], -1).reshape(-1, 2) + 0.5
+            reach.append(np.abs(_slopes(images, i, corners)).max())
+    return float(np.quantile(reach, 0.9)) if reach else None
+
+
+def _pixel_slope(images: ImageSet) -> float:
+    """What one pixel spans at the image's centre, at a distance of one."""
+    spans = [max(c.width / c.full().fx, c.height / c.full().fy) for c in images.cameras]
+    return float(np.median(spans) / np.median([max(c.width, c.height) for c in images.cameras]))
+
+
+def scene_frame(poses: np.ndarray, images: ImageSet, depth: float | None = None) -> SceneFrame:
+    """The unit frame of a set, from its poses world_from_cam [n, 4, 4] (noisy ones will do) and images.
+
+    Several sets of poses of the same images, one after the other, get a frame that suits them all. Where the optical
+    axes do not meet, the scene is assumed to lie at ``depth`` in front of the cameras, in the poses' unit.
+    """
+    centres = poses[:, :3, 3]
+    focus = focus_point(poses)
+    centre, distance = focus.point, focus.mean_distance
+    if focus.conditioning < CONVERGING or focus.in_front < 0.5:
+        spread = rms_spread(centres)
+        axis = poses[:, :3, 2].mean(0)
+        length = float(np.linalg.norm(axis))
+        forward = axis / length if length > 0.2 else np.zeros(3)
+        guess = FORWARD_FACING_DEPTH * spread if spread > 0 else 1.0
+        distance = guess if depth is None else depth
+        centre = centres.mean(0) + distance * forward
+        logger.info("optical axes do not meet: taking the scene %.3g ahead of the cameras", distance)
+    tangent = _half_angle_tangent(images)
+    silhouette = _silhouette_tangent(images)
+    if silhouette is not None:
+        tangent = min(tangent, ALPHA_MARGIN * silhouette)
+    half = distance * tangent
+    unit_from_world = Similarity(1 / half, np.eye(3), -centre / half)
+    return SceneFrame(
+        unit_from_world=unit_from_world,
+        unbounded=images.background is None,
+        distance=distance / half,
+        pixel=_pixel_slope(images) * distance / half,
+        far=FAR_BOXES if images.background is None else 4 * distance / half + 4,
+        background=images.background,
+        near=_near(poses, images, distance) if images.background is None else 0.0,
+    )
+
+
+def _near(poses: np.ndarray, images: ImageSet, distance: float) -> float:
+    intrinsics = Intrinsics.from_cameras(images.cameras)
+    rigs = poses.reshape(-1, len(images), 4, 4)
+    return min(nearest_shared(rig, intrinsics, distance) for rig in rigs)

@@ -1,0 +1,88 @@
+"""From initial poses to the optimisation at its first step, and from optimised poses back to the input's frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
+from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Method, find_method
+from biresnerf.refinement.parameters.intrinsics_parameters import lenses_of
+from biresnerf.refinement.parameters.rigid_bodies import rigid_bodies
+from biresnerf.refinement.scene.scene import Scene
+from biresnerf.refinement.scene.scene_depth import matched_depth
+from biresnerf.refinement.scene.scene_frame import scene_frame
+
+# Cameras. Their system is dense: 1,000 take five minutes of one core and 1.9 GB.
+LEAST_ADJUSTED, MOST_ADJUSTED = 3, 1000
+# Where matches placed most cameras, stage 1 has only to form the field: its lengths shrink to this share.
+MATCHED_COARSE_SHARE = 2 / 3
+
+
+def first_step(scene: Scene, options: ResolvedOptions, device: torch.device, threads: int) -> JointOptimiser:
+    """The optimisation at its first step, in the unit frame of the initial poses."""
+    dataset, images, start = scene.dataset, scene.images, scene.start
+    bodies = rigid_bodies(dataset, options)
+    world_from_cam = bodies.held(start.world_from_cam, dataset.world_from_cam)
+    frame = scene_frame(world_from_cam, images, matched_depth(dataset, world_from_cam, scene.tracks))
+    poses = frame.unit_from_world.apply_to_poses(world_from_cam)
+    excluded = scene.excluded_from_training
+    adjusted = scene.tracks is not None and adjusts_cameras(dataset, find_method(options.method))
+    fisheye = any(camera.full().fisheye for camera in dataset.cameras)
+    by_photos = "none" if adjusted and not fisheye else options.refine_intrinsics
+    lenses = lenses_of(dataset, images, by_photos, excluded, device, dollies=not bodies.tied)
+    optimiser = JointOptimiser(
+        images, frame, poses, options, excluded, device, threads, pose_mobility(start), bodies, lenses
+    )
+    optimiser.camera_errors.doubt(start.guessed)
+    return optimiser
+
+
+def adjusts_cameras(dataset: Dataset, method: Method) -> bool:
+    """Whether all cameras are adjusted at the end, and perspective lenses with them where there are tracks.
+
+    Not by methods of others.
+    """
+    return method.robust_extensions and LEAST_ADJUSTED <= len(dataset) <= MOST_ADJUSTED
+
+
+def pose_mobility(start: InitialPoses) -> NDArray[np.float64]:
+    """Each camera's factor of the pose rate [2, n] in stage 1 and stage 2.
+
+    Cameras placed by matches keep still until the field has formed: an unformed field would carry them away.
+    """
+    return np.stack([np.where(start.matched, 0.0, 1.0), np.ones(len(start.matched))])
+
+
+def stage_lengths(start: InitialPoses, asked: RefineOptions, resolved: ResolvedOptions) -> ResolvedOptions:
+    """`resolved` with a shorter stage 1 where matches placed most cameras, unless its length was `asked` for."""
+    if not (start.mostly_matched and find_method(resolved.method).robust_extensions):
+        return resolved
+    names = [n for n in ("coarse_steps_min", "coarse_steps_max") if getattr(asked, n) is None]
+    shorter = {name: round(MATCHED_COARSE_SHARE * getattr(resolved, name)) for name in names}
+    return resolved.model_copy(update=shorter)
+
+
+def poses_in_input_frame(
+    dataset: Dataset, optimiser: JointOptimiser
+) -> tuple[NDArray[np.float64], Similarity]:
+    """Refined world_from_cam [n, 4, 4] in the input's frame, and the similarity `input_from_optimised`.
+
+    The optimisation leaves frame and scale free. The similarity that fits the optimised poses to the given ones best
+    fixes them; it is robust to lost cameras unless the method says otherwise. Fixed cameras and rigs leave less free.
+    """
+    world_from_unit = optimiser.frame.unit_from_world.inverse()
+    optimised = world_from_unit.apply_to_poses(optimiser.poses.poses().numpy())
+    given, tied = dataset.world_from_cam, dataset.anchors
+    input_from_optimised = optimiser.bodies.input_from_optimised(optimised, given)
+    if input_from_optimised is None and optimiser.method.robust_frame:
+        input_from_optimised = align_robust(optimised[tied], given[tied], with_rotations=True)
+    elif input_from_optimised is None:
+        input_from_optimised = align_by_spread(optimised[tied], given[tied])
+    carried = input_from_optimised.apply_to_poses(optimised)
+    return optimiser.bodies.restored(carried, given), input_from_optimised

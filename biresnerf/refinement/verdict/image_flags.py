@@ -1,0 +1,96 @@
+"""Problems of single photos: blur, a different exposure, a pose that moved far."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.field.radiance_field import PositionGradient
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+
+Array = NDArray[np.float64]
+
+NEIGHBOURS = 6  # photos from the nearest places, which show about the same
+BLURRED_BELOW = 0.3  # of the neighbours' sharpness: a blur of about one px of the working size
+GAIN_RAYS = 256  # of each photo
+EXPOSURE_OFF = 0.2  # log of the gain against the median photo's: a fifth, or a quarter of a stop
+DEVIATIONS = 5.0  # robust standard deviations that an outlier must stand out by as well
+# A pose moved far by more than so many medians, and at least so many degrees or so much of the cameras' distance.
+FAR_TIMES, FAR_DEG, FAR_SHARE = 4.0, 1.0, 0.02
+MAD_TO_DEVIATION = 1.4826
+DARKEST = 0.02  # mean colour below which a photo has no gain
+
+
+def sharpness(images: ImageSet, world_from_cam: Array) -> Array:
+    """Variance of each photo's Laplacian [n] over the median of its neighbours', at working size."""
+    variances = np.array([_laplacian_variance(images, i) for i in range(len(images))])
+    centres = world_from_cam[:, :3, 3]
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    apart = apart / max(float(np.median(apart)), 1e-300)
+    apart += np.linalg.norm(world_from_cam[:, None, :3, 2] - world_from_cam[None, :, :3, 2], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    nearest = np.argsort(apart, axis=1, kind="stable")[:, : min(NEIGHBOURS, len(images) - 1)]
+    return variances / np.maximum(np.median(variances[nearest], axis=1), 1e-12)
+
+
+def _laplacian_variance(images: ImageSet, index: int) -> float:
+    """Of the brightness (0 to 1), over pixels whose neighbours count as well."""
+    grey = images.image(index).astype(np.float64).mean(2) / 255
+    if min(grey.shape) < 3:
+        return 0.0
+    laplacian = _four_neighbours(grey) - 4 * grey[1:-1, 1:-1]
+    counts = images.counts_image(index)
+    if counts is not None:
+        laplacian = laplacian[(_four_neighbours(counts.astype(np.float64)) == 4) & counts[1:-1, 1:-1]]
+    return float(laplacian.var()) if laplacian.size else 0.0
+
+
+def _four_neighbours(values: Array) -> Array:
+    """The sum of the four neighbours of each inner pixel of [h, w]."""
+    return values[1:-1, :-2] + values[1:-1, 2:] + values[:-2, 1:-1] + values[2:, 1:-1]
+
+
+@torch.no_grad()
+def gains(optimiser: JointOptimiser) -> Array:
+    """Brightness of each photo over that of its render [n], from random pixels that show the scene; NaN if none do."""
+    count = len(optimiser.poses)
+    batch = optimiser.sampler.draw(GAIN_RAYS * count, 0.0, optimiser.generator)
+    shown, rendered = np.zeros(count), np.zeros(count)
+    matrices = optimiser.poses.matrices().detach()
+    for part in torch.arange(len(batch.image), device=optimiser.device).split(GAIN_RAYS * 32):
+        image = batch.image[part]
+        origin, direction = optimiser.cast(matrices[image], image, batch.xy[part])
+        rendering = optimiser.render(
+            origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=False
+        )
+        seen = (rendering.opacity > 0.5).float()  # the background shines as it likes
+        for total, colour in ((shown, batch.sharp[part]), (rendered, rendering.colour)):
+            values = (colour.mean(1) * seen).double().cpu().numpy()
+            np.add.at(total, image.cpu().numpy(), values)
+    dark = np.minimum(shown, rendered) < DARKEST * GAIN_RAYS
+    return np.where(dark, np.nan, shown / np.maximum(rendered, 1e-12))
+
+
+def blurred(relative: Array) -> NDArray[np.bool_]:
+    """Which photos [n] are blurred, by their `sharpness`."""
+    return relative < BLURRED_BELOW
+
+
+def exposure_off(gain: Array) -> NDArray[np.bool_]:
+    """Which photos [n] are exposed otherwise than the rest, by their `gains`."""
+    logs = np.log(gain)
+    known = np.isfinite(logs)
+    if not known.any():
+        return np.zeros(len(gain), dtype=np.bool_)
+    apart = np.abs(logs - np.median(logs[known]))
+    deviation = MAD_TO_DEVIATION * float(np.median(apart[known]))
+    return known & (apart > max(EXPOSURE_OFF, DEVIATIONS * deviation))
+
+
+def moved_far(turned_deg: Array, shifted: Array, distance: float) -> NDArray[np.bool_]:
+    """Which cameras [n] moved by far more than most; `distance` is that of the cameras from the scene."""
+    turn = turned_deg > max(FAR_DEG, FAR_TIMES * float(np.median(turned_deg)))
+    shift = shifted > max(FAR_SHARE * distance, FAR_TIMES * float(np.median(shifted)))
+    return turn | shift

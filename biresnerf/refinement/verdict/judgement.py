@@ -1,0 +1,197 @@
+"""The verdict on a finished optimisation: gather the evidence, decide, and check each photo."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import GUESSES, Dataset
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.geometry.focus import focus_point, rms_spread
+from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.refinement.lost.own_matches import contradicted
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.scene.scene import Scene
+from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.start.first_step import poses_in_input_frame
+from biresnerf.refinement.verdict import image_flags
+from biresnerf.refinement.verdict.pose_evidence import (
+    EpipolarComparison,
+    compare_on_matches,
+    working_share,
+)
+from biresnerf.refinement.verdict.verdict import MEASURABLE_PX, Findings, decide, failed_checks, frame_doubt
+from biresnerf.refinement.views.compare_rigs import (
+    BeforeAfter,
+    Effort,
+    HeldOutComparison,
+    Rig,
+    compare_placed,
+)
+from biresnerf.refinement.views.held_out_views import ROUNDS_MOST
+from biresnerf.refinement.views.motion import moved_px
+from biresnerf.report import Verdict
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+GUESSED = GUESSES | {"forward-facing", "turntable"}
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """The verdict, and what was found about each image [n].
+
+    Attributes:
+        trial_psnr: of the unseen views, before and after [2, n]; NaN for the others.
+        epipolar_px: before and after [2, n]; NaN where there are too few matches.
+        renders: of some held-out views, in the verdict's training on the input's poses and on the refined ones.
+        sharpness, gain: see `image_flags`.
+        contradicted, moved_far, blurred, exposure_off: bool.
+    """
+
+    verdict: Verdict
+    trial_psnr: Array
+    renders: BeforeAfter
+    epipolar_px: Array
+    sharpness: Array
+    gain: Array
+    contradicted: NDArray[np.bool_]
+    moved_far: NDArray[np.bool_]
+    blurred: NDArray[np.bool_]
+    exposure_off: NDArray[np.bool_]
+
+
+def judge(stages: TwoStages) -> Judgement | None:
+    """The verdict on the refined poses; None where the options ask for none.
+
+    Raises:
+        Interrupted: stopped; a continued run judges again.
+    """
+    if not stages.optimiser.options.verdict:
+        return None
+    message = "comparing the refined poses with the input's"
+    with stages.timed("judging"):
+        judgement = judge_poses(
+            stages.scene, stages.optimiser, stages.monitor.should_stop,
+            lambda share: stages.report_evaluation(share, message=message), _rounds(stages),
+            stages.forecast.took,
+        )  # fmt: skip
+    logger.info("verdict: %s", judgement.verdict.verdict)
+    return judgement
+
+
+def _rounds(stages: TwoStages) -> int:
+    """How many rounds of trainings there is time for; one in any case."""
+    each_s = stages.forecast.seconds("judging")
+    in_time = (stages.ends - time.monotonic()) / max(each_s, 1e-9)
+    return int(min(max(in_time, 1), ROUNDS_MOST))
+
+
+def judge_poses(
+    scene: Scene,
+    optimiser: JointOptimiser,
+    should_stop: Callable[[], bool] = lambda: False,
+    report: Callable[[float], None] = lambda _share: None,
+    rounds_most: int = ROUNDS_MOST,
+    took: Callable[[float], None] = lambda _work: None,
+) -> Judgement:
+    """Compare the optimised poses with the dataset's own; `report` is called with the share of work done.
+
+    Fields are trained in ``rounds_most`` rounds at most. `took` is called with the work that it was.
+
+    Raises:
+        Interrupted: ``should_stop`` returned true.
+    """
+    report(0.0)
+    dataset, images = scene.dataset, scene.images
+    refined = optimiser.lenses.refined(dataset)
+    rows = range(len(dataset))
+    before = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in rows))
+    after = Rig(poses_in_input_frame(dataset, optimiser)[0], tuple(refined.camera_of(i) for i in rows))
+    turned, shifted = motion(before.world_from_cam, after.world_from_cam)
+    spread = rms_spread(before.world_from_cam[:, :3, 3])
+    grounded = sum(frame.pose_source not in GUESSED for frame in dataset.frames) > len(dataset) / 2
+    lost = int(optimiser.camera_errors.lost.sum())
+    failed = failed_checks(after.world_from_cam, lost)
+    heldout: HeldOutComparison | None = None
+    epipolar: EpipolarComparison | None = None
+    moved = 0.0
+    placed = np.array([frame.pose_source not in GUESSES for frame in dataset.frames])
+    if np.isfinite(after.world_from_cam).all():
+        moved = moved_px(before, after, images)
+        if scene.tracks is not None:
+            epipolar = compare_on_matches(
+                before, after, scene.tracks, placed, started_from_matches=bool(scene.start.matched.any())
+            )
+        if moved >= MEASURABLE_PX:
+            heldout = compare_placed(
+                before, after, scene, optimiser, placed | (not grounded),
+                should_stop, report, Effort(rounds_most=rounds_most),
+            )  # fmt: skip
+    took(heldout.work if heldout else 0.0)
+    verdict = decide(
+        Findings(
+            failed=failed,
+            moved_px=moved,
+            heldout=heldout.evidence if heldout else None,
+            epipolar=epipolar.evidence if epipolar else None,
+            compared_with=_source_of_poses(dataset),
+            grounded=grounded,
+            working_share=working_share(before, images),
+            out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
+        )
+    )
+    return _with_images(verdict, images, optimiser, before, heldout, epipolar, turned, shifted)
+
+
+def motion(before: Array, after: Array) -> tuple[Array, Array]:
+    """Rotation (deg) and distance of the centres [n] between poses [n, 4, 4] of the same cameras."""
+    turned = rotation_between_deg(before, after)
+    return turned, np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+
+
+def _source_of_poses(dataset: Dataset) -> Literal["given", "seeded", "mixed"]:
+    given = sum(frame.pose_source == "given" for frame in dataset.frames)
+    if given == len(dataset):
+        return "given"
+    return "mixed" if given else "seeded"
+
+
+def _with_images(
+    verdict: Verdict,
+    images: ImageSet,
+    optimiser: JointOptimiser,
+    before: Rig,
+    heldout: HeldOutComparison | None,
+    epipolar: EpipolarComparison | None,
+    turned: Array,
+    shifted: Array,
+) -> Judgement:
+    trial_psnr, epipolar_px = np.full((2, len(images)), np.nan), np.full((2, len(images)), np.nan)
+    if heldout is not None:
+        trial_psnr[:, heldout.views] = heldout.before.psnr, heldout.after.psnr
+    if epipolar is not None:
+        epipolar_px[:] = epipolar.before, epipolar.after
+    sharpness = image_flags.sharpness(images, before.world_from_cam)
+    gain = image_flags.gains(optimiser)
+    distance = focus_point(before.world_from_cam).mean_distance
+    return Judgement(
+        verdict=verdict,
+        trial_psnr=trial_psnr,
+        renders=heldout.renders if heldout is not None else {},
+        epipolar_px=epipolar_px,
+        sharpness=sharpness,
+        gain=gain,
+        contradicted=contradicted(epipolar_px[1]),
+        moved_far=image_flags.moved_far(turned, shifted, distance),
+        blurred=image_flags.blurred(sharpness),
+        exposure_off=image_flags.exposure_off(gain),
+    )

@@ -1,0 +1,82 @@
+"""The evidence for or against refined poses beside unseen views: feature matches and motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.data.points.tracks import Tracks
+from biresnerf.refinement.adjustment.paired import paired
+from biresnerf.refinement.lost.own_matches import LEAST_PX, OwnMatches
+from biresnerf.refinement.verdict.verdict import EPIPOLAR_MATTERS
+from biresnerf.refinement.views.compare_rigs import Rig
+from biresnerf.report import EpipolarEvidence
+
+Array = NDArray[np.float64]
+
+LEAST_MATCHED = 4  # images
+
+
+@dataclass(frozen=True, eq=False)
+class EpipolarComparison:
+    """Median error of all of each image's matches [n] (px, full size) with either rig; NaN where it has too few."""
+
+    before: Array
+    after: Array
+    evidence: EpipolarEvidence
+
+
+def compare_on_matches(
+    before: Rig, after: Rig, tracks: Tracks, placed: NDArray[np.bool_], *, started_from_matches: bool
+) -> EpipolarComparison | None:
+    """Each image's median epipolar error with either rig; None where too few images have matches.
+
+    The evidence is of points that were left out of every estimate, where they know half of the images that all points
+    know. Images without a pose before say nothing: any pose is better than a guess.
+
+    Args:
+        placed: which images [n] had more than a guess for a pose before.
+        started_from_matches: whether points not left out had a part in the rig `after`.
+    """
+    old, new = _errors_px(before, after, tracks)
+    counted = placed if placed.any() else ~placed
+    judging, figures = tracks.split()[1], (old, new)
+    if judging is not None:
+        left_out = _errors_px(before, after, judging)
+        enough = max(LEAST_MATCHED, _known(figures, counted).sum() / 2)
+        judging, figures = (
+            (judging, left_out) if _known(left_out, counted).sum() >= enough else (None, figures)
+        )
+    known = _known(figures, counted)
+    if known.sum() < LEAST_MATCHED:
+        return None
+    one, other = (errors[known] for errors in figures)
+    gains = np.log2(np.maximum(one, LEAST_PX) / np.maximum(other, LEAST_PX))
+    comparison = paired(one, other, EPIPOLAR_MATTERS, gains)
+    medians = {"before": float(np.median(one)), "after": float(np.median(other))}
+    sides = [max(camera.width, camera.height) for camera in after.cameras]
+    evidence = EpipolarEvidence(
+        matches=len((judging or tracks).pairs()[0]),
+        independent=judging is not None or not started_from_matches,
+        error_px=comparison.model_copy(update=medians),
+        share_of_image=medians["after"] / float(np.median(sides)),
+    )
+    return EpipolarComparison(old, new, evidence)
+
+
+def _errors_px(before: Rig, after: Rig, tracks: Tracks) -> tuple[Array, Array]:
+    old, new = (OwnMatches(tracks, rig.cameras).errors_px(rig.world_from_cam) for rig in (before, after))
+    return old, new
+
+
+def _known(errors: tuple[Array, Array], counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return np.isfinite(errors[0]) & np.isfinite(errors[1]) & counted
+
+
+def working_share(rig: Rig, images: ImageSet) -> float:
+    """The photos' long sides at working size over those at full size: the median."""
+    full = np.array([max(camera.width, camera.height) for camera in rig.cameras])
+    return float(np.median(np.maximum(images.widths, images.heights) / full))

@@ -1,0 +1,79 @@
+"""What is known of the poses that a run returns, in the input's frame and unit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from biresnerf.geometry.focus import focus_point, rms_spread
+from biresnerf.refinement.finish.expected_errors import ExpectedErrors, expected_errors
+from biresnerf.refinement.finish.outcome import Finish
+from biresnerf.refinement.lost.own_matches import contradicted
+from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.start.first_step import poses_in_input_frame
+from biresnerf.refinement.verdict.judgement import Judgement
+from biresnerf.uncertainty import KnownFrom, PoseUncertainty
+
+FIXED = "they were kept as given, on request"
+CONTRADICTED = "their feature matches contradict them"
+NO_EVIDENCE = "no feature matches or patches support them"
+LOST = "no pose was found that agrees with the photo"
+OPEN = "their matches do not determine them"
+
+
+def pose_uncertainty(
+    stages: TwoStages, finish: Finish, judgement: Judgement | None
+) -> tuple[PoseUncertainty, ...]:
+    """Of each image's returned pose; of none where the method is another one's.
+
+    Args:
+        finish: with the poses that fit all evidence that is to be trusted.
+        judgement: None where there is no verdict, and the refined poses are returned.
+    """
+    optimiser, dataset = stages.optimiser, stages.scene.dataset
+    if not optimiser.method.robust_extensions:
+        return ()
+    poses, input_from_optimised = poses_in_input_frame(dataset, optimiser)
+    errors_px = np.full((2, len(dataset)), np.nan) if judgement is None else judgement.epipolar_px
+    wrong = contradicted(errors_px[1])
+    if judgement is not None and judgement.verdict.returned == "input":
+        poses, wrong = dataset.world_from_cam, contradicted(errors_px[0])
+    found: ExpectedErrors | None = None
+    if finish.fit is not None and np.isfinite(poses).all():
+        input_from_unit = input_from_optimised @ optimiser.frame.unit_from_world.inverse()
+        in_unit, fit = input_from_unit.inverse().apply_to_poses(poses), finish.fit
+        in_unit_errors = expected_errors(
+            in_unit, fit.world_from_cam, fit.evidence, fit.patch_noise, optimiser.bodies
+        )
+        found = in_unit_errors.carried(input_from_unit)
+    lost = optimiser.camera_errors.lost.tolist()
+    reasons = [
+        FIXED if optimiser.bodies.fixed[i]
+        else CONTRADICTED if wrong[i]
+        else None if found is not None and found.known[i]
+        else LOST if lost[i]
+        else NO_EVIDENCE if found is None or not (found.by_tracks[i] or found.by_patches[i])
+        else OPEN
+        for i in range(len(dataset))
+    ]  # fmt: skip
+    focus = focus_point(poses)
+    distance = focus.mean_distance if focus.well_posed else rms_spread(poses[:, :3, 3])
+    return tuple(
+        PoseUncertainty(known_from="nothing", why_unknown=why)
+        if why is not None or found is None
+        else _known(found, i, distance)
+        for i, why in enumerate(reasons)
+    )
+
+
+def _known(found: ExpectedErrors, image: int, distance: float) -> PoseUncertainty:
+    source: KnownFrom = "photos"
+    if found.by_tracks[image]:
+        source = "matches and photos" if found.by_patches[image] else "matches"
+    rotation, position = (float(bounds[image]) for bounds in found.bounds_90())
+    return PoseUncertainty(
+        known_from=source,
+        rotation_deg=float(np.degrees(rotation)),
+        position=position,
+        position_percent=100 * position / distance,
+        covariance=found.moments[image].tolist(),
+    )

@@ -1,0 +1,194 @@
+"""The report of a run: all that report.json holds."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.photos.photo_folders import few_names
+from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.field.backends import gpu_faults
+from biresnerf.refinement.finish.given_poses import accuracy_report, accuracy_warnings
+from biresnerf.refinement.finish.outcome import Finish
+from biresnerf.refinement.finish.time_budget import budget_warnings
+from biresnerf.refinement.lost.own_matches import LEAST_PAIRS
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.scene.scene import Scene
+from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.start.choose_start import MARGIN_DB
+from biresnerf.refinement.start.first_step import poses_in_input_frame
+from biresnerf.refinement.verdict.camera_reports import camera_reports, focal_warnings
+from biresnerf.refinement.verdict.judgement import Judgement, motion
+from biresnerf.refinement.verdict.pose_uncertainty import FIXED
+from biresnerf.refinement.views.evaluation import ViewScore
+from biresnerf.refinement.views.floaters import unshared_opacity
+from biresnerf.report import HeldOut, ImageReport, Report
+from biresnerf.uncertainty import PoseUncertainty
+
+
+def run_report(
+    stages: TwoStages,
+    scores: list[ViewScore],
+    judgement: Judgement | None,
+    state: Literal["complete", "partial"],
+    finish: Finish = Finish(),
+    uncertainty: tuple[PoseUncertainty, ...] = (),
+) -> Report:
+    """The report of a run as it is now.
+
+    Args:
+        scores: of held-out views, as far as they are scored.
+        judgement: None where there is no verdict.
+        finish: what came of the adjustment of all cameras.
+        uncertainty: of each image's returned pose, or nothing.
+    """
+    from biresnerf import __version__
+
+    scene, optimiser, record = stages.scene, stages.optimiser, stages.record
+    dataset = scene.dataset
+    refined, similarity = poses_in_input_frame(dataset, optimiser)
+    return Report(
+        version=__version__,
+        state=state,
+        options=optimiser.options,
+        verdict=judgement.verdict if judgement is not None else None,
+        images=_image_reports(stages, scores, judgement, refined, uncertainty),
+        cameras=camera_reports(dataset, optimiser.lenses),
+        heldout=held_out_report(optimiser, scores) if scores else None,
+        start_trials=scene.start.trials,
+        candidates=finish.candidates,
+        input_accuracy=finish.given and accuracy_report(finish.given),
+        geo_reference=scene.start.geo_reference,
+        steps_done=optimiser.step_index,
+        switch_step=optimiser.switch if optimiser.method.two_stages else None,
+        switch_reason=record.switch_reason,
+        resumed=record.resumed,
+        seconds={stage: round(seconds, 3) for stage, seconds in record.seconds.items()},
+        backend=optimiser.field.backend,
+        device=str(optimiser.device),
+        threads=optimiser.threads,
+        working_size=(int(scene.images.widths.max()), int(scene.images.heights.max())),
+        input_from_optimised=similarity.report(),
+        warnings=dataset.warnings
+        + focal_warnings(dataset, optimiser.lenses)
+        + turntable_warnings(scene.start)
+        + accuracy_warnings(finish.given, optimiser.options)
+        + unmatched_warnings(scene)
+        + gpu_warnings(optimiser.device)
+        + budget_warnings(stages)
+        + _unknown_warnings(dataset, uncertainty),
+    )
+
+
+def held_out_report(optimiser: JointOptimiser, scores: list[ViewScore]) -> HeldOut:
+    """Means over the held-out views, at their present poses."""
+    matrices = optimiser.poses.matrices().detach()
+    return HeldOut(
+        count=len(scores),
+        psnr=float(np.mean([s.psnr for s in scores])),
+        ssim=float(np.mean([s.ssim for s in scores])),
+        unshared_opacity=float(
+            np.mean([unshared_opacity(optimiser, matrices[s.image], s.image) for s in scores])
+        ),
+    )
+
+
+def turntable_warnings(start: InitialPoses) -> tuple[str, ...]:
+    """A warning where photos do not tell which way the table turned; empty where they do, or there was none."""
+    if start.source != "turntable" or start.trials[0].psnr >= start.trials[1].psnr + MARGIN_DB:
+        return ()
+    better, other = start.trials
+    return (
+        f"The photos hardly show which way the table turned ({better.psnr:.2f} dB, the other way {other.psnr:.2f} dB). "
+        "The result may be a mirror image.",
+    )
+
+
+def gpu_warnings(device: torch.device) -> tuple[str, ...]:
+    """A warning where the CUDA kernels were not used."""
+    faults = gpu_faults(device)
+    if not faults:
+        return ()
+    return (
+        f"The CUDA kernels did not pass their check on this GPU ({faults[0]}). Plain torch was used instead, which is "
+        "many times slower. docs/cuda.md says what to send.",
+    )
+
+
+def unmatched_warnings(scene: Scene) -> tuple[str, ...]:
+    """A warning that names the images that matches left out of a set they mostly placed, and that no tracks show."""
+    tracks, count = scene.tracks, len(scene.dataset)
+    observed = np.zeros(count) if tracks is None else np.bincount(tracks.image, minlength=count)
+    unmatched = np.flatnonzero(scene.start.unmatched & (observed < LEAST_PAIRS)).tolist()
+    if not unmatched:
+        return ()
+    names = ", ".join(scene.dataset.names[i] for i in unmatched)
+    return (
+        f"{len(unmatched)} of {count} images have no feature matches; their poses come from the photos alone. Check "
+        f"them before you rely on them: {names}.",
+    )
+
+
+def _unknown_warnings(dataset: Dataset, uncertainty: tuple[PoseUncertainty, ...]) -> tuple[str, ...]:
+    """A warning for each reason why poses are not known, with the images' names."""
+    named: dict[str, list[str]] = {}
+    for name, pose in zip(dataset.names, uncertainty, strict=bool(uncertainty)):
+        if pose.why_unknown is not None and pose.why_unknown != FIXED:
+            named.setdefault(pose.why_unknown, []).append(name)
+    return tuple(
+        f"The accuracy of {len(names)} of {len(dataset)} poses is not known: {why}. Check before you rely on them: "
+        f"{few_names(names, 20)}."
+        for why, names in named.items()
+    )
+
+
+def _image_reports(
+    stages: TwoStages,
+    scores: list[ViewScore],
+    judgement: Judgement | None,
+    refined: np.ndarray,
+    uncertainty: tuple[PoseUncertainty, ...],
+) -> tuple[ImageReport, ...]:
+    scene, optimiser, repaired = stages.scene, stages.optimiser, stages.repair.repaired
+    exposures = optimiser.exposure.gains()
+    turn, shift = motion(scene.dataset.world_from_cam, refined)
+    scored = {score.image: score for score in scores}
+    return tuple(
+        ImageReport(
+            name=frame.name,
+            pose_source=scene.start.sources[i],
+            held_out=i in scene.held_out,
+            fixed=bool(optimiser.bodies.fixed[i]),
+            moved_deg=float(turn[i]),
+            moved_units=float(shift[i]),
+            uncertainty=uncertainty[i] if uncertainty else None,
+            repaired=i in repaired,
+            exposure=None if exposures is None else tuple(exposures[i].tolist()),
+            psnr=scored[i].psnr if i in scored else None,
+            ssim=scored[i].ssim if i in scored else None,
+            **_judged(judgement, i),
+        )
+        for i, frame in enumerate(scene.dataset.frames)
+    )
+
+
+def _judged(judgement: Judgement | None, image: int) -> dict[str, float | bool | None]:
+    """What a judgement holds for one image, by the names of `ImageReport`."""
+    if judgement is None:
+        return {}
+    figures = {
+        "sharpness": judgement.sharpness[image],
+        "gain": judgement.gain[image],
+        "trial_psnr_before": judgement.trial_psnr[0, image],
+        "trial_psnr_after": judgement.trial_psnr[1, image],
+        "epipolar_px_before": judgement.epipolar_px[0, image],
+        "epipolar_px_after": judgement.epipolar_px[1, image],
+    }
+    flags = {
+        name: bool(getattr(judgement, name)[image])
+        for name in ("contradicted", "moved_far", "blurred", "exposure_off")
+    }
+    return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | flags

@@ -1,0 +1,180 @@
+"""Two sets of poses of the same photos compared on unseen views, each in fields trained on it alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.options.refine_options import ResolvedOptions
+from biresnerf.refinement.adjustment.paired import paired
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.scene.scene import Scene
+from biresnerf.refinement.views.held_out_views import ROUNDS_MOST, unseen_rounds
+from biresnerf.refinement.views.pose_trials import LOOKS, PoseTrials, TrialScores, joined
+from biresnerf.report import HeldOutEvidence
+
+Array = NDArray[np.float64]
+BeforeAfter = dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]
+
+SHOWN = 4  # held-out views that are rendered with either rig, to be looked at
+# Differences that matter and are larger than chance: trainings on the same poses differ by less (docs/verdict.md).
+PSNR_MATTERS, SSIM_MATTERS = 0.5, 0.01  # dB, and 1
+# Before the end of a training chance is larger, as its rates have not fallen yet: 0.3 dB.
+EARLY = 2  # times what matters
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Poses [n, 4, 4], in one frame where they are compared, and the lens of each image at full size."""
+
+    world_from_cam: Array
+    cameras: tuple[Camera, ...]
+
+    def of(self, images: NDArray[np.int64]) -> Rig:
+        """Those images [m] alone."""
+        return Rig(self.world_from_cam[images], tuple(self.cameras[i] for i in images))
+
+    def lenses(self, images: ImageSet) -> tuple[Camera, ...]:
+        """The lenses at the photos' working size."""
+        return tuple(
+            camera.resized(small.width, small.height)
+            for camera, small in zip(self.cameras, images.cameras, strict=True)
+        )
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is trained to compare two rigs.
+
+    Attributes:
+        times: the steps that the options say are taken so many times.
+        rounds_most: small sets are trained so often, with other views left out, unless the first ones decide.
+        looks: shares of a training after which fields are compared; the last is 1.
+    """
+
+    times: int = 1
+    rounds_most: int = ROUNDS_MOST
+    looks: tuple[float, ...] = LOOKS
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutComparison:
+    """Scores of the unseen `views` after two trainings.
+
+    Attributes:
+        work: of all trainings, see `Trial.work`.
+        renders: of some held-out views [h, w, 3] with either rig, by their index.
+    """
+
+    views: list[int]
+    before: TrialScores
+    after: TrialScores
+    evidence: HeldOutEvidence
+    work: float
+    renders: BeforeAfter
+
+
+def compare_on_unseen_views(
+    pair: tuple[Rig, Rig],
+    images: ImageSet,
+    held_out: Sequence[int],
+    options: ResolvedOptions,
+    device: torch.device,
+    threads: int,
+    should_stop: Callable[[], bool],
+    report: Callable[[float], None] = lambda _share: None,
+    effort: Effort = Effort(),
+) -> HeldOutComparison | None:
+    """Train a field on either rig, held still, and score both on the same unseen views; None of too few images.
+
+    Trainings end at the first of the looks that decides.
+
+    Args:
+        held_out: views that the refinement never trained on; others join them where these are few.
+        report: called with the share of work done, if the present round decides.
+
+    Raises:
+        Interrupted: ``should_stop`` returned true.
+    """
+    steps = effort.times * options.trial_steps
+    rounds = unseen_rounds(len(images), held_out)[: effort.rounds_most]
+    if steps == 0 or not rounds[0]:
+        return None
+    rigs = [rig.world_from_cam for rig in pair]
+    earlier: list[tuple[TrialScores, ...]] = []
+    seen: list[int] = []
+    work = 0.0
+    renders: BeforeAfter = {}
+    for done, views in enumerate(rounds):
+        trials = PoseTrials(images, views, rigs, options, steps, device, threads, should_stop)
+        running = [trials.begin(rig.world_from_cam, rig.lenses(images)) for rig in pair]
+        seen = seen + views
+        for look in effort.looks:
+            for side, trial in enumerate(running):
+                trial.train(look)
+                report((done + look * (side + 1) / len(running)) / (done + look))
+            scores = tuple(trial.scores() for trial in running)
+            old, new = (joined(side) for side in zip(*earlier, scores, strict=True))
+            did = work + sum(trial.work for trial in running)
+            evidence = _evidence(old, new, running[0].optimiser.step_index, len(set(seen) & set(held_out)))
+            decided = _decided(evidence, EARLY if look < 1 else 1)
+            if not done and (decided or look == 1):
+                shown = [view for view in views if view in held_out][:SHOWN]
+                renders = {view: (running[0].render(view), running[1].render(view)) for view in shown}
+            found = HeldOutComparison(seen, old, new, evidence, did, renders)
+            if decided:
+                return found
+        earlier.append(scores)
+        work = did
+    return found
+
+
+def _evidence(before: TrialScores, after: TrialScores, steps: int, strictly: int) -> HeldOutEvidence:
+    psnr, ssim = (
+        paired(before.psnr, after.psnr, PSNR_MATTERS),
+        paired(before.ssim, after.ssim, SSIM_MATTERS),
+    )
+    return HeldOutEvidence(steps=steps, strictly=strictly, psnr=psnr, ssim=ssim)
+
+
+def _decided(evidence: HeldOutEvidence, times: float) -> bool:
+    """Whether both intervals lie beyond so many times what matters, on the same side.
+
+    Other views, or more steps, would hardly change that.
+    """
+    psnr, ssim = evidence.psnr, evidence.ssim
+    if psnr.low is None or psnr.high is None or ssim.low is None or ssim.high is None:
+        return False
+    better = psnr.low > times * PSNR_MATTERS and ssim.low > times * SSIM_MATTERS
+    worse = psnr.high < -times * PSNR_MATTERS and ssim.high < -times * SSIM_MATTERS
+    return better or worse
+
+
+def compare_placed(
+    before: Rig,
+    after: Rig,
+    scene: Scene,
+    optimiser: JointOptimiser,
+    placed: NDArray[np.bool_],
+    should_stop: Callable[[], bool],
+    report: Callable[[float], None] = lambda _share: None,
+    effort: Effort = Effort(),
+) -> HeldOutComparison | None:
+    """`compare_on_unseen_views` of the images placed [n] alone: others would spoil the fields of both rigs."""
+    rows = np.flatnonzero(placed)
+    images = scene.images if placed.all() else scene.images.of(rows)
+    held_out = np.flatnonzero(np.isin(rows, scene.held_out)).tolist()
+    found = compare_on_unseen_views(
+        (before.of(rows), after.of(rows)), images, held_out, optimiser.options, optimiser.device, optimiser.threads,
+        should_stop, report, effort,
+    )  # fmt: skip
+    if found is None:
+        return None
+    renders = {int(rows[view]): pair for view, pair in found.renders.items()}
+    return replace(found, views=rows[found.views].tolist(), renders=renders)

@@ -1,0 +1,162 @@
+"""Measuring a finished field: held-out poses fitted to it, views rendered, PSNR and SSIM; and the orbit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.field.radiance_field import PositionGradient
+from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.views.image_metrics import psnr, ssim
+
+FIT_STEPS, FIT_RATE, FIT_RAYS = 100, 1e-3, 1024  # BARF's test-time pose refinement
+FIT_EXPOSURE_RATE = 1e-2
+CHUNK = 8192  # rays rendered at once
+SWING_BELOW_DEG = 200.0  # cameras spread less than this about the scene: the orbit swings to and fro
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedView:
+    """A view at working size: colour [h, w, 3] in 0..1 and depth [h, w] (unit lengths along the ray)."""
+
+    colour: np.ndarray
+    depth: np.ndarray
+    opacity: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ViewScore:
+    """A view scored against its photo."""
+
+    image: int
+    view: RenderedView
+    psnr: float
+    ssim: float
+
+
+def fit_rays(optimiser: JointOptimiser) -> int:
+    """Rays of one step of fitting poses to the frozen field: as BARF, but no more than a large network can afford."""
+    return min(FIT_RAYS, optimiser.rays) if optimiser.method.large_network else FIT_RAYS
+
+
+def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
+    """Fit the poses of held-out views to the frozen field by their photometric error (method 2.4, item 4).
+
+    And their exposures, where those are compensated. Poses that are held stay: the field's own error would move them.
+    """
+    if not held_out or (optimiser.poses_held and optimiser.exposure.gains() is None):
+        return
+    mobility = torch.zeros(len(optimiser.poses), device=optimiser.device)
+    mobility[held_out] = 0.0 if optimiser.poses_held else 1.0
+    mobility[torch.from_numpy(optimiser.bodies.fixed).to(optimiser.device)] = 0.0
+    schedule = optimiser.schedule
+    gradient = PositionGradient()
+    poses = optimiser.poses
+    poses.restart_adam()
+    exposure = optimiser.exposure
+    exposure.restart_adam()
+    rays = fit_rays(optimiser)
+    for step in range(FIT_STEPS):
+        batch = optimiser.sampler.draw(rays, 0.0, optimiser.generator, held_out_only=True)
+        matrices = poses.matrices()[batch.image]
+        origin, direction = optimiser.cast(matrices, batch.image, batch.xy)
+        rendering = optimiser.render(origin, direction, 0, schedule.fine_interval, gradient, jitter=True)
+        colour = exposure.forgiven(exposure.shown(rendering, batch.image), batch.sharp)
+        optimiser.method.loss(colour, batch.sharp).mean().backward()
+        poses.step(FIT_RATE * 0.1 ** (step / FIT_STEPS), mobility)
+        exposure.step(FIT_EXPOSURE_RATE * 0.1 ** (step / FIT_STEPS))
+
+
+@torch.no_grad()
+def render_view(
+    optimiser: JointOptimiser,
+    unit_from_cam: Tensor,
+    image: int,
+    intrinsics: Intrinsics | None = None,
+    stride: int = 1,
+    *,
+    as_photo: bool = False,
+) -> RenderedView:
+    """Render what a camera at `unit_from_cam` [3, 4] with the intrinsics of `image` sees, whole.
+
+    `intrinsics` are the run's images' where not given; of rows and columns every `stride`-th is rendered. `as_photo`
+    gives it the exposure of photo `image`, to be compared with it; else it has the mean exposure of all.
+    """
+    lenses = intrinsics or optimiser.intrinsics
+    width, height = int(lenses.width[image]), int(lenses.height[image])
+    rows, columns = torch.arange(0, height, stride) + 0.5, torch.arange(0, width, stride) + 0.5
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    pixels = torch.stack([x, y], -1).reshape(-1, 2).to(optimiser.device)
+    parts = []
+    for xy in pixels.split(CHUNK):
+        index = torch.full((len(xy),), image, device=optimiser.device)
+        origin, direction = optimiser.cast(
+            unit_from_cam.float().to(optimiser.device).expand(len(xy), 3, 4), index, xy, lenses
+        )
+        part = optimiser.render(
+            origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=False
+        )
+        colour = optimiser.exposure.shown(part, index) if as_photo else part.colour
+        parts.append(torch.cat([colour, part.depth[:, None], part.opacity[:, None]], 1).cpu())
+    whole = torch.cat(parts).reshape(len(rows), len(columns), 5).numpy()
+    return RenderedView(whole[..., :3].clip(0, 1), whole[..., 3], whole[..., 4])
+
+
+def score_views(optimiser: JointOptimiser, images: ImageSet, views: Iterable[int]) -> Iterator[ViewScore]:
+    """Render each view at its present pose and score it against its photo, where its pixels count."""
+    matrices = optimiser.poses.matrices().detach()
+    for image in views:
+        view = render_view(optimiser, matrices[image], image, as_photo=True)
+        photo = torch.from_numpy(images.image(image).astype(np.float32) / 255)
+        colour = torch.from_numpy(view.colour)
+        mask = images.counts_image(image)
+        counts = None if mask is None else torch.from_numpy(mask)
+        yield ViewScore(image, view, psnr(colour, photo, counts), ssim(colour, photo, counts))
+
+
+def orbit_poses(unit_from_cam: np.ndarray, frames: int) -> np.ndarray:
+    """Cameras [frames, 3, 4] circling the unit frame's centre at the rig's mean height and distance.
+
+    A rig that sees the scene from one side only gets a path that swings over the directions it covers.
+    """
+    centres = unit_from_cam[:, :3, 3]
+    up = -unit_from_cam[:, :3, 1].mean(0)
+    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    towards = centres.mean(0) - up * (centres.mean(0) @ up)
+    if np.linalg.norm(towards) < 0.1 * np.linalg.norm(centres, axis=1).mean():
+        towards = centres[0] - up * (centres[0] @ up)  # a full circle has no side of its own
+    first = towards / max(float(np.linalg.norm(towards)), 1e-9)
+    second = np.cross(up, first)
+    azimuth = np.arctan2(centres @ second, centres @ first)
+    height = float(np.median(centres @ up))
+    radius = float(np.median(np.hypot(centres @ first, centres @ second)))
+    reach = float(np.degrees(np.quantile(azimuth, 0.95) - np.quantile(azimuth, 0.05)))
+    turn = np.linspace(0, 2 * np.pi, frames, endpoint=False)
+    if reach < SWING_BELOW_DEG:
+        middle = float(np.median(azimuth))
+        turn = middle + np.radians(reach) / 2 * np.sin(turn)
+    poses = []
+    for angle in turn:
+        eye = radius * (np.cos(angle) * first + np.sin(angle) * second) + height * up
+        forward = -eye / max(float(np.linalg.norm(eye)), 1e-9)
+        right = np.cross(forward, up)
+        right = right / max(float(np.linalg.norm(right)), 1e-9)
+        poses.append(np.stack([right, np.cross(forward, right), forward, eye], 1))
+    return np.stack(poses)
+
+
+def render_orbit(
+    optimiser: JointOptimiser, frames: int, after_frame: Callable[[int], None]
+) -> Iterator[np.ndarray]:
+    """Frames uint8 [h, w, 3] of a video around the scene, with the first image's intrinsics."""
+    path = orbit_poses(optimiser.poses.poses().numpy(), frames)
+    for i, pose in enumerate(path):
+        view = render_view(optimiser, torch.from_numpy(pose), 0)
+        after_frame(i)
+        yield np.rint(view.colour * 255).astype(np.uint8)

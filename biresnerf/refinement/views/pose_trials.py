@@ -1,0 +1,190 @@
+"""Equal short trainings on sets of poses: which set lets a field predict photos it was not shown?
+
+Everything but the poses (and the lenses, where they were refined too) is the same in each: photos, unseen views, scene
+box, steps, samples and random seed. Unseen views are rendered from the poses as they stand, fitted to no field: a fit
+would hide the errors under comparison. Each set is scored within its own field, so it need not share its frame's last
+digits with the others. Where poses move, those of the unseen views follow the field without training it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.data.photos.images import ImageSet
+from biresnerf.errors import Interrupted
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.options.refine_options import ResolvedOptions
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
+from biresnerf.refinement.scene.scene_frame import scene_frame
+from biresnerf.refinement.views.evaluation import render_view
+from biresnerf.refinement.views.image_metrics import psnr, ssim
+
+SAMPLES = 1 << 14  # a step
+# Until a field of an open scene has formed, good poses predict unseen views no better than bad ones (fountain-P11: no
+# difference after 200 steps, 4 dB after 400).
+OPEN_STEPS = 2  # times the steps of a scene with a background
+OPEN_STEP = 1.6  # times the work of a step of one, as measured (docs/speed.md)
+ONE_IN, VIEWS_MOST = 5, 16  # unseen views: one in so many, but no more than that
+# Shares of a training after which fields are compared. What differs clearly differs more and more (docs/verdict.md).
+LOOKS = (0.25, 0.5, 1.0)
+RAYS_PER_STEP = 100  # pixels of all unseen views that are rendered at the end, for each step of the training
+
+
+def trial_views(count: int) -> list[int]:
+    """Indices of the views of `count` that a trial does not train on, evenly spread."""
+    return list(range(ONE_IN // 2, count, max(ONE_IN, -(-count // VIEWS_MOST))))
+
+
+@dataclass(frozen=True, eq=False)
+class TrialScores:
+    """PSNR (dB) and SSIM of each unseen view, float64 [views]."""
+
+    psnr: NDArray[np.float64]
+    ssim: NDArray[np.float64]
+
+
+def joined(parts: Sequence[TrialScores]) -> TrialScores:
+    """The scores of several trials, one after the other."""
+    return TrialScores(np.concatenate([p.psnr for p in parts]), np.concatenate([p.ssim for p in parts]))
+
+
+class PoseTrials:
+    """Scores sets of poses, one after the other, under the same conditions.
+
+    Args:
+        images: photos at working size.
+        unseen: indices of the views that no field is trained on.
+        rigs: sets of poses [n, 4, 4] that together define the scene box; in one frame.
+        options: the field's sizes and rates.
+        steps: of each training; an open scene takes `OPEN_STEPS` times as many.
+        should_stop: called after every step.
+    """
+
+    def __init__(
+        self,
+        images: ImageSet,
+        unseen: Sequence[int],
+        rigs: Sequence[NDArray[np.float64]],
+        options: ResolvedOptions,
+        steps: int,
+        device: torch.device,
+        threads: int,
+        should_stop: Callable[[], bool],
+        sampler: PhotoSampler | None = None,
+    ) -> None:
+        self.images, self.unseen = images, list(unseen)
+        self.frame = scene_frame(np.concatenate(list(rigs)), images)
+        self.steps = steps * (OPEN_STEPS if self.frame.unbounded else 1)
+        # All of it stage 1, and the rates fall to their end: with the rates of a longer run's first half, trainings on
+        # the same poses differ by 0.25 dB from seed to seed (lego at 100 px, 200 steps), so by 0.04.
+        self._options = options.model_copy(
+            update={
+                "steps": self.steps,
+                "coarse_steps_min": self.steps,
+                "coarse_steps_max": self.steps,
+                "samples_per_step": min(SAMPLES, options.samples_per_step),
+            }
+        )
+        self._device, self._threads, self._should_stop = device, threads, should_stop
+        self._sampler = sampler or PhotoSampler(images, self.unseen, device)
+
+    def score(
+        self,
+        world_from_cam: NDArray[np.float64],
+        cameras: tuple[Camera, ...] | None = None,
+        *,
+        moving: bool = False,
+    ) -> TrialScores:
+        """Train a field on all but the unseen views, from these poses and lenses, and score it on the unseen.
+
+        Args and errors are those of `begin` and `Trial.train`.
+        """
+        trial = self.begin(world_from_cam, cameras, moving=moving)
+        trial.train(1.0)
+        return trial.scores()
+
+    def begin(
+        self,
+        world_from_cam: NDArray[np.float64],
+        cameras: tuple[Camera, ...] | None = None,
+        *,
+        moving: bool = False,
+    ) -> Trial:
+        """A field before its first step.
+
+        Args:
+            world_from_cam: [n, 4, 4], in the frame of the rigs.
+            cameras: of each image at working size; the photos' own where left out.
+            moving: whether poses are optimised with the field.
+        """
+        images = self.images if cameras is None else replace(self.images, cameras=cameras)
+        poses = self.frame.unit_from_world.apply_to_poses(world_from_cam)
+        optimiser = JointOptimiser(
+            images, self.frame, poses, self._options, self.unseen, self._device, self._threads,
+            sampler=self._sampler,
+        )  # fmt: skip
+        optimiser.poses_held = not moving
+        return Trial(optimiser, images, self.unseen, self.steps, self._should_stop)
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One set of poses in training: a field that takes so many `steps` in all."""
+
+    optimiser: JointOptimiser
+    images: ImageSet
+    unseen: Sequence[int]
+    steps: int
+    should_stop: Callable[[], bool]
+
+    def train(self, share: float) -> None:
+        """Step until this share of the training is done.
+
+        Raises:
+            Interrupted: ``should_stop`` returned true.
+        """
+        while self.optimiser.step_index < round(share * self.steps):
+            if self.should_stop():
+                raise Interrupted("stopped while sets of poses were compared")
+            self.optimiser.step()
+
+    @property
+    def work(self) -> float:
+        """Of the steps so far, in steps of a scene with a background."""
+        return self.optimiser.step_index * (OPEN_STEP if self.optimiser.frame.unbounded else 1.0)
+
+    def scores(self) -> TrialScores:
+        """How well the field predicts the unseen views by now. The more steps, the more pixels are rendered."""
+        pixels = int(sum(self.images.widths[v] * self.images.heights[v] for v in self.unseen))
+        stride = max(1, math.ceil(math.sqrt(pixels / (RAYS_PER_STEP * self.optimiser.step_index))))
+        return score_unseen(self.optimiser, self.images, self.unseen, stride)
+
+    def render(self, view: int) -> NDArray[np.float32]:
+        """A view whole [h, w, 3], to be looked at."""
+        matrices = self.optimiser.poses.matrices().detach()
+        return render_view(self.optimiser, matrices[view], view, as_photo=True).colour
+
+
+def score_unseen(
+    optimiser: JointOptimiser, images: ImageSet, unseen: Sequence[int], stride: int
+) -> TrialScores:
+    """How well the field predicts unseen views from where they stand, on every `stride`-th pixel across and down."""
+    matrices = optimiser.poses.matrices().detach()
+    scores = []
+    for view in unseen:
+        rendered = torch.from_numpy(
+            render_view(optimiser, matrices[view], view, stride=stride, as_photo=True).colour
+        )
+        photo = torch.from_numpy(images.image(view)[::stride, ::stride].astype(np.float32) / 255)
+        mask = images.counts_image(view)
+        counts = None if mask is None else torch.from_numpy(mask[::stride, ::stride].copy())
+        scores.append((psnr(rendered, photo, counts), ssim(rendered, photo, counts)))
+    table = np.array(scores, dtype=np.float64).reshape(-1, 2)
+    return TrialScores(table[:, 0], table[:, 1])

@@ -1,0 +1,83 @@
+"""Fisheyes in the adjustment: poses come to the truth, errors are in pixels of the photo."""
+
+import numpy as np
+import pytest
+import torch
+
+from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.refinement.adjustment.adjustment import adjust_poses
+from biresnerf.refinement.adjustment.cameras import Cameras
+from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
+from biresnerf.refinement.adjustment.lens.lenses import Lenses
+from biresnerf.refinement.adjustment.track_term import TrackTerm
+from tests.refinement.adjustment.rig import disturbed, observed, ring, rotation_errors_deg
+
+CAMERAS = 8
+FISHEYE = Camera("OPENCV_FISHEYE", 800, 800, (250.0, 250.0, 402.0, 398.0, 0.02, -0.005, 0.001, 0.0))
+PINHOLE = Camera("PINHOLE", 400, 400, (500.0, 505.0, 201.0, 199.0))
+ALL, SOME = [FISHEYE] * CAMERAS, [FISHEYE, PINHOLE] * (CAMERAS // 2)
+
+
+@pytest.fixture(name="rng")
+def generator():
+    return np.random.default_rng(6)
+
+
+def scene(rng, cameras, noise_px=0.0):
+    """Points up to 115 degrees from the axes of fisheyes; near the middle where pinholes look."""
+    truth, far = ring(CAMERAS, rng), 8.0 if cameras is ALL else 0.8
+    intrinsics = Intrinsics.from_cameras(cameras)
+    tracks = observed(truth, rng.uniform(-far, far, (200, 3)), intrinsics, rng, noise_px, seen_by=CAMERAS)
+    rays = directions_in_cam(intrinsics, torch.from_numpy(tracks.image), torch.from_numpy(tracks.xy))
+    return truth, Evidence(intrinsics, tracks.where((rays[:, 2] > np.cos(np.radians(115))).numpy()))
+
+
+@pytest.mark.parametrize("cameras", [ALL, SOME], ids=["all", "some"])
+def test_fisheyes_return_to_the_truth(rng, cameras):
+    truth, evidence = scene(rng, cameras)
+    start = disturbed(truth, rng, 0.02, 0.05)
+    found = adjust_poses(start, evidence, PosePrior.equal(start, 0.1, 0.4))
+    assert rotation_errors_deg(start, truth).mean() > 1
+    assert rotation_errors_deg(found.world_from_cam, truth).max() < 1e-3
+
+
+def test_points_behind_the_axis_are_among_the_evidence(rng):
+    truth, evidence = scene(rng, ALL)
+    points = TrackTerm(evidence.tracks, evidence.intrinsics, Cameras.of(truth), 1.0).unknowns
+    seen = points[evidence.tracks.point] - truth[evidence.tracks.image, :3, 3]
+    depth = np.einsum("mj,mj->m", seen, truth[evidence.tracks.image, :3, 2])
+    assert (depth < 0).mean() > 0.1
+
+
+def test_errors_of_fisheyes_are_in_pixels_of_the_photo(rng):
+    truth, evidence = scene(rng, ALL)
+    term = TrackTerm(evidence.tracks, evidence.intrinsics, Cameras.of(truth), 1.0)
+    off = disturbed(truth, rng, 1e-5, 0.0)
+    in_cam = np.einsum(
+        "mji,mj->mi",
+        off[term.image, :3, :3],
+        term.unknowns[term.point] - off[term.image, :3, 3],
+    )
+    seen = project(evidence.intrinsics, torch.from_numpy(term.image), torch.from_numpy(in_cam)).numpy()
+    of_photo = np.linalg.norm(seen - term.xy, axis=1)
+    np.testing.assert_allclose(term.errors_px(Cameras.of(off)), of_photo, rtol=0.01)
+
+
+def test_the_noise_of_fisheyes_is_measured(rng):
+    truth, evidence = scene(rng, ALL, noise_px=0.4)
+    start = disturbed(truth, rng, 0.01, 0.03)
+    found = adjust_poses(start, evidence, PosePrior.equal(start, 0.1, 0.4))
+    assert found.track_noise_px == pytest.approx(0.4, rel=0.1)
+
+
+def test_a_pinhole_among_fisheyes_finds_its_focal_length(rng):
+    truth, evidence = scene(rng, SOME)
+    long = Camera("PINHOLE", 400, 400, (520.0, 505.0 * 1.04, 201.0, 199.0))
+    wrong = Intrinsics.from_cameras([FISHEYE, long] * (CAMERAS // 2))
+    deviation = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    lenses = Lenses(np.arange(CAMERAS) % 2, np.zeros((2, 3)), deviation)
+    found = adjust_poses(
+        truth, Evidence(wrong, evidence.tracks, lenses=lenses), PosePrior.equal(truth, 0.1, 0.4)
+    )
+    np.testing.assert_allclose(np.exp(found.lenses.correction[:, 0]), [1, 1 / 1.04], rtol=1e-4)

@@ -1,0 +1,98 @@
+"""Stage 2 in two rounds: when cameras are held after the first adjustment, and when they go on with the field."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from biresnerf.refinement.finish import rounds
+from biresnerf.refinement.finish.adjust_cameras import adjust_cameras
+from biresnerf.refinement.finish.rounds import FIRST_ROUND, LEARNING, run_stage_2
+from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
+from biresnerf.refinement.stages.checkpoint import load_checkpoint
+from biresnerf.refinement.stages.two_stages import TwoStages
+from tests.refinement.adjustment.rig import disturbed, observed
+from tests.refinement.finish.test_adjust_cameras import errors_deg, lenses, stages
+from tests.refinement.tiny_scene import tiny_optimiser, tiny_options
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(name="rng")
+def generator():
+    return np.random.default_rng(2)
+
+
+def test_the_field_learns_at_adjusted_poses_that_stand_still(tmp_path, rng):
+    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    run.run_stage_1()
+    before = errors_deg(run, truth)
+    ends = []
+    step = run.optimiser.step
+
+    def watched():
+        ends.append(run.optimiser.poses.poses())
+        return step()
+
+    run.optimiser.step = watched
+    finish = run_stage_2(run)
+    assert [each.name for each in finish.candidates if each.chosen] == ["adjusted-tracks"]
+    steps = run.optimiser.options.steps
+    assert run.optimiser.step_index == (FIRST_ROUND + LEARNING) * steps
+    assert all(torch.equal(ends[-1], poses) for poses in ends[-round(LEARNING * steps) :])
+    assert errors_deg(run, truth).mean() < 0.2 * before.mean()
+
+
+def test_tracks_that_agree_on_other_poses_than_the_photos_are_not_believed(tmp_path, rng):
+    """As of a symmetric thing: all tracks fit poses that are far from the truth."""
+    run, truth = stages(tmp_path, rng, refined=0.003)
+    run.run_stage_1()
+    folded = disturbed(truth, rng, 0.1, 0.3)
+    tracks = observed(folded, rng.uniform(-0.5, 0.5, (120, 3)), lenses(run.scene.dataset), rng, 0.02)
+    run.scene = replace(run.scene, tracks=tracks)
+    run.repair = LostCameraRepair(run.optimiser, None)
+    # So many as tell poses apart in photos of that size.
+    run.optimiser.options = run.optimiser.options.model_copy(update={"trial_steps": 60})
+    before = errors_deg(run, truth)
+    finish = run_stage_2(run)
+    assert [each.name for each in finish.candidates if each.chosen] == ["refined"]
+    assert run.optimiser.step_index == run.optimiser.options.steps
+    assert not run.optimiser.poses_held
+    assert run.optimiser.lenses.certainty == (None,)
+    assert finish.fit is None
+    assert errors_deg(run, truth).mean() < 2 * before.mean() + 0.5
+
+
+def test_poses_go_on_with_the_field_to_the_last_step_where_no_evidence_tells(tmp_path, rng):
+    run, _ = stages(tmp_path, rng)
+    run.scene = replace(run.scene, tracks=None)
+    run.run_stage_1()
+    assert run_stage_2(run).candidates == ()
+    assert run.optimiser.step_index == run.optimiser.options.steps
+    assert not run.optimiser.poses_held
+
+
+def test_a_run_resumed_after_the_first_adjustment_ends_at_the_same_poses(tmp_path, rng):
+    run, _ = stages(tmp_path / "once", rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    run.run_stage_1()
+    run_stage_2(run)
+    again = TwoStages(
+        tiny_optimiser(run.scene.dataset, run.scene.images, tiny_options()), run.scene, run.folder
+    )
+    again.restore(load_checkpoint(run.folder))
+    assert again.optimiser.schedule.steps == run.optimiser.step_index
+    run_stage_2(again)
+    torch.testing.assert_close(again.optimiser.poses.poses(), run.optimiser.poses.poses())
+
+
+@pytest.mark.parametrize(("ends", "adjusted"), [(np.inf, 2), (0.0, 1)])
+def test_cameras_are_adjusted_again_only_where_there_is_time(tmp_path, rng, monkeypatch, ends, adjusted):
+    """The first adjustment finds nothing better, so that the field's poses would be adjusted once more."""
+    run, _ = stages(tmp_path, rng, refined=0.0, noise_px=0.3)
+    run.run_stage_1()
+    run.ends, calls = ends, []
+    monkeypatch.setattr(rounds, "adjust_cameras", lambda run: calls.append(run) or adjust_cameras(run))
+    run_stage_2(run)
+    assert run.optimiser.step_index == run.optimiser.options.steps
+    assert len(calls) == adjusted

@@ -1,0 +1,102 @@
+"""A run with a time budget takes as many steps as fit, and says where even few do not."""
+
+import math
+import time
+
+import pytest
+
+from biresnerf.forecast import RATES
+from biresnerf.refinement.finish.time_budget import LEAST, budget_warnings, choose_steps, keep_to_budget
+from biresnerf.refinement.finish.work_ahead import step_weights, work_ahead
+from biresnerf.refinement.stages.checkpoint import load_checkpoint
+from biresnerf.refinement.stages.two_stages import MEASURED_STEPS, TwoStages
+from tests.refinement.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
+
+STEPS = 400
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return tiny_set(tmp_path_factory.mktemp("scene"))
+
+
+def stages_of(scene, folder, **changed):
+    lengths = {"steps": STEPS, "coarse_steps_min": 100, "coarse_steps_max": 200, "verdict": False}
+    options = tiny_options(**{**lengths, **changed})
+    return TwoStages(tiny_optimiser(*scene, options), given_scene(*scene), folder)
+
+
+def with_step_of(stages, seconds):
+    """As if steps of stage 1 took so long, and those of stage 2 twice as long; all else nothing."""
+    weights = stages.forecast.step_weights = step_weights(stages.optimiser.options, unbounded=False)
+    stages.forecast.rates = dict.fromkeys(RATES, 0.0) | {
+        "coarse step": seconds / weights["coarse"],
+        "fine step": 2 * seconds / weights["fine"],
+    }
+    return stages
+
+
+def left_s(stages):
+    return stages.forecast.left_s(work_ahead(stages))
+
+
+@pytest.mark.parametrize("seconds", [350.0, 450.0, 550.0])
+def test_as_many_steps_are_taken_as_there_is_time_for(scene, tmp_path, seconds):
+    stages = with_step_of(stages_of(scene, tmp_path), 1.0)
+    stages.ends = time.monotonic() + seconds
+    choose_steps(stages, STEPS)
+    assert LEAST * STEPS < stages.optimiser.schedule.steps < STEPS
+    assert left_s(stages) == pytest.approx(seconds, rel=0.02)
+    options = stages.optimiser.options
+    assert options.coarse_steps_max == pytest.approx(options.steps / 2, abs=1)
+
+
+def test_no_more_steps_are_taken_than_were_asked_for_and_no_fewer_than_a_tenth(scene, tmp_path):
+    stages = with_step_of(stages_of(scene, tmp_path), 1.0)
+    stages.ends = time.monotonic() + 1e6
+    choose_steps(stages, STEPS)
+    assert stages.optimiser.schedule.steps == STEPS
+    stages.ends = time.monotonic() - 1e6
+    choose_steps(stages, STEPS)
+    assert stages.optimiser.schedule.steps == round(LEAST * STEPS)
+
+
+def test_steps_that_were_too_few_are_added_again_where_they_turn_out_faster(scene, tmp_path):
+    stages = with_step_of(stages_of(scene, tmp_path), 1.0)
+    stages.ends = time.monotonic() + 400
+    choose_steps(stages, STEPS)
+    few = stages.optimiser.schedule.steps
+    stages.optimiser.start_reconstruction()
+    choose_steps(with_step_of(stages, 0.7), STEPS)
+    assert few < stages.optimiser.schedule.steps < STEPS
+
+
+@pytest.mark.slow
+def test_a_run_without_time_ends_early_and_says_what_it_took(scene, tmp_path):
+    stages = stages_of(scene, tmp_path, time_budget_s=0.01)
+    keep_to_budget(stages, time.monotonic(), STEPS)
+    assert finished(stages)
+    assert MEASURED_STEPS <= stages.optimiser.step_index == round(LEAST * STEPS)
+    (warning,) = budget_warnings(stages)
+    assert "of a budget of 0.01 s" in warning
+
+
+@pytest.mark.slow
+def test_a_run_without_a_budget_takes_all_its_steps(scene, tmp_path):
+    stages = stages_of(scene, tmp_path, steps=60, coarse_steps_min=10, coarse_steps_max=20)
+    keep_to_budget(stages, time.monotonic(), 60)
+    assert (stages.ends, finished(stages)) == (math.inf, True)
+    assert stages.optimiser.step_index == 60
+    assert budget_warnings(stages) == ()
+
+
+@pytest.mark.slow
+def test_a_resumed_run_keeps_the_lengths_that_were_chosen(scene, tmp_path):
+    stages = stages_of(scene, tmp_path, time_budget_s=0.01)
+    keep_to_budget(stages, time.monotonic(), STEPS)
+    assert finished(stages)
+    again = stages_of(scene, tmp_path, time_budget_s=0.01)
+    again.restore(load_checkpoint(tmp_path))
+    assert again.optimiser.options == stages.optimiser.options
+    assert again.optimiser.schedule == stages.optimiser.schedule
+    assert again.detector.cap == stages.optimiser.options.coarse_steps_max < 200

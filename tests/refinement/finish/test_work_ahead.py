@@ -1,0 +1,81 @@
+"""What a run has before it follows from the set, the options, and how far it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from biresnerf.data.points.tracks import Tracks
+from biresnerf.forecast import Forecast
+from biresnerf.refinement.finish.work_ahead import (
+    FIRST_ROUND,
+    LEARNING,
+    expect_rest,
+    expect_run,
+    step_weights,
+    work_ahead,
+)
+from biresnerf.refinement.stages.two_stages import TwoStages
+from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
+
+TRACKS = Tracks.of(np.array([0, 0]), np.array([0, 1]), np.ones((2, 2)))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return tiny_set(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture
+def stages_of(scene, tmp_path):
+    def make(tracks=None, **options) -> TwoStages:
+        dataset, images = scene
+        optimiser = tiny_optimiser(dataset, images, tiny_options(**options))
+        stages = TwoStages(optimiser, replace(given_scene(dataset, images), tracks=tracks), tmp_path)
+        expect_rest(stages)
+        return stages
+
+    return make
+
+
+def test_with_tracks_fewer_steps_are_taken_and_adjusted_cameras_are_checked(stages_of):
+    short, long = stages_of(), stages_of(TRACKS)
+    assert (short.forecast.share, long.forecast.share) == (1.0, FIRST_ROUND + LEARNING)
+    weight = step_weights(short.optimiser.options, unbounded=False)["fine"]
+    assert short.forecast.left["fine"] == pytest.approx(20 * weight)
+    assert long.forecast.left["fine"] == pytest.approx(10 * weight)
+    assert short.forecast.left["checking"] == 0 < long.forecast.left["checking"]
+
+
+def test_what_was_adjusted_once_is_adjusted_once_more_and_not_checked_again(stages_of):
+    stages = stages_of(TRACKS)
+    before = work_ahead(stages)
+    stages.record = stages.record.model_copy(update={"adjusted": True})
+    after = work_ahead(stages)
+    assert after["adjusting"] == before["adjusting"] / 2
+    assert after["checking"] == 0
+
+
+def test_the_verdict_takes_time_only_where_it_is_asked_for(stages_of):
+    assert work_ahead(stages_of(verdict=False))["judging"] == 0
+    few, many = (work_ahead(stages_of(trial_steps=steps))["judging"] for steps in (50, 100))
+    assert many > 0
+    assert many == pytest.approx(2 * few)
+
+
+def test_methods_of_others_do_not_adjust(stages_of):
+    assert work_ahead(stages_of(method="biresnerf-paper"))["adjusting"] == 0
+
+
+def test_a_run_from_given_poses_is_known_before_its_first_step(scene, stages_of):
+    found, options = Forecast(), tiny_options(start="given")
+    expect_run(found, scene[0], options)
+    assert found.left == pytest.approx(stages_of(start="given").forecast.left)
+
+
+def test_matching_is_expected_where_poses_are_compared_with_matches(scene):
+    pytest.importorskip("pycolmap")
+    found = Forecast()
+    expect_run(found, scene[0], tiny_options(start="auto"))
+    assert all(found.left[phase] > 0 for phase in ("features", "matching", "mapping", "trying", "checking"))
+    assert found.left["mapping"] == len(scene[0])

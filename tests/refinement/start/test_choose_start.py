@@ -1,0 +1,183 @@
+"""Choosing the poses to start from: a short training tells good poses from noisy ones, whoever found them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter
+
+from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.errors import Interrupted
+from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.options.refine_options import RefineOptions
+from biresnerf.progress import Monitor
+from biresnerf.refinement.start import choose_start as start_module
+from biresnerf.refinement.start.choose_start import choose_start, find_start
+from biresnerf.refinement.start.first_step import pose_mobility, stage_lengths
+from biresnerf.refinement.views import pose_trials
+from biresnerf.refinement.views.pose_trials import PoseTrials, trial_views
+from tests.refinement.tiny_scene import CPU, tiny_options, tiny_set
+
+pytestmark = pytest.mark.slow
+
+VIEWS = 9
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return tiny_set(tmp_path_factory.mktemp("scene"), views=VIEWS, size=24)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(start_module, "TRIAL_STEPS", 60)
+    monkeypatch.setattr(start_module, "MOVING_STEPS", 150)
+    monkeypatch.setattr(pose_trials, "SAMPLES", 8192)
+
+
+def candidates(dataset, first: np.ndarray, second: np.ndarray) -> list[InitialPoses]:
+    return [
+        InitialPoses(first, "given", ("given",) * VIEWS),
+        InitialPoses(second, "matches-incremental", ("matches-incremental",) * VIEWS),
+    ]
+
+
+def choose(images, tried: list[InitialPoses]) -> InitialPoses:
+    return choose_start(tried, images, tiny_options(), CPU, 2, lambda: False)
+
+
+def test_good_matches_win_over_noisy_given_poses(scene):
+    dataset, images = scene
+    noisy = perturb_poses(dataset.world_from_cam, 0.15, seed=1)
+    chosen = choose(images, candidates(dataset, noisy, dataset.world_from_cam))
+    assert chosen.source == "matches-incremental"
+    np.testing.assert_array_equal(chosen.world_from_cam, dataset.world_from_cam)
+    assert chosen.trials[1].psnr > chosen.trials[0].psnr + 1
+    np.testing.assert_array_equal(pose_mobility(chosen), [[0.0] * VIEWS, [1.0] * VIEWS])
+
+
+def test_trials_end_once_one_is_clearly_better(scene, monkeypatch):
+    monkeypatch.setattr(start_module, "TRIAL_STEPS", 240)
+    dataset, images = scene
+    truth, works = dataset.world_from_cam, []
+    for other in (perturb_poses(truth, 0.3, seed=1), truth):
+        tried = candidates(dataset, other, truth)
+        choose_start(tried, images, tiny_options(), CPU, 2, lambda: False, works.append)
+    assert works == [2 * 240 / 4, 2 * (240 + 150)]
+
+
+def test_good_given_poses_win_over_wrong_matches(scene):
+    dataset, images = scene
+    wrong = perturb_poses(dataset.world_from_cam, 0.15, seed=2)
+    chosen = choose(images, candidates(dataset, dataset.world_from_cam, wrong))
+    assert chosen.source == "given"
+    np.testing.assert_array_equal(pose_mobility(chosen), 1.0)
+    assert [trial.source for trial in chosen.trials] == ["given", "matches-incremental"]
+    np.testing.assert_array_equal(chosen.matched_poses, wrong)  # remembered, to be judged at the end
+    kept = TypeAdapter(InitialPoses).validate_json(TypeAdapter(InitialPoses).dump_json(chosen))
+    np.testing.assert_array_equal(kept.matched_poses, wrong)
+
+
+def test_without_matches_no_matched_poses_are_remembered(scene):
+    dataset, images = scene
+    given = InitialPoses(dataset.world_from_cam, "given", ("given",) * VIEWS)
+    found = find_start([given], images, tiny_options(), CPU, 2, Monitor())
+    assert found.matched_poses is None
+    kept = TypeAdapter(InitialPoses).validate_json(TypeAdapter(InitialPoses).dump_json(found))
+    assert kept.matched_poses is None
+
+
+def test_on_a_tie_the_given_poses_stay_if_matches_agree(scene):
+    dataset, images = scene
+    poses = dataset.world_from_cam
+    assert choose(images, candidates(dataset, poses, poses.copy())).source == "given"
+
+
+def test_cameras_that_all_candidates_guess_have_no_say(scene):
+    dataset, images = scene
+    truth = dataset.world_from_cam
+    noisy = perturb_poses(truth, 0.15, seed=1)
+    placed = np.arange(VIEWS - 1)
+
+    def with_a_guess(poses: np.ndarray, name: str) -> InitialPoses:
+        guessed = poses.copy()
+        guessed[-1] = guessed[0]  # where another photo was taken from
+        return InitialPoses(guessed, name, (name,) * (VIEWS - 1) + ("nearest-view",))
+
+    found = choose(images, [with_a_guess(noisy, "given"), with_a_guess(truth, "matches-incremental")])
+    without = choose(
+        images.of(placed),
+        [
+            InitialPoses(poses[placed], name, (name,) * (VIEWS - 1))
+            for poses, name in ((noisy, "given"), (truth, "matches-incremental"))
+        ],
+    )
+    assert [trial.psnr for trial in found.trials] == [trial.psnr for trial in without.trials]
+    assert found.source == "matches-incremental"
+    assert len(found.matched_poses) == len(found.world_from_cam) == VIEWS
+
+
+def test_poses_that_may_move_in_a_trial_improve(scene):
+    dataset, images = scene
+    noisy = perturb_poses(dataset.world_from_cam, 0.05, seed=1)
+    trials = PoseTrials(images, trial_views(VIEWS), [noisy], tiny_options(), 150, CPU, 2, lambda: False)
+    assert trials.score(noisy, moving=True).psnr.mean() > trials.score(noisy).psnr.mean() + 0.5
+
+
+def test_where_poses_as_they_are_do_not_tell_those_win_that_improve_with_the_field(scene, monkeypatch):
+    """As of a symmetric thing, whose matches give a model that is consistent but wrong."""
+    dataset, images = scene
+    monkeypatch.setattr(start_module, "CLEAR_DB", 50.0)
+    noisy = perturb_poses(dataset.world_from_cam, 0.05, seed=1)
+    folded = dataset.world_from_cam[np.arange(VIEWS) // 2]  # half of the views stand where others do
+    chosen = choose(images, candidates(dataset, folded, noisy))
+    assert chosen.source == "matches-incremental"
+    assert chosen.trials[1].psnr > chosen.trials[0].psnr + 1
+    assert choose(images, candidates(dataset, noisy, folded)).source == "given"
+
+
+def test_stage_1_is_shorter_where_matches_placed_the_cameras_and_its_length_was_left_open(scene):
+    dataset, _ = scene
+    given, matched = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
+    open_options = RefineOptions(preset="fast")
+    resolved = open_options.resolved("cpu")
+    assert stage_lengths(given, open_options, resolved) == resolved
+    shorter = stage_lengths(matched, open_options, resolved)
+    assert (shorter.coarse_steps_min, shorter.coarse_steps_max) == (400, 800)
+    fixed = RefineOptions(preset="fast", coarse_steps_min=500, coarse_steps_max=900)
+    assert stage_lengths(matched, fixed, fixed.resolved("cpu")) == fixed.resolved("cpu")
+
+
+def test_cameras_that_matches_left_out_where_they_placed_most_are_not_reliable(scene):
+    dataset, _ = scene
+    matched, guess = "matches-incremental", "neighbours"
+    everyone = [False] * 9
+    for sources, guessed, unmatched in (
+        ((matched,) * 8 + ("given",), everyone, [*everyone[1:], True]),
+        ((matched,) * 2 + ("given",) * 7, everyone, everyone),
+        (("given",) * 8 + (guess,), [*everyone[1:], True], everyone),
+        ((guess,) * 9, everyone, everyone),
+    ):
+        start = InitialPoses(dataset.world_from_cam, sources[0], sources)
+        assert start.guessed.tolist() == guessed
+        assert start.unmatched.tolist() == unmatched
+        assert start.reliable.tolist() == [not (a or b) for a, b in zip(guessed, unmatched, strict=True)]
+
+
+def test_a_stop_ends_the_trial(scene):
+    dataset, images = scene
+    tried = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
+    with pytest.raises(Interrupted):
+        choose_start(tried, images, tiny_options(), CPU, 2, lambda: True)
+
+
+def test_a_start_survives_its_checkpoint(scene):
+    dataset, images = scene
+    noisy = perturb_poses(dataset.world_from_cam, 0.15, seed=1)
+    chosen = choose(images, candidates(dataset, noisy, dataset.world_from_cam))
+    start = TypeAdapter(InitialPoses)
+    back = start.validate_python(json.loads(json.dumps(start.dump_python(chosen))))
+    np.testing.assert_array_equal(back.world_from_cam, chosen.world_from_cam)
+    assert (back.source, back.sources, back.trials) == (chosen.source, chosen.sources, chosen.trials)

@@ -1,0 +1,102 @@
+"""A scene small enough to take many steps of in a test, and an optimiser on it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.photos.images import ImageSet, load_images
+from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.data.synthetic.scene import write_synthetic_scene
+from biresnerf.errors import Interrupted
+from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.scene.scene import Scene
+from biresnerf.refinement.scene.scene_frame import scene_frame
+from biresnerf.refinement.stages.two_stages import TwoStages
+
+CPU = torch.device("cpu")
+
+
+def tiny_run(**changed) -> RefineOptions:
+    """Options of a run of 40 steps: stage 2 from step 20."""
+    values = {
+        "preset": "fast",
+        "device": "cpu",
+        "threads": 2,
+        "steps": 40,
+        "coarse_steps_min": 10,
+        "coarse_steps_max": 20,
+        "check_every": 5,
+        "max_image_size": 24,
+        "samples_per_step": 4096,
+        "pose_resolution_max": 24,
+        "reconstruction_resolution_min": 32,
+        "reconstruction_resolution_max": 64,
+        "reconstruction_levels": 3,
+        "table_size_log2": 12,
+        "warmup_steps": 10,
+        "holdout": 1,
+        "orbit_frames": 0,
+    }
+    return RefineOptions(**{**values, **changed})
+
+
+def tiny_options(**changed) -> ResolvedOptions:
+    """The same, resolved."""
+    return tiny_run(**changed).resolved("cpu")
+
+
+def tiny_set(folder: Path, views: int = 7, size: int = 24) -> tuple[Dataset, ImageSet]:
+    """The synthetic scene with true poses, read back."""
+    dataset = read_dataset(write_synthetic_scene(folder, views, size, seed=3))
+    return dataset, load_images(dataset, size)
+
+
+def tiny_optimiser(
+    dataset: Dataset, images: ImageSet, options: RefineOptions, held_out: list[int] | None = None
+) -> JointOptimiser:
+    frame = scene_frame(dataset.world_from_cam, images)
+    start = frame.unit_from_world.apply_to_poses(dataset.world_from_cam)
+    return JointOptimiser(images, frame, start, options, held_out or [], CPU, threads=2)
+
+
+def given_scene(
+    dataset: Dataset, images: ImageSet, held_out: list[int] | None = None, given: np.ndarray | None = None
+) -> Scene:
+    """The set as a run has it that starts from its own poses, or from others."""
+    poses = dataset.world_from_cam if given is None else given
+    start = InitialPoses(poses, "given", ("given",) * len(dataset))
+    return Scene(dataset, images, start, held_out or [])
+
+
+def finished(stages: TwoStages) -> bool:
+    """Run both stages; false if they were stopped."""
+    try:
+        stages.run_stage_1()
+        stages.run_stage_2()
+    except Interrupted:
+        return False
+    return True
+
+
+def photos_set(photos: list[np.ndarray]) -> ImageSet:
+    """An `ImageSet` of these uint8 [h, w, 3] arrays; cameras do not matter."""
+    from biresnerf.geometry.camera.camera_models import Camera
+
+    heights, widths = [p.shape[0] for p in photos], [p.shape[1] for p in photos]
+    return ImageSet(
+        pixels=np.concatenate([p.reshape(-1, 3) for p in photos]),
+        alpha=None,
+        offsets=np.cumsum([0, *(h * w for h, w in zip(heights, widths, strict=True))]),
+        widths=np.array(widths, np.int32),
+        heights=np.array(heights, np.int32),
+        cameras=tuple(
+            Camera("SIMPLE_PINHOLE", w, h, (20.0, w / 2, h / 2)) for h, w in zip(heights, widths, strict=True)
+        ),
+        background=None,
+    )

@@ -1,0 +1,266 @@
+"""The verdict on poses of known truth: the better set wins, whichever side it is on, and photos tell on themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.photos.images import ImageSet, load_images
+from biresnerf.data.points.tracks import Tracks
+from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.refinement.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
+from biresnerf.refinement.verdict.judgement import Judgement, judge_poses
+from biresnerf.refinement.verdict.pose_evidence import compare_on_matches, working_share
+from biresnerf.refinement.views import pose_trials
+from biresnerf.refinement.views.compare_rigs import Rig
+from biresnerf.refinement.views.held_out_views import held_out_views, unseen_rounds, unseen_views
+from biresnerf.refinement.views.motion import moved_px
+from biresnerf.report import EpipolarEvidence
+from tests.refinement.tiny_scene import CPU, given_scene, tiny_optimiser, tiny_options, tiny_set
+
+pytestmark = pytest.mark.slow
+
+VIEWS = 14
+OPTIONS = tiny_options(trial_steps=60, samples_per_step=8192)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return tiny_set(tmp_path_factory.mktemp("scene"), views=VIEWS, size=24)
+
+
+@pytest.fixture(scope="module")
+def noisy(scene):
+    return perturb_poses(scene[0].world_from_cam, 0.1, seed=1)
+
+
+def with_poses(dataset: Dataset, poses: np.ndarray) -> Dataset:
+    frames = tuple(replace(f, world_from_cam=p) for f, p in zip(dataset.frames, poses, strict=True))
+    return replace(dataset, frames=frames)
+
+
+def true_matches(dataset: Dataset) -> Tracks:
+    """Where random points of the scene lie in pairs of photos, by the true poses; to half a pixel."""
+    rng = np.random.default_rng(7)
+    points = rng.uniform(-0.5, 0.5, (600, 3))
+    pair = rng.integers(0, VIEWS, (600, 2))
+    pair[:, 1] = (pair[:, 0] + 1 + pair[:, 1] % (VIEWS - 1)) % VIEWS
+    full = dataset.camera_of(0).full()
+    xy = np.empty((600, 2, 2))
+    for side in (0, 1):
+        poses = dataset.world_from_cam[pair[:, side]]
+        in_cam = np.einsum("mji,mj->mi", poses[:, :3, :3], points - poses[:, :3, 3])
+        xy[:, side] = in_cam[:, :2] / in_cam[:, 2:] * [full.fx, full.fy] + [full.cx, full.cy]
+    return Tracks.of_matches(pair, xy + rng.normal(0, 0.1, xy.shape))
+
+
+def judged(
+    scene: tuple[Dataset, ImageSet],
+    given: np.ndarray,
+    refined: np.ndarray,
+    tracks: Tracks | None = None,
+) -> Judgement:
+    """The verdict on a run that was given one set of poses and ended with the other."""
+    dataset, images = scene
+    optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3])
+    run = replace(given_scene(with_poses(dataset, given), images, [3]), tracks=tracks)
+    return judge_poses(run, optimiser)
+
+
+def test_true_poses_in_place_of_noisy_ones_are_an_improvement(scene, noisy):
+    verdict = judged(scene, noisy, scene[0].world_from_cam).verdict
+    assert (verdict.verdict, verdict.returned) == ("improved", "refined")
+    assert verdict.heldout.psnr.difference > 0.5
+    assert verdict.heldout.strictly == 1
+
+
+def test_other_views_are_left_out_only_until_they_decide(scene):
+    truth = scene[0].world_from_cam
+    first, second = unseen_rounds(VIEWS, [3])
+    far, near = (judged(scene, perturb_poses(truth, noise, seed=1), truth).verdict for noise in (0.3, 0.02))
+    assert far.heldout.psnr.count == len(first)
+    assert near.heldout.psnr.count == len(first) + len(second)
+    assert far.heldout.psnr.low > 0.5
+
+
+def test_trainings_end_once_they_decide_and_the_work_they_were_is_told(scene):
+    dataset, images = scene
+    truth, steps = dataset.world_from_cam, 240
+    options = OPTIONS.model_copy(update={"trial_steps": steps})
+    optimiser = tiny_optimiser(dataset, images, options, held_out=[3])
+    for noise, expected in ((0.3, steps // 4), (0.02, steps)):
+        run = given_scene(with_poses(dataset, perturb_poses(truth, noise, seed=1)), images, [3])
+        works: list[float] = []
+        evidence = judge_poses(run, optimiser, took=works.append).verdict.heldout
+        assert evidence.steps == expected
+        rounds = 1 if expected < steps else 2
+        assert works == [2 * rounds * expected]
+
+
+def test_poses_that_a_broken_refinement_spoilt_are_not_returned(scene, noisy):
+    verdict = judged(scene, scene[0].world_from_cam, noisy).verdict
+    assert (verdict.verdict, verdict.returned) == ("kept_input", "input")
+    assert verdict.heldout.psnr.difference < -0.5
+
+
+def test_poses_that_stayed_are_unchanged(scene):
+    poses = scene[0].world_from_cam
+    verdict = judged(scene, poses, perturb_poses(poses, 1e-5, seed=2)).verdict
+    assert (verdict.verdict, verdict.returned) == ("unchanged", "input")
+
+
+def test_the_working_share_is_of_the_long_sides(scene):
+    dataset = scene[0]
+    rig = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in range(VIEWS)))
+    assert working_share(rig, scene[1]) == 1
+    assert working_share(rig, load_images(dataset, 12)) == 0.5
+
+
+def test_matches_alone_tell_good_poses_from_bad_ones(scene, noisy, monkeypatch):
+    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_, **__: None)
+    truth, matches = scene[0].world_from_cam, true_matches(scene[0])
+    better, worse = judged(scene, noisy, truth, matches), judged(scene, truth, noisy, matches)
+    assert (better.verdict.verdict, worse.verdict.verdict) == ("improved", "kept_input")
+    assert better.verdict.epipolar.error_px.after < 0.3 < better.verdict.epipolar.error_px.before
+    assert np.nanmax(better.epipolar_px[1]) < np.nanmin(better.epipolar_px[0])
+
+
+def test_swapping_the_sets_swaps_the_evidence(scene, noisy):
+    truth, matches = scene[0].world_from_cam, true_matches(scene[0])
+    forth, back = judged(scene, noisy, truth, matches).verdict, judged(scene, truth, noisy, matches).verdict
+    # The refined rig is carried to the input's frame, which no evidence depends on but by rounding and the scene box.
+    assert back.epipolar.error_px.difference == pytest.approx(-forth.epipolar.error_px.difference, abs=1e-3)
+    assert back.heldout.psnr.difference == pytest.approx(-forth.heldout.psnr.difference, abs=0.1)
+
+
+def test_lost_frames_fail_the_check(scene):
+    upside_down = scene[0].world_from_cam.copy()
+    upside_down[: VIEWS // 2 + 1, :3, :3] = upside_down[: VIEWS // 2 + 1, :3, :3] @ np.diag([-1.0, 1, -1])
+    judgement = judged(scene, scene[0].world_from_cam, upside_down)
+    assert judgement.verdict.verdict in ("failed_check", "kept_input")
+    assert judgement.verdict.returned == "input"
+
+
+def test_images_whose_poses_were_guessed_have_no_part_in_the_trials(scene, noisy):
+    dataset, images = scene
+    truth = dataset.world_from_cam
+
+    def judged_with_a_guess(guess: np.ndarray) -> Judgement:
+        given, refined = noisy.copy(), truth.copy()
+        given[1] = refined[1] = guess
+        frames = list(with_poses(dataset, given).frames)
+        frames[1] = replace(frames[1], pose_source="nearest-view")
+        run = given_scene(replace(dataset, frames=tuple(frames)), images, [3])
+        return judge_poses(run, tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3]))
+
+    found = judged_with_a_guess(truth[0])
+    assert found.verdict.verdict == "improved"
+    assert found.verdict.heldout.strictly == 1
+    assert np.isnan(found.trial_psnr[:, 1]).all()
+    assert np.isfinite(found.trial_psnr[:, 3]).all()
+    # Trials are the same wherever the guess is, but for rounding of the frame that poses are carried to.
+    other = judged_with_a_guess(truth[5])
+    np.testing.assert_allclose(other.trial_psnr[0], found.trial_psnr[0], atol=0.05)
+
+
+def test_motion_in_the_image_is_that_of_a_turned_camera(scene):
+    dataset, images = scene
+    cameras = tuple(dataset.camera_of(i) for i in range(VIEWS))
+    turned = dataset.world_from_cam.copy()
+    angle = 0.02
+    about_y = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turned[:, :3, :3] = turned[:, :3, :3] @ about_y
+    moved = moved_px(Rig(dataset.world_from_cam, cameras), Rig(turned, cameras), images)
+    assert moved == pytest.approx(angle * images.cameras[0].full().fx, rel=0.1)
+
+
+def test_unseen_views_hold_those_never_trained_on_and_spare_enough():
+    for count in range(4, 120):
+        held_out = [1] if count > 5 else []
+        views = unseen_views(count, held_out, 16)
+        assert set(held_out) <= set(views) < set(range(count))
+        assert len(views) == len(set(views)) <= max(1, min(16, count // 3))
+    assert len(unseen_views(100, list(range(0, 100, 10)), 16)) == 16
+    assert unseen_views(30, list(range(12)), 16) == list(range(12))
+
+
+@pytest.mark.parametrize("count", range(1, 40))
+def test_small_sets_are_looked_at_in_rounds_until_enough_views_were_unseen_or_all(count):
+    held_out = held_out_views(count, "auto")
+    rounds = unseen_rounds(count, held_out, 16)
+    assert rounds[0] == unseen_views(count, held_out, 16)
+    seen = [view for views in rounds for view in views]
+    assert len(seen) == len(set(seen)), "no view counts twice"
+    assert all(len(views) <= max(1, count // 3) for views in rounds), "two thirds are left to learn from"
+    if len(rounds[0]) >= 8 or not rounds[0]:
+        assert len(rounds) == 1
+    elif count >= 9:
+        assert len(seen) >= 8
+
+
+def test_a_blurred_photo_tells_on_itself(scene):
+    dataset, images = scene
+    spoilt = images.pixels.copy()
+    rows = slice(int(images.offsets[5]), int(images.offsets[6]))
+    photo = images.image(5).astype(float)
+    for _ in range(3):
+        photo = sum(np.roll(photo, shift, (0, 1)) for shift in ((0, 0), (0, 1), (1, 0), (1, 1))) / 4
+    spoilt[rows] = photo.reshape(-1, 3).astype(np.uint8)
+    poses = dataset.world_from_cam
+    assert not blurred(sharpness(images, poses)).any()
+    assert np.flatnonzero(blurred(sharpness(replace(images, pixels=spoilt), poses))).tolist() == [5]
+
+
+def test_outliers_in_exposure_and_motion_are_flagged_and_they_alone():
+    gain = np.exp(np.random.default_rng(1).normal(0, 0.02, 20))
+    assert not exposure_off(gain).any()
+    gain[[4, 9]] = 0.7, np.nan
+    assert np.flatnonzero(exposure_off(gain)).tolist() == [4]
+    assert not exposure_off(np.full(5, np.nan)).any()
+    turned, shifted = np.full(20, 0.5), np.full(20, 0.01)
+    assert not moved_far(turned, shifted, 4.0).any()
+    turned[3], shifted[8] = 6.0, 0.5
+    assert np.flatnonzero(moved_far(turned, shifted, 4.0)).tolist() == [3, 8]
+
+
+def test_trainings_are_the_same_again(scene):
+    dataset, images = scene
+    trials = pose_trials.PoseTrials(
+        images, [2, 6], [dataset.world_from_cam], OPTIONS, 20, CPU, 2, lambda: False
+    )
+    first, again = trials.score(dataset.world_from_cam), trials.score(dataset.world_from_cam)
+    np.testing.assert_array_equal(first.psnr, again.psnr)
+
+
+def test_matches_of_points_left_out_judge_and_photos_placed_by_a_guess_do_not(scene, noisy):
+    dataset, truth = scene[0], scene[0].world_from_cam
+    cameras = tuple(dataset.camera_of(i) for i in range(VIEWS))
+    tracks = true_matches(dataset)
+    guessed = np.arange(VIEWS) < VIEWS // 2
+    worse = np.where(guessed[:, None, None], truth, noisy)
+    before = np.where(guessed[:, None, None], noisy, truth)  # the guesses gain, the placed ones lose
+
+    def found(placed: np.ndarray, tracks: Tracks, *, started: bool) -> EpipolarEvidence:
+        rigs = Rig(before, cameras), Rig(worse, cameras)
+        return compare_on_matches(*rigs, tracks, placed, started_from_matches=started).evidence
+
+    judged_by_all = found(~guessed, tracks, started=True)
+    assert judged_by_all.error_px.finding != "better"
+    assert judged_by_all.error_px.count == VIEWS - VIEWS // 2
+    assert judged_by_all.independent
+    assert judged_by_all.matches == len(tracks.split()[1].pairs()[0])
+    few = tracks.where(tracks.point < 12 * VIEWS)  # too few points to spare any
+    assert not found(~guessed, few, started=True).independent
+    assert found(~guessed, few, started=False).independent
+
+
+def test_a_camera_that_its_own_matches_contradict_is_named(scene, monkeypatch):
+    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_, **__: None)
+    truth, refined = scene[0].world_from_cam, scene[0].world_from_cam.copy()
+    refined[5] = refined[6]
+    found = judged(scene, truth, refined, true_matches(scene[0]))
+    assert np.flatnonzero(found.contradicted).tolist() == [5]
+    assert not judged(scene, refined, truth, true_matches(scene[0])).contradicted.any()

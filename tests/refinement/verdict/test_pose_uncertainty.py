@@ -1,0 +1,81 @@
+"""The statement on each returned pose: in the caller's frame and unit, with a reason where nothing is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from biresnerf.geometry.pose_error import pose_error
+from biresnerf.geometry.similarity import Similarity, align_by_spread
+from biresnerf.refinement.adjustment.cameras import Cameras
+from biresnerf.refinement.finish.adjust_cameras import adjust_cameras
+from biresnerf.refinement.finish.expected_errors import TRACK_MODEL_ERROR
+from biresnerf.refinement.finish.outcome import Finish
+from biresnerf.refinement.start.first_step import poses_in_input_frame
+from biresnerf.refinement.verdict.judgement import judge_poses
+from biresnerf.refinement.verdict.pose_uncertainty import CONTRADICTED, NO_EVIDENCE, pose_uncertainty
+from tests.refinement.adjustment.rig import disturbed
+from tests.refinement.finish.test_adjust_cameras import VIEWS, stages
+
+SCALE = 50.0  # of the caller's world
+CARRY = Similarity(SCALE, np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([7.0, -3, 100]))
+
+
+@pytest.fixture(name="rng")
+def generator():
+    return np.random.default_rng(2)
+
+
+def noisy_run(folder, rng):
+    """A run whose input is far off, in a world of its own, and the true poses there."""
+    run, truth = stages(
+        folder, rng, given=lambda poses: CARRY.apply_to_poses(disturbed(poses, rng, 0.1, 0.3)), noise_px=0.1
+    )
+    return run, CARRY.apply_to_poses(truth)
+
+
+def test_errors_in_the_callers_frame_and_unit_are_within_the_bounds(tmp_path, rng):
+    run, truth = noisy_run(tmp_path, rng)
+    known = pose_uncertainty(run, adjust_cameras(run), None)
+    assert {each.known_from for each in known} == {"matches"}
+    poses, _ = poses_in_input_frame(run.scene.dataset, run.optimiser)
+    errors = pose_error(poses, truth).aligned
+    for figure, limit in (
+        (errors.rotation_deg, [each.rotation_deg for each in known]),
+        (errors.centre_percent, [each.position_percent for each in known]),
+    ):
+        assert np.median(limit) / (4 * TRACK_MODEL_ERROR) < figure.median < np.median(limit)
+    share = [each.position / each.position_percent for each in known]
+    np.testing.assert_allclose(
+        share, np.linalg.norm(truth[:, :3, 3] - CARRY.translation, axis=1).mean() / 100, rtol=0.1
+    )
+
+
+def test_errors_along_the_axes_of_the_callers_world_are_as_large_as_the_covariance_says(tmp_path, rng):
+    run, truth = noisy_run(tmp_path, rng)
+    matrices = np.array([each.covariance for each in pose_uncertainty(run, adjust_cameras(run), None)])
+    poses, _ = poses_in_input_frame(run.scene.dataset, run.optimiser)
+    frame = align_by_spread(truth, poses)
+    errors = Cameras.of(frame.apply_to_poses(truth)).apart(Cameras.of(poses)).reshape(-1, 6)
+    squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(matrices), errors)
+    turned = np.kron(np.eye(2), CARRY.rotation)  # the right size along other axes
+    elsewhere = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(turned @ matrices @ turned.T), errors)
+    assert 0.5 < TRACK_MODEL_ERROR**2 * squares.mean() / 6 < 2
+    assert elsewhere.mean() > 1.5 * squares.mean()
+
+
+def test_without_evidence_nothing_is_said_to_be_known(tmp_path, rng):
+    run, _ = stages(tmp_path, rng)
+    for each in pose_uncertainty(run, Finish(), None):
+        assert (each.rotation_deg, each.position, each.covariance) == (None, None, None)
+        assert (each.known_from, each.why_unknown) == ("nothing", NO_EVIDENCE)
+
+
+def test_a_pose_that_its_own_matches_contradict_is_not_known(tmp_path, rng):
+    run, _ = stages(tmp_path, rng)
+    finish = adjust_cameras(run)
+    judgement = judge_poses(run.scene, run.optimiser)
+    errors = judgement.epipolar_px.copy()
+    errors[:, 3] = 20 * np.nanmedian(errors)
+    known = pose_uncertainty(run, finish, replace(judgement, epipolar_px=errors))
+    assert [each.why_unknown for each in known] == [CONTRADICTED if i == 3 else None for i in range(VIEWS)]

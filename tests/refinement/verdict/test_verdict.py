@@ -1,0 +1,159 @@
+"""The decision: fixed rules, symmetric in the two sets of poses, and the input has the benefit of the doubt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import t as student
+
+from biresnerf.refinement.adjustment.paired import paired, student_quantile
+from biresnerf.refinement.verdict.verdict import (
+    EPIPOLAR_MATTERS,
+    FITS_BELOW,
+    MEASURABLE_PX,
+    Findings,
+    decide,
+    failed_checks,
+    frame_doubt,
+)
+from biresnerf.refinement.views.compare_rigs import PSNR_MATTERS, SSIM_MATTERS
+from biresnerf.report import EpipolarEvidence, HeldOutEvidence
+
+OPPOSITE = {"better": "worse", "worse": "better", "same": "same", "open": "open"}
+
+
+def held_out(gain: float, spread: float = 0.2, views: int = 8) -> HeldOutEvidence:
+    """Evidence of views that gain so much (dB), plus and minus the spread."""
+    before = np.linspace(20, 25, views)
+    gains = gain + spread * np.resize([1.0, -1.0], views)
+    similarity = np.full(views, 0.8)
+    return HeldOutEvidence(
+        steps=200,
+        strictly=views,
+        psnr=paired(before, before + gains, PSNR_MATTERS),
+        ssim=paired(similarity, similarity + 0.01 * gains, SSIM_MATTERS),
+    )
+
+
+def matched(octaves: float, *, independent: bool = True, share: float = 0.001) -> EpipolarEvidence:
+    """Evidence of images whose error halves so many times."""
+    gains = octaves + 0.05 * np.resize([1.0, -1.0], 10)
+    before = np.full(10, 2.0)
+    return EpipolarEvidence(
+        matches=1000,
+        independent=independent,
+        error_px=paired(before, before / 2**gains, EPIPOLAR_MATTERS, gains),
+        share_of_image=share,
+    )
+
+
+def findings(
+    heldout: HeldOutEvidence | None = None, epipolar: EpipolarEvidence | None = None, **changed
+) -> Findings:
+    told = Findings(
+        failed=(), moved_px=3.0, heldout=heldout, epipolar=epipolar, compared_with="given", grounded=True
+    )
+    return replace(told, **changed)
+
+
+@pytest.mark.parametrize(
+    ("told", "verdict", "returned"),
+    [
+        (findings(held_out(4.0)), "improved", "refined"),
+        (findings(held_out(4.0), matched(1.0)), "improved", "refined"),
+        (findings(held_out(0.05), matched(1.0)), "improved", "refined"),
+        (findings(held_out(-4.0)), "kept_input", "input"),
+        (findings(held_out(-4.0), matched(-1.0)), "kept_input", "input"),
+        (findings(held_out(0.05)), "kept_input", "input"),
+        (findings(held_out(0.05), matched(0.0)), "kept_input", "input"),
+        (findings(held_out(0.05), matched(-1.0)), "kept_input", "input"),
+        (findings(held_out(4.0), matched(-1.0)), "inconclusive", "input"),
+        (findings(held_out(-4.0), matched(1.0)), "inconclusive", "input"),
+        (findings(held_out(1.0, spread=3.0)), "inconclusive", "input"),
+        (findings(held_out(4.0, views=1)), "inconclusive", "input"),
+        (findings(), "inconclusive", "input"),
+        (findings(held_out(4.0), moved_px=MEASURABLE_PX / 2), "unchanged", "input"),
+        (findings(held_out(4.0), failed=("Gone.",)), "failed_check", "input"),
+        (findings(held_out(4.0), matched(1.0), out_of_frame="Far."), "improved", "refined"),
+        (findings(held_out(4.0), out_of_frame="Far."), "failed_check", "input"),
+        (findings(held_out(0.05), matched(1.0), out_of_frame="Far."), "failed_check", "input"),
+        (findings(held_out(4.0), matched(-1.0), out_of_frame="Far."), "failed_check", "input"),
+        (findings(held_out(4.0), matched(1.0, share=2 * FITS_BELOW)), "inconclusive", "input"),
+    ],
+)
+def test_the_verdict_follows_from_the_evidence(told, verdict, returned):
+    decided = decide(told)
+    assert (decided.verdict, decided.returned) == (verdict, returned)
+    assert decided.why
+
+
+def test_matches_that_made_the_start_speak_against_refined_poses_but_not_for_them():
+    assert decide(findings(epipolar=matched(1.0, independent=False))).verdict == "inconclusive"
+    assert decide(findings(held_out(0.05), matched(1.0, independent=False))).verdict == "kept_input"
+    assert decide(findings(held_out(4.0), matched(-1.0, independent=False))).verdict == "inconclusive"
+    assert decide(findings(epipolar=matched(-1.0, independent=False))).verdict == "kept_input"
+
+
+def test_matches_that_gain_little_do_not_speak_for_poses_that_moved_far():
+    """They lose 1 px: a tenth of 11 px, but for one that is free."""
+    moved_far, fairly, a_little = ({"moved_px": moved} for moved in (11.5, 10.5, 0.9))
+    assert decide(findings(held_out(0.05), matched(1.0), **moved_far)).verdict == "inconclusive"
+    assert decide(findings(held_out(0.05), matched(1.0), **fairly)).verdict == "improved"
+    assert decide(findings(held_out(4.0), matched(1.0), **moved_far)).verdict == "improved"
+    assert decide(findings(held_out(0.05), matched(0.11), **a_little)).verdict == "improved"
+    # At half the size a px of the matches is half a px of the motion.
+    assert decide(findings(epipolar=matched(1.0), working_share=0.5, **fairly)).verdict == "inconclusive"
+
+
+def test_without_evidence_refined_poses_stand_only_against_a_guess():
+    assert decide(findings(grounded=False)).returned == "refined"
+    assert decide(findings(held_out(-4.0), grounded=False)).returned == "input"
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_swapping_the_two_sets_turns_every_finding_round(seed):
+    rng = np.random.default_rng(seed)
+    before, after = rng.normal(20, 2, (2, rng.integers(2, 12))) + rng.normal(0, 1, (2, 1))
+    forth, back = paired(before, after, PSNR_MATTERS), paired(after, before, PSNR_MATTERS)
+    assert back.difference == pytest.approx(-forth.difference)
+    assert (back.low, back.high) == (pytest.approx(-forth.high), pytest.approx(-forth.low))
+    assert back.finding == OPPOSITE[forth.finding]
+
+
+def test_what_improves_one_way_is_kept_the_other_way():
+    for gain in (0.6, 1.0, 3.0):
+        assert decide(findings(held_out(gain))).verdict == "improved"
+        assert decide(findings(held_out(-gain))).verdict == "kept_input"
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 5, 15, 30, 31, 60, 500])
+def test_the_interval_is_students(freedom):
+    assert student_quantile(freedom) == pytest.approx(student.ppf(0.975, freedom), rel=2e-3)
+
+
+def test_chance_alone_rarely_improves():
+    rng = np.random.default_rng(5)
+    views, repeats = 10, 2000
+    noise = rng.normal(0, 0.3, (repeats, views))
+    said = [paired(np.zeros(views), gains, PSNR_MATTERS).finding for gains in noise]
+    assert said.count("better") / repeats < 0.01
+
+
+def test_what_is_inconsistent_fails_the_check():
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    assert failed_checks(poses, lost=3) == ()
+    broken = poses.copy()
+    broken[2, 0, 3] = np.nan
+    assert "not finite" in failed_checks(broken, lost=0)[0]
+    assert "lost" in failed_checks(poses, lost=4)[0]
+
+
+def test_poses_far_from_the_input_doubt_its_frame_and_the_verdict_says_so():
+    still = np.zeros(6)
+    assert frame_doubt(still + 59, still + 0.4, 1.0) == ""
+    for turned, shifted in ((still + 100, still), (still, still + 2)):
+        doubt = frame_doubt(turned, shifted, 1.0)
+        assert "only roughly" in doubt
+        assert doubt in decide(findings(held_out(4.0), matched(1.0), out_of_frame=doubt)).why[0]

@@ -1,0 +1,159 @@
+"""Views kept out, the orbit's cameras, whole renders and held-out poses fitted to a frozen field."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from biresnerf.data.synthetic.scene import synthetic_cameras
+from biresnerf.refinement.views import evaluation
+from biresnerf.refinement.views.evaluation import fit_held_out_poses, orbit_poses, render_view, score_views
+from biresnerf.refinement.views.held_out_views import held_out_views
+from tests.refinement.tiny_scene import tiny_optimiser, tiny_options, tiny_set
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 6, 10, 47, 100, 1000])
+@pytest.mark.parametrize("asked", ["auto", 0, 1, 7, 200])
+def test_held_out_views_are_distinct_indices_and_leave_three_to_learn_from(count, asked):
+    views = held_out_views(count, asked)
+    assert views == sorted(set(views))
+    assert all(0 <= view < count for view in views)
+    assert not views or count - len(views) >= 3
+    if asked != "auto":
+        assert len(views) == max(0, min(asked, count - 3))
+
+
+def test_a_tenth_is_held_out_by_default_at_most_ten_and_none_of_a_few():
+    counts = {5: 0, 6: 1, 25: 2, 100: 10, 1000: 10}
+    assert {n: len(held_out_views(n, "auto")) for n in counts} == counts
+
+
+def test_held_out_views_are_spread_evenly():
+    gaps = np.diff([-5, *held_out_views(100, 10), 105])
+    assert gaps.min() >= 9
+    assert gaps.max() <= 11
+
+
+def test_views_whose_own_pose_is_doubtful_are_not_held_out():
+    sound = np.ones(11, dtype=bool)
+    assert held_out_views(11, "auto", sound) == held_out_views(11, "auto") == [5]
+    sound[5] = False
+    (view,) = held_out_views(11, "auto", sound)
+    assert view in (4, 6)
+    assert not {5} & set(held_out_views(11, 8, sound))
+    assert held_out_views(11, "auto", np.zeros(11, dtype=bool)) == [5], "nothing better: any will do"
+
+
+def turned(rig: np.ndarray) -> np.ndarray:
+    tilt = np.eye(4)
+    tilt[:3, :3] = Rotation.from_euler("xyz", [40, 25, 10], degrees=True).as_matrix()
+    return tilt @ rig
+
+
+def arc(reach_deg: float, count: int = 15) -> np.ndarray:
+    start = synthetic_cameras(11, 4)[5]
+    turns = np.linspace(-reach_deg / 2, reach_deg / 2, count)
+    rotation = Rotation.from_euler("z", turns[:, None], degrees=True).as_matrix()
+    rig = np.tile(np.eye(4), (count, 1, 1))
+    rig[:, :3] = rotation @ start[:3]
+    return rig
+
+
+RIGS = {
+    "dome": synthetic_cameras(40, 0),
+    "tilted dome": turned(synthetic_cameras(40, 0)),
+    "arc": arc(60),
+    "tilted arc": turned(arc(60)),
+    "one camera": synthetic_cameras(40, 0)[7:8],
+    "all in one place": np.repeat(synthetic_cameras(40, 0)[7:8], 4, axis=0),
+}
+
+
+@pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS.keys())
+def test_orbit_cameras_are_rigid_and_look_at_the_centre(rig):
+    poses = orbit_poses(rig, 24)
+    assert poses.shape == (24, 3, 4)
+    rotation, eye = poses[:, :, :3], poses[:, :, 3]
+    np.testing.assert_allclose(
+        rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (24, 1, 1)), atol=1e-9
+    )
+    np.testing.assert_allclose(np.linalg.det(rotation), 1)
+    in_cam = np.einsum("nji,nj->ni", rotation, -eye)  # the origin as each camera sees it
+    np.testing.assert_allclose(in_cam[:, :2], 0, atol=1e-9)
+    assert (in_cam[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS.keys())
+def test_orbit_cameras_are_upright_as_the_rig_is_and_about_as_far_away(rig):
+    poses = orbit_poses(rig, 24)
+    up = -rig[:, :3, 1].mean(0)
+    assert (-poses[:, :, 1] @ up > 0).all()
+    distance, given = np.linalg.norm(poses[:, :, 3], axis=1), np.linalg.norm(rig[:, :3, 3], axis=1)
+    assert 0.5 * given.min() < distance.min()
+    assert distance.max() < 1.1 * given.max()
+
+
+def test_a_full_rig_is_circled_and_a_narrow_one_swung_over():
+    full = orbit_poses(RIGS["dome"], 24)[:, :, 3]
+    azimuth = np.unwrap(np.arctan2(full[:, 1], full[:, 0]))
+    assert abs(np.diff(azimuth)).sum() == pytest.approx(2 * np.pi * 23 / 24, rel=0.01)  # up is not quite z
+    swing = orbit_poses(RIGS["arc"], 24)[:, :, 3]
+    nearest = np.linalg.norm(swing[:, None] - RIGS["arc"][None, :, :3, 3], axis=2).min(1)
+    assert nearest.max() < 0.15 * np.linalg.norm(RIGS["arc"][0, :3, 3])  # never leaves what the rig has seen
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    dataset, images = tiny_set(tmp_path_factory.mktemp("scene"))
+    optimiser = tiny_optimiser(dataset, images, tiny_options(), held_out=[3])
+    for _ in range(20):
+        optimiser.step()
+    return optimiser, images
+
+
+def test_a_whole_view_has_every_pixel_once_in_its_place(trained):
+    optimiser, images = trained
+    view = render_view(optimiser, optimiser.poses.matrices().detach()[2], 2)
+    assert view.colour.shape == (*images.image(2).shape[:2], 3)
+    assert view.depth.shape == view.opacity.shape == images.image(2).shape[:2]
+    assert 0 <= view.colour.min() <= view.colour.max() <= 1
+    # One pixel by itself: the same ray gives the same colour.
+    with torch.no_grad():
+        matrix = optimiser.poses.matrices()[2:3]
+        origin, direction = optimiser.cast(matrix, torch.tensor([2]), torch.tensor([[17.5, 6.5]]))
+        alone = optimiser.render(
+            origin, direction, 0, optimiser.schedule.fine_interval, optimiser.schedule.position_gradient(0, None),
+            jitter=False,
+        )  # fmt: skip
+    np.testing.assert_allclose(view.colour[6, 17], alone.colour[0].numpy(), atol=1e-6)
+
+
+def test_fitting_held_out_poses_moves_them_alone_and_no_field(trained, monkeypatch):
+    monkeypatch.setattr(evaluation, "FIT_STEPS", 8)
+    optimiser, _ = trained
+    before = {
+        k: v.clone()
+        for k, v in optimiser.state().items()
+        if k.startswith(("field.pose_table", "field.network"))
+    }
+    poses = optimiser.poses.matrices().detach().clone()
+    fit_held_out_poses(optimiser, [3])
+    after = optimiser.poses.matrices().detach()
+    assert [i for i in range(len(poses)) if not torch.equal(poses[i], after[i])] == [3]
+    for name, tensor in before.items():
+        assert torch.equal(optimiser.state()[name], tensor), name
+
+
+def test_scores_compare_the_render_of_each_view_with_its_own_photo(trained):
+    optimiser, images = trained
+    scores = list(score_views(optimiser, images, [1, 3]))
+    assert [score.image for score in scores] == [1, 3]
+    for score in scores:
+        photo = images.image(score.image) / 255
+        assert score.psnr == pytest.approx(
+            -10 * np.log10(((score.view.colour - photo) ** 2).mean()), abs=1e-3
+        )
