@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from docs.generate.commands_page import commands_page
+from docs.generate.conventions_picture import conventions_svg
 from docs.generate.format_tables import format_page, page_formats
 from docs.generate.notebooks import notebook
 from docs.generate.options_page import options_page
@@ -36,6 +37,7 @@ def _writers() -> dict[Path, Callable[[], str]]:
         ROOT / "service/web/formats.json": page_formats,
         ROOT / "docs/result.schema.json": result_schema,
         ROOT / "docs/openapi.json": openapi_document,
+        ROOT / "docs/pictures/conventions.svg": conventions_svg,
         **{walk.with_suffix(".ipynb"): partial(notebook, walk) for walk in walks},
     }
 
