@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
-from biresnerf.data.formats.bind_images import ParsedPoses, bind_images
+from biresnerf.data.formats.bind_images import bind_images
+from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.options.formats import Format

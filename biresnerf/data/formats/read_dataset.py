@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, dataset_of, without_problems
+from biresnerf.data.formats.bind_images import dataset_of
 from biresnerf.data.formats.folder import FolderContents, look_at, look_into
+from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry, without_problems
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.photos.masks import refuse_unfit_mask

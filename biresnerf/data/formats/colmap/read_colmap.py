@@ -6,8 +6,9 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, by_name, dataset_of
+from biresnerf.data.formats.bind_images import by_name, dataset_of
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
+from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry
 from biresnerf.data.model.colmap_scene import ColmapModel
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.model.part_of_model import without_images

@@ -13,9 +13,9 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry
 from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
+from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import FrameCamera, ParsedPoses, PoseEntry, in_order
+from biresnerf.data.formats.bind_images import in_order
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, listed_name
+from biresnerf.data.formats.parsed_poses import FrameCamera, ParsedPoses, PoseEntry
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix

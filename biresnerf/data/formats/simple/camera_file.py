@@ -10,9 +10,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import FrameCamera, LensOf
 from biresnerf.data.formats.colmap import read_text as colmap_text
 from biresnerf.data.formats.colmap.model_checks import broken, camera_of_numbers
+from biresnerf.data.formats.parsed_poses import FrameCamera, LensOf
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.model.untrusted_file import read_json_object, read_text
 from biresnerf.data.photos.image_files import ImageHeader

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry
 from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
+from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.untrusted_file import first_problem, read_text

@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, in_order
+from biresnerf.data.formats.bind_images import in_order
 from biresnerf.data.formats.codec import Codec, WriteContext
+from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry
 from biresnerf.data.formats.simple.bundler import bundler_problem, refuse_lenses
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.dataset import SourceFormat

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import Assignment, ParsedPoses, PoseEntry
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import rigid_pose
 from biresnerf.data.formats.match_names import match_files
+from biresnerf.data.formats.parsed_poses import Assignment, ParsedPoses, PoseEntry
 from biresnerf.data.formats.simple.camera_file import read_camera_file
 from biresnerf.data.formats.simple.times_of_images import (
     MAX_TIME_APART_S,

@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from biresnerf.data.formats.bad_frames import attempt, good_frames, tolerate
-from biresnerf.data.formats.bind_images import PoseEntry
 from biresnerf.data.formats.match_names import ENDS, SAME_PATH, match_files
+from biresnerf.data.formats.parsed_poses import PoseEntry
 from biresnerf.data.photos.image_files import find_image
 from biresnerf.data.photos.named_images import lies_in, refuse_outside
 from biresnerf.data.photos.photo_folders import by_path, few_names, images_below

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from biresnerf.data.formats.bind_images import FrameCamera
+from biresnerf.data.formats.parsed_poses import FrameCamera
 from biresnerf.data.formats.transforms.write_intrinsics import FOCAL_KEYS
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
 from biresnerf.data.photos.image_files import ImageHeader

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bad_frames import attempt, good_frames
-from biresnerf.data.formats.bind_images import ParsedPoses, PoseEntry, dataset_of, without_problems
+from biresnerf.data.formats.bind_images import dataset_of
 from biresnerf.data.formats.colmap.read_model import model_file_formats, read_colmap_model
+from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry, without_problems
 from biresnerf.data.formats.transforms.find_photos import find_photos
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.model.conventions import world_from_cam_of_file

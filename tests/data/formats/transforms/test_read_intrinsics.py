@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from biresnerf.data.formats.bind_images import FrameCamera
+from biresnerf.data.formats.parsed_poses import FrameCamera
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.errors import InputError
