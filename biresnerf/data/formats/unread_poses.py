@@ -22,7 +22,6 @@ class UnreadForm:
 
 _FOUR_NUMBERS = rb"\s*([-+]?[\d.]+(e[-+]?\d+)?\s+){4}"
 UNREAD = (
-    UnreadForm("OpenSfM or OpenDroneMap", ("reconstruction.json", "opensfm/reconstruction.json"), rb"\s*\["),
     UnreadForm("Meshroom", ("cameras.sfm", "sfm.sfm"), rb"\s*\{"),
     UnreadForm("OpenMVG", ("sfm_data.json",), rb"\s*\{"),
     UnreadForm("RealityCapture", ("*.csv",), rb"#name,x,y,alt"),

@@ -112,8 +112,8 @@ def _blank(match: re.Match[str]) -> str:
     return match[0] if match[0].startswith('"') else re.sub(r"[^\n]", " ", match[0])
 
 
-def read_json_object(path: Path, *, apart: str | None = None) -> dict[str, Any]:
-    """The object in the JSON file ``path``.
+def read_json(path: Path, *, apart: str | None = None) -> Any:
+    """The value in the JSON file ``path``.
 
     Comments (``//`` and ``/* */``) are left out.
 
@@ -122,8 +122,7 @@ def read_json_object(path: Path, *, apart: str | None = None) -> dict[str, Any]:
 
     Raises:
         InputError: ``pose_file_invalid`` for a file that cannot be read, is larger than ``MAX_TEXT_BYTES``,
-            is not JSON, has a key twice, is nested too deeply, or is not an object; ``pose_not_finite`` for NaN and
-            Infinity.
+            is not JSON, has a key twice, or is nested too deeply; ``pose_not_finite`` for NaN and Infinity.
     """
     text = read_text(path)
     try:
@@ -137,12 +136,21 @@ def read_json_object(path: Path, *, apart: str | None = None) -> dict[str, Any]:
         raise invalid_file(path.name, "nested too deeply.", "Export the poses again.") from None
     except ValueError as error:  # numbers of thousands of digits
         raise invalid_file(path.name, f"not readable: {error}.", "Export the poses again.") from None
+    looked_at = document
+    if apart is not None and isinstance(document, dict):
+        looked_at = {key: value for key, value in document.items() if key != apart}
+    refuse_non_finite(looked_at, path.name)
+    return document
+
+
+def read_json_object(path: Path, *, apart: str | None = None) -> dict[str, Any]:
+    """As `read_json`, for a file that must hold an object. Raises InputError ``pose_file_invalid`` for another."""
+    document = read_json(path, apart=apart)
     if not isinstance(document, dict):
         what = f"holds a {type(document).__name__}, not an object with `frames`."
         raise invalid_file(
             path.name, what, "Give a transforms.json as nerfstudio, instant-ngp or Blender write it."
         )
-    refuse_non_finite({key: value for key, value in document.items() if key != apart}, path.name)
     return document
 
 
@@ -168,6 +176,21 @@ def read_model(model: type[Model], path: Path, *, code: str, hint: str) -> Model
         return model.model_validate(read_json_object(path))
     except ValidationError as error:
         raise first_problem(error, path, code=code, hint=hint) from None
+
+
+def checked(model: type[Model], value: object, where: str, hint: str) -> Model:
+    """A part of a document, at ``where``, as ``model``.
+
+    Raises:
+        InputError: ``pose_not_finite`` for a number that is not finite, else ``pose_file_invalid``.
+    """
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        first = error.errors()[0]
+        code = "pose_not_finite" if first["type"] == "finite_number" else "pose_file_invalid"
+        field = ".".join(str(part) for part in first["loc"])
+        raise InputError(code, f"{first['msg']}.", where=f"{where} {field}".rstrip(), hint=hint) from None
 
 
 def first_problem(error: ValidationError, path: Path, *, code: str, hint: str) -> InputError:

@@ -34,6 +34,7 @@ PLACES = {
     "kitti": "kitti.txt",
     "bundler": "bundle.out",
     "llff": "poses_bounds.npy",
+    "opensfm": "reconstruction.json",
 }
 WRITTEN_ONLY = (
     "pinhole",
@@ -41,7 +42,6 @@ WRITTEN_ONLY = (
     "csv",
     "scene",
     "points",
-    "opensfm",
     "meshroom",
     "openmvg",
     "realitycapture",

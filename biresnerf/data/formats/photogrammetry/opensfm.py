@@ -3,31 +3,46 @@
 Layout and conventions: opensfm/io.py (camera_to_json, shot_to_json, point_to_json) and opensfm/features.py
 (normalized_image_coordinates) of mapillary/OpenSfM. A rotation is the axis times the angle of cam_from_world, OpenCV
 axes. Lengths in the picture are shares of its longer side, from its centre, where a picture's corner lies half a
-pixel from the first pixel's middle, as here. p1 and p2 are OpenCV's.
+pixel from the first pixel's middle, as here. p1 and p2 are OpenCV's. The lenses' formulas are in
+opensfm/src/geometry/camera_distortions_functions.h: perspective and fisheye have k1 and k2 and one focal length.
 """
 
 from __future__ import annotations
 
 import math
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
-from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.bad_frames import attempt
+from biresnerf.data.formats.codec import Codec, head_holds
+from biresnerf.data.formats.colmap.model_checks import image_name, rigid_pose
+from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses
 from biresnerf.data.formats.photogrammetry.lens_limits import BROWN, FISHEYE, refuse_other_lenses
+from biresnerf.data.formats.pose_rows import Placed, Row, at_size_of, folder_with_photos, lens_of, parsed_rows
 from biresnerf.data.model.atomic_file import write_json
+from biresnerf.data.model.colmap_scene import matrix_of_pose
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json
 from biresnerf.data.photos.photo_folders import IMAGE_FOLDER
-from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera, FullParameters
+from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.options.formats import Format
 
 OPENSFM = Format(
     name="opensfm",
     title="reconstruction.json (OpenSfM)",
     rank=62,
+    found_as=("reconstruction.json", "opensfm/reconstruction.json"),
+    suffixes=(".json",),
+    gives="poses and lenses of the largest reconstruction",
+    checked_against="files that `convert` wrote; a real one, against its own numbers",
     in_set="reconstruction.json",
     loses=("rigs", "mask paths"),
     instead="pinhole",
@@ -35,6 +50,121 @@ OPENSFM = Format(
     heading="For OpenSfM, OpenDroneMap",
     hint="Put it into the folder of the project; photos are in its images/",
 )
+
+
+_HINT = "Give the reconstruction.json that OpenSfM or OpenDroneMap wrote."
+_Vector: TypeAlias = tuple[float, float, float]
+# The coefficients of each lens that is read.
+_LENSES: dict[str, tuple[str, ...]] = {
+    "perspective": ("k1", "k2"),
+    "simple_radial": ("k1",),
+    "radial": ("k1", "k2"),
+    "brown": BROWN,
+    "fisheye": ("k1", "k2"),
+    "fisheye_opencv": FISHEYE,
+}
+
+
+class _Shot(BaseModel, allow_inf_nan=False):
+    rotation: _Vector
+    translation: _Vector
+    camera: str
+
+
+class _Lens(BaseModel, allow_inf_nan=False):
+    """One focal length, or two and a principal point; coefficients that a lens does not name are left alone."""
+
+    projection_type: str = "perspective"
+    width: int = 0
+    height: int = 0
+    focal: float = 0.0
+    focal_x: float = 0.0
+    focal_y: float = 0.0
+    c_x: float = 0.0
+    c_y: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+
+def parse_opensfm(_root: Path, file: Path) -> ParsedPoses:
+    """The shots of the reconstruction that has most of them.
+
+    Raises:
+        InputError: codes as in docs/input.md.
+    """
+    document = read_json(file)
+    parts = [part for part in document if isinstance(part, dict)] if isinstance(document, list) else []
+    sizes = [len(part["shots"]) if isinstance(part.get("shots"), dict) else 0 for part in parts]
+    if not any(sizes):
+        raise invalid_file(file.name, "holds no reconstruction with shots.", _HINT)
+    largest = sizes.index(max(sizes))
+    part, place = parts[largest], f"{file.name} [{largest}]"
+    listed = part.get("cameras")
+    cameras = listed if isinstance(listed, dict) else {}
+
+    @cache
+    def lens(key: str) -> Camera | LensOf | InputError:
+        return attempt(partial(_read_lens, cameras.get(key), f"{place}.cameras.{key}"))
+
+    def read(value: Any, where: str) -> Placed:
+        shot = checked(_Shot, value, where, _HINT)
+        pose = world_from_cam_of_vector(shot.rotation, shot.translation, where)
+        found = lens(shot.camera)
+        if isinstance(found, InputError):
+            raise found
+        return pose, found
+
+    rows: list[Row] = []
+    for name, value in part["shots"].items():
+        where = f"{place}.shots.{name}"
+        rows.append((image_name(name, where), where, partial(read, value, where)))
+    others = sum(sizes) - max(sizes)
+    notes = [f"{others} images belong to smaller reconstructions of {file.name}; their poses were not taken"]
+    return parsed_rows("opensfm", [file], rows, notes=notes if others else ())
+
+
+def world_from_cam_of_vector(rotation: _Vector, translation: _Vector, where: str) -> NDArray[np.float64]:
+    """``world_from_cam`` [4, 4] of an axis times an angle (radians) and a translation, both of cam_from_world.
+
+    Raises:
+        InputError: ``pose_not_finite`` or ``pose_out_of_range``.
+    """
+    vector = np.array(rotation)
+    half = float(np.linalg.norm(vector)) / 2.0
+    quat_wxyz = (math.cos(half), *(vector * (0.5 * float(np.sinc(half / math.pi)))).tolist())
+    return rigid_inverse(matrix_of_pose(rigid_pose((*quat_wxyz, *translation), where, _HINT)))
+
+
+def _read_lens(value: Any, where: str) -> Camera | LensOf:
+    lens = checked(_Lens, value, where, _HINT)
+    kind = lens.projection_type
+    if kind not in _LENSES:
+        raise InputError(
+            "camera_model_unsupported",
+            f"the camera type {kind[:40]} is not supported.",
+            where=where,
+            hint=f"Supported are {', '.join(_LENSES)}.",
+        )
+    focal_x, focal_y = (lens.focal_x, lens.focal_y) if lens.focal_x else (lens.focal, lens.focal)
+    coefficients = {name: getattr(lens, name) for name in _LENSES[kind]}
+
+    def at(width: int, height: int) -> Camera:
+        size = max(width, height)
+        full = FullParameters(
+            focal_x * size,
+            focal_y * size,
+            lens.c_x * size + width / 2,
+            lens.c_y * size + height / 2,
+            **coefficients,
+            fisheye=kind.startswith("fisheye"),
+        )
+        return lens_of(full, where, (width, height))
+
+    return at_size_of(at) if not (lens.width and lens.height) else at(lens.width, lens.height)
 
 
 def write_opensfm(refined: RefinedSet, path: Path) -> None:
@@ -94,4 +224,13 @@ def _lens(camera: Camera) -> dict[str, Any]:
     }
 
 
-CODECS = (Codec(OPENSFM, write=lambda refined, path, _: write_opensfm(refined, path)),)
+CODECS = (
+    Codec(
+        OPENSFM,
+        parse=parse_opensfm,
+        recognises=head_holds(b'"cameras"'),
+        image_root=folder_with_photos,
+        write=lambda refined, path, _: write_opensfm(refined, path),
+        given_back=lambda dataset: dataset.source.dialect == "opensfm",
+    ),
+)
