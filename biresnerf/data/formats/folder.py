@@ -85,12 +85,17 @@ def look_at(file: Path) -> FolderContents:
     """
     readable = [(name, codec) for name, codec in ALL_CODECS.items() if codec.parse is not None]
 
-    def by_suffix_alone(item: tuple[str, Codec]) -> bool:
+    def doubt(item: tuple[str, Codec]) -> int:
         codec = item[1]
-        return file.name not in codec.format.found_as or not codec.recognises(file)
+        place = codec.place_of(file)
+        if place is None or not codec.recognises(place):
+            return 3
+        if file.name in codec.format.found_as or place != file:
+            return 0
+        return 2 if codec.recognises is Path.is_file else 1
 
-    # A name that a format declares goes before a suffix, which several may share.
-    for name, codec in sorted(readable, key=by_suffix_alone):
+    # A name that a format declares goes before what a file begins with, and that before a suffix, which several share.
+    for name, codec in sorted(readable, key=doubt):
         place = codec.place_of(file)
         if place is not None:
             return FolderContents(codec.image_root(place), name, place, (), ())

@@ -11,6 +11,7 @@ from typing import TypeAlias
 
 from biresnerf.data.photos.photo_folders import IMAGE_FOLDER
 
+NO_EXTENSION = "without extension"
 _IMAGES = f"{IMAGE_FOLDER}/"
 
 
@@ -78,8 +79,8 @@ _RULES: tuple[Rule, ...] = (
     _OTHER_FORM,
     *ENDS,
     ("by file name, whatever its case", lambda name: posixpath.basename(_normal(name)).casefold()),
-    ("by file name without extension", lambda name: PurePosixPath(_normal(name)).stem.casefold()),
-    ("by path without extension", lambda name: posixpath.splitext(_normal(name))[0]),
+    (f"by file name {NO_EXTENSION}", lambda name: PurePosixPath(_normal(name)).stem.casefold()),
+    (f"by path {NO_EXTENSION}", lambda name: posixpath.splitext(_normal(name))[0]),
 )
 
 

@@ -20,6 +20,7 @@ from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters, smallest_model
 
 MAX_ROWS = 100_000
+MAX_SKEW = 1e-3  # of the focal length: a third of a pixel at the corner of a photo of 640 px
 Lens: TypeAlias = Camera | LensOf | None
 # ``world_from_cam`` [4, 4] (OpenCV axes) or None, and the lens.
 Placed: TypeAlias = tuple[NDArray[np.float64] | None, Lens]
@@ -72,6 +73,28 @@ def lens_of(full: FullParameters, where: str, size: tuple[int, int]) -> Camera:
     """The lens in the smallest model that holds it. Raises InputError ``intrinsics_invalid``."""
     model, params = smallest_model(full, None)
     return camera_of_numbers(model, *size, params, where)
+
+
+def pinhole_of(matrix: NDArray[np.float64], where: str, first_pixel: float) -> Callable[[int, int], Camera]:
+    """The pinhole lens of an intrinsic matrix [3, 3] (or [4, 4]) at a width and a height.
+
+    Args:
+        first_pixel: where the matrix has the middle of the first pixel: at 0, or at 0.5 as here.
+
+    Raises:
+        InputError: ``camera_model_unsupported`` for skew; ``intrinsics_invalid``.
+    """
+    fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    if abs(float(matrix[0, 1])) > MAX_SKEW * abs(fx):
+        raise InputError(
+            "camera_model_unsupported",
+            f"the skew ({float(matrix[0, 1]):.3g} px) is not zero, and no supported camera model has it.",
+            where=where,
+            hint="Give undistorted images with square pixels.",
+        )
+    shift = 0.5 - first_pixel
+    full = FullParameters(fx, fy, cx + shift, cy + shift)
+    return lambda width, height: lens_of(full, where, (width, height))
 
 
 def at_size_of(make: Callable[[int, int], Camera]) -> LensOf:

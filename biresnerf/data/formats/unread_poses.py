@@ -27,8 +27,6 @@ UNREAD = (
     UnreadForm("RealityCapture", ("*.csv",), rb"#name,x,y,alt"),
     UnreadForm("RealityCapture", ("*.xmp", "images/*.xmp"), rb"(?s).*\bxcr:"),
     UnreadForm("Tanks and Temples", ("*.log",), rb"\s*\d+\s+\d+\s+\d+\s*\n" + _FOUR_NUMBERS),
-    UnreadForm("7-Scenes or 3DMatch", ("frame-*.pose.txt", "*/frame-*.pose.txt"), _FOUR_NUMBERS),
-    UnreadForm("ScanNet or NSVF", ("pose/*.txt", "poses/*.txt"), _FOUR_NUMBERS),
     UnreadForm("MVSNet", ("cams/*_cam.txt",), rb"\s*extrinsic"),
     UnreadForm("sdfstudio", ("meta_data.json",), rb'(?s).*"camtoworld"'),
     UnreadForm("NeuS or IDR", ("cameras_sphere.npz", "cameras.npz"), rb"PK"),

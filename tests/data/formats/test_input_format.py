@@ -22,7 +22,7 @@ from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
 from biresnerf.geometry.perturb import perturb_poses
 from tests.data.formats.random_sets import random_camera, random_model, random_poses, random_result
 from tests.data.formats.readers import ours, seen_points, through_json_frame
-from tests.data.scenes import assert_complete, nerfstudio_scene, save, write_image
+from tests.data.scenes import HEIGHT, WIDTH, assert_complete, nerfstudio_scene, save, write_image
 
 # What nerfstudio 1.1.5 knows (nerfstudio/cameras/cameras.py, CAMERA_MODEL_TO_TYPE).
 NERFSTUDIO_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"}
@@ -188,3 +188,14 @@ def test_a_text_model_comes_back_as_text():
         assert (
             formats_given_back(replace(dataset, source=replace(dataset.source, colmap=model))) == given_back
         )
+
+
+def test_a_file_of_another_name_is_known_by_what_it_begins_with(tmp_path):
+    for index in range(3):
+        write_image(tmp_path / f"{index}.png", index)
+    rows = [
+        {"img_name": str(i), "width": WIDTH, "height": HEIGHT, "position": [i, 0, 0], "fx": 18, "fy": 18}
+        for i in range(3)
+    ]
+    turned = [{**row, "rotation": np.eye(3).tolist()} for row in rows]
+    assert read_dataset(save(tmp_path, turned, "mine.json")).source.dialect == "gaussian-splatting"

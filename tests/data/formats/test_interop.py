@@ -21,6 +21,8 @@ if not CASES.is_dir():
 
 # The case: format, frames, frames with a pose, and what a warning says of it.
 READ = {
+    "05_poses_silently_ignored/7scenes": ("matrix-files", 8, 8, None),
+    "06_says_no_images_where_there_are/scannet": ("matrix-files", 8, 8, "focal length"),
     "02_own_instant_ngp_folder_ignored": ("nerfstudio", 4, 4, None),
     "03_list_rd_not_read": ("bundler", 10, 10, None),
     "04_bundler_list_windows_paths": ("bundler", 10, 10, "kermit001.jpg"),
@@ -36,6 +38,7 @@ READ = {
     "23_tum_header_without_hash": ("tum", 40, 39, "by time"),
 }
 REFUSED = {
+    "06_says_no_images_where_there_are/nsvf": ("poses_coincide", "one point"),
     "05_poses_silently_ignored/3dgs_cameras": ("image_missing", "14 of 14 images not found"),
     "05_poses_silently_ignored/opensfm": ("image_missing", "19 of 19 images not found"),
     "17_mp4": ("no_images", "1 video (v.mp4)"),
@@ -56,7 +59,7 @@ def test_a_case_is_read_and_what_was_done_with_it_is_said(name):
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_case_that_cannot_be_read_is_refused_by_its_name(name):
     code, said = REFUSED[name]
-    with pytest.raises(InputError, match=r"photo|found") as caught:
+    with pytest.raises(InputError, match=r"photo|found|point") as caught:
         read_dataset(CASES / name)
     assert caught.value.code == code
     assert said in caught.value.detail

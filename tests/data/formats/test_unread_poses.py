@@ -17,8 +17,6 @@ FILES = {
     "cameras.csv": "#name,x,y,alt,heading,pitch,roll,f\n",
     "images/0.xmp": '<x:xmpmeta><rdf:Description xcr:Version="3">',
     "Ignatius.log": f"0 0 0\n{MATRIX}",
-    "frame-000000.pose.txt": MATRIX,
-    "pose/0.txt": MATRIX,
     "cams/00000000_cam.txt": f"extrinsic\n{MATRIX}",
     "meta_data.json": '{"frames": [{"camtoworld": []}]}',
     "cameras_sphere.npz": "PK\x03\x04",

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from biresnerf.data.formats.datasets.neus import write_neus
 from biresnerf.data.formats.photogrammetry.meshroom import write_meshroom
 from biresnerf.data.formats.photogrammetry.openmvg import write_openmvg
 from biresnerf.data.formats.photogrammetry.opensfm import write_opensfm
 from biresnerf.data.formats.photogrammetry.realitycapture import write_realitycapture
-from biresnerf.data.formats.simple.neus import write_neus
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
 from tests.data.formats.random_sets import random_result

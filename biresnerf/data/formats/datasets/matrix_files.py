@@ -1,0 +1,136 @@
+"""A 4 x 4 matrix per image in a file of its own: ScanNet, NSVF, 7-Scenes, 3DMatch, MobileBrick.
+
+Camera to world, OpenCV axes. Lenses stand in files beside: ``intrinsic/NAME.txt`` (MobileBrick, an ARKit capture),
+``intrinsic/intrinsic_color.txt`` (ScanNet), ``intrinsics.txt`` (NSVF: a matrix, or f, cx, cy and 0 in the first line),
+``camera-intrinsics.txt`` (3DMatch). All these programs take a pixel's coordinates for its indices: load_intrinsics and
+get_uv in fairnr/data/data_utils.py of facebookresearch/NSVF, depth2xyz in utils/geometry.py of
+ActiveVisionLab/MobileBrick, the kernel of fusion.py in andyzeng/tsdf-fusion-python, which also shows 7-Scenes' axes.
+ScanNet's axes: nerfstudio's scannet_dataparser.py. A pose that was lost is infinite there.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.formats.bad_frames import attempt
+from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses
+from biresnerf.data.formats.pose_rows import Placed, Row, at_size_of, parsed_rows, pinhole_of
+from biresnerf.data.model.pose_validation import rigid_matrix
+from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
+from biresnerf.errors import InputError
+from biresnerf.options.formats import Format
+
+MATRIX_FILES = Format(
+    name="matrix-files",
+    title="a 4 × 4 per image (ScanNet, 7-Scenes, NSVF, 3DMatch, MobileBrick)",
+    rank=83,
+    found_as=("pose", "poses", "."),
+    gives="poses; one lens, or one an image, from the intrinsics beside them",
+    checked_against=(
+        "files written from the programs' sources; real ones of andyzeng/tsdf-fusion-python (7-Scenes) and of "
+        "borglab/gtsfm (MobileBrick), against their own numbers"
+    ),
+)
+_HINT = "Give a file of 4 rows of 4 numbers for each image, camera to world."
+_FOLDERS = ("pose", "poses")
+_FRAME = re.compile(r"(.*frame-\d+)\.pose\.txt$")  # 7-Scenes and 3DMatch, beside NAME.color.png
+_SHARED = ("intrinsic/intrinsic_color.txt", "intrinsics.txt", "camera-intrinsics.txt")
+_HEAD_BYTES = 4096
+
+
+def parse_matrix_files(_root: Path, place: Path) -> ParsedPoses:
+    """The poses of the files in ``place``, each for the image of its name.
+
+    Raises:
+        InputError: codes as in docs/input.md.
+    """
+    files = _pose_files(place)
+    root = _image_root(place)
+    shared = next((root / name for name in _SHARED if (root / name).is_file()), None)
+    shared_lens = None if shared is None else attempt(partial(_lens, shared))
+    if isinstance(shared_lens, InputError):
+        raise shared_lens
+
+    def read(file: Path) -> Placed:
+        own = root / "intrinsic" / file.name
+        lens = _lens(own) if own.is_file() else shared_lens
+        values = finite_numbers(read_text(file).split(), file.name, _HINT)
+        if len(values) not in (12, 16):
+            raise invalid_file(file.name, f"has {len(values)} numbers, not 16.", _HINT)
+        return rigid_matrix(values.reshape(-1, 4).tolist(), file.name)[0], lens
+
+    rows: list[Row] = [(name, file.name, partial(read, file)) for name, file in files.items()]
+    used = [*files.values(), *([shared] if shared else [])]
+    return parsed_rows("matrix-files", used, rows, take_file_names=True, photo_folders=("color", "image"))
+
+
+def _pose_files(place: Path) -> dict[str, Path]:
+    """The files with a matrix each, by the name of the image that each is for."""
+    if place.name in _FOLDERS:
+        return {f"{path.stem}.png": path for path in sorted(place.glob("*.txt")) if path.is_file()}
+    found = {}
+    for path in sorted([*place.glob("frame-*.pose.txt"), *place.glob("*/frame-*.pose.txt")]):
+        match = _FRAME.match(path.relative_to(place).as_posix())
+        if match and path.is_file():
+            found[f"{match[1]}.color.png"] = path
+    return found
+
+
+def _recognises(place: Path) -> bool:
+    """Whether the first file begins with the numbers of a matrix, and nothing else."""
+    first = next(iter(_pose_files(place).values()), None) if place.is_dir() else None
+    if first is None:
+        return False
+    with first.open("rb") as file:
+        words = file.read(_HEAD_BYTES).decode("latin-1").split()
+    return len(words) in (12, 16) and not isinstance(attempt(partial(_floats, words)), InputError)
+
+
+def _floats(words: list[str]) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        raise invalid_file("", "holds a word that is not a number.", _HINT) from None
+
+
+def _lens(file: Path) -> LensOf:
+    lines = [line.split() for line in read_text(file).splitlines() if line.strip()]
+    numbers = [len(line) for line in lines]
+    matrix: NDArray[np.float64]
+    if numbers in ([4] * 4, [4] * 3, [3] * 3):
+        words = [word for line in lines for word in line]
+        matrix = finite_numbers(words, file.name, _HINT).reshape(len(lines), -1)
+    elif numbers and numbers[0] == 4:
+        focal, cx, cy, _ = finite_numbers(lines[0], f"{file.name} first line", _HINT).tolist()
+        matrix = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+    else:
+        raise invalid_file(
+            file.name, "is no intrinsic matrix of 3 or 4 rows.", "Give fx 0 cx, 0 fy cy, 0 0 1."
+        )
+    return at_size_of(pinhole_of(matrix, file.name, 0.0))
+
+
+def _image_root(place: Path) -> Path:
+    return place.parent if place.name in _FOLDERS else place
+
+
+def _place(file: Path) -> Path | None:
+    own = file.suffix.lower() == ".txt" and (file.parent.name in _FOLDERS or _FRAME.match(file.name))
+    return file.parent if own else None
+
+
+CODECS = (
+    Codec(
+        MATRIX_FILES,
+        parse=parse_matrix_files,
+        recognises=_recognises,
+        pose_place=_place,
+        image_root=_image_root,
+    ),
+)
