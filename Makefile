@@ -2,7 +2,7 @@
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
-EXTRAS ?= service,otel,colmap,studies,dev
+EXTRAS ?= service,otel,colmap,studies,docs,dev
 # Test files side by side: more than there are cores, as many wait for servers. 0: one after the other, in this process.
 TEST_PROCESSES ?= $(shell cores=$$(nproc 2>/dev/null || echo 2); echo $$((cores + (cores + 1) / 2)))
 # Runs of `make promises`, of up to 50 steps each.
@@ -19,7 +19,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Each process of the tests would compile all modules, and pytest rewrite all assertions, again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs fuzz promises audit sbom compose-check consumers-check
+.PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs docs-site fuzz promises audit sbom compose-check consumers-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -68,6 +68,9 @@ bench: setup  ## the measurements; BENCH="arguments"
 
 docs: setup  ## write the generated pages, notebooks and schemas (docs/openapi.json) again
 	$(BIN)/python -m docs.generate
+
+docs-site: setup  ## the documentation as a site in build/site, which needs no network and no server
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 fuzz: setup  ## a hundred thousand made-up requests against a real service; FUZZ="arguments"
 	$(BIN)/python -m tests.service.fuzzing $(FUZZ)
