@@ -29,7 +29,6 @@ UNREAD = (
     UnreadForm("Tanks and Temples", ("*.log",), rb"\s*\d+\s+\d+\s+\d+\s*\n" + _FOUR_NUMBERS),
     UnreadForm("MVSNet", ("cams/*_cam.txt",), rb"\s*extrinsic"),
     UnreadForm("sdfstudio", ("meta_data.json",), rb'(?s).*"camtoworld"'),
-    UnreadForm("NeuS or IDR", ("cameras_sphere.npz", "cameras.npz"), rb"PK"),
     UnreadForm("BOP", ("scene_camera.json",), rb'(?s).*"cam_K"'),
     UnreadForm("EuRoC", ("*/data.csv",), rb"#timestamp.*p_RS_R"),
     UnreadForm("Nerfies", ("camera/*.json",), rb'(?s).*"orientation"'),

@@ -35,6 +35,7 @@ PLACES = {
     "bundler": "bundle.out",
     "llff": "poses_bounds.npy",
     "opensfm": "reconstruction.json",
+    "neus": "cameras_sphere.npz",
 }
 WRITTEN_ONLY = (
     "pinhole",
@@ -45,7 +46,6 @@ WRITTEN_ONLY = (
     "meshroom",
     "openmvg",
     "realitycapture",
-    "neus",
 )
 FORMS = tuple(name for name, one in formats().items() if one.in_set)
 BOUNDS = ("--bounds", 0.5, 9)  # for sets without points
@@ -94,7 +94,7 @@ def write_set(folder: Path, seed: int, count: int, k1: float = 0.01) -> None:
 @given(seed=st.integers(0, 2**31), count=st.integers(3, 6))
 def test_there_and_back_keeps_poses_and_names(tmp_path_factory, form: str, seed: int, count: int) -> None:
     folder = tmp_path_factory.mktemp("set")
-    write_set(folder / "given", seed, count, 0.0 if form == "llff" else 0.01)
+    write_set(folder / "given", seed, count, 0.0 if form in ("llff", "neus") else 0.01)
     given_set = read_dataset(folder / "given")
     there = converted(folder / "given", folder / "there", "--to", form, *(BOUNDS if form == "llff" else ()))
     assert there["formats"] == {form: str(folder / "there" / PLACES[form])}

@@ -21,6 +21,7 @@ if not CASES.is_dir():
 
 # The case: format, frames, frames with a pose, and what a warning says of it.
 READ = {
+    "06_says_no_images_where_there_are/dtu": ("neus", 8, 8, "by their numbers"),
     "05_poses_silently_ignored/7scenes": ("matrix-files", 8, 8, None),
     "06_says_no_images_where_there_are/scannet": ("matrix-files", 8, 8, "focal length"),
     "02_own_instant_ngp_folder_ignored": ("nerfstudio", 4, 4, None),

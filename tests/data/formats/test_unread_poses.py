@@ -19,7 +19,6 @@ FILES = {
     "Ignatius.log": f"0 0 0\n{MATRIX}",
     "cams/00000000_cam.txt": f"extrinsic\n{MATRIX}",
     "meta_data.json": '{"frames": [{"camtoworld": []}]}',
-    "cameras_sphere.npz": "PK\x03\x04",
     "scene_camera.json": '{"0": {"cam_K": []}}',
     "mav0/data.csv": "#timestamp, p_RS_R_x [m]\n",
     "camera/0.json": '{"orientation": []}',

@@ -2,29 +2,47 @@
 
 Conventions: models/dataset.py of Totoro97/NeuS. ``world_mat_i`` is K [R | t] of cam_from_world, OpenCV axes;
 ``scale_mat_i`` takes the unit sphere to the world. A pixel's coordinates are its indices (gen_rays_at), so the
-principal point lies half a pixel nearer to the corner than here. Rows belong to the photos of image/ by name.
+principal point lies half a pixel nearer to the corner than here. Rows belong to the photos of image/ by name. IDR's
+cameras.npz is the same.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+import io
+import re
+import zipfile
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.formats.bind_images import in_order
 from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.parsed_poses import Assignment, ParsedPoses
+from biresnerf.data.formats.pose_rows import Placed, Row, at_size_of, parsed_rows, pinhole_of
 from biresnerf.data.formats.simple.bundler import refuse_lenses
 from biresnerf.data.formats.simple.llff import rows_by_name
 from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.data.model.untrusted_file import invalid_file, read_bytes
+from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.focus import focus_point
+from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.options.formats import Format
 
 NEUS = Format(
     name="neus",
     title="cameras_sphere.npz (NeuS, IDR)",
     rank=55,
+    found_as=("cameras_sphere.npz", "cameras.npz"),
+    suffixes=(".npz",),
+    gives="poses, one lens an image",
+    checked_against="files that `convert` wrote; a real one of jingz666/NeuF, against its projections",
     in_set="cameras_sphere.npz",
     loses=("names", "distortion", "rigs", "points", "mask paths"),
     instead="pinhole",
@@ -33,6 +51,94 @@ NEUS = Format(
 )
 _HELD = 0.98  # of the points that the sphere must hold
 _HALF_PX = 0.5
+_WORLD = re.compile(r"world_mat_(\d{1,6})\.npy")
+
+
+_HINT = "Give the cameras_sphere.npz that was made for these images."
+_MAX_BYTES = 64 * 2**20
+_MAX_MATRIX_BYTES = 1024  # a 4 x 4 of float64 takes 256
+
+
+def parse_neus(_root: Path, file: Path) -> ParsedPoses:
+    """The cameras of ``file`` in its world, before ``scale_mat``; for the images in the order of their names.
+
+    Where there are fewer images than cameras, their names must be the cameras' numbers.
+
+    Raises:
+        InputError: codes as in docs/input.md.
+    """
+    matrices = _world_matrices(file)
+
+    def read(number: int) -> Placed:
+        return _decomposed(matrices[number], f"{file.name} world_mat_{number}")
+
+    rows: list[Row] = [
+        (str(number), f"{file.name} world_mat_{number}", partial(read, number)) for number in sorted(matrices)
+    ]
+    parsed = parsed_rows("neus", [file], rows, photo_folders=("image", "rgb"))
+
+    def assign(names: Sequence[str]) -> Assignment:
+        numbers = [PurePosixPath(name).stem for name in names]
+        by_number = {int(entry.name): entry for entry in parsed.entries}
+        if len(names) < len(by_number) and all(
+            stem.isdecimal() and int(stem) in by_number for stem in numbers
+        ):
+            found = [
+                (name, replace(by_number[int(stem)], name=name))
+                for name, stem in zip(names, numbers, strict=True)
+            ]
+            return found, [f"{file.name}: images were taken by their numbers"]
+        hint = "Leave in image/ just the images that the cameras are for; their order by name decides."
+        return in_order(parsed.entries, names, file.name, hint)
+
+    return replace(parsed, assign=assign, named=False)
+
+
+def _world_matrices(file: Path) -> dict[int, NDArray[np.float64]]:
+    """The ``world_mat_i`` by number. Raises InputError ``pose_file_invalid``; no array is unpacked beyond 1 kB."""
+    found = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(read_bytes(file, _MAX_BYTES))) as archive:
+            for entry in archive.infolist():
+                match = _WORLD.fullmatch(entry.filename)
+                if match is None:
+                    continue
+                if entry.file_size > _MAX_MATRIX_BYTES:
+                    raise ValueError(f"{entry.filename} is too long")
+                with archive.open(entry) as opened:
+                    data = np.lib.format.read_array(io.BytesIO(opened.read()), allow_pickle=False)
+                found[int(match[1])] = np.array(data, dtype=np.float64)
+    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError, RuntimeError, EOFError) as error:
+        raise invalid_file(file.name, f"cannot be read: {error}.", _HINT) from None
+    if not found:
+        raise invalid_file(file.name, "holds no world_mat_0.", _HINT)
+    return found
+
+
+def _decomposed(matrix: NDArray[np.float64], where: str) -> Placed:
+    """The pose and lens of a projection K [R | t], of any scale."""
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise invalid_file(where, f"is an array of shape {matrix.shape}, not 4 x 4.", _HINT)
+    if not np.isfinite(matrix).all():
+        raise InputError("pose_not_finite", "NaN or an infinite number.", where=where, hint=_HINT)
+    projection = matrix[:3] * (1.0 if np.linalg.det(matrix[:3, :3]) > 0.0 else -1.0)
+    # K R by a QR of the transposed block in reverse order, with the signs that make K's diagonal positive.
+    q, r = np.linalg.qr(projection[::-1, :3].T)
+    lens, rotation = r.T[::-1, ::-1], q.T[::-1]
+    signs = np.where(np.diag(lens) < 0.0, -1.0, 1.0)
+    lens, rotation = lens * signs, signs[:, None] * rotation
+    if np.diag(lens).min() <= 1e-12 * np.abs(lens).max():
+        raise invalid_file(where, "is no projection of a camera.", _HINT)
+    cam_from_world = np.column_stack([rotation, np.linalg.solve(lens, projection[:, 3])])
+    pose = rigid_inverse(rigid_matrix(cam_from_world.tolist(), where)[0])
+    return pose, at_size_of(pinhole_of(lens / lens[2, 2], where, 0.0))
+
+
+def _recognises(file: Path) -> bool:
+    if not zipfile.is_zipfile(file):
+        return False
+    with zipfile.ZipFile(file) as archive:
+        return any(_WORLD.fullmatch(name) for name in archive.namelist())
 
 
 def write_neus(refined: RefinedSet, path: Path) -> None:
@@ -78,4 +184,12 @@ def _sphere(refined: RefinedSet) -> NDArray[np.float64]:
     return matrix
 
 
-CODECS = (Codec(NEUS, write=lambda refined, path, _: write_neus(refined, path)),)
+CODECS = (
+    Codec(
+        NEUS,
+        parse=parse_neus,
+        recognises=_recognises,
+        write=lambda refined, path, _: write_neus(refined, path),
+        given_back=lambda dataset: dataset.source.dialect == "neus",
+    ),
+)
