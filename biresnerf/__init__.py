@@ -8,13 +8,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from biresnerf.errors import BiresnerfError, InputError, Interrupted, RefinementError
-from biresnerf.openmp import let_waiting_threads_sleep
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.progress import Progress
 
 if TYPE_CHECKING:
-    from biresnerf.pipeline import refine_poses
     from biresnerf.result import Result, load
+    from biresnerf.run.refine import refine
 
 __version__ = "0.1.0"
 __all__ = [
@@ -26,18 +25,18 @@ __all__ = [
     "RefinementError",
     "Result",
     "load",
-    "refine_poses",
+    "refine",
 ]
+_MODULES = {"refine": "run.refine", "load": "result", "Result": "result"}
 
 
 def __getattr__(name: str) -> Any:
-    if name == "refine_poses":
-        let_waiting_threads_sleep()
-        from biresnerf.pipeline import refine_poses
+    if name not in _MODULES:
+        raise AttributeError(f"module 'biresnerf' has no attribute {name!r}")
+    from importlib import import_module
 
-        return refine_poses
-    if name in ("Result", "load"):
-        from biresnerf import result
+    return getattr(import_module(f"biresnerf.{_MODULES[name]}"), name)
 
-        return getattr(result, name)
-    raise AttributeError(f"module 'biresnerf' has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

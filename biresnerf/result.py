@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -11,8 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
-from biresnerf.data.formats.result_formats import read_result
+from biresnerf.data.formats.result_formats import read_result, write_exports
 from biresnerf.data.formats.simple.poses_json import (
     POSES,
     PoseImage,
@@ -25,6 +28,7 @@ from biresnerf.data.show.history import HISTORY, read_history
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.options.formats import formats
 from biresnerf.report import Report, Verdict
 from biresnerf.viewer.report_html import read_report
 
@@ -90,6 +94,31 @@ class Result:
         target.mkdir(parents=True, exist_ok=True)
         write_colmap_binary(read_result(self.folder).model, target)
         return target
+
+    def export(self, folder: str | Path, *names: str, photos: str | Path | None = None) -> tuple[Path, ...]:
+        """Write the returned poses in further formats into `folder`, as ``biresnerf export`` does.
+
+        Args:
+            names: of the formats, as docs/formats.md lists them: ``"nerfstudio", "llff"``.
+            photos: the input's folder, which formats that hold photos need.
+
+        Returns:
+            the file or folder of each format.
+
+        Raises:
+            InputError: ``invalid_options``, ``export_not_possible``, or a code of the readers.
+        """
+        known = [name for name, one in formats().items() if one.of_result]
+        for name in names:
+            if name not in known:
+                near = get_close_matches(name, known, 1)
+                said = f"unknown format; did you mean `{near[0]}`?" if near else "unknown format."
+                raise InputError("invalid_options", said, where=name, hint=f"There are {', '.join(known)}.")
+        refined = read_result(self.folder, None if photos is None else Path(photos))
+        written, notes = write_exports(refined, Path(folder), names, WriteContext())
+        for note in notes:
+            warnings.warn(note, stacklevel=2)
+        return tuple(Path(folder) / formats()[name].in_result for name in written)
 
     def plot_cameras(self, axes: Axes | None = None) -> Axes:
         """Draw the cameras before (grey) and after (blue); needs matplotlib."""

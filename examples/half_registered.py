@@ -13,9 +13,9 @@ The notebook is generated from this file (`make docs`).
 # %%
 from collections import Counter
 
-from walk import arguments, in_words, pose_table, show_progress
+from walk import arguments, in_words, pose_table
 
-from biresnerf import refine_poses
+import biresnerf
 from biresnerf.commands.poses.make_scene import make_scene
 
 here = arguments("half_registered", views=40, size=200, preset="fast", steps=1200, orbit_frames=0)
@@ -28,12 +28,15 @@ print(pose_table(here.truth, given=here.scene))
 # Every image of the folder gets a pose. `pose_source` is the origin of its initial pose.
 
 # %%
-report = refine_poses(here.scene, here.refined, here.options, show_progress)
-print(in_words(report))
-print("poses began from:", Counter(image.pose_source for image in report.images))
+result = biresnerf.refine(here.scene, here.refined, progress=True, **here.options)
+print(in_words(result))
+print("poses began from:", Counter(image.pose_source for image in result.report.images))
 
 # %% [markdown]
 # ## Before and after, against the truth
 
 # %%
 print(pose_table(here.truth, given=here.scene, refined=here.refined))
+
+# %%
+result.plot_cameras().figure.savefig(here.output / "cameras.png")

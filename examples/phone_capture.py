@@ -11,9 +11,9 @@ The notebook is generated from this file (`make docs`).
 # poses, and removes the errors again.
 
 # %%
-from walk import arguments, in_words, pose_table, show_progress
+from walk import arguments, in_words, pose_table
 
-from biresnerf import refine_poses
+import biresnerf
 from biresnerf.commands.poses.make_scene import make_scene
 
 here = arguments("phone_capture", views=40, size=200, preset="fast", steps=1200, orbit_frames=0)
@@ -27,11 +27,14 @@ print(pose_table(here.truth, given=here.scene))
 # whether the refined poses predict unseen photos better than the phone's.
 
 # %%
-report = refine_poses(here.scene, here.refined, here.options, show_progress)
-print(in_words(report))
+result = biresnerf.refine(here.scene, here.refined, progress=True, **here.options)
+print(in_words(result))
 
 # %% [markdown]
 # ## Before and after, against the truth
 
 # %%
 print(pose_table(here.truth, given=here.scene, refined=here.refined))
+
+# %%
+result.plot_cameras().figure.savefig(here.output / "cameras.png")

@@ -10,9 +10,9 @@ The notebook is generated from this file (`make docs`).
 # and slow changes of colour are enough for a field.
 
 # %%
-from walk import arguments, in_words, pose_table, show_progress
+from walk import arguments, in_words, pose_table
 
-from biresnerf import refine_poses
+import biresnerf
 from biresnerf.commands.poses.make_scene import make_scene
 
 here = arguments("vase", views=40, size=160, preset="fast", steps=1500, holdout=8, orbit_frames=0)
@@ -25,11 +25,14 @@ print(pose_table(here.truth, given=here.scene))
 # The few matches may mislead. A trial on unseen views decides whether to start from them.
 
 # %%
-report = refine_poses(here.scene, here.refined, here.options, show_progress)
-print(in_words(report))
+result = biresnerf.refine(here.scene, here.refined, progress=True, **here.options)
+print(in_words(result))
 
 # %% [markdown]
 # ## Before and after, against the truth
 
 # %%
 print(pose_table(here.truth, given=here.scene, refined=here.refined))
+
+# %%
+result.plot_cameras().figure.savefig(here.output / "cameras.png")

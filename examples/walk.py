@@ -6,18 +6,17 @@ import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from biresnerf import RefineOptions
+from biresnerf import Result
 from biresnerf.commands.poses.evaluate import matched_names
 from biresnerf.commands.settings_option import parse_settings
 from biresnerf.data.formats.read_dataset import read_poses
 from biresnerf.errors import InputError
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.options.refine_options import parse_options
-from biresnerf.progress import Progress
-from biresnerf.report import Report
 
 
 @dataclass(frozen=True)
@@ -28,14 +27,14 @@ class Arguments:
         output: a new folder for all of its files.
         of: the user's own set, with poses taken as true; None to make a set.
         views, size: number of images of the made set, and their width (px).
-        options: of the refinement.
+        options: of the refinement, by name.
     """
 
     output: Path
     of: Path | None
     views: int
     size: int
-    options: RefineOptions
+    options: dict[str, Any]
 
     @property
     def scene(self) -> Path:
@@ -53,7 +52,7 @@ class Arguments:
         return self.output / "refined"
 
 
-def arguments(name: str, *, views: int, size: int, **settings: object) -> Arguments:
+def arguments(name: str, *, views: int, size: int, **options: Any) -> Arguments:
     """The walk's defaults, overridden by the command line; a notebook has none."""
     parser = argparse.ArgumentParser(prog=f"{name}.py")
     parser.add_argument("--output", type=Path, default=Path(name), help=f"new folder (default: {name})")
@@ -62,22 +61,18 @@ def arguments(name: str, *, views: int, size: int, **settings: object) -> Argume
     parser.add_argument("--size", type=int, default=size, help="width of the images, px")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE")
     given = parser.parse_args([] if "ipykernel" in sys.modules else None)
+    options |= parse_settings(tuple(given.settings))
     try:
-        options = parse_options({**settings, **parse_settings(tuple(given.settings))})
+        parse_options(options)
     except InputError as error:
         parser.error(str(error))
     return Arguments(given.output, given.of, given.views, given.size, options)
 
 
-def show_progress(progress: Progress) -> None:
-    """Print one line that updates in place."""
-    print(f"\r{progress.stage:<10} {100 * progress.fraction:3.0f} %", end="", file=sys.stderr, flush=True)
-
-
-def in_words(report: Report) -> str:
-    """The verdict and the warnings, a line each, below the progress line."""
-    verdict = report.verdict.in_words() if report.verdict else ()
-    return "\n".join(["", *verdict, *(f"warning: {warning}" for warning in report.warnings)])
+def in_words(result: Result) -> str:
+    """The verdict and the warnings, a line each."""
+    verdict = result.verdict.in_words() if result.verdict else ()
+    return "\n".join([*verdict, *(f"warning: {warning}" for warning in result.report.warnings)])
 
 
 def pose_table(truth: Path, **sets: Path) -> str:

@@ -154,8 +154,9 @@ def test_importing_a_light_part_loads_no_heavy_library(module, forbidden):
 
 def test_the_method_is_reached_through_the_package():
     code = (
-        "import biresnerf, sys; assert 'torch' not in sys.modules; method = biresnerf.refine_poses; "
-        "assert 'torch' in sys.modules; assert biresnerf.refine_poses is method and callable(method)"
+        "import biresnerf, sys; method = biresnerf.refine; assert 'torch' not in sys.modules; "
+        "import biresnerf.refinement.scene.scene, biresnerf.run.refine; "
+        "assert biresnerf.refine is method and callable(method)"
     )
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 

@@ -12,7 +12,7 @@ import pytest
 pytestmark = pytest.mark.slow
 
 ENTRANCES = {
-    "library": "import biresnerf; biresnerf.refine_poses",
+    "library": "import biresnerf\ntry: biresnerf.refine('none', 'out')\nexcept biresnerf.InputError: import torch",
     "command line": "from biresnerf.command_line import main\ntry: main()\nexcept SystemExit: import torch",
     "job": "import pathlib; from workers.run.job_process import main; main(pathlib.Path('none')); import torch",
 }

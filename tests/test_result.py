@@ -99,6 +99,19 @@ def test_a_colmap_model_is_written_where_it_is_asked_for_and_nothing_overwritten
         biresnerf.load(folder).to_colmap(tmp_path / "sparse")
 
 
+def test_further_formats_hold_the_returned_poses(written, tmp_path):
+    refined, folder = written
+    files = biresnerf.load(folder).export(tmp_path / "for others", "kitti", "opensfm")
+    assert [path.relative_to(tmp_path).as_posix() for path in files] == [
+        "for others/kitti.txt",
+        "for others/reconstruction.json",
+    ]
+    rows = np.loadtxt(files[0]).reshape(-1, 3, 4)
+    np.testing.assert_allclose(rows, refined.world_from_cam[:, :3], atol=1e-8)
+    with pytest.raises(InputError, match="did you mean `opensfm`"):
+        biresnerf.load(folder).export(tmp_path, "opensfn")
+
+
 def test_drawn_cameras_lie_where_the_poses_are(written):
     pytest.importorskip("matplotlib").use("Agg")
     refined, folder = written

@@ -78,9 +78,14 @@ class Format:
         object.__setattr__(self, "in_result", self.in_result or self.in_set)
 
     @property
+    def of_result(self) -> bool:
+        """Whether a finished result can be written in it: it needs nothing else but photos."""
+        return bool(self.in_result) and not {"input", "bounds"} & set(self.needs)
+
+    @property
     def on_request(self) -> bool:
-        """Whether a result can be written in it on request: everything it needs is always available."""
-        return bool(self.in_result) and not self.always and not {"input", "bounds"} & set(self.needs)
+        """Whether a result is written in it on request only."""
+        return self.of_result and not self.always
 
 
 @cache

@@ -23,7 +23,6 @@ from biresnerf.result import Array, Result
 
 FOLDER = Path(__file__).resolve().parents[1] / "pictures"
 VIEWS, SIZE, NOISE, SEED = 48, 200, 0.15, 3
-OPTIONS = biresnerf.RefineOptions(preset="fast", max_image_size=SIZE, orbit_frames=0)
 MOVING, STILL, FRAME_MS = 24, 12, 60  # frames, and how long each is seen
 SIDE, GAP, CAPTION = 220, 8, 22  # px
 
@@ -35,8 +34,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         scene, out = Path(temporary, "scene"), Path(temporary, "out")
         make_scene(scene, "dome", own=None, views=VIEWS, size=SIZE, noise=NOISE, seed=SEED)
-        biresnerf.refine_poses(scene, out, OPTIONS)
-        result = biresnerf.load(out)
+        result = biresnerf.refine(
+            scene, out, progress=True, preset="fast", max_image_size=SIZE, orbit_frames=0
+        )
         draw_cameras(result, FOLDER / "cameras.webp")
         draw_before_after(result, FOLDER / "before_after.webp")
 

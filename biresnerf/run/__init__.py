@@ -1,0 +1,1 @@
+"""One run as a call: `biresnerf.refine`, how it shows its progress, and how Ctrl-C ends it."""

@@ -1,0 +1,64 @@
+"""`biresnerf.refine`: a whole refinement in one call, for programs, notebooks and the command line."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.openmp import let_waiting_threads_sleep
+from biresnerf.options.refine_options import parse_options
+from biresnerf.progress import OnProgress
+from biresnerf.result import Result, load
+from biresnerf.run.show_progress import ShownProgress
+from biresnerf.run.stop_request import StopRequest
+
+
+def refine(
+    input: str | Path,
+    output: str | Path,
+    /,
+    *,
+    progress: bool | OnProgress = False,
+    should_stop: Callable[[], bool] | None = None,
+    overwrite: bool = False,
+    **options: Any,
+) -> Result:
+    """Refine the camera poses of an image set, as the command ``biresnerf refine`` does.
+
+    All files of the result go to `output`. The same call resumes an interrupted run, and begins with stage 2 where only
+    options of stage 2 differ.
+
+    Args:
+        input: a folder of images, with or without poses, or a file with poses (docs/input.md).
+        output: a folder that is empty, new, or holds an unfinished run of the same input and options.
+        progress: True draws one bar over the whole run, with the time left: in notebooks, too; lines where there is
+            neither a notebook nor a terminal. A function is called with a `Progress` a few times a second.
+        should_stop: asked after every step, view, frame and photo; once true, a checkpoint and a partial result are
+            written. Without it, Ctrl-C asks for the same, as does a notebook's stop button.
+        overwrite: remove a finished result from `output` first.
+        options: of the refinement, by name, as docs/options.md lists them: ``preset="fast", steps=2000``.
+
+    Returns:
+        the result: poses are world_from_cam [n, 4, 4], float64, OpenCV axes, in the input's own frame and scale.
+
+    Raises:
+        InputError: the user can fix it: ``invalid_options`` with the nearest name of a wrong one, or a code of
+            docs/troubleshooting.md. Those of the input and the options come before torch is loaded.
+        RefinementError: the optimisation diverged.
+        Interrupted: stopped on request; the checkpoint and a partial result are in `output`, or nothing yet where
+            initial poses were still being looked for.
+    """
+    let_waiting_threads_sleep()
+    asked = parse_options(options)
+    with ExitStack() as during:
+        on_progress = during.enter_context(ShownProgress()) if progress is True else progress or None
+        stop = should_stop or during.enter_context(StopRequest(signal.SIGINT))
+        dataset = read_dataset(Path(input), strict=asked.bad_frames == "refuse")
+        from biresnerf.pipeline import refine_poses  # loads torch, which takes seconds
+
+        refine_poses(dataset, output, asked, on_progress, stop, overwrite=overwrite)
+    return load(output)

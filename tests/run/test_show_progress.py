@@ -1,0 +1,62 @@
+"""The bar and the lines that people see of a run."""
+
+from __future__ import annotations
+
+import io
+import logging
+import re
+import sys
+
+import pytest
+
+from biresnerf.progress import Progress
+from biresnerf.run.show_progress import LINE_EVERY, ShownProgress
+
+
+class Terminal(io.StringIO):
+    """What a terminal was sent."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def run_of(steps: int) -> list[Progress]:
+    told = [Progress(stage="preparing", message="resuming at step 3")]
+    for step in range(1, steps + 1):
+        told.append(
+            Progress(
+                stage="coarse", step=step, steps_total=steps, fraction=step / steps, eta_s=75.0 * (1 - step / steps),
+                metrics={"psnr": 12.5},
+            )
+        )  # fmt: skip
+    return told
+
+
+def shown(monkeypatch: pytest.MonkeyPatch, stream: io.StringIO, steps: int) -> str:
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setenv("COLUMNS", "100")
+    with ShownProgress() as show:
+        for progress in run_of(steps):
+            show(progress)
+            if progress.step == 2:
+                logging.getLogger("tests").warning("a word of the log")
+    return stream.getvalue()
+
+
+def test_a_terminal_has_one_bar_with_the_time_left_and_news_above_it(monkeypatch):
+    monkeypatch.setattr(logging.getLogger(), "handlers", [logging.StreamHandler(terminal := Terminal())])
+    said = shown(monkeypatch, terminal, 5)
+    drawn = said.split("\r")
+    assert "resuming at step 3\n" in said
+    assert re.search(r"coarse  40 %\|#+ +\| 00:0\d, step 2/5  train PSNR 12\.5 dB  0:45 left", said)
+    assert any(part.strip() == "a word of the log" for part in re.split(r"[\r\n]", said))
+    assert drawn[-1].strip() == "", "the bar leaves nothing behind"
+
+
+def test_a_file_has_lines_without_control_characters(monkeypatch):
+    said = shown(monkeypatch, io.StringIO(), 2 * LINE_EVERY)
+    lines = said.splitlines()
+    assert lines[0] == "preparing    0 % resuming at step 3"
+    assert lines[1].startswith("coarse ")
+    assert "\r" not in said
+    assert len(lines) == 4  # of 41 reports
