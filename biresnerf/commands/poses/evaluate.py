@@ -1,10 +1,11 @@
-"""`biresnerf evaluate RESULT TRUTH`: how far poses are from those of a reference."""
+"""`biresnerf evaluate RESULT TRUTH`: how far poses are from those of a reference, and how far they were before."""
 
 from __future__ import annotations
 
+import posixpath
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -12,45 +13,45 @@ from biresnerf.commands.answers import print_json
 from biresnerf.errors import InputError
 
 if TYPE_CHECKING:
-    from biresnerf.geometry.pose_error import FrameError, PoseError, Spread
-    from biresnerf.geometry.trajectory_error import TrajectoryError
-
-_ROWS = (
-    ("rotation_deg", "rotation (deg)"),
-    ("centre_percent", "camera centre (% of distance)"),
-    ("translation", "translation t of cam_from_world"),
-    ("translation_table", "  the same x100 at distance 4"),
-)
-_TITLES = {
-    "aligned": "aligned",
-    "aligned_robust": "robust",
-    "own_frame": "own frame",
-    "paper_compat": "paper compat",
-}
+    from biresnerf.commands.poses.error_table import Measured
+    from biresnerf.geometry.pose_error import Array
 
 
 @click.command("evaluate")
 @click.argument("result", type=click.Path(path_type=Path))
 @click.argument("truth", type=click.Path(path_type=Path))
+@click.option(
+    "--before",
+    "before_path",
+    type=click.Path(path_type=Path),
+    help="Poses to compare with. Default: those that were given, where RESULT is a folder that `refine` wrote.",
+)
+@click.option(
+    "--plot", "-o", type=click.Path(path_type=Path),
+    help="Also draw the errors of each image into this file (.png, .svg, .pdf).",
+)  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")
 @click.option("--paper-compat", is_flag=True, help="Add the alignment of BARF's and BAA-NGP's code.")
-def evaluate_command(result: Path, truth: Path, as_json: bool, paper_compat: bool) -> None:
-    """Measure the poses of RESULT against those of TRUTH.
+def evaluate_command(
+    result: Path, truth: Path, before_path: Path | None, plot: Path | None, as_json: bool, paper_compat: bool
+) -> None:
+    """Measure the poses of RESULT against those of TRUTH, beside the poses before.
 
-    Both are files with poses, or folders that hold one, in any form that `refine` reads. Images are matched by name,
-    with or without extension, else by file name alone where just one has it; they need not be there. "aligned" is after
-    BARF's similarity of the camera centres, as published tables have it: the least-squares rotation, and the ratio of
-    the rigs' sizes for scale; "robust" after one that single lost cameras do not drag along; "own frame" without any
-    alignment. --paper-compat adds the alignment of the published code with its flaw on flat rigs. ATE and RPE (from
-    each image to the next, in RESULT's order) are after the least-squares similarity (Umeyama's); AUC is of the
-    relative poses of all pairs, and needs none. docs/conventions.md defines them all.
+    RESULT and TRUTH are files with poses, or folders that hold one, in any form that `refine` reads. Images are matched
+    by name, with or without extension, else by file name alone where just one has it; they need not be there. "robust"
+    is after a similarity that single lost cameras do not drag along; "aligned" after BARF's similarity of the camera
+    centres, as published tables have it: the least-squares rotation, and the ratio of the rigs' sizes for scale; "own
+    frame" without any alignment: it includes where the whole rig lies, which photos alone cannot tell. --paper-compat
+    adds the alignment of the published code with its flaw on flat rigs. ATE and RPE (from each image to the next, in
+    RESULT's order) are after the least-squares similarity (Umeyama's); AUC is of the relative poses of all pairs, and
+    needs none. docs/conventions.md defines them all.
     """
-    import numpy as np
-
+    from biresnerf.commands.poses.error_table import error_table
+    from biresnerf.commands.poses.plot_errors import refuse_other_files
     from biresnerf.data.formats.read_dataset import read_poses
-    from biresnerf.geometry.pose_error import paper_compat_error, pose_error
-    from biresnerf.geometry.trajectory_error import trajectory_error
 
+    if plot is not None:
+        refuse_other_files(plot)
     estimated, true = read_poses(result), read_poses(truth)
     pairs = matched_names(list(estimated), list(true))
     if not pairs:
@@ -60,22 +61,95 @@ def evaluate_command(result: Path, truth: Path, as_json: bool, paper_compat: boo
             where=str(result),
             hint="Compare files of the same images; file_path decides.",
         )
-    both = np.stack([estimated[name] for name, _ in pairs]), np.stack([true[name] for _, name in pairs])
-    error, further = pose_error(*both), trajectory_error(*both)
-    frames = {"aligned": error.aligned, "aligned_robust": error.aligned_robust, "own_frame": error.own_frame}
-    if paper_compat:
-        frames["paper_compat"] = paper_compat_error(*both)
+    before = _given_poses(result) if before_path is None else read_poses(before_path)
+    had = dict(matched_names([name for name, _ in pairs], list(before)))
+    after = _measure(estimated, true, pairs, paper_compat)
+    earlier = None
+    if had:
+        of_before = [(had[name], other) for name, other in pairs if name in had]
+        earlier = _measure(before, true, of_before, paper_compat)
+    if plot is not None:
+        _plot(plot, {name: before[had[name]] for name in had}, estimated, true, pairs, after)
     left_out = {"result": len(estimated) - len(pairs), "truth": len(true) - len(pairs)}
     by_file_name = sum(_bare(name) != _bare(other) for name, other in pairs)
-    names = [name for name, _ in pairs]
     if as_json:
-        named = _as_json(error, frames, names, left_out)
-        print_json({**named, **further.model_dump(), "matched_by_file_name": by_file_name})
+        print_json(
+            {
+                **after.as_json(),
+                "before": None if earlier is None else earlier.as_json(),
+                "left_out": left_out,
+                "matched_by_file_name": by_file_name,
+            }
+        )
         return
-    click.echo(_as_table(error, frames, names, left_out))
-    click.echo("\n" + _further_lines(further))
+    click.echo(error_table(after, earlier, left_out))
     if by_file_name:
         click.echo(f"\n{by_file_name} images were matched by file name alone, from folders of other names")
+    if plot is not None:
+        click.echo(f"\nplot: {plot}")
+
+
+def _given_poses(result: Path) -> dict[str, Array]:
+    """The poses by name that a result of `refine` began with; none of anything else."""
+    from biresnerf.data.formats.simple.poses_json import POSES, matrix_of, read_poses_json
+
+    if not (result / POSES).is_file():
+        return {}
+    return {
+        posixpath.normpath(image.name): matrix_of(image.world_from_cam_before)
+        for image in read_poses_json(result / POSES).images
+        if image.world_from_cam_before is not None
+    }
+
+
+def _measure(
+    poses: dict[str, Array], true: dict[str, Array], pairs: list[tuple[str, str]], paper_compat: bool
+) -> Measured:
+    import numpy as np
+
+    from biresnerf.commands.poses.error_table import Measured
+    from biresnerf.geometry.pose_error import paper_compat_error, pose_error
+    from biresnerf.geometry.trajectory_error import trajectory_error
+
+    both = np.stack([poses[name] for name, _ in pairs]), np.stack([true[name] for _, name in pairs])
+    error = pose_error(*both)
+    frames = {
+        "aligned_robust": error.aligned_robust,
+        "aligned": error.aligned,
+        "own_frame": error.own_frame,
+    }
+    if paper_compat:
+        frames["paper_compat"] = paper_compat_error(*both)
+    return Measured([name for name, _ in pairs], error, frames, trajectory_error(*both))
+
+
+def _plot(
+    path: Path,
+    before: dict[str, Array],
+    estimated: dict[str, Array],
+    true: dict[str, Array],
+    pairs: list[tuple[str, str]],
+    after: Measured,
+) -> None:
+    """Draws the errors after robust alignment, of each set by itself."""
+    import numpy as np
+
+    from biresnerf.commands.poses.plot_errors import plot_errors
+    from biresnerf.geometry.pose_error import CameraErrors, camera_errors
+    from biresnerf.geometry.similarity import align_robust
+
+    truth = np.stack([true[other] for _, other in pairs])
+    sets = {}
+    for label, poses in (("before", before), ("after", estimated)):
+        known = np.array([name in poses for name, _ in pairs])
+        if not known.any():
+            continue
+        stack = np.stack([poses[name] for name, _ in pairs if name in poses])
+        found = camera_errors(align_robust(stack, truth[known]).apply_to_poses(stack), truth[known])
+        columns = np.full((3, len(pairs)), np.nan)
+        columns[:, known] = found.rotation_deg, found.translation, found.centre
+        sets[label] = CameraErrors(*columns)
+    plot_errors(path, sets, after.error.reference_distance, f"{len(pairs)} images against the true poses")
 
 
 def matched_names(estimated: list[str], true: list[str]) -> list[tuple[str, str]]:
@@ -115,40 +189,3 @@ def _bare(name: str) -> str:
     from biresnerf.data.photos.image_files import is_image_name
 
     return str(Path(name).with_suffix("")) if is_image_name(Path(name)) else name
-
-
-def _as_json(
-    error: PoseError, frames: dict[str, FrameError], names: list[str], left_out: dict[str, int]
-) -> dict[str, Any]:
-    named = {key: {**frame.model_dump(), "worst": names[frame.worst]} for key, frame in frames.items()}
-    return {**error.model_dump(), **named, "left_out": left_out}
-
-
-def _as_table(
-    error: PoseError, frames: dict[str, FrameError], names: list[str], left_out: dict[str, int]
-) -> str:
-    lines = [f"{error.cameras} cameras; distance {error.reference_distance:.6g} ({error.reference})"]
-    if any(left_out.values()):
-        lines.append(
-            f"left out: {left_out['result']} only in the result, {left_out['truth']} only in the truth"
-        )
-    for key, frame in frames.items():
-        title = _TITLES[key]
-        lines.append(f"\n{title:<34}{'mean':>12}{'median':>12}{'max':>12}   worst {names[frame.worst]}")
-        for key, label in _ROWS:
-            spread: Spread = getattr(frame, key)
-            lines.append(f"  {label:<32}{spread.mean:>12.5g}{spread.median:>12.5g}{spread.max:>12.5g}")
-    return "\n".join(lines)
-
-
-def _further_lines(error: TrajectoryError) -> str:
-    lines = [f"ATE {error.ate_rmse:.5g} (RMSE, in the truth's units)"]
-    if error.rpe_translation_rmse is not None:
-        turned = error.rpe_rotation_deg_rmse
-        lines.append(
-            f"RPE {error.rpe_translation_rmse:.5g}, {turned:.5g} deg (RMSE, from each image to the next)"
-        )
-    if error.auc:
-        areas = "  ".join(f"@{limit} {100 * area:.1f} %" for limit, area in error.auc.items())
-        lines.append(f"AUC of relative poses {areas} (degrees)")
-    return "\n".join(lines)

@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from imageio.v3 import imread
 from scipy.spatial.transform import Rotation
 
 from biresnerf.commands.poses.evaluate import evaluate_command, matched_names
+from biresnerf.data.formats.simple.poses_json import write_poses_json
 from biresnerf.errors import InputError
+from biresnerf.geometry.pose_error import pose_error
+from tests.data.formats.random_sets import random_result
 from tests.data.formats.simple import trajectories
 from tests.geometry.rigs import dome, jitter, similar
 
@@ -66,6 +71,49 @@ def test_ate_rpe_and_auc_are_told_in_json_and_in_words(tmp_path):
     # Of 66 pairs the 11 of the turned camera are wrong; the others are right.
     assert error["auc"]["10"] == pytest.approx(55 / 66, abs=1e-6)
     assert re.search(r"AUC of relative poses @1 83\.3 %", run(*files))
+
+
+def test_errors_before_and_after_stand_side_by_side_and_are_drawn(tmp_path):
+    truth, rng = dome(9, np.random.default_rng(0)), np.random.default_rng(1)
+    refined = random_result(1, count=9)
+    given = [None if i == 4 else pose for i, pose in enumerate(jitter(truth, rng, 0.2, 0.2))]
+    after = jitter(truth, rng, 0.01, 0.01)
+    images = [
+        replace(image, name=f"./images/{i:02}.png", world_from_cam=after[i], given=given[i])
+        for i, image in enumerate(refined.images)
+    ]
+    write_poses_json(replace(refined, images=tuple(images)), tmp_path / "out" / "poses.json")
+    write(tmp_path / "out" / "transforms.json", after)
+    files = tmp_path / "out", write(tmp_path / "truth.json", truth)
+    error = json.loads(run(*files, "--json"))
+    known = [i for i in range(9) if i != 4]
+    expected = pose_error(np.stack([given[i] for i in known]), truth[known])
+    assert error["before"]["cameras"] == 8
+    assert error["before"]["aligned_robust"]["rotation_deg"]["median"] == pytest.approx(
+        expected.aligned_robust.rotation_deg.median
+    )
+    table = run(*files, "--plot", tmp_path / "errors.svg")
+    was, now = error["before"]["aligned_robust"], error["aligned_robust"]
+    assert f"rotation {was['rotation_deg']['median']:.3g} -> {now['rotation_deg']['median']:.3g} deg" in table
+    assert "1 cameras had no pose before" in table
+    drawn = (tmp_path / "errors.svg").read_text()
+    for label, frame in (("before", was), ("after", now)):
+        assert f"{label}: median {frame['rotation_deg']['median']:.3g}°" in drawn
+        assert f"{label}: median {frame['centre_percent']['median']:.3g} %" in drawn
+    run(*files, "-o", tmp_path / "errors.png")
+    assert imread(tmp_path / "errors.png").shape[:2] == (600, 960)
+
+
+def test_other_poses_stand_before_on_request_and_none_where_none_were(tmp_path):
+    truth, rng = dome(9, np.random.default_rng(0)), np.random.default_rng(1)
+    files = write(tmp_path / "a.json", truth), write(tmp_path / "b.json", truth)
+    assert json.loads(run(*files, "--json"))["before"] is None
+    before = write(tmp_path / "c.json", jitter(truth, rng, 0.2, 0.2))
+    error = json.loads(run(*files, "--before", before, "--json"))
+    assert error["before"]["aligned"]["rotation_deg"]["median"] > 1
+    refused = CliRunner().invoke(evaluate_command, [*map(str, files), "-o", str(tmp_path / "errors.gif")])
+    assert isinstance(refused.exception, InputError)
+    assert "End it with .png" in str(refused.exception)
 
 
 def test_the_published_alignment_is_added_on_request_only(tmp_path):
