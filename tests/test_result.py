@@ -101,10 +101,11 @@ def test_a_colmap_model_is_written_where_it_is_asked_for_and_nothing_overwritten
 
 def test_further_formats_hold_the_returned_poses(written, tmp_path):
     refined, folder = written
-    files = biresnerf.load(folder).export(tmp_path / "for others", "kitti", "opensfm")
+    files = biresnerf.load(folder).export(tmp_path / "for others", "kitti", "opensfm", "nerfstudio")
     assert [path.relative_to(tmp_path).as_posix() for path in files] == [
         "for others/kitti.txt",
         "for others/reconstruction.json",
+        "for others/transforms_nerfstudio.json",
     ]
     rows = np.loadtxt(files[0]).reshape(-1, 3, 4)
     np.testing.assert_allclose(rows, refined.world_from_cam[:, :3], atol=1e-8)

@@ -56,10 +56,11 @@ def plot_errors(path: Path, sets: dict[str, CameraErrors], distance: float, titl
             style = {"color": COLOURS[label], "lw": 1}
             axes.plot(values, marker=".", label=f"{label}: median {middle:.3g}{unit}", **style)
             axes.axhline(middle, linestyle=":", **style)
-    rotation.set(ylabel="rotation error (°)", yscale="log", title=title)
+    rotation.set(ylabel="rotation error (°)", yscale="log")
+    rotation.set_title(title, loc="left", fontsize=10)
     centre.set(ylabel="position error (% of distance)", yscale="log", xlabel="image")
     for axes in (rotation, centre):
         axes.grid(alpha=0.3)
-        axes.legend(loc="upper right")
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "biresnerf"}), whole_file(path) as temporary:
         figure.savefig(temporary, dpi=120, format=path.suffix[1:].lower())
