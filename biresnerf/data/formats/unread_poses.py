@@ -22,8 +22,6 @@ class UnreadForm:
 
 _FOUR_NUMBERS = rb"\s*([-+]?[\d.]+(e[-+]?\d+)?\s+){4}"
 UNREAD = (
-    UnreadForm("Meshroom", ("cameras.sfm", "sfm.sfm"), rb"\s*\{"),
-    UnreadForm("OpenMVG", ("sfm_data.json",), rb"\s*\{"),
     UnreadForm("RealityCapture", ("*.csv",), rb"#name,x,y,alt"),
     UnreadForm("RealityCapture", ("*.xmp", "images/*.xmp"), rb"(?s).*\bxcr:"),
     UnreadForm("Tanks and Temples", ("*.log",), rb"\s*\d+\s+\d+\s+\d+\s*\n" + _FOUR_NUMBERS),

@@ -35,6 +35,8 @@ PLACES = {
     "bundler": "bundle.out",
     "llff": "poses_bounds.npy",
     "opensfm": "reconstruction.json",
+    "meshroom": "cameras.sfm",
+    "openmvg": "sfm_data.json",
     "neus": "cameras_sphere.npz",
 }
 WRITTEN_ONLY = (
@@ -43,8 +45,6 @@ WRITTEN_ONLY = (
     "csv",
     "scene",
     "points",
-    "meshroom",
-    "openmvg",
     "realitycapture",
 )
 FORMS = tuple(name for name, one in formats().items() if one.in_set)

@@ -39,6 +39,8 @@ READ = {
     "23_tum_header_without_hash": ("tum", 40, 39, "by time"),
 }
 REFUSED = {
+    "05_poses_silently_ignored/meshroom": ("image_missing", "images not found"),
+    "05_poses_silently_ignored/openmvg": ("image_missing", "images not found"),
     "06_says_no_images_where_there_are/nsvf": ("poses_coincide", "one point"),
     "05_poses_silently_ignored/3dgs_cameras": ("image_missing", "14 of 14 images not found"),
     "05_poses_silently_ignored/opensfm": ("image_missing", "19 of 19 images not found"),

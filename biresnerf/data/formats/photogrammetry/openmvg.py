@@ -3,26 +3,42 @@
 Layout: src/openMVG/sfm/sfm_data_io_cereal.cpp, version 0.3, as cereal writes polymorphic pointers in JSON: a pointer's
 first mention has the highest bit of its id set, and so has a type's, which then has its name. A rotation is
 cam_from_world by rows, beside the centre; OpenCV axes. pinhole_radial_k3 has k1 to k3, pinhole_brown_t2 also OpenCV's
-p1 and p2 (cameras/Camera_Pinhole_Brown.hpp), fisheye is OpenCV's.
+p1 and p2 (cameras/Camera_Pinhole_Brown.hpp), fisheye is OpenCV's. pinhole_radial_k1 has k1 alone, pinhole nothing
+(Camera_Pinhole_Radial_io.hpp, Camera_Pinhole_io.hpp); each has its coefficients under a key of its own.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-from biresnerf.data.formats.codec import Codec
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from biresnerf.data.formats.codec import Codec, head_holds
+from biresnerf.data.formats.colmap.model_checks import listed_name
+from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.formats.photogrammetry.landmarks import Landmark, landmarks
 from biresnerf.data.formats.photogrammetry.lens_limits import BROWN, FISHEYE, refuse_other_lenses
+from biresnerf.data.formats.photogrammetry.views import View, listed, parsed_views, pose_of_centre
+from biresnerf.data.formats.pose_rows import folder_with_photos, lens_of
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json_object
+from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera, FullParameters
 from biresnerf.options.formats import Format
 
 OPENMVG = Format(
     name="openmvg",
     title="sfm_data.json (OpenMVG)",
     rank=64,
+    found_as=("sfm_data.json",),
+    suffixes=(".json",),
+    gives="poses and lenses",
+    checked_against="files that `convert` wrote; a real one of LucasSwitz/OnlineSFM (lenses, no poses yet)",
     in_set="sfm_data.json",
     loses=("rigs", "mask paths"),
     instead="pinhole",
@@ -30,6 +46,7 @@ OPENMVG = Format(
     heading="For OpenMVG",
     hint="Set root_path in it to the folder of the photos",
 )
+_Vector: TypeAlias = tuple[float, float, float]
 _FIRST = 2**31  # cereal's mark of what is mentioned for the first time
 _VIEW = 2**30  # its id of a pointer to the declared type itself
 _TYPES = {
@@ -37,6 +54,96 @@ _TYPES = {
     "pinhole_brown_t2": ("disto_t2", BROWN),
     "fisheye": ("fisheye", FISHEYE),
 }
+
+
+_HINT = "Give the sfm_data.json that OpenMVG wrote, in version 0.3."
+_COEFFICIENTS: dict[str, tuple[str, ...]] = {
+    "disto_k1": ("k1",), "disto_k3": ("k1", "k2", "k3"), "disto_t2": BROWN, "fisheye": FISHEYE,
+}  # fmt: skip
+
+
+class _View(BaseModel):
+    local_path: str = ""
+    filename: str
+    id_pose: int
+    id_intrinsic: int
+
+
+class _Pose(BaseModel, allow_inf_nan=False):
+    rotation: tuple[_Vector, _Vector, _Vector]
+    center: _Vector
+
+
+class _Lens(BaseModel, allow_inf_nan=False):
+    width: int
+    height: int
+    focal_length: float
+    principal_point: tuple[float, float]
+
+
+def parse_openmvg(_root: Path, file: Path) -> ParsedPoses:
+    """The views of ``file``; those without a pose have none.
+
+    Raises:
+        InputError: codes as in docs/input.md.
+    """
+    document = read_json_object(file)
+
+    def pose(value: Any, where: str) -> NDArray[np.float64]:
+        found = checked(_Pose, value, where, _HINT)
+        return pose_of_centre(np.array(found.rotation).T, found.center, where)
+
+    def view(value: Any, where: str) -> View:
+        found = checked(_View, value, where, _HINT)
+        name = listed_name(f"{found.local_path}/{found.filename}".lstrip("/"), f"{where}.filename")
+        return View(name, where, str(found.id_pose), str(found.id_intrinsic))
+
+    def numbered(key: str) -> list[tuple[str, Any, str]]:
+        rows = listed(document, key, file, _HINT)
+        return [
+            (str(row.get("key")), row.get("value"), f"{file.name} {key}[{i}]") for i, row in enumerate(rows)
+        ]
+
+    poses = {number: partial(pose, value, where) for number, value, where in numbered("extrinsics")}
+    lenses = {
+        number: partial(_read_lens, _pointed(value), where) for number, value, where in numbered("intrinsics")
+    }
+    views = [view(_pointed(value), where) for _, value, where in numbered("views")]
+    return parsed_views("openmvg", file, views, poses, lenses)
+
+
+def _pointed(value: Any) -> Any:
+    """What a pointer of cereal holds."""
+    wrapper = value.get("ptr_wrapper") if isinstance(value, dict) else None
+    return wrapper.get("data") if isinstance(wrapper, dict) else None
+
+
+def _read_lens(value: Any, where: str) -> Camera:
+    if isinstance(value, dict) and "focal_length" not in value:
+        raise InputError(
+            "camera_model_unsupported",
+            "has no focal length, as a spherical camera, which is not supported.",
+            where=where,
+            hint="Give perspective or fisheye images.",
+        )
+    lens = checked(_Lens, value, where, _HINT)
+    key = next((key for key in _COEFFICIENTS if key in value), None)
+    names = _COEFFICIENTS[key] if key else ()
+    numbers = value[key] if key else []
+    if not isinstance(numbers, list) or len(numbers) != len(names):
+        raise invalid_file(f"{where} {key}", f"is not {len(names)} numbers.", _HINT)
+    coefficients = {
+        name: _number(number, f"{where} {key}") for name, number in zip(names, numbers, strict=True)
+    }
+    focal, (cx, cy) = lens.focal_length, lens.principal_point
+    full = FullParameters(focal, focal, cx, cy, **coefficients, fisheye=key == "fisheye")
+    return lens_of(full, where, (lens.width, lens.height))
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise invalid_file(where, "holds something that is not a number.", _HINT)
+    return float(value)
 
 
 def write_openmvg(refined: RefinedSet, path: Path) -> None:
@@ -108,4 +215,13 @@ def _landmark(landmark: Landmark) -> dict[str, Any]:
     return {"key": landmark.number, "value": {"X": landmark.xyz, "observations": observations}}
 
 
-CODECS = (Codec(OPENMVG, write=lambda refined, path, _: write_openmvg(refined, path)),)
+CODECS = (
+    Codec(
+        OPENMVG,
+        parse=parse_openmvg,
+        recognises=head_holds(b'"sfm_data_version"'),
+        image_root=folder_with_photos,
+        write=lambda refined, path, _: write_openmvg(refined, path),
+        given_back=lambda dataset: dataset.source.dialect == "openmvg",
+    ),
+)
