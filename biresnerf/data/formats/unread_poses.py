@@ -22,8 +22,6 @@ class UnreadForm:
 
 _FOUR_NUMBERS = rb"\s*([-+]?[\d.]+(e[-+]?\d+)?\s+){4}"
 UNREAD = (
-    UnreadForm("RealityCapture", ("*.csv",), rb"#name,x,y,alt"),
-    UnreadForm("RealityCapture", ("*.xmp", "images/*.xmp"), rb"(?s).*\bxcr:"),
     UnreadForm("Tanks and Temples", ("*.log",), rb"\s*\d+\s+\d+\s+\d+\s*\n" + _FOUR_NUMBERS),
     UnreadForm("MVSNet", ("cams/*_cam.txt",), rb"\s*extrinsic"),
     UnreadForm("sdfstudio", ("meta_data.json",), rb'(?s).*"camtoworld"'),

@@ -35,6 +35,7 @@ PLACES = {
     "bundler": "bundle.out",
     "llff": "poses_bounds.npy",
     "opensfm": "reconstruction.json",
+    "realitycapture": "realitycapture.csv",
     "meshroom": "cameras.sfm",
     "openmvg": "sfm_data.json",
     "neus": "cameras_sphere.npz",
@@ -45,7 +46,6 @@ WRITTEN_ONLY = (
     "csv",
     "scene",
     "points",
-    "realitycapture",
 )
 FORMS = tuple(name for name, one in formats().items() if one.in_set)
 BOUNDS = ("--bounds", 0.5, 9)  # for sets without points

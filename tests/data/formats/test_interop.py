@@ -21,6 +21,7 @@ if not CASES.is_dir():
 
 # The case: format, frames, frames with a pose, and what a warning says of it.
 READ = {
+    "05_poses_silently_ignored/rc_csv": ("realitycapture", 8, 8, None),
     "06_says_no_images_where_there_are/dtu": ("neus", 8, 8, "by their numbers"),
     "05_poses_silently_ignored/7scenes": ("matrix-files", 8, 8, None),
     "06_says_no_images_where_there_are/scannet": ("matrix-files", 8, 8, "focal length"),
@@ -39,6 +40,7 @@ READ = {
     "23_tum_header_without_hash": ("tum", 40, 39, "by time"),
 }
 REFUSED = {
+    "05_poses_silently_ignored/rc_xmp": ("poses_coincide", "one point"),
     "05_poses_silently_ignored/meshroom": ("image_missing", "images not found"),
     "05_poses_silently_ignored/openmvg": ("image_missing", "images not found"),
     "06_says_no_images_where_there_are/nsvf": ("poses_coincide", "one point"),

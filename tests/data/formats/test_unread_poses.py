@@ -12,8 +12,6 @@ from biresnerf.errors import InputError
 MATRIX = "1 0 0 0\n0 1.5e-3 0 0\n0 0 1 0\n0 0 0 1\n"
 # The beginning of a file as each program's documentation shows it.
 FILES = {
-    "cameras.csv": "#name,x,y,alt,heading,pitch,roll,f\n",
-    "images/0.xmp": '<x:xmpmeta><rdf:Description xcr:Version="3">',
     "Ignatius.log": f"0 0 0\n{MATRIX}",
     "cams/00000000_cam.txt": f"extrinsic\n{MATRIX}",
     "meta_data.json": '{"frames": [{"camtoworld": []}]}',

@@ -5,7 +5,6 @@ Lens: Agisoft Metashape user manual, appendix on camera models ("frame" type). I
 
 from __future__ import annotations
 
-import xml.parsers.expat
 from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
@@ -16,9 +15,10 @@ from numpy.typing import NDArray
 from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
 from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry
+from biresnerf.data.formats.photogrammetry.xml_file import read_xml
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
-from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
+from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file
 from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
@@ -36,7 +36,6 @@ METASHAPE = Format(
 
 
 _HINT = "Export the cameras from Metashape again."
-_MAX_DEPTH, _MAX_ELEMENTS = 50, 500_000
 
 
 def parse_metashape(_root: Path, file: Path) -> ParsedPoses:
@@ -76,31 +75,9 @@ def parse_metashape(_root: Path, file: Path) -> ParsedPoses:
     return ParsedPoses(source, tuple(entries), notes=tuple(notes), take_file_names=True)
 
 
-class _Builder(ElementTree.TreeBuilder):
-    """A tree that is neither too deep nor too large."""
-
-    depth = elements = 0
-
-    def start(self, tag: str, attrs: dict[str, str]) -> ElementTree.Element:
-        self.depth, self.elements = self.depth + 1, self.elements + 1
-        if self.depth > _MAX_DEPTH or self.elements > _MAX_ELEMENTS:
-            raise ElementTree.ParseError("nested too deeply, or too long")
-        return super().start(tag, attrs)
-
-    def end(self, tag: str) -> ElementTree.Element:
-        self.depth -= 1
-        return super().end(tag)
-
-
 def _chunk(file: Path) -> ElementTree.Element:
-    """The one chunk of the file. Entities are refused, so nothing can expand."""
-    text = read_text(file)
-    try:
-        if "<!DOCTYPE" in text or "<!ENTITY" in text:
-            raise ElementTree.ParseError("document types and entities are not read")
-        tree = ElementTree.fromstring(text, parser=ElementTree.XMLParser(target=_Builder()))
-    except (ElementTree.ParseError, xml.parsers.expat.ExpatError, ValueError) as error:
-        raise invalid_file(file.name, f"is no XML that is read: {error}.", _HINT) from None
+    """The one chunk of the file."""
+    tree = read_xml(file, _HINT)
     chunks = [tree] if tree.tag == "chunk" else list(tree.iter("chunk"))
     if len(chunks) != 1:
         raise invalid_file(file.name, f"has {len(chunks)} chunks, not one.", _HINT)

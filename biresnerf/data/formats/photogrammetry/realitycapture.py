@@ -11,22 +11,34 @@ from __future__ import annotations
 import csv
 import io
 import math
+from functools import partial
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.codec import Codec, head_holds
+from biresnerf.data.formats.colmap.model_checks import listed_name
+from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses
 from biresnerf.data.formats.photogrammetry.lens_limits import refuse_other_lenses
+from biresnerf.data.formats.pose_rows import Placed, Row, at_size_of, lens_of, parsed_rows
 from biresnerf.data.model.atomic_file import write_text
+from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera, FullParameters
 from biresnerf.options.formats import Format
 
 REALITYCAPTURE = Format(
     name="realitycapture",
     title="RealityCapture csv",
     rank=65,
+    found_as=("realitycapture.csv", "*.csv"),
+    suffixes=(".csv",),
+    gives="poses and lenses, from a csv of internal and external camera parameters",
+    checked_against="files that `convert` wrote; no export of the program itself was at hand",
     in_set="realitycapture.csv",
     loses=("rigs", "points", "mask paths"),
     instead="pinhole",
@@ -39,6 +51,101 @@ COLUMNS = (
 )  # fmt: skip
 _FILM_MM = 36.0
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
+
+
+_HINT = "Export Internal/External camera parameters, with the columns name, x, y, alt, heading, pitch, roll and f."
+_NEEDED = COLUMNS[:8]
+
+
+def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
+    """The rows of ``file``. Columns other than pose and focal length may be missing.
+
+    Raises:
+        InputError: codes as in docs/input.md.
+    """
+    lines = read_text(file).splitlines()
+    start = next((index for index, line in enumerate(lines) if line.startswith(COLUMNS[0])), None)
+    if start is None:
+        raise invalid_file(file.name, f"has no line that begins with {COLUMNS[0]}.", _HINT)
+    head, *table = csv.reader(lines[start:])
+    columns = [name.strip() for name in head]
+    missing = [name for name in _NEEDED if name not in columns]
+    if missing:
+        raise invalid_file(f"{file.name} line {start + 1}", f"has no column {missing[0]}.", _HINT)
+
+    def read(words: list[str], where: str) -> Placed:
+        if len(words) != len(columns):
+            raise invalid_file(where, f"has {len(words)} values for {len(columns)} columns.", _HINT)
+        given = {
+            name: word for name, word in zip(columns, words, strict=True) if name in COLUMNS[1:] and word
+        }
+        numbers = finite_numbers(list(given.values()), where, _HINT).tolist()
+        value = dict.fromkeys(COLUMNS[1:], 0.0) | dict(zip(given, numbers, strict=True))
+        rotation = _rotation(value["heading"], value["pitch"], value["roll"]) @ _OPENGL_FROM_OPENCV
+        centre = [value["x"], value["y"], value["alt"]]
+        pose = rigid_matrix(np.column_stack([rotation, centre]).tolist(), where)[0]
+        distortion = FilmLens(
+            value["f"], value["px"], value["py"],
+            (value["k1"], value["k2"], value["k3"], value["k4"]), (value["t1"], value["t2"]),
+        )  # fmt: skip
+        return pose, lens_on_film(distortion, where)
+
+    name_at = columns.index(COLUMNS[0])
+    rows: list[Row] = []
+    for number, words in enumerate(table, start=start + 2):
+        if words:
+            where = f"{file.name} line {number}"
+            name = words[name_at] if name_at < len(words) else ""
+            rows.append((listed_name(name, where), where, partial(read, words, where)))
+    return parsed_rows("realitycapture", [file], rows)
+
+
+class FilmLens(NamedTuple):
+    """A lens in RealityCapture's units.
+
+    Attributes:
+        focal_mm: of a film 36 mm wide.
+        u, v: the principal point from the centre, in shares of the longer side.
+        radial: k1 to k4.
+        tangential: OpenCV's p1 and p2.
+    """
+
+    focal_mm: float
+    u: float
+    v: float
+    radial: tuple[float, float, float, float]
+    tangential: tuple[float, float]
+
+
+def lens_on_film(lens: FilmLens, where: str) -> LensOf:
+    """The lens at each image's size. Raises InputError ``camera_model_unsupported`` for a fourth radial coefficient."""
+    k1, k2, k3, k4 = lens.radial
+    if k4:
+        raise InputError(
+            "camera_model_unsupported",
+            "k4 is not zero, and no supported camera model has it.",
+            where=where,
+            hint="Set the distortion model to Brown3 and export again, or export undistorted images.",
+        )
+
+    def at(width: int, height: int) -> Camera:
+        size = max(width, height)
+        focal = lens.focal_mm * size / _FILM_MM
+        cx, cy = lens.u * size + width / 2, lens.v * size + height / 2
+        p1, p2 = lens.tangential
+        full = FullParameters(focal, focal, cx, cy, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
+        return lens_of(full, where, (width, height))
+
+    return at_size_of(at)
+
+
+def _rotation(heading_deg: float, pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
+    """Rz(-heading) Rx(pitch) Ry(roll) [3, 3]."""
+    (c, a, b), (cz, cx, cy) = (f(np.radians([-heading_deg, pitch_deg, roll_deg])) for f in (np.sin, np.cos))
+    about_z = np.array([[cz, -c, 0.0], [c, cz, 0.0], [0.0, 0.0, 1.0]])
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -a], [0.0, a, cx]])
+    about_y = np.array([[cy, 0.0, b], [0.0, 1.0, 0.0], [-b, 0.0, cy]])
+    return np.asarray(about_z @ about_x @ about_y)
 
 
 def write_realitycapture(refined: RefinedSet, path: Path) -> None:
@@ -84,4 +191,12 @@ def _angles_deg(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
     return math.degrees(-yaw), math.degrees(pitch), math.degrees(roll)
 
 
-CODECS = (Codec(REALITYCAPTURE, write=lambda refined, path, _: write_realitycapture(refined, path)),)
+CODECS = (
+    Codec(
+        REALITYCAPTURE,
+        parse=parse_realitycapture,
+        recognises=lambda file: head_holds(b"#name,")(file) and head_holds(b"heading")(file),
+        write=lambda refined, path, _: write_realitycapture(refined, path),
+        given_back=lambda dataset: dataset.source.dialect == "realitycapture",
+    ),
+)
