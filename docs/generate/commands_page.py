@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import pkgutil
+from collections import Counter
+from collections.abc import Container, Iterable
 from inspect import cleandoc
 from pathlib import Path
 
 import click
 
-from biresnerf.command_line import SECTIONS, first_sentence
+from biresnerf.command_line import SECTIONS
 from docs.generate.markdown import table
 
 ROOT = Path(__file__).resolve().parents[2]
 
-_HEAD = """# Commands
+Row = tuple[str, str]
 
-Written by `make docs` from the commands' own help; a test fails when they differ. `biresnerf COMMAND --help` says the same.
+SHARED_BY = 5  # commands; an option of so many is described once
+
+_HEAD = """# Commands: all options
+
+Written by `make docs` from `biresnerf COMMAND --help`. [command-line.md](command-line.md) groups the commands by what they are for, and lists the exit statuses.
+
+"""
+_SHARED = """
+## Options of several commands
 
 """
 
@@ -36,24 +46,37 @@ def all_commands() -> dict[str, click.Command]:
 def commands_page() -> str:
     """The page."""
     commands = all_commands()
-    rows = [
-        (f"[`{name}`](#{name.replace(' ', '-')})", first_sentence(command))
-        for name, command in commands.items()
-    ]
-    sections = [_section(name, command) for name, command in commands.items()]
-    return "\n".join((_HEAD + table(("command", "does"), rows), *sections))
+    links = ", ".join(f"[`{name}`](#{name.replace(' ', '-')})" for name in commands)
+    rows = {name: _options(command) for name, command in commands.items()}
+    shared = shared_options(rows.values())
+    sections = [_section(name, command, shared) for name, command in commands.items()]
+    return "\n".join((_HEAD + links + "\n" + _SHARED + table(("option", ""), shared), *sections))
 
 
-def _section(name: str, command: click.Command) -> str:
-    context = click.Context(command, info_name=f"biresnerf {name}")
-    usage = " ".join(command.collect_usage_pieces(context))
+def shared_options(options: Iterable[list[Row]]) -> list[Row]:
+    """Options that `SHARED_BY` commands or more describe in the same words."""
+    counts = Counter(row for rows in options for row in rows)
+    return [row for row, count in counts.items() if count >= SHARED_BY]
+
+
+def _options(command: click.Command) -> list[Row]:
+    context = click.Context(command)
     rows = []
     for parameter in command.get_params(context):
         record = parameter.get_help_record(context) if isinstance(parameter, click.Option) else None
         if record and "--help" not in record[0]:
             rows.append((f"`{record[0]}`", " ".join(record[1].split()) or "–"))
+    return rows
+
+
+def _section(name: str, command: click.Command, shared: Container[Row]) -> str:
+    context = click.Context(command, info_name=f"biresnerf {name}")
+    usage = " ".join(command.collect_usage_pieces(context))
     text = "\n\n".join(" ".join(part.split()) for part in cleandoc(command.help or "").split("\n\n"))
     parts = [f"## {name}\n", f"`biresnerf {name} {usage}`\n", text + "\n"]
-    if rows:
-        parts.append(table(("option", ""), rows))
+    options = _options(command)
+    if own := [row for row in options if row not in shared]:
+        parts.append(table(("option", ""), own))
+    if common := [row[0] for row in options if row in shared]:
+        parts.append("[Also](#options-of-several-commands): " + ", ".join(common) + ".\n")
     return "\n".join(parts)

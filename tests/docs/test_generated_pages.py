@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 
+import click
 import pytest
 
 from biresnerf.options.refine_options import RefineOptions
@@ -26,9 +27,30 @@ def test_every_option_setting_and_command_has_its_place_and_a_meaning():
 
     assert keys("options.md") >= set(RefineOptions.model_fields)
     assert keys("settings.md") == {f"BIRESNERF_{name.upper()}" for name in Settings.model_fields}
-    sections = set(re.findall(r"^## (.+)$", (ROOT / "docs/commands.md").read_text(), flags=re.M))
-    assert sections == set(all_commands())
-    assert {"refine", "submit", "keys create"} <= sections
+    named = set(sections_of_commands())
+    assert named - {"Options of several commands"} == set(all_commands())
+    assert {"refine", "submit", "keys create"} <= named
+
+
+def sections_of_commands() -> dict[str, str]:
+    parts = re.split(r"^## (.+)$", (ROOT / "docs/commands.md").read_text(), flags=re.M)[1:]
+    return dict(zip(parts[::2], parts[1::2], strict=True))
+
+
+def test_a_command_names_all_its_options_and_each_is_described_there_or_with_those_of_several():
+    sections = sections_of_commands()
+    shared = set(re.findall(r"^\| `(--[\w-]+)", sections["Options of several commands"], flags=re.M))
+    assert {"--json", "--url", "--api-key"} <= shared
+    for name, command in all_commands().items():
+        named = set(re.findall(r"`(?:-\w, )?(--[\w-]+)", sections[name]))
+        described = set(re.findall(r"^\| `(?:-\w, )?(--[\w-]+)", sections[name], flags=re.M))
+        options = {
+            next(text for text in parameter.opts if text.startswith("--"))
+            for parameter in command.params
+            if isinstance(parameter, click.Option) and not parameter.hidden and "--help" not in parameter.opts
+        }
+        assert options <= named, name
+        assert options <= described | shared, name
 
 
 def test_a_notebook_holds_the_code_of_its_script_and_no_output():
