@@ -40,7 +40,7 @@ async def fill(database: Database, dataset: str, count: int) -> None:
         async with database.transaction() as connection:
             for n in range(first, min(count, first + 1000)):
                 job_id = f"job_0load{n:07}"
-                entry_id = await job_queue.enqueue(connection, job_id, order=0, held=False)
+                entry_id = await job_queue.enqueue(connection, job_id, "refine", order=0, held=False)
                 await connection.execute(
                     "INSERT INTO jobs (id, dataset_id, options, planned_steps, fingerprint, queue_id, created_at)"
                     " VALUES (%s, %s, %s, 3000, '', %s, now() - interval '1 day' + make_interval(secs => %s))",

@@ -34,7 +34,6 @@ CONNECT: dict[str, Any] = {
     # Keepalives rest while bytes are under way; without this a query into a dead line waits a quarter of an hour.
     "tcp_user_timeout": 60_000,
 }
-LISTEN_CHANNEL = "biresnerf_jobs"
 RECONNECT_S = 1.0
 
 

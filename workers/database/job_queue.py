@@ -1,11 +1,11 @@
-"""The queue of jobs: the one module that knows Procrastinate, which keeps it.
+"""The queues of jobs: the one module that knows Procrastinate, which keeps them.
 
 We use its schema and its public `JobManager`, inside our own transactions. An entry of the queue is ``todo``,
 ``doing`` (a worker has it) or over. Its `Worker` is not used: its heartbeats run in the event loop, stop when a worker
 begins to drain, and end the worker when the database is away; at its start it unregisters workers that an outage
 kept silent; and it reports the end of a job without asking whether the entry is still its own. Each of these breaks a
 promise (tests/workers/queue/test_heartbeat.py, test_fenced_worker.py, test_queue_contract.py). The loop of
-`workers.queue.slot` takes its place.
+`workers.queue.lane` takes its place.
 
 Other SQL reads the queue through the views and writes it through the function that are defined here.
 """
@@ -13,7 +13,7 @@ Other SQL reads the queue through the views and writes it through the function t
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -27,10 +27,13 @@ from psycopg import AsyncCursor
 from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
 
+from biresnerf.wire.jobs import JobKind
 from workers.database.database import Connection
 
-QUEUE = "refine"
-CHANNEL = f"procrastinate_queue_v1#{QUEUE}"
+REFINEMENTS: JobKind = "refine"
+EXPORTS: JobKind = "export"
+KINDS = (REFINEMENTS, EXPORTS)  # each has a queue of its name: exports do not wait behind refinements
+CHANNELS = tuple(f"procrastinate_queue_v1#{kind}" for kind in KINDS)
 NEW_ENTRY = ""  # see `subject_of`
 KEEP_ENTRIES_H = 24
 ALWAYS = datetime(1970, 1, 1, tzinfo=UTC)
@@ -64,10 +67,11 @@ HEARTBEAT: LiteralString = (
 
 @dataclass(frozen=True)
 class Entry:
-    """A job in the queue."""
+    """A job in a queue; ``kind`` names the queue."""
 
     id: int
     job_id: str
+    kind: JobKind
 
 
 def schema_steps() -> list[tuple[str, str]]:
@@ -84,11 +88,14 @@ def schema_steps() -> list[tuple[str, str]]:
     return [(SCHEMA_STEP, f"{SchemaManager.get_schema()}\n{_INTERFACE}"), *later]
 
 
-async def enqueue(connection: Connection, job_id: str, *, order: int, held: bool) -> int:
-    """Add a job and return the entry's id. Lower ``order`` runs earlier; ``held`` waits for `offer_queue_entry`."""
+async def enqueue(connection: Connection, job_id: str, kind: JobKind, *, order: int, held: bool) -> int:
+    """Add a job and return the entry's id.
+
+    Of jobs of one kind, the one of lower ``order`` runs earlier; ``held`` waits for `offer_queue_entry`.
+    """
     job = Job(
-        queue=QUEUE,
-        task_name=QUEUE,
+        queue=kind,
+        task_name=kind,
         priority=-order,
         lock=None,
         queueing_lock=None,
@@ -100,21 +107,24 @@ async def enqueue(connection: Connection, job_id: str, *, order: int, held: bool
     return added.id
 
 
-async def take(connection: Connection, worker_id: int) -> Entry | None:
-    """The next entry, for a worker that works on none; none where none is due.
+async def take(connection: Connection, worker_id: int, kinds: Sequence[JobKind] = KINDS) -> Entry | None:
+    """The next entry of ``kinds``, for a worker that works on none of them; none where none is due.
 
     An entry that the worker already has comes first: the answer was lost with the connection.
     """
     await connection.execute(HEARTBEAT, (worker_id,))
     held = await connection.rows(
-        "SELECT id, args ->> 'job_id' AS job_id FROM procrastinate_jobs"
-        " WHERE worker_id = %s AND status = 'doing'",
+        "SELECT id, args ->> 'job_id' AS job_id, queue_name AS kind FROM procrastinate_jobs"
+        " WHERE worker_id = %s AND status = 'doing' AND queue_name = ANY (%s)",
         worker_id,
+        list(kinds),
     )
     if held:
-        return Entry(held[0]["id"], held[0]["job_id"])
-    job = await _manager(connection).fetch_job(queues=[QUEUE], worker_id=worker_id)
-    return None if job is None or job.id is None else Entry(job.id, str(job.task_kwargs["job_id"]))
+        return Entry(**held[0])
+    job = await _manager(connection).fetch_job(queues=list(kinds), worker_id=worker_id)
+    if job is None or job.id is None:
+        return None
+    return Entry(job.id, str(job.task_kwargs["job_id"]), EXPORTS if job.queue == EXPORTS else REFINEMENTS)
 
 
 async def acknowledge(
@@ -159,7 +169,7 @@ async def cancel(connection: Connection, entry_id: int) -> None:
 
 
 def subject_of(notification: str) -> str:
-    """What a notification on `CHANNEL` is about: `NEW_ENTRY`, or the id of the entry that is to be cancelled."""
+    """What a notification on `CHANNELS` is about: `NEW_ENTRY`, or the id of the entry that is to be cancelled."""
     content = json.loads(notification)
     return NEW_ENTRY if content["type"] == "job_inserted" else str(content["job_id"])
 
@@ -177,9 +187,9 @@ async def unregister_worker(connection: Connection, worker_id: int | None) -> No
 async def entries_of_worker(connection: Connection, worker_id: int | None) -> list[int]:
     """Entries that the worker has, or any worker, in the order in which they are to be locked."""
     rows = await connection.rows(
-        "SELECT id FROM procrastinate_jobs WHERE status = 'doing' AND queue_name = %s"
+        "SELECT id FROM procrastinate_jobs WHERE status = 'doing'"
         " AND (%s::bigint IS NULL OR worker_id = %s) ORDER BY id",
-        *(QUEUE, worker_id, worker_id),
+        *(worker_id, worker_id),
     )
     return [row["id"] for row in rows]
 
@@ -191,7 +201,7 @@ async def unregister_silent_workers(connection: Connection, silent_s: float) -> 
 
 async def entries_of_silent_workers(connection: Connection, silent_s: float) -> list[int]:
     """Entries whose worker is not registered, or sent no heartbeat for ``silent_s``."""
-    stalled = await _manager(connection).get_stalled_jobs(queue=QUEUE, seconds_since_heartbeat=silent_s)
+    stalled = await _manager(connection).get_stalled_jobs(seconds_since_heartbeat=silent_s)
     return sorted(job.id for job in stalled if job.id is not None)
 
 

@@ -1,4 +1,4 @@
-"""Notifications: one LISTEN connection per channel and process wakes local waiters, who then read the tables.
+"""Notifications: a LISTEN connection of each process wakes local waiters, who then read the tables.
 
 A notification only says "look"; what happened is in the tables. A lost one costs a poll interval, no event.
 """
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 import psycopg
 from psycopg import sql
 
-from workers.database.database import AWAY, CONNECT, LISTEN_CHANNEL, Database, first_line
+from workers.database.database import AWAY, CONNECT, Database, first_line
 from workers.process.waiting import retry_while_unavailable
 from workers.settings.errors import Unavailable
 
@@ -26,7 +26,7 @@ class Listener:
 
     Args:
         poll_s: how long a lost notification can go unnoticed.
-        channel: where to listen.
+        channels: where to listen.
         subject_of: what a notification is about.
     """
 
@@ -34,10 +34,10 @@ class Listener:
         self,
         database: Database,
         poll_s: float,
-        channel: str = LISTEN_CHANNEL,
+        *channels: str,
         subject_of: Callable[[str], str] = str,
     ) -> None:
-        self.poll_s, self._channel, self._subject_of = poll_s, channel, subject_of
+        self.poll_s, self._channels, self._subject_of = poll_s, channels, subject_of
         self._database = database
         self._waiting: dict[str, set[asyncio.Event]] = defaultdict(set)
 
@@ -62,7 +62,8 @@ class Listener:
             async with await psycopg.AsyncConnection.connect(
                 self._database.url, autocommit=True, **CONNECT
             ) as connection:
-                await connection.execute(sql.SQL("LISTEN {}").format(sql.Identifier(self._channel)))
+                for channel in self._channels:
+                    await connection.execute(sql.SQL("LISTEN {}").format(sql.Identifier(channel)))
                 for subject in list(self._waiting):
                     self._wake(subject)
                 while True:

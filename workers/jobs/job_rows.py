@@ -17,13 +17,13 @@ from workers.settings.errors import Conflict
 
 JOB = """
     SELECT jobs.*, CASE WHEN jobs.state = 'queued' THEN
-        (SELECT count(*) FROM jobs AS ahead WHERE ahead.state = 'queued'
+        (SELECT count(*) FROM jobs AS ahead WHERE ahead.state = 'queued' AND ahead.kind = jobs.kind
             AND (ahead.queue_order, ahead.queue_id) <= (jobs.queue_order, jobs.queue_id))
         END AS queue_position
     FROM jobs"""
 # The same for many at once: counting for each job takes seconds where thousands wait.
-PLACES = """places AS (SELECT queue_id, row_number() OVER (ORDER BY queue_order, queue_id) AS queue_position
-    FROM jobs WHERE state = 'queued')"""
+PLACES = """places AS (SELECT queue_id, row_number() OVER (PARTITION BY kind ORDER BY queue_order, queue_id)
+    AS queue_position FROM jobs WHERE state = 'queued')"""
 # With the store's tenant as parameter; none for all tenants.
 MINE = "jobs.tenant = coalesce(%s, jobs.tenant)"
 

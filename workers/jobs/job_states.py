@@ -38,7 +38,7 @@ async def add_event(
 async def insert_job(connection: Connection, values: Mapping[str, Any]) -> dict[str, Any]:
     """Write a new job, ``values`` by column; `queue_job` is given what this returns."""
     row = {**values, "trace": traceparent()}
-    statement = sql.SQL("INSERT INTO jobs ({}) VALUES ({}) RETURNING id, queue_order, held").format(
+    statement = sql.SQL("INSERT INTO jobs ({}) VALUES ({}) RETURNING id, kind, queue_order, held").format(
         sql.SQL(", ").join(map(sql.Identifier, row)), sql.SQL(", ").join([sql.Placeholder()] * len(row))
     )
     return await connection.only_row(statement, *row.values())
@@ -51,7 +51,9 @@ async def queue_job(connection: Connection, job: Mapping[str, Any]) -> None:
 
 
 async def _enqueue(connection: Connection, job: Mapping[str, Any]) -> None:
-    entry_id = await job_queue.enqueue(connection, job["id"], order=job["queue_order"], held=job["held"])
+    entry_id = await job_queue.enqueue(
+        connection, job["id"], job["kind"], order=job["queue_order"], held=job["held"]
+    )
     await connection.execute("UPDATE jobs SET queue_id = %s WHERE id = %s", (entry_id, job["id"]))
 
 
@@ -148,7 +150,7 @@ async def take_back(connection: Connection, entry_id: int, stall_s: float) -> No
 async def requeue_lost(connection: Connection, silent_s: float) -> None:
     """Queue unfinished jobs again whose queue entry is gone, if they have not changed for ``silent_s``."""
     for job in await connection.rows(
-        "SELECT jobs.id, jobs.queue_order, jobs.held"
+        "SELECT jobs.id, jobs.kind, jobs.queue_order, jobs.held"
         " FROM jobs LEFT JOIN queue_entries AS entry ON entry.id = jobs.queue_id"
         " WHERE jobs.state IN ('queued', 'running')"
         " AND jobs.updated_at < clock_timestamp() - make_interval(secs => %s)"

@@ -13,12 +13,14 @@ from workers.database.notifications import Listener
 from workers.records import JobUpdate
 from workers.settings.errors import Unavailable
 
+CHANNEL = "biresnerf_jobs"
+
 
 class JobListener(Listener):
     """Wakes subscribers of jobs. ``poll_s`` is how long a lost notification can go unnoticed."""
 
     def __init__(self, database: Database, poll_s: float) -> None:
-        super().__init__(database, poll_s)
+        super().__init__(database, poll_s, CHANNEL)
         self._revisions: dict[str, int | None] = {}
         self._change = 0
         self._changes: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""A slot: a small process that runs one job at a time, each in a child process. Loads no torch, no numpy."""
+"""A slot: a small process that runs one refinement at a time, and exports beside it. Loads no torch, no numpy."""
 
 from __future__ import annotations
 
@@ -14,30 +14,24 @@ import re
 import shutil
 import signal
 import sys
-import time
-from collections.abc import AsyncIterator, Mapping
-from functools import partial
+from collections.abc import AsyncIterator, Coroutine, Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, TypeVar
 
 from workers.database import job_queue
 from workers.database.database import Database, open_database
-from workers.database.job_queue import Entry
+from workers.database.job_queue import EXPORTS, REFINEMENTS
 from workers.database.notifications import Listener
 from workers.database.statistics import announce_slot
-from workers.jobs.claim import Claim, Fenced, cancel_requested, claim_job, input_bytes
-from workers.jobs.job_states import say_what_it_waits_for
-from workers.process.disk_space import job_disk_budget
 from workers.process.exit_status import ExitStatus
 from workers.process.waiting import first_done, retry_while_unavailable
 from workers.process.watchdog import run_process
 from workers.queue.heartbeat import Heartbeat
 from workers.queue.janitor import Janitor, release_worker
-from workers.run.attempt import Attempt, Ending
-from workers.settings.errors import LimitReached, SetupError, Unavailable
-from workers.settings.logs import log_context
+from workers.queue.lane import Lane, Workplace
+from workers.settings.errors import SetupError, Unavailable
 from workers.settings.settings import Settings
-from workers.settings.traces import set_up_traces, span
+from workers.settings.traces import set_up_traces
 from workers.store.files import open_files
 from workers.store.store_identity import require_same_store
 
@@ -45,6 +39,7 @@ log = logging.getLogger(__name__)
 
 STORE_PATIENCE_S = 180.0  # a job that has run for an hour waits for its store to come back
 HOST = platform.node() or "localhost"
+T = TypeVar("T")
 
 
 class SlotLock:
@@ -83,7 +78,7 @@ ENDS = {
 
 
 class Slot:
-    """Takes jobs from the queue and runs them one after the other until it is stopped.
+    """Takes jobs from the queue until it is stopped: refinements one after the other, and exports beside them.
 
     With ``one_job`` it ends after the first, and with ``idle_exit_s`` where it found none for so long.
     """
@@ -117,12 +112,18 @@ class Slot:
                 )
             await require_same_store(database, self._files)
             async with self._registered(database) as worker_id:
-                listener = Listener(database, self._settings.poll_s, job_queue.CHANNEL, job_queue.subject_of)
+                listener = Listener(
+                    database, self._settings.poll_s, *job_queue.CHANNELS, subject_of=job_queue.subject_of
+                )
                 janitor = Janitor(database, self._files, self._settings)
                 side = [asyncio.create_task(listener.run()), asyncio.create_task(janitor.run())]
                 try:
                     log.info("slot %s is ready", self._name)
-                    return await self._work(database, listener, worker_id)
+                    place = Workplace(
+                        *(database, self._files, listener, self._settings, worker_id),
+                        *(self._scratch, self._variables(), self._stop),
+                    )
+                    return await self._work(place)
                 finally:
                     for task in side:
                         task.cancel()
@@ -144,99 +145,37 @@ class Slot:
             with contextlib.suppress(Unavailable):  # then a janitor does it
                 await database.run(job_queue.unregister_worker, worker_id)
 
-    async def _work(self, database: Database, listener: Listener, worker_id: int) -> ExitStatus:
+    async def _work(self, place: Workplace) -> ExitStatus:
         for number in (signal.SIGTERM, signal.SIGINT):
-            asyncio.get_running_loop().add_signal_handler(number, self._stop.set)
-        idle_from = time.monotonic()
-        with listener.waiting(job_queue.NEW_ENTRY) as added:
-            while not self._stop.is_set():
-                added.clear()
-                try:
-                    entry = await database.run(job_queue.take, worker_id)
-                except Unavailable as error:
-                    log.warning("the queue cannot be read: %s", error)
-                    entry, idle_from = None, time.monotonic()  # nobody knows whether there is work
-                if entry is not None:
-                    ending = await self._work_on(database, listener, entry, worker_id)
-                    if self._one_job and ending is not None:
-                        return ENDS[ending.how]
-                    idle_from = time.monotonic()
-                    continue
-                left_s = idle_from + self._idle_exit_s - time.monotonic()
-                if left_s <= 0:
-                    break
-                pause_s = min(self._settings.poll_s, left_s)
-                await first_done(added.wait(), self._stop.wait(), asyncio.sleep(pause_s))
-        return ExitStatus.NO_JOB if self._one_job else ExitStatus.DONE
+            asyncio.get_running_loop().add_signal_handler(number, place.stop.set)
+        if self._one_job:
+            return await self._work_on_one(place)
+        refinements = Lane(place, (REFINEMENTS,))
+        await self._exporting(place, refinements.run(asyncio.Event(), self._idle_exit_s))
+        return ExitStatus.DONE
 
-    async def _work_on(
-        self, database: Database, listener: Listener, entry: Entry, worker_id: int
-    ) -> Ending | None:
-        """How the attempt ended; none where there was nothing to run."""
-        with log_context(job_id=entry.job_id):
-            try:
-                ending = await self._run_job(database, listener, entry)
-            except Fenced as fenced:
-                log.warning("%s; exiting", fenced)
-                os._exit(ExitStatus.FENCED)  # its queue entry belongs to the new owner
-            except Exception:  # our own failure must not end the slot
-                log.exception("the job goes back to the queue")
-                ending = Ending("setback", self._settings.stall_s / 4)
-            acknowledge = partial(job_queue.acknowledge, again_in_s=ending.again_in_s if ending else None)
-            if not await retry_while_unavailable(lambda: database.run(acknowledge, entry.id, worker_id)):
-                log.warning("queue entry %d now belongs to another worker", entry.id)
-            return ending
+    async def _work_on_one(self, place: Workplace) -> ExitStatus:
+        lane, never = Lane(place, job_queue.KINDS), asyncio.Event()
+        while (entry := await lane.next(never, self._idle_exit_s)) is not None:
+            work = lane.work_on(entry)
+            ending = await (work if entry.kind == EXPORTS else self._exporting(place, work))
+            if ending is not None:
+                return ENDS[ending.how]
+        return ExitStatus.NO_JOB
 
-    async def _run_job(self, database: Database, listener: Listener, entry: Entry) -> Ending | None:
-        if not await self._fits_on_disk(database, entry.job_id):
-            say = partial(say_what_it_waits_for, job_id=entry.job_id, cause="disk_full")
-            await retry_while_unavailable(lambda: database.run(say))
-            return Ending("setback", self._settings.stall_s / 4)
-        claim = await claim_job(database, entry.job_id, self._settings.max_attempts, self._settings.stall_s)
-        if claim is None:
-            return None
-        log.info("attempt %s begins", claim.name)
-        folder = self._scratch / f"{entry.job_id}-{claim.name}"
-        attempt = Attempt(database, self._files, self._settings, claim, folder, self._variables())
-        watching = asyncio.create_task(self._stop_when_asked(database, listener, entry, attempt))
+    async def _exporting(self, place: Workplace, work: Coroutine[None, None, T]) -> T:
+        """What ``work`` returns. Exports run beside it: they take seconds, and it may take hours."""
+        over = asyncio.Event()
+        working = asyncio.create_task(work)
+        exporting = asyncio.create_task(Lane(place, (EXPORTS,)).run(over))
         try:
-            return await self._traced(attempt, claim)
+            await first_done(working, exporting)
+            over.set()
+            await asyncio.gather(working, exporting)
+            return working.result()
         finally:
-            watching.cancel()
-
-    async def _stop_when_asked(
-        self, database: Database, listener: Listener, entry: Entry, attempt: Attempt
-    ) -> None:
-        """Stop the attempt when its job is cancelled, or when this slot is stopped."""
-        with listener.waiting(str(entry.id)) as changed:
-            while True:
-                changed.clear()
-                if self._stop.is_set():
-                    attempt.ask_stop("shutdown")
-                with contextlib.suppress(Unavailable):
-                    if await cancel_requested(database, entry.job_id):
-                        attempt.ask_stop("cancel")
-                        return
-                stopped = [] if self._stop.is_set() else [self._stop.wait()]
-                await first_done(changed.wait(), asyncio.sleep(self._settings.poll_s), *stopped)
-
-    async def _fits_on_disk(self, database: Database, job_id: str) -> bool:
-        """Whether the job's files fit on the local disk. If not, the job waits for space here or on another host."""
-        size = await retry_while_unavailable(lambda: input_bytes(database, job_id))
-        try:
-            job_disk_budget(self._settings).require(size)
-        except LimitReached as full:
-            log.warning("the job waits for disk space: %s", full.detail)
-            return False
-        return True
-
-    async def _traced(self, attempt: Attempt, claim: Claim) -> Ending:
-        """Run the attempt, as part of the trace of its submission."""
-        if self._settings.traces == "off":
-            return await attempt.run()
-        about_it: dict[str, str | int] = {"job": claim.job_id, "number": claim.attempt}
-        with span("attempt", parent=claim.trace, about=about_it):
-            return await attempt.run()
+            working.cancel()
+            exporting.cancel()
 
     def _variables(self) -> Mapping[str, str]:
         """Which device and how many cores the job of this slot may use."""

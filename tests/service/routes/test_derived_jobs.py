@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,24 @@ def test_an_export_is_a_job_whose_files_stand_among_the_result(
     problem(http.post(done_job["links"]["exports"], json={"formats": ["obj"]}), 422, "invalid_request")
     problem(http.post(done_job["links"]["exports"], json={"formats": []}), 422, "invalid_request")
     problem(http.post(export["links"]["exports"], json={"formats": ["kitti"]}), 409, "state_conflict")
+
+
+def test_an_export_is_done_while_refinements_hold_and_wait_for_the_only_slot(
+    http: httpx.Client, dataset: str
+) -> None:
+    done = finished(http, submit(http, dataset)["id"])
+    long = submit(http, dataset, steps=4000, step_ms=50)
+    while http.get(long["links"]["self"]).json()["state"] != "running":
+        time.sleep(0.1)
+    waiting = submit(http, dataset)
+    export = http.post(done["links"]["exports"], json={"formats": ["kitti"]}).json()
+    assert export["queue_position"] == 1, "a place among exports"
+    assert finished(http, export["id"])["state"] == "succeeded"
+    states = [http.get(job["links"]["self"]).json()["state"] for job in (long, waiting)]
+    assert states == ["running", "queued"]
+    for job in (waiting, long):
+        http.post(job["links"]["cancel"])
+        finished(http, job["id"])
 
 
 def test_only_a_result_is_exported_and_exports_are_deleted_with_it(http: httpx.Client, dataset: str) -> None:

@@ -78,15 +78,16 @@ def test_the_columns_that_our_statements_name_exist(database_url: str):
 
 
 def test_our_wake_up_uses_the_channel_workers_listen_on():
-    assert list(get_channel_for_queues([job_queue.QUEUE])) == [job_queue.CHANNEL]
+    assert sorted(get_channel_for_queues(job_queue.KINDS)) == sorted(job_queue.CHANNELS)
 
 
 def test_the_notifications_say_what_they_are_about(database_url: str):
     with psycopg.connect(database_url, autocommit=True) as connection:
-        connection.execute(f'LISTEN "{job_queue.CHANNEL}"'.encode())
+        for channel in job_queue.CHANNELS:
+            connection.execute(f'LISTEN "{channel}"'.encode())
         connection.execute(
             "INSERT INTO procrastinate_jobs (id, queue_name, task_name) VALUES (7, %s, 'x')",
-            (job_queue.QUEUE,),
+            (job_queue.EXPORTS,),
         )
         connection.execute("UPDATE procrastinate_jobs SET status = 'doing'")
         connection.execute("SELECT procrastinate_cancel_job_v1(7, true, false)")
