@@ -69,6 +69,11 @@ class Info(Record):
     limits: SizeLimits
     archives: list[str] = Field(examples=[["application/zip", "application/x-tar", "application/gzip"]])
     job_counts: dict[JobState, int] = Field(examples=[{"queued": 2, "running": 1, "succeeded": 40}])
+    workers: int = Field(examples=[2], description="Worker slots that are alive.")
+    scopes: list[str] = Field(
+        examples=[["read", "jobs:write"]],
+        description="What your key permits; everything where none is needed.",
+    )
     share: TenantShare = Field(description="Your limits and your usage. A limit of 0 means no limit.")
 
 

@@ -39,7 +39,7 @@ async def get_options(
 
 @router.get("/v1/info")
 async def get_info(caller: ReadCaller) -> Info:
-    """Version and limits of this service, your share of it, and how many of your jobs are in each state."""
+    """Version, limits and workers of this service, your key's scopes, your share, and your jobs by state."""
     limits = {
         name: getattr(caller.service.settings, name)
         for name in SizeLimits.model_fields
@@ -50,5 +50,7 @@ async def get_info(caller: ReadCaller) -> Info:
         limits=SizeLimits(**limits, max_archive_ratio=RATIO_MAX),
         archives=ARCHIVES,
         job_counts=await caller.jobs.counts(),
+        workers=await caller.service.stores.monitor.living_workers(),
+        scopes=sorted(caller.scopes),
         share=await caller.service.stores.tenants.share(caller.tenant),
     )

@@ -19,7 +19,7 @@ class Tally(FrozenModel):
 
 
 class SlotCount(FrozenModel):
-    """Living slots of one kind that do, or do not, run a job."""
+    """Living slots of one kind that do, or do not, run a refinement; exports run beside them."""
 
     kind: str
     busy: bool
@@ -50,13 +50,14 @@ class Statistics(FrozenModel):
     tallies: tuple[Tally, ...]
 
 
-_SLOTS = """
+_LIVING = """slots JOIN queue_workers AS worker ON worker.id = slots.worker_id
+    AND worker.last_heartbeat > now() - make_interval(secs => %s)"""
+_SLOTS = f"""
     SELECT slots.kind,
-        EXISTS (SELECT FROM queue_entries AS entry
+        EXISTS (SELECT FROM queue_entries AS entry JOIN running_refinements ON queue_id = entry.id
             WHERE entry.worker_id = worker.id AND entry.state = 'doing') AS busy,
         count(*) AS slots
-    FROM slots JOIN queue_workers AS worker ON worker.id = slots.worker_id
-    WHERE worker.last_heartbeat > now() - make_interval(secs => %s) GROUP BY 1, 2"""
+    FROM {_LIVING} GROUP BY 1, 2"""
 _TALLIES = """
     SELECT name, label, bucket, sum(count)::bigint AS count, sum(amount) AS amount FROM (
         SELECT name, label, bucket, count, amount FROM tallies
@@ -88,6 +89,12 @@ async def read_statistics(database: Database, stall_s: float) -> Statistics:
             bounds_s=tuple(bounds["bounds_s"]),
             tallies=tuple(Tally(**row) for row in await connection.rows(_TALLIES)),
         )
+
+
+async def living_slots(database: Database, stall_s: float) -> int:
+    """Slots whose worker sent a heartbeat within ``stall_s``; raises `Unavailable`."""
+    (row,) = await database.fetch(f"SELECT count(*) AS n FROM {_LIVING}", stall_s)
+    return int(row["n"])
 
 
 async def fold_tallies(connection: Connection) -> None:

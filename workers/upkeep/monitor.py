@@ -8,7 +8,7 @@ from typing import Literal
 
 from workers.database.database import Database
 from workers.database.migrate import step_names
-from workers.database.statistics import Statistics, read_statistics
+from workers.database.statistics import Statistics, living_slots, read_statistics
 from workers.settings.errors import Unavailable
 from workers.store.files import FileStore
 
@@ -26,6 +26,10 @@ class Monitor:
     async def statistics(self) -> Statistics:
         """The figures; raises `Unavailable`."""
         return await read_statistics(self._database, self._stall_s)
+
+    async def living_workers(self) -> int:
+        """Worker slots that sent a heartbeat within the stall time; raises `Unavailable`."""
+        return await living_slots(self._database, self._stall_s)
 
     async def lacking(self) -> dict[Need, str]:
         """What is not as it has to be, and why; empty where jobs can be taken. Answers within seconds."""
@@ -52,9 +56,13 @@ class Monitor:
 
 
 async def _in_time(check: Awaitable[str]) -> str:
+    asked = asyncio.ensure_future(check)
+    # A query is cancelled by asking the server, which takes long where that is frozen: nobody waits for it here.
+    asked.add_done_callback(lambda done: done.cancelled() or done.exception())
     try:
-        return await asyncio.wait_for(check, CHECK_S)
-    except TimeoutError:
-        return f"No answer within {CHECK_S:g} s."
+        await asyncio.wait({asked}, timeout=CHECK_S)
+        return await asked if asked.done() else f"No answer within {CHECK_S:g} s."
     except Unavailable as error:
         return error.detail
+    finally:
+        asked.cancel()

@@ -64,16 +64,23 @@ def service_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @contextmanager
-def service_at(url: str | None, api_key: str | None, job: JobName | None = None) -> Iterator[Client]:
-    """A client of the service in the job's address, at `--url`, or on this machine. Errors become exit codes."""
+def client_extra() -> Iterator[None]:
+    """Around imports of the client; raises `InputError` (``extra_missing``)."""
     try:
-        from biresnerf.client import Client, JobFailed, ServiceError
+        yield
     except ModuleNotFoundError as error:
         raise InputError(
             "extra_missing",
             f"The package {error.name} is not installed.",
             hint="Install it with: pip install 'biresnerf[client]'",
         ) from None
+
+
+@contextmanager
+def service_at(url: str | None, api_key: str | None, job: JobName | None = None) -> Iterator[Client]:
+    """A client of the service in the job's address, at `--url`, or on this machine. Errors become exit codes."""
+    with client_extra():
+        from biresnerf.client import Client, JobFailed, ServiceError
     try:
         chosen = (job.url if job is not None else None) or url or DEFAULT_URL
         with Client(chosen, api_key=api_key, on_pause=_print_pause) as client:

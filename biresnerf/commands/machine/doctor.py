@@ -10,22 +10,32 @@ import click
 
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option, print_json
+from biresnerf.commands.jobs.service_options import client_extra
 from biresnerf.commands.machine.machine_checks import CHECKS, Check, Found
 
 SERVICE_CHECKS = "service.commands.doctor_checks:CHECKS"
 
 
 @click.command("doctor")
+@click.option("--service", metavar="URL", help="Check a running service instead, as its clients see it.")
+@click.option("--api-key", envvar="BIRESNERF_API_KEY", help="For --service. Prefer BIRESNERF_API_KEY.")
 @json_option
-def doctor_command(as_json: bool) -> int:
+def doctor_command(service: str | None, api_key: str | None, as_json: bool) -> int:
     """Check this installation: versions, kernels, GPU, COLMAP, PostgreSQL, disks, built pages.
 
     The first run compiles the kernels, which takes a minute or two. The exit status is 1 if something is broken;
     whatever is only missing is optional.
+
+    With --service, check a running service from outside: address, TLS, readiness, clock, key, version, workers,
+    room, and the upload and deletion of three pictures.
     """
+    findings: Iterator[Found] = (check() for check in all_checks())
+    if service is not None:
+        with client_extra():
+            from biresnerf.commands.machine.service_checks import service_checks
+        findings = service_checks(service, api_key)
     found = []
-    for check in all_checks():
-        result = check()
+    for result in findings:
         found.append(result)
         if not as_json:
             click.echo(f"{result.state:<8} {result.name:<12} {result.detail}")
