@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from biresnerf.data.formats.bad_frames import tolerate
-from biresnerf.data.formats.match_names import NO_EXTENSION, match_files
+from biresnerf.data.formats.match_names import EXPECTED, match_files
 from biresnerf.data.formats.parsed_poses import Assignment, ParsedPoses, PoseEntry
 from biresnerf.data.formats.posed_photos import PosedPhotos, read_photos
 from biresnerf.data.model.dataset import Dataset, Frame, IntrinsicsSource, SourceFormat
@@ -39,7 +39,7 @@ def bind_images(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
     assign = parsed.assign or partial(by_name, parsed.entries, strict=parsed.strict)
     pairs, notes = assign(names)
     if parsed.take_file_names:
-        notes = [note for note in notes if NO_EXTENSION not in note]
+        notes = [note for note in notes if not any(words in note for words in EXPECTED)]
         pairs = [(name, replace(entry, name=name)) for name, entry in pairs]
     images = [(files[name], entry) for name, entry in pairs]
     return dataset_of(root, images, parsed.source, [*parsed.notes, *notes], within, strict=parsed.strict)

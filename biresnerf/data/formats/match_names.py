@@ -11,7 +11,8 @@ from typing import TypeAlias
 
 from biresnerf.data.photos.photo_folders import IMAGE_FOLDER
 
-NO_EXTENSION = "without extension"
+# What a file that names no folders and extensions says nothing new with.
+EXPECTED = ("without extension", "by file name alone")
 _IMAGES = f"{IMAGE_FOLDER}/"
 
 
@@ -79,8 +80,8 @@ _RULES: tuple[Rule, ...] = (
     _OTHER_FORM,
     *ENDS,
     ("by file name, whatever its case", lambda name: posixpath.basename(_normal(name)).casefold()),
-    (f"by file name {NO_EXTENSION}", lambda name: PurePosixPath(_normal(name)).stem.casefold()),
-    (f"by path {NO_EXTENSION}", lambda name: posixpath.splitext(_normal(name))[0]),
+    ("by file name without extension", lambda name: PurePosixPath(_normal(name)).stem.casefold()),
+    ("by path without extension", lambda name: posixpath.splitext(_normal(name))[0]),
 )
 
 

@@ -20,17 +20,14 @@ class UnreadForm:
     begins: bytes = b""
 
 
-_FOUR_NUMBERS = rb"\s*([-+]?[\d.]+(e[-+]?\d+)?\s+){4}"
 UNREAD = (
-    UnreadForm("Tanks and Temples", ("*.log",), rb"\s*\d+\s+\d+\s+\d+\s*\n" + _FOUR_NUMBERS),
-    UnreadForm("MVSNet", ("cams/*_cam.txt",), rb"\s*extrinsic"),
-    UnreadForm("sdfstudio", ("meta_data.json",), rb'(?s).*"camtoworld"'),
-    UnreadForm("BOP", ("scene_camera.json",), rb'(?s).*"cam_K"'),
-    UnreadForm("EuRoC", ("*/data.csv",), rb"#timestamp.*p_RS_R"),
-    UnreadForm("Nerfies", ("camera/*.json",), rb'(?s).*"orientation"'),
-    UnreadForm("Polycam", ("*/corrected_cameras/*.json", "corrected_cameras/*.json"), rb'(?s).*"t_00"'),
-    UnreadForm("Record3D", ("metadata.json", "metadata"), rb'(?s).*"poses"'),
-)  # fmt: skip
+    UnreadForm("ContextCapture (BlocksExchange)", ("*.xml",), rb"(?s).*<BlocksExchange"),
+    UnreadForm("Pix4D", ("*calibrated_external_camera_parameters.txt",), rb"imageName"),
+    UnreadForm("VisualSFM", ("*.nvm",), rb"NVM_V"),
+    UnreadForm("OpenMVS", ("*.mvs",), rb"MVS"),
+    UnreadForm("Stray Scanner", ("odometry.csv",), rb"timestamp"),
+    UnreadForm("ARKitScenes", ("*.traj",), rb"\s*([-+]?[\d.]+(e[-+]?\d+)?\s+){7}"),
+)
 
 
 def refuse_unread(root: Path) -> None:

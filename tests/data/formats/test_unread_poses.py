@@ -9,17 +9,14 @@ from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.unread_poses import UNREAD
 from biresnerf.errors import InputError
 
-MATRIX = "1 0 0 0\n0 1.5e-3 0 0\n0 0 1 0\n0 0 0 1\n"
 # The beginning of a file as each program's documentation shows it.
 FILES = {
-    "Ignatius.log": f"0 0 0\n{MATRIX}",
-    "cams/00000000_cam.txt": f"extrinsic\n{MATRIX}",
-    "meta_data.json": '{"frames": [{"camtoworld": []}]}',
-    "scene_camera.json": '{"0": {"cam_K": []}}',
-    "mav0/data.csv": "#timestamp, p_RS_R_x [m]\n",
-    "camera/0.json": '{"orientation": []}',
-    "keyframes/corrected_cameras/0.json": '{"t_00": 1}',
-    "metadata.json": '{"K": [], "poses": []}',
+    "block.xml": '<?xml version="1.0"?>\n<BlocksExchange version="2.1">',
+    "p4d_calibrated_external_camera_parameters.txt": "imageName X Y Z Omega Phi Kappa\n",
+    "scene.nvm": "NVM_V3\n\n4\n",
+    "scene.mvs": "MVS\x00",
+    "odometry.csv": "timestamp, frame, x, y, z, qx, qy, qz, qw\n",
+    "lowres_wide.traj": "3845.6 0.1 0.2 0.3 1.5e-3 0.5 0.6\n",
 }
 
 
@@ -45,6 +42,15 @@ def test_every_form_is_tried():
 
 
 def test_other_files_of_such_names_are_left_alone(photos):
-    for name in ("notes.csv", "images/0.xmp", "run.log", "metadata.json"):
+    for name in (
+        "notes.csv",
+        "images/0.xmp",
+        "run.log",
+        "metadata.json",
+        "meta_data.json",
+        "a.xml",
+        "camera/0.json",
+    ):
+        (photos / name).parent.mkdir(exist_ok=True)
         (photos / name).write_text('{"of": "another program"}')
     assert len(read_dataset(photos)) == 4
