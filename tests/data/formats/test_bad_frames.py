@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -123,3 +124,49 @@ def test_comments_in_a_transforms_file_are_read_over_and_wrong_json_is_still_pla
     path.write_text(path.read_text().replace('"frames"', "frames", 1))
     with pytest.raises(InputError, match="line"):
         read_dataset(path)
+
+
+def spoil_line(path: Path, line: int, text: str) -> None:
+    lines = path.read_text().splitlines()
+    lines[line] = text
+    path.write_text("\n".join(lines) + "\n")
+
+
+def spoil_row(path: Path) -> None:
+    rows = np.load(path)
+    rows[1, 0] = np.nan
+    np.save(path, rows)
+
+
+SPOILED = {
+    "tum": lambda folder: spoil_line(folder / "trajectory.txt", 1, "1 0 0 0 0 0 0 one"),
+    "kitti": lambda folder: spoil_line(folder / "poses.txt", 1, "1 0 0"),
+    "bundler": lambda folder: spoil_line(folder / "bundle.out", 8, "2 0 0"),
+    "llff": lambda folder: spoil_row(folder / "poses_bounds.npy"),
+    "metashape": lambda folder: (folder / "cameras.xml").write_text(
+        (folder / "cameras.xml").read_text().replace('label="b"><transform>', 'label="b"><transform>7 ')
+    ),
+}
+PLACES = {
+    "tum": "line 2",
+    "kitti": "line 2",
+    "bundler": "camera 1",
+    "llff": "row 1",
+    "metashape": "camera 'b'",
+}
+
+
+@pytest.mark.parametrize("form", SPOILED)
+def test_one_bad_line_costs_one_image_its_pose_and_is_named(tmp_path, form):
+    trajectories.write_set(form, tmp_path)
+    SPOILED[form](tmp_path)
+    dataset = read_dataset(tmp_path)
+    assert dataset.posed.tolist() == [True, False, True, True]
+    kept = [frame.world_from_cam for frame in dataset.frames if frame.world_from_cam is not None]
+    np.testing.assert_allclose(kept, trajectories.truth()[[0, 2, 3]], atol=1e-12)
+    said = [text for text in dataset.warnings if "1 of 4 poses cannot be used" in text]
+    assert len(said) == 1
+    assert PLACES[form] in said[0]
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path, strict=True)
+    assert PLACES[form] in caught.value.where

@@ -45,10 +45,9 @@ class _Camera(BaseModel, allow_inf_nan=False):
     skew: float = 0.0
     pixel_aspect_ratio: float = 1.0
     radial_distortion: _Vector = (0.0, 0.0, 0.0)
-    tangential: list[float] | None = Field(
-        default=None, min_length=2
-    )  # as its own to_json has it; files call it tangential_distortion
-    tangential_distortion: list[float] = Field(default=[0.0, 0.0], min_length=2)  # the first two are used
+    # Its own to_json calls it tangential, published sets tangential_distortion; some have a third number, which is 0.
+    tangential: list[float] | None = Field(default=None, min_length=2)
+    tangential_distortion: list[float] = Field(default=[0.0, 0.0], min_length=2)
 
 
 def parse_nerfies(_root: Path, place: Path) -> ParsedPoses:

@@ -1,21 +1,26 @@
 """Metashape's camera export (XML): sensors, cameras, and their poses in the chunk's own frame.
 
-Lens: Agisoft Metashape user manual, appendix on camera models ("frame" type). Its p1 and p2 are COLMAP's p2 and p1.
+Lens: Agisoft Metashape user manual, appendix on camera models ("frame" type). Its p1 and p2 are COLMAP's p2 and p1. b2
+(skew) has no place in any camera model here; it is left out where that moves no pixel by more than half a pixel.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.formats.bad_frames import attempt
 from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
-from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry
+from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.formats.photogrammetry.xml_file import read_xml
+from biresnerf.data.formats.pose_rows import Placed, entry_of
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file
@@ -35,6 +40,7 @@ METASHAPE = Format(
 )
 
 
+MAX_SKEW_PX = 0.5  # at the edge of the picture; a smaller b2 (skew) is left out
 _HINT = "Export the cameras from Metashape again."
 
 
@@ -55,17 +61,17 @@ def parse_metashape(_root: Path, file: Path) -> ParsedPoses:
         camera.get("component_id") for camera in cameras.values() if camera.find("transform") is not None
     )
     main = components.most_common(1)[0][0] if components else None
-    lenses: dict[str | None, Camera | None] = {}
+    lenses: dict[str | None, Camera | InputError | None] = {}
     entries, apart = [], []
     for label, camera in sorted(cameras.items()):
         where, sensor = f"{file.name} camera {label!r}", camera.get("sensor_id")
         if sensor not in lenses:
-            lenses[sensor] = _camera(sensors.get(sensor), f"{file.name} sensor {sensor}")
-        pose = _pose(camera, where)
-        if pose is not None and camera.get("component_id") != main:
-            pose = None
+            lenses[sensor] = attempt(partial(_camera, sensors.get(sensor), f"{file.name} sensor {sensor}"))
+        entry = entry_of(label, where, partial(_read, camera, lenses[sensor], where))
+        if entry.world_from_cam is not None and camera.get("component_id") != main:
+            entry = replace(entry, world_from_cam=None)
             apart.append(label)
-        entries.append(PoseEntry(label, pose, where, lenses[sensor]))
+        entries.append(entry)
     notes = [f"{file.name}: poses are in the chunk's own frame; its transform was not applied"]
     if apart:
         notes.append(
@@ -102,6 +108,12 @@ def _labelled(chunk: ElementTree.Element, file: Path) -> dict[str, ElementTree.E
     return entries
 
 
+def _read(camera: ElementTree.Element, lens: Camera | InputError | None, where: str) -> Placed:
+    if isinstance(lens, InputError):
+        raise lens
+    return _pose(camera, where), lens
+
+
 def _pose(entry: ElementTree.Element, where: str) -> NDArray[np.float64] | None:
     transform = entry.find("transform")
     if transform is None:
@@ -133,7 +145,7 @@ def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
     for name in ("f", "fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2"):
         numbers = finite_numbers(calibration.findtext(name, "").split(), where, _HINT)
         values[name] = float(numbers[0]) if len(numbers) else 0.0
-    unmodelled = [name for name in ("k4", "p3", "p4", "b2") if values[name]]
+    unmodelled = [name for name in ("k4", "p3", "p4") if values[name]]
     if unmodelled:
         raise InputError(
             "camera_model_unsupported",
@@ -148,6 +160,15 @@ def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
         width, height = int(size["width"]), int(size["height"])
     except (KeyError, ValueError):
         raise invalid_file(where, "has no resolution of whole width and height.", _HINT) from None
+    off_px = abs(values["b2"]) * height / 2 / max(abs(values["f"]), 1e-9)  # at the upper and lower edge
+    if values["b2"] and off_px > MAX_SKEW_PX:
+        raise InputError(
+            "camera_model_unsupported",
+            f"b2 moves pixels by up to {off_px:.2g} px; no supported camera model has it, and it is left out up to "
+            f"{MAX_SKEW_PX:g} px only.",
+            where=where,
+            hint="Optimise the cameras without b2 and export again, or export undistorted images.",
+        )
     return _colmap_camera(values, width, height, where)
 
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.formats.bad_frames import attempt
 from biresnerf.data.formats.bind_images import in_order
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, listed_name
@@ -65,9 +67,13 @@ def parse_bundler(root: Path, file: Path) -> ParsedPoses:
     cameras = read_cameras(file)
     list_file, listed = _listed_names(root, file, len(cameras))
     entries = []
-    for index, (lens, pose) in enumerate(cameras):
+    for index, camera in enumerate(cameras):
         where = f"{file.name} camera {index}"
         name = str(index) if list_file is None else listed[index]
+        if isinstance(camera, InputError):
+            entries.append(PoseEntry(name, None, where, problem=camera))
+            continue
+        lens, pose = camera
         entries.append(PoseEntry(name, pose, where, None if pose is None else partial(_camera, lens, where)))
     files = (file,) if list_file is None else (file, list_file)
     hint = "Give list.txt as it was written with the bundle file: one image a line, in its order."
@@ -82,11 +88,14 @@ def parse_bundler(root: Path, file: Path) -> ParsedPoses:
 Lens = tuple[float, float, float]
 
 
-def read_cameras(file: Path) -> list[tuple[Lens, NDArray[np.float64] | None]]:
-    """Focal length (px), k1, k2, and ``world_from_cam`` [4, 4] of each camera; None where it has no pose.
+BundlerCamera: TypeAlias = tuple[Lens, NDArray[np.float64] | None]
+
+
+def read_cameras(file: Path) -> list[BundlerCamera | InputError]:
+    """Focal length (px), k1, k2, and ``world_from_cam`` [4, 4] of each camera (None without a pose); or its error.
 
     Raises:
-        InputError: ``pose_file_invalid`` and codes of `rigid_matrix`.
+        InputError: ``pose_file_invalid`` where the file as a whole cannot be read.
     """
     lines = [
         line.split() for line in read_text(file).splitlines() if line.strip() and not line.startswith("#")
@@ -103,15 +112,17 @@ def read_cameras(file: Path) -> list[tuple[Lens, NDArray[np.float64] | None]]:
             f"has {len(lines)} lines, which is not what {cameras} cameras and {points} points take.",
             _HINT,
         )
-    entries = []
-    for index in range(cameras):
-        at = 1 + _LINES_PER_CAMERA * index
-        where = f"{file.name} camera {index}"
-        block = _numbers(lines[at : at + _LINES_PER_CAMERA], _LINES_PER_CAMERA, 3, where)
-        focal, k1, k2 = block[0]
-        pose = None if focal == 0.0 else _world_from_cam(block[1:4], block[4], where)
-        entries.append(((float(focal), float(k1), float(k2)), pose))
-    return entries
+    starts = [1 + _LINES_PER_CAMERA * index for index in range(cameras)]
+    return [
+        attempt(partial(_camera_of, lines[at : at + _LINES_PER_CAMERA], f"{file.name} camera {index}"))
+        for index, at in enumerate(starts)
+    ]
+
+
+def _camera_of(lines: Sequence[Sequence[str]], where: str) -> BundlerCamera:
+    block = _numbers(lines, _LINES_PER_CAMERA, 3, where)
+    focal, k1, k2 = block[0].tolist()
+    return (focal, k1, k2), None if focal == 0.0 else _world_from_cam(block[1:4], block[4], where)
 
 
 def _world_from_cam(

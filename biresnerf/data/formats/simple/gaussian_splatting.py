@@ -6,18 +6,19 @@ principal point in the image's centre.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel
 
 from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name
-from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry
-from biresnerf.data.model.dataset import SourceFormat
+from biresnerf.data.formats.parsed_poses import ParsedPoses
+from biresnerf.data.formats.pose_rows import Placed, Row, parsed_rows
 from biresnerf.data.model.pose_validation import rigid_matrix
-from biresnerf.data.model.untrusted_file import first_problem, read_text
-from biresnerf.errors import InputError
+from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json
 from biresnerf.options.formats import Format
 
 GAUSSIAN_SPLATTING = Format(
@@ -32,10 +33,16 @@ GAUSSIAN_SPLATTING = Format(
 _Vector = tuple[float, float, float]
 
 
-class _Row(BaseModel, strict=True, allow_inf_nan=False):
+_HINT = "Give the cameras.json that 3DGS wrote."
+
+
+class _Name(BaseModel):
+    img_name: str
+
+
+class _Row(BaseModel, allow_inf_nan=False):
     """A camera as the file has it; further keys are left alone."""
 
-    img_name: str
     width: float
     height: float
     position: _Vector
@@ -50,24 +57,22 @@ def parse_gaussian_splatting(_root: Path, file: Path) -> ParsedPoses:
     Raises:
         InputError: codes as in docs/input.md.
     """
-    try:
-        rows = TypeAdapter(list[_Row]).validate_json(read_text(file))
-    except ValidationError as error:
-        finite = error.errors()[0]["type"] != "finite_number"
-        code = "pose_file_invalid" if finite else "pose_not_finite"
-        raise first_problem(error, file, code=code, hint="Give the cameras.json that 3DGS wrote.") from None
-    entries = tuple(_entry(row, f"{file.name} [{index}]") for index, row in enumerate(rows))
-    if len({entry.name for entry in entries}) != len(entries):
-        raise InputError("duplicate_image", "names an image twice.", where=file.name, hint="Remove one.")
-    return ParsedPoses(SourceFormat("gaussian-splatting", files=(file,)), entries)
+    document = read_json(file)
+    if not isinstance(document, list):
+        raise invalid_file(file.name, "is no list of cameras.", _HINT)
+    rows: list[Row] = []
+    for index, value in enumerate(document):
+        where = f"{file.name} [{index}]"
+        name = checked(_Name, value, where, _HINT).img_name
+        rows.append((image_name(name, f"{where}.img_name"), where, partial(_read, value, where)))
+    return parsed_rows("gaussian-splatting", [file], rows)
 
 
-def _entry(row: _Row, where: str) -> PoseEntry:
-    name = image_name(row.img_name, f"{where}.img_name")
+def _read(value: Any, where: str) -> Placed:
+    row = checked(_Row, value, where, _HINT)
     pose, _ = rigid_matrix(np.column_stack([row.rotation, row.position]).tolist(), where)
     params = (row.fx, row.fy, row.width / 2, row.height / 2)
-    lens = camera_of_numbers("PINHOLE", round(row.width), round(row.height), params, where)
-    return PoseEntry(name, pose, where, lens)
+    return pose, camera_of_numbers("PINHOLE", round(row.width), round(row.height), params, where)
 
 
 CODECS = (Codec(GAUSSIAN_SPLATTING, parse=parse_gaussian_splatting, recognises=head_holds(b'"img_name"')),)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -11,13 +12,14 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import in_order
 from biresnerf.data.formats.codec import Codec, WriteContext
-from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry
+from biresnerf.data.formats.parsed_poses import ParsedPoses
+from biresnerf.data.formats.pose_rows import Placed, entry_of
 from biresnerf.data.formats.simple.bundler import bundler_problem, refuse_lenses
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.untrusted_file import read_bytes
+from biresnerf.data.model.untrusted_file import invalid_file, read_bytes
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.formats import Format
@@ -57,12 +59,11 @@ def parse_llff(_root: Path, file: Path) -> ParsedPoses:
     Raises:
         InputError: codes as in docs/input.md.
     """
-    entries = []
-    for index, row in enumerate(_rows(file)):
-        where = f"{file.name} row {index}"
-        down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
-        pose, _ = rigid_matrix(np.stack([right, down, -back, centre], axis=1).tolist(), where)
-        entries.append(PoseEntry(str(index), pose, where, _camera(height, width, focal, where)))
+    entries = [
+        entry_of(str(index), where, partial(_read_row, row, where))
+        for index, row in enumerate(_rows(file))
+        for where in [f"{file.name} row {index}"]
+    ]
     hint = "Leave in images/ just the images that the poses are for; their order by name decides."
     return ParsedPoses(
         SourceFormat("llff", files=(file,)),
@@ -70,6 +71,15 @@ def parse_llff(_root: Path, file: Path) -> ParsedPoses:
         assign=lambda names: in_order(entries, names, file.name, hint),
         named=False,
     )
+
+
+def _read_row(row: NDArray[np.float64], where: str) -> Placed:
+    if not np.isfinite(row).all():
+        hint = "Write it again with numpy.save, 17 numbers a row."
+        raise InputError("pose_not_finite", "NaN or an infinite number.", where=where, hint=hint)
+    down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
+    pose, _ = rigid_matrix(np.stack([right, down, -back, centre], axis=1).tolist(), where)
+    return pose, _camera(height, width, focal, where)
 
 
 def _camera(height: float, width: float, focal: float, where: str) -> Camera:
@@ -85,16 +95,14 @@ def _camera(height: float, width: float, focal: float, where: str) -> Camera:
 
 
 def _rows(file: Path) -> NDArray[np.float64]:
-    """The rows, float64 [n, 17], finite.
+    """The rows, float64 [n, 17].
 
     The npy header is matched and not evaluated as the Python literal that it is: on hostile headers numpy.load raises
     more than ValueError (TokenError, RecursionError, MemoryError), and it allocates before it reads.
     """
 
-    def invalid(what: str, code: str = "pose_file_invalid") -> InputError:
-        return InputError(
-            code, what, where=file.name, hint="Write it again with numpy.save, 17 numbers a row."
-        )
+    def invalid(what: str) -> InputError:
+        return invalid_file(file.name, what, "Write it again with numpy.save, 17 numbers a row.")
 
     content = read_bytes(file, _MAX_HEADER_BYTES + MAX_IMAGES * _COLUMNS * 8)
     start = {1: 10, 2: 12}.get(content[6] if len(content) > 12 else 0, 0)
@@ -109,10 +117,7 @@ def _rows(file: Path) -> NDArray[np.float64]:
     if count > MAX_IMAGES or len(numbers) != count * _COLUMNS * dtype.itemsize:
         raise invalid(f"has {count} rows by its header, but its content is shorter or longer.")
     order: Literal["F", "C"] = "F" if by_columns else "C"
-    rows = np.frombuffer(numbers, dtype).reshape((count, _COLUMNS), order=order).astype(np.float64)
-    if not np.isfinite(rows).all():
-        raise invalid("NaN or an infinite number.", "pose_not_finite")
-    return rows
+    return np.frombuffer(numbers, dtype).reshape((count, _COLUMNS), order=order).astype(np.float64)
 
 
 def llff_problem(camera: Camera) -> str | None:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from biresnerf.data.formats.codec import Codec
-from biresnerf.data.formats.colmap.model_checks import rigid_pose
 from biresnerf.data.formats.match_names import match_files
 from biresnerf.data.formats.parsed_poses import Assignment, ParsedPoses, PoseEntry
 from biresnerf.data.formats.simple.camera_file import read_camera_file
@@ -23,13 +20,11 @@ from biresnerf.data.formats.simple.times_of_images import (
     number_of,
     times_of_images,
 )
+from biresnerf.data.formats.simple.trajectory_lines import IMAGES_OF, Trajectory
 from biresnerf.data.model.atomic_file import write_text
-from biresnerf.data.model.colmap_scene import matrix_of_pose
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.data.model.dataset import SourceFormat
-from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.untrusted_file import finite_numbers, read_text
 from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
@@ -74,74 +69,8 @@ KITTI = Format(
     hint="A trajectory in KITTI format",
 )
 
-_IMAGES_OF = "{stem}_images.txt"  # beside our KITTI files, which have no room for names: an image a line
-MAX_POSES = 100_000
 _PHOTO_FOLDERS = ("image_2", "image_0", "image_3", "image_1")  # KITTI's: the colour cameras first
-_HINT = "Give lines of `time x y z qx qy qz qw` (TUM), or of 12 numbers, [R | t] by rows (KITTI)."
 _HEAD = "# timestamp tx ty tz qx qy qz qw: camera to world, OpenCV axes (x right, y down, z forward), the input's frame"
-_COLUMNS: dict[int, str] = {8: "tum", 12: "kitti"}
-# What `refine` writes above its poses: which image was taken when.
-_NAMED_TIME = re.compile(r"#\s*([-+0-9.eE]+)\s+(\S.*\S|\S)\s*$")
-
-
-class Trajectory:
-    """Poses in the file's order; ``times_s`` and the names of images by time where the file has them."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self.poses: list[NDArray[np.float64]] = []
-        self.times_s: list[float] = []
-        self.lines: list[int] = []
-        self.name_of_time: dict[float, str] = {}
-        columns = 0
-        for number, line in enumerate(read_text(file).splitlines(), start=1):
-            words = line.replace(",", " ").split()
-            if not words or line.lstrip().startswith("#"):
-                self._note_name(line)
-                continue
-            where = f"{file.name} line {number}"
-            if not columns and all(number_of(word) is None for word in words):
-                continue  # a header that is not marked as a comment
-            columns = columns or len(words)
-            if len(words) not in _COLUMNS or len(words) != columns:
-                raise _invalid(where, f"has {len(words)} numbers, not 8 (TUM) or 12 (KITTI) as every line.")
-            values = finite_numbers(words, where, _HINT)
-            if columns == 8:
-                time, *centre, x, y, z, w = values.tolist()
-                self.times_s.append(time)
-                self.poses.append(matrix_of_pose(rigid_pose([w, x, y, z, *centre], where, _HINT)))
-            else:
-                self.poses.append(rigid_matrix(values.reshape(3, 4).tolist(), where)[0])
-            self.lines.append(number)
-            if len(self.poses) > MAX_POSES:
-                raise _invalid(where, f"more than {MAX_POSES} poses are not read.")
-        if not self.poses:
-            raise _invalid(file.name, "holds no pose.")
-        self.dialect = _COLUMNS[columns]
-        self.image_names = [self.name_of_time.get(time, "") for time in self.times_s]
-        list_file = file.with_name(_IMAGES_OF.format(stem=file.stem))
-        self.files = [file]
-        if not self.times_s and list_file.is_file():
-            self.files.append(list_file)
-            self.image_names = read_text(list_file).splitlines()
-            if len(self.image_names) != len(self.poses):
-                raise _invalid(
-                    list_file.name, f"names {len(self.image_names)} images for {len(self.poses)} poses."
-                )
-        if len(set(self.times_s)) != len(self.times_s):
-            raise _invalid(file.name, "two poses have the same time.")
-
-    def _note_name(self, line: str) -> None:
-        match = _NAMED_TIME.match(line.strip())
-        time = number_of(match[1]) if match else None
-        if match and time is not None:
-            self.name_of_time[time] = match[2]
-
-    def names(self) -> list[str]:
-        """A name for each pose: the image's where the file has one, else the time, else the pose's number from 0."""
-        if not self.times_s:
-            return self.image_names or [str(index) for index in range(len(self.poses))]
-        return [name or f"{time:.17g}" for name, time in zip(self.image_names, self.times_s, strict=True)]
 
 
 def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
@@ -165,6 +94,8 @@ def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
         PoseEntry(name, pose @ pose_from_cam, f"{file.name} line {line}", lens, timestamp_s=time)
         for name, pose, line, time in rows
     ]
+    for index, bad in trajectory.problems.items():
+        entries[index] = replace(bad, name=entries[index].name, lens=lens)
 
     def assign(names: Sequence[str]) -> Assignment:
         pose_of, how = matched(trajectory, names, root)
@@ -178,7 +109,8 @@ def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
 
     table = [root / TIMES_OF_IMAGES] if (root / TIMES_OF_IMAGES).is_file() else []
     source = SourceFormat(trajectory.dialect, files=(*trajectory.files, *camera_files, *table))
-    return ParsedPoses(source, tuple(entries), assign, named=False, photo_folders=_PHOTO_FOLDERS)
+    every = (*entries, *trajectory.left_out)
+    return ParsedPoses(source, every, assign, named=False, photo_folders=_PHOTO_FOLDERS)
 
 
 def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[dict[str, int], str]:
@@ -235,10 +167,6 @@ def _is_trajectory(file: Path) -> bool:
     return len(words) == 12 and all(number_of(word.decode("latin-1")) is not None for word in words)
 
 
-def _invalid(where: str, what: str, code: str = "pose_file_invalid") -> InputError:
-    return InputError(code, what, where=where, hint=_HINT)
-
-
 def write_tum(refined: RefinedSet, path: Path) -> None:
     """One line an image: time (s), centre, quaternion with the scalar last.
 
@@ -261,7 +189,7 @@ def write_kitti(refined: RefinedSet, path: Path) -> None:
     """
     rows = [" ".join(repr(value) for value in pose[:3].ravel().tolist()) for pose in refined.world_from_cam]
     _write_lines(
-        path.with_name(_IMAGES_OF.format(stem=path.stem)), [image.file_name for image in refined.images]
+        path.with_name(IMAGES_OF.format(stem=path.stem)), [image.file_name for image in refined.images]
     )
     _write_lines(path, rows)
 

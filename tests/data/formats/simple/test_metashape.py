@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from biresnerf.data.formats.parsed_poses import without_problems
 from biresnerf.data.formats.photogrammetry.metashape import parse_metashape
+from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera import Intrinsics, project
-from tests.data.formats.simple.trajectories import metashape_xml
+from tests.data.formats.simple.trajectories import metashape_xml, write_images
 
 WIDTH, HEIGHT = 20, 16
 IDENTITY = " ".join(map(str, np.eye(4).ravel()))
@@ -20,7 +22,7 @@ IDENTITY = " ".join(map(str, np.eye(4).ravel()))
 def parsed(folder: Path, **parts: str):
     file = folder / "cameras.xml"
     file.write_text(metashape_xml(**parts))
-    return parse_metashape(folder, file)
+    return without_problems(parse_metashape(folder, file))
 
 
 def by_the_manual(points: np.ndarray, k: tuple[float, float, float], p: tuple[float, float], b1: float):
@@ -53,7 +55,7 @@ def test_the_lens_projects_as_the_manual_says(tmp_path, k, p, b1):
     np.testing.assert_allclose(found.numpy(), by_the_manual(points, k, p, b1), atol=1e-4)
 
 
-@pytest.mark.parametrize("term", ["k4", "p3", "p4", "b2"])
+@pytest.mark.parametrize("term", ["k4", "p3", "p4"])
 def test_a_term_that_no_supported_model_has_is_refused_and_named(tmp_path, term):
     with pytest.raises(InputError, match=term) as refused:
         parsed(tmp_path, lens=f"<{term}>0.01</{term}>")
@@ -87,3 +89,16 @@ def test_an_entity_is_refused_before_it_expands(tmp_path):
     with pytest.raises(InputError) as refused:
         parse_metashape(tmp_path, file)
     assert refused.value.code == "pose_file_invalid"
+
+
+@pytest.mark.parametrize(("b2", "read"), [(1.0, True), (1.2, False)])
+def test_a_skew_is_left_out_up_to_half_a_pixel_at_the_edge(tmp_path, b2, read):
+    """b2 moves a pixel by b2 * y / f: 8 px above the centre, at a focal length of 18.5 px, by 0.43 of b2."""
+    write_images(tmp_path)
+    (tmp_path / "cameras.xml").write_text(metashape_xml(lens=f"<b2>{b2}</b2>"))
+    if read:
+        assert read_dataset(tmp_path).camera_of(0).full().fx == 18.5
+        return
+    with pytest.raises(InputError, match=r"b2 moves pixels by up to 0\.52 px") as caught:
+        read_dataset(tmp_path)
+    assert caught.value.code == "camera_model_unsupported"
