@@ -1,0 +1,83 @@
+"""What chance seldom meets in few runs: writes of a worker that was replaced, repeated writes, and lost answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.workers.queue.promises.actors import Act, Worker
+from tests.workers.queue.promises.faulty_connections import AFTER_COMMIT
+from tests.workers.queue.promises.machine import Promises, promises_on
+
+ENDS = ("publish", "fail", "give back (None)", "give back (error)", "give back (disk_full)")
+WRITES = ("progress", "checkpoint", *ENDS)
+CANCELLED = "cancelled"
+
+
+class Play:
+    """One job, and three workers whose steps are told; each is compared with the model."""
+
+    def __init__(self, promises: type[Promises], *, cancelling: bool = False) -> None:
+        self.machine, self._cancelling = promises(), cancelling
+        self.machine.begin(limit=0)
+        self.workers = list(self.machine.actors.workers)
+        self._perform(self.machine.actors.possible(self.machine.world), "client: submit job0", set())
+
+    def does(self, number: int, *steps: str, lost: bool = False) -> None:
+        """Also what the worker's program would not do at this moment. ``lost``: the answer, with its connection."""
+        worker = self.workers[number]
+        for step in steps:
+            name = f"worker {worker.id}: {step}" + (" job0" if step != "take" else "")
+            self._perform(self._acts(worker), name, {AFTER_COMMIT} if lost else set())
+            if step == "claim" and self._cancelling:
+                self._perform(self.machine.actors.possible(self.machine.world), "client: cancel job0", set())
+
+    def is_replaced(self, number: int) -> None:
+        """It falls silent, and its job goes to the next worker."""
+        self.machine.silence(self.workers[number])
+        self.machine.notice(self.workers[number])
+        self.does(number + 1, "take", "claim")
+
+    def end(self) -> None:
+        """A good worker brings the job to its end."""
+        self.machine.teardown()
+
+    def _acts(self, worker: Worker) -> Iterator[Act]:
+        yield from self.machine.actors.next_of(worker, self.machine.world)
+        if worker.claim is not None:
+            yield from self.machine.actors._writes(worker, self.machine.world)
+
+    def _perform(self, acts: Iterator[Act], name: str, cuts: set[int]) -> None:
+        act = next(act for act in acts if act.name == name)
+        self.machine.perform(act, cuts)
+
+
+def test_nothing_is_changed_by_a_worker_that_was_replaced(database_url: str, tmp_path: Path):
+    with promises_on(database_url, tmp_path) as promises:
+        for write in WRITES:
+            for published in (False, True):
+                play = Play(promises)
+                play.does(0, "take", "claim", "checkpoint")
+                play.is_replaced(0)
+                if published:
+                    play.does(1, "publish")
+                play.does(0, write)
+                play.end()
+
+
+def test_a_write_whose_answer_was_lost_is_done_once(database_url: str, tmp_path: Path):
+    with promises_on(database_url, tmp_path) as promises:
+        for write in (*WRITES, CANCELLED):
+            play = Play(promises, cancelling=write == CANCELLED)
+            play.does(0, "take", "claim")
+            play.does(0, write, lost=True)
+            play.end()
+
+
+def test_an_attempt_ends_once_however_often_it_says_so(database_url: str, tmp_path: Path):
+    with promises_on(database_url, tmp_path) as promises:
+        for first in ENDS:
+            for second in WRITES:
+                play = Play(promises)
+                play.does(0, "take", "claim", first, second)
+                play.end()
