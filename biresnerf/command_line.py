@@ -43,6 +43,7 @@ SECTIONS = (
             "evaluate": "biresnerf.commands.poses.evaluate:evaluate_command",
             "convert": "biresnerf.commands.poses.convert:convert_command",
             "export": "biresnerf.commands.poses.export:export_command",
+            "view": "biresnerf.commands.poses.view:view_command",
             "report": "biresnerf.commands.poses.report:report_command",
             "make-scene": "biresnerf.commands.poses.make_scene:make_scene_command",
             "bench": "biresnerf.commands.machine.bench:bench_command",

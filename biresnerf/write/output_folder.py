@@ -8,13 +8,13 @@ from pathlib import Path
 
 from biresnerf.data.model.refined_set import REFINED
 from biresnerf.data.show.history import HISTORY
-from biresnerf.data.show.view_file import CONTACT_SHEET, THUMBNAIL, VIEW
+from biresnerf.data.show.view_file import CONTACT_SHEET, PREVIEW, THUMBNAIL, VIEW
 from biresnerf.errors import InputError
 from biresnerf.options.formats import formats
 from biresnerf.refinement.stages.checkpoint import CHECKPOINT, OTHER_FOLDER
 from biresnerf.viewer.report_html import REPORT_HTML
 
-REPORT, PREVIEW, CONFIG = "report.json", "preview", "config.json"
+REPORT, CONFIG = "report.json", "config.json"
 RENDERS, ORBIT = "renders", "renders/orbit.mp4"
 
 

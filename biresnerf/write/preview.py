@@ -13,7 +13,7 @@ from biresnerf.data.seeding.seeding_preview import write_seeding_preview
 from biresnerf.data.seeding.seeding_progress import SeedingProgress
 from biresnerf.data.show.history import HISTORY
 from biresnerf.data.show.renders import picture_stems
-from biresnerf.data.show.view_file import THUMBNAIL
+from biresnerf.data.show.view_file import PREVIEW, THUMBNAIL
 from biresnerf.data.show.view_pictures import write_thumbnail
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.progress import Monitor, Progress
@@ -21,7 +21,7 @@ from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.first_step import poses_in_input_frame
 from biresnerf.refinement.verdict.run_report import run_report
 from biresnerf.refinement.views.evaluation import render_view
-from biresnerf.write.output_folder import PREVIEW, REPORT, OutputFolder
+from biresnerf.write.output_folder import REPORT, OutputFolder
 from biresnerf.write.result import described, write_rendered
 
 TRANSFORMS = "transforms.json"

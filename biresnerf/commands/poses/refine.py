@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from biresnerf.viewer.report_html import REPORT_HTML
 @settings_option
 @click.option("--overwrite", is_flag=True, help="Replace a finished result in OUT.")
 @click.option("--open", "open_report", is_flag=True, help="Open OUT/report.html in a browser at the end.")
+@click.option("--view", is_flag=True, help="Show the cameras in the browser while they move; needs viser.")
 @click.option("--verbose", "-v", is_flag=True, help="Print log messages.")
 @json_option
 def refine_command(
@@ -44,6 +46,7 @@ def refine_command(
     settings: dict[str, Any],
     overwrite: bool,
     open_report: bool,
+    view: bool,
     verbose: bool,
     as_json: bool,
 ) -> int:
@@ -58,7 +61,12 @@ def refine_command(
     parse_options(options)  # what is no option must not be taken for another argument
     from biresnerf.run.refine import refine
 
-    with StopRequest(signal.SIGINT, signal.SIGTERM) as stop:
+    with StopRequest(signal.SIGINT, signal.SIGTERM) as stop, ExitStack() as during:
+        if view:
+            from biresnerf.live_view.live_view import LiveView, shown_live
+
+            live = during.enter_context(shown_live(LiveView(output, input_path)))
+            click.echo(f"view at {live.url}", err=True)
         try:
             result = refine(
                 input_path, output, progress=True, should_stop=stop, overwrite=overwrite, **options

@@ -12,6 +12,7 @@ from biresnerf.data.model.untrusted_file import read_model
 from biresnerf.frozen_model import FrozenModel
 
 VIEW, THUMBNAIL = "view.json", "thumbnail.jpg"
+PREVIEW = "preview"  # folder of what a run under way shows of itself
 CONTACT_SHEET, POINTS = "view/contact_sheet.jpg", "view/points_{source}.bin"
 
 

@@ -13,6 +13,7 @@ from PIL import Image
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.show.view_file import CONTACT_SHEET, POINTS, ContactSheet, ShownPoints
+from biresnerf.errors import InputError
 
 THUMBNAIL_PX = 320
 # Long side of a photo in the contact sheet by how many there are at most: some megabytes, and no side that JPEG or a
@@ -76,6 +77,25 @@ def write_points(
             )
         )
     return tuple(written)
+
+
+def read_points(folder: Path, shown: ShownPoints) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Positions [n, 3] in the input's world and colours [n, 3] of a layer of the result in ``folder``.
+
+    Raises:
+        InputError: ``view_file_invalid`` for a file of another length; OSError where it is not there.
+    """
+    content = (folder / shown.file).read_bytes()
+    if len(content) != 15 * shown.count:
+        raise InputError(
+            "view_file_invalid",
+            f"has {len(content)} bytes, not {15 * shown.count}.",
+            where=shown.file,
+            hint="Leave the files of a result together, as they were written.",
+        )
+    xyz = np.frombuffer(content, "<f4", 3 * shown.count).reshape(-1, 3)
+    rgb = np.frombuffer(content, np.uint8, offset=12 * shown.count).reshape(-1, 3)
+    return xyz.astype(np.float64) + shown.origin, rgb
 
 
 def _write_jpeg(picture: Image.Image, path: Path) -> Path:
