@@ -26,6 +26,7 @@ from biresnerf.live_view.state import (
 )
 
 try:
+    import psutil
     import viser
 except ModuleNotFoundError:
     raise InputError(
@@ -63,8 +64,7 @@ class LiveView:
         self._names: tuple[str, ...] = ()
         self._cameras: dict[str, Any] = {}
         self._first_look = (np.full(3, 3.0), np.zeros(3))
-        rich.reconfigure(quiet=True)  # viser prints boxes about itself with it, where commands print JSON
-        self.server = viser.ViserServer(host, port, label="BiResNeRF", verbose=False)
+        self.server = _listening(host, port)
         self.url = f"http://{host}:{self.server.get_port()}"
         self._said = self.server.gui.add_markdown("nothing to see yet")
         for name, label in (("after", "refined poses"), ("before", "given poses")):
@@ -170,6 +170,15 @@ class LiveView:
 
     def _look_at_all(self, client: Any) -> None:
         client.camera.position, client.camera.look_at = self._first_look
+
+
+def _listening(host: str, port: int) -> Any:
+    rich.reconfigure(quiet=True)  # viser prints boxes about itself with it, where commands print JSON
+    while True:
+        try:
+            return viser.ViserServer(host, port, label="BiResNeRF", verbose=False)
+        except psutil.NoSuchProcess:  # viser 0.2 looks at all processes, and fails where one has just ended
+            continue
 
 
 def _spread(seen: Seen) -> float:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import httpx
 import numpy as np
+import psutil
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -138,6 +139,16 @@ def test_all_cameras_are_before_the_first_look_and_a_click_looks_through_one(res
 
 def photo_at(browser: Browser, path: str) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(browser.scene[path]["_image_data"])), float)
+
+
+def test_a_process_that_ends_meanwhile_does_not_keep_the_view_from_starting(result, tmp_path, monkeypatch):
+    class Ended:
+        def cwd(self) -> str:
+            raise psutil.NoSuchProcess(1)
+
+    others = [[Ended()], []]
+    monkeypatch.setattr(psutil, "process_iter", lambda: others.pop(0) if others else [])
+    LiveView(tmp_path / "out", port=free_port()).stop()
 
 
 @pytest.mark.parametrize("source", ["input", "contact sheet"])
