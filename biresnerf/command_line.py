@@ -72,6 +72,12 @@ SECTIONS = (
         {
             "up": "service.commands.serve:up_command",
             "demo": "service.commands.serve:demo_command",
+        },
+    ),
+    Section(
+        "Operate a service of several processes or machines",
+        "service",
+        {
             "api": "service.commands.serve:api_command",
             "worker": "service.commands.serve:worker_command",
             "dispatcher": "service.commands.upkeep:dispatcher_command",

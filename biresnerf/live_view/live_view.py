@@ -144,6 +144,7 @@ class LiveView:
             fov=2 * math.atan2(camera.height / 2, camera.full().fy),
             aspect=camera.width / camera.height,
             scale=size,
+            line_width=1.0,
             color=colour,
             image=picture,
             wxyz=turned,

@@ -64,7 +64,7 @@ def read_state(folder: Path, poses: Path) -> Seen:
     if poses.parent.name != PREVIEW:
         layers = read_view_file(folder).points
         if layers:
-            points, colours = read_points(folder, layers[0])
+            points, colours = read_points(folder, max(layers, key=lambda layer: layer.count))
     before = [i.world_from_cam_before for i in document.images]
     return Seen(
         names=tuple(image.name for image in document.images),

@@ -23,7 +23,14 @@ def test_the_page_of_commands_and_the_help_have_a_place_for_each() -> None:
     named = set(re.findall(r"`([a-z-]+)[` ]", page))
     assert {name.split()[0] for name in COMMANDS} <= named
     said = CliRunner().invoke(cli, ["--help"]).stdout
-    assert "Run a service:" in said
+    sections = re.split(r"\n(?=\S[^\n]*:\n)", said)
+    users, operators = (
+        next(part for part in sections if part.startswith(title))
+        for title in ("Run a service:", "Operate a service")
+    )
+    assert "  up " in users
+    assert "  tenants " in operators
+    assert sections.index(users) < sections.index(operators)
     assert "Others:" not in said
 
 
