@@ -212,7 +212,8 @@ def test_what_is_seen_needs_no_torch():
 @pytest.mark.slow
 def test_the_cameras_of_a_refinement_can_be_watched(tmp_path):
     write_synthetic_scene(tmp_path / "scene", 6, 24, seed=1)
-    words = [*command(tmp_path / "scene", tmp_path / "out", start="none"), "--view", "--json"]
+    settings = {"start": "none", "verdict": False, "shown_views": 0, "steps": 100}
+    words = [*command(tmp_path / "scene", tmp_path / "out", **settings), "--view", "--json"]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None
