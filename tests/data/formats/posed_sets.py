@@ -9,6 +9,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image
 
+from biresnerf.data.formats.registry import ALL_CODECS
+from biresnerf.data.formats.result_formats import formats_given_back
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet
 from tests.data.formats.random_sets import random_result
@@ -47,6 +49,8 @@ def renamed(refined: RefinedSet, names: list[str]) -> RefinedSet:
 def assert_reads_as(dataset: Dataset, refined: RefinedSet, dialect: str, pixels: float = 1e-6) -> None:
     """The set has the result's images, poses (to 1e-9) and lenses (points are seen at the same ``pixels``)."""
     assert dataset.source.dialect == dialect
+    own = (dialect,) if dialect in ALL_CODECS and ALL_CODECS[dialect].write is not None else ()
+    assert formats_given_back(dataset) == own
     there = {PurePosixPath(name).name: index for index, name in enumerate(dataset.file_names)}
     assert len(there) == len(dataset) == len(refined)
     for index, image in enumerate(refined.images):

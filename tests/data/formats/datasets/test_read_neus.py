@@ -73,8 +73,11 @@ def test_a_bad_matrix_costs_one_image_its_pose(tmp_path):
         assert_complete(caught.value, code, "world_mat_1")
 
 
-@pytest.mark.parametrize("content", [b"PK", np.array([None]), np.zeros(10**6)])
-def test_files_that_hold_something_else_are_refused_at_once(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(b"PK", "zip"), (np.array([None]), "llow_pickle"), (np.zeros(10**6), "world_mat_0.npy is too long")],
+)
+def test_files_that_hold_something_else_are_refused_at_once(tmp_path, content, said):
     result_with_photos(tmp_path, "PINHOLE")
     file = tmp_path / "cameras_sphere.npz"
     if isinstance(content, bytes):
@@ -82,7 +85,9 @@ def test_files_that_hold_something_else_are_refused_at_once(tmp_path, content):
     else:
         np.savez_compressed(file, world_mat_0=content)
         assert zipfile.is_zipfile(file)
-    assert refused_at_once(lambda: read_dataset(file)).code == "pose_file_invalid"
+    error = refused_at_once(lambda: read_dataset(file))
+    assert error.code == "pose_file_invalid"
+    assert said in error.detail
 
 
 def test_a_real_file_projects_as_its_matrices_do(tmp_path):
