@@ -118,14 +118,20 @@ def api_command(host: str | None, port: int | None, processes: int | None) -> No
 
 @click.command("worker")
 @click.option("--slot", default="cpu0", show_default=True, help="cpuN, or gpuN for GPU number N.")
+@click.option(
+    "--free-slot",
+    type=click.Choice(["cpu", "gpu"]),
+    help="In place of --slot: the first that is free on this host, of cpu0, cpu1 … or gpu0, gpu1 …",
+)
 @click.option("--one-job", is_flag=True, help="End after one job; the exit status says how it ended.")
 @click.option(
     "--idle-exit", type=click.FloatRange(min=0), metavar="SECONDS", help="End where no job came for so long."
 )
-def worker_command(slot: str, one_job: bool, idle_exit: float | None) -> None:
+def worker_command(slot: str, free_slot: str | None, one_job: bool, idle_exit: float | None) -> None:
     """Run one worker slot, which runs one job at a time.
 
-    Needs BIRESNERF_DATABASE_URL, and a database brought up to date by `biresnerf migrate`. With --one-job the exit
+    Needs BIRESNERF_DATABASE_URL, and a database brought up to date by `biresnerf migrate`. Where CUDA_VISIBLE_DEVICES
+    is set, jobs of a --free-slot gpu get that device, as batch systems give it. With --one-job the exit
     status says how the job ended, or that there was none; docs/operations.md lists the statuses.
     """
     from workers.queue.slot import main
@@ -133,6 +139,8 @@ def worker_command(slot: str, one_job: bool, idle_exit: float | None) -> None:
     with setup_problems():
         settings_with().require_database_url()
     sys.argv = ["biresnerf worker", "--slot", slot]
+    if free_slot is not None:
+        sys.argv += ["--free-slot", free_slot]
     if one_job:
         sys.argv += ["--one-job"]
     if idle_exit is not None:

@@ -56,7 +56,10 @@ begun = json.loads(state.read_text()) if state.exists() else {"step": 0, "chain"
 start, chain = begun["step"], begun["chain"]
 with open(plan["journal"], "a") as journal:
     knows_database = "BIRESNERF_DATABASE_URL" in os.environ
-    said = {"pid": os.getpid(), "from": start, "database": knows_database, "at": time.time()}
+    device = os.environ.get("CUDA_VISIBLE_DEVICES")
+    said = {
+        "pid": os.getpid(), "from": start, "database": knows_database, "at": time.time(), "device": device,
+    }  # fmt: skip
     journal.write(json.dumps(said) + "\n")
 sys.stderr.write(f"counting from {start}\n")
 sys.stdout.write("a line of a library that is no report\n")

@@ -5,18 +5,15 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import fcntl
 import logging
 import math
 import os
-import platform
 import re
 import shutil
 import signal
 import sys
 from collections.abc import AsyncIterator, Coroutine, Mapping
-from pathlib import Path
-from typing import IO, TypeVar
+from typing import TypeVar
 
 from workers.database import job_queue
 from workers.database.database import Database, open_database
@@ -29,7 +26,8 @@ from workers.process.watchdog import run_process
 from workers.queue.heartbeat import Heartbeat
 from workers.queue.janitor import Janitor, release_worker
 from workers.queue.lane import Lane, Workplace
-from workers.settings.errors import SetupError, Unavailable
+from workers.queue.slot_lock import HOST, SlotLock, lock_free_slot
+from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.settings.traces import set_up_traces
 from workers.store.files import open_files
@@ -38,35 +36,7 @@ from workers.store.store_identity import require_same_store
 log = logging.getLogger(__name__)
 
 STORE_PATIENCE_S = 180.0  # a job that has run for an hour waits for its store to come back
-HOST = platform.node() or "localhost"
 T = TypeVar("T")
-
-
-class SlotLock:
-    """Makes a slot name unique on this host and remembers the queue id of who held it last."""
-
-    def __init__(self, data_dir: Path, name: str) -> None:
-        """Take the lock; raises `SetupError` where another process holds it."""
-        folder = data_dir / "slots"
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{HOST}.{name}"
-        self._file: IO[str] = path.open("a+")
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # freed by the kernel, however we die
-        except BlockingIOError:
-            raise SetupError(
-                "slot_taken", f"Slot {name} runs already on this machine; give this one another --slot."
-            ) from None
-        self._file.seek(0)
-        text = self._file.read().strip()
-        self.predecessor = int(text) if text.isdigit() else None
-
-    def remember(self, worker_id: int) -> None:
-        """Write down our id for our successor."""
-        self._file.truncate(0)
-        self._file.write(str(worker_id))
-        self._file.flush()
-
 
 ENDS = {
     "succeeded": ExitStatus.DONE,
@@ -80,19 +50,23 @@ ENDS = {
 class Slot:
     """Takes jobs from the queue until it is stopped: refinements one after the other, and exports beside them.
 
-    With ``one_job`` it ends after the first, and with ``idle_exit_s`` where it found none for so long.
+    With ``one_job`` it ends after the first, and with ``idle_exit_s`` where it found none for so long. ``gpu`` is the
+    device of its jobs; with none they get what the environment gives them.
     """
 
     def __init__(
-        self, settings: Settings, name: str, *, one_job: bool = False, idle_exit_s: float | None = None
+        self,
+        settings: Settings,
+        lock: SlotLock,
+        *,
+        gpu: str | None = None,
+        one_job: bool = False,
+        idle_exit_s: float | None = None,
     ) -> None:
-        if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", name):
-            raise SetupError("bad_slot_name", f"--slot {name!r}: letters, digits, - and _ only, at most 40.")
-        self._settings, self._name = settings, name
+        self._settings, self._lock, self._name, self._gpu = settings, lock, lock.name, gpu
         self._one_job, self._idle_exit_s = one_job, math.inf if idle_exit_s is None else idle_exit_s
         self._files = open_files(settings, patience_s=STORE_PATIENCE_S)
-        self._lock = SlotLock(settings.data_dir, name)
-        self._scratch = settings.scratch_dir / f"{HOST}.{name}"
+        self._scratch = settings.scratch_dir / f"{HOST}.{lock.name}"
         self._stop = asyncio.Event()
 
     async def run(self) -> ExitStatus:
@@ -180,9 +154,8 @@ class Slot:
     def _variables(self) -> Mapping[str, str]:
         """Which device and how many cores the job of this slot may use."""
         variables = {"PYTHONUNBUFFERED": "1"}
-        gpu = re.fullmatch(r"gpu(\d+)", self._name)
-        if gpu:
-            variables["CUDA_VISIBLE_DEVICES"] = gpu[1]
+        if self._gpu is not None:
+            variables["CUDA_VISIBLE_DEVICES"] = self._gpu
         if self._settings.slots > 1 and "OMP_NUM_THREADS" not in os.environ:
             share = max(1, (os.cpu_count() or 1) // self._settings.slots)
             variables |= {"OMP_NUM_THREADS": str(share), "NUMBA_NUM_THREADS": str(share)}
@@ -193,16 +166,30 @@ def main() -> int:
     """`python -m workers.queue.slot --slot NAME`, settings from the environment."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--slot", default="cpu0")
+    parser.add_argument("--free-slot", choices=("cpu", "gpu"))
     parser.add_argument("--one-job", action="store_true")
     parser.add_argument("--idle-exit", type=float, metavar="S")
     given = parser.parse_args()
 
     async def work(settings: Settings) -> ExitStatus:
-        set_up_traces(given.slot, settings)
-        slot = Slot(settings, given.slot, one_job=given.one_job, idle_exit_s=given.idle_exit)
+        if given.free_slot is None:
+            lock = SlotLock(settings.data_dir, given.slot)
+        else:
+            lock = lock_free_slot(settings.data_dir, given.free_slot)
+        set_up_traces(lock.name, settings)
+        gpu = re.fullmatch(r"gpu(\d+)", lock.name)
+        # What gave the process a device of its own knows which; the free slot's number says nothing of it.
+        given_device = given.free_slot is not None and "CUDA_VISIBLE_DEVICES" in os.environ
+        slot = Slot(
+            settings,
+            lock,
+            gpu=gpu[1] if gpu and not given_device else None,
+            one_job=given.one_job,
+            idle_exit_s=given.idle_exit,
+        )
         return await slot.run()
 
-    return run_process(given.slot, work)
+    return run_process(given.free_slot or given.slot, work)
 
 
 if __name__ == "__main__":

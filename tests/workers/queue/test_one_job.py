@@ -25,8 +25,11 @@ class OneJob:
     def __init__(self, settings: Settings, slots: Slots, folder: Path) -> None:
         self.settings, self._slots, self._folder = settings, slots, folder
 
-    def start(self, *words: str, slot: str = "a", **changes: object) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "biresnerf.command_line", "worker", "--slot", slot, "--one-job"]
+    def start(
+        self, *words: str, slot: str | None = "a", kind: str = "cpu", **changes: object
+    ) -> subprocess.Popen[bytes]:
+        named = ["--free-slot", kind] if slot is None else ["--slot", slot]
+        command = [sys.executable, "-m", "biresnerf.command_line", "worker", *named, "--one-job"]
         settings = self.settings.model_copy(update=changes)
         return self._slots.run(settings, [*command, *words], self._folder / f"one-{slot}.log")
 
@@ -84,6 +87,32 @@ async def test_sigterm_in_mid_job_leaves_a_checkpoint_and_the_job_in_the_queue(
     job = await counting.stores.jobs.get(counting.id)
     assert (job.state, job.attempt) == ("succeeded", 1)
     await counting.assert_one_result(60)
+
+
+async def test_free_slots_have_the_first_names_that_nobody_holds(
+    counting: Counting, one_job: OneJob, settings: Settings
+):
+    names = settings.data_dir / "slots"
+    workers = [one_job.start(slot=None) for _ in range(3)]
+    await _slots_seen(counting, 3)
+    for process in workers:
+        process.terminate()
+        assert await status(process) == ExitStatus.NO_JOB
+    assert {path.name.rpartition(".")[2] for path in names.iterdir()} == {"cpu0", "cpu1", "cpu2"}
+    assert await status(one_job.start("--idle-exit", "0", slot=None)) == ExitStatus.NO_JOB
+    assert len(list(names.iterdir())) == 3
+
+
+@pytest.mark.parametrize(("given", "expected"), [({"CUDA_VISIBLE_DEVICES": "3"}, "3"), ({}, "0")])
+async def test_a_job_of_a_free_gpu_slot_gets_the_device_that_the_worker_was_given(
+    counting: Counting, one_job: OneJob, monkeypatch: pytest.MonkeyPatch, given: dict[str, str], expected: str
+):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    await counting.submit(3, 0.01)
+    assert await status(one_job.start(slot=None, kind="gpu")) == ExitStatus.DONE
+    assert counting.starts()[0]["device"] == expected
 
 
 async def test_a_job_that_fails_or_is_cancelled_says_so(counting: Counting, one_job: OneJob):
