@@ -19,7 +19,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Each process of the tests would compile all modules, and pytest rewrite all assertions, again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs docs-site fuzz promises audit sbom compose-check consumers-check
+.PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs docs-site fuzz promises audit sbom compose-check slurm-check consumers-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -88,6 +88,9 @@ sbom: setup $(TOOLS)  ## what is installed, as CycloneDX, in build/sbom.json
 
 compose-check:  ## build the image, run compose.yaml with podman, lose a worker in mid job (root; long)
 	tests/deploy/compose_check.sh
+
+slurm-check: setup  ## workers for what waits on a real Slurm of one node; loses the node in mid job (root; 3 minutes; Debian's slurmctld, slurmd, slurm-client, munge)
+	BIRESNERF_TEST_SLURM=1 $(BIN)/python -m pytest -s -n 0 tests/deploy/test_slurm.py $(PYTEST)
 
 consumers-check: setup $(CONSUMERS)/.installed  ## what other programs' own readers make of what is written; their environment is some 4 GB
 	BIRESNERF_CONSUMERS=$(abspath $(CONSUMERS)) $(BIN)/python -m pytest -n 0 tests/consumers $(PYTEST)

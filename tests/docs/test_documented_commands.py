@@ -28,6 +28,7 @@ NOT_RUN = {
     "kubectl ": "needs a cluster; tests/deploy renders the manifests and runs their processes",
     "sh deploy/prepare.sh": "tests/deploy writes secrets where the file stands",
     "python -m pytest": "CI runs all tests",
+    "python deploy/slurm": "needs Slurm; tests/deploy/test_slurm.py runs it on one",
     "python -m benchmarks": "takes minutes to hours; the figures stand beside the command",
     "biresnerf compare": "takes hours; tests/studies/commands/test_compare.py runs a small one",
     "biresnerf study": "takes hours; tests/studies/commands/test_compare.py runs a small one",
