@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import json
 import os
 import random
@@ -12,26 +13,49 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 from benchmarks.chaos.clients import Clients
 from benchmarks.chaos.faults import Faults
-from benchmarks.chaos.installation import Installation
+from benchmarks.chaos.installation import Installation, free_port
+from benchmarks.chaos.real_clients import RealClients
+from benchmarks.chaos.surroundings import ObjectStore, SmallDisk, Surroundings, WrongClock, lacking
 from benchmarks.chaos.verdict import Claim, claims_about_jobs, claims_about_rest, told
 from workers.database.database import open_database
 from workers.store.trash import RETRY_S
 
 
+@contextlib.asynccontextmanager
+async def surroundings(folder: Path) -> AsyncIterator[Surroundings]:
+    """Of real jobs."""
+    disk, store = SmallDisk(folder / "disk"), ObjectStore(free_port(), free_port(), folder / "store.log")
+    try:
+        async with store.serving():
+            yield Surroundings(disk, store, WrongClock(folder))
+    finally:
+        disk.unmount()
+
+
 async def storm(
-    folder: Path, *, jobs: int, workers: int, every_s: float, seed: int, at_once: int = 8
+    folder: Path,
+    *,
+    jobs: int,
+    workers: int,
+    every_s: float,
+    seed: int,
+    at_once: int = 8,
+    around: Surroundings | None = None,
 ) -> tuple[list[Claim], dict[str, Any]]:
-    """Run the jobs under faults; what has to hold, and what happened."""
+    """Run the jobs under faults; what has to hold, and what happened. With ``around`` they are real."""
     began = time.monotonic()
-    installation = Installation(folder, replicas=2, workers=workers)
-    clients = Clients(installation.ports, folder, random.Random(seed))
+    installation = Installation(folder, replicas=2, workers=workers, around=around)
+    kind = Clients if around is None else RealClients
+    clients = kind(installation.ports, folder, random.Random(seed))
     over = asyncio.Event()
     async with installation:
+        await clients.prepare()
         faults = Faults(installation, random.Random(seed + 1), every_s)
         failing = asyncio.create_task(faults.run(over))
         try:
@@ -68,6 +92,14 @@ def new_folder() -> Path:
     return folder
 
 
+async def real_storm(folder: Path, **asked: Any) -> tuple[list[Claim], dict[str, Any]]:
+    """With refinements, on a small disk, with an object store; raises `SystemExit` where that cannot be had."""
+    if missing := lacking():
+        raise SystemExit(f"A storm with real jobs needs {', '.join(missing)}.")
+    async with surroundings(folder) as around:
+        return await storm(folder, around=around, **asked)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description="Jobs under random faults; exit status 0 where all held.")
     parser.add_argument("--jobs", type=int, default=200)
@@ -75,12 +107,14 @@ def main() -> int:
     parser.add_argument("--every", type=float, default=3.0, help="Seconds between two faults, on average.")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--output", type=Path, default=Path("chaos.json"))
+    parser.add_argument("--real", action="store_true", help="Refine photos; more can fail then. Needs root.")
     parser.add_argument("--keep", action="store_true", help="Leave the folder with logs and files.")
     asked = parser.parse_args()
     folder = new_folder()
+    begin = real_storm if asked.real else storm
     try:
         claims, happened = asyncio.run(
-            storm(folder, jobs=asked.jobs, workers=asked.workers, every_s=asked.every, seed=asked.seed)
+            begin(folder, jobs=asked.jobs, workers=asked.workers, every_s=asked.every, seed=asked.seed)
         )
     finally:
         if asked.keep:
@@ -88,7 +122,13 @@ def main() -> int:
         else:
             shutil.rmtree(folder, ignore_errors=True)
     passed = not any(claim.broken for claim in claims)
-    settings = {"jobs": asked.jobs, "workers": asked.workers, "every_s": asked.every, "seed": asked.seed}
+    settings = {
+        "real": asked.real,
+        "jobs": asked.jobs,
+        "workers": asked.workers,
+        "every_s": asked.every,
+        "seed": asked.seed,
+    }
     verdict = {"passed": passed, **settings, **happened, "claims": {c.name: c.broken for c in claims}}
     asked.output.write_text(json.dumps(verdict, indent=1) + "\n")
     sys.stdout.write(f"{'passed' if passed else 'FAILED'}; written to {asked.output}\n")

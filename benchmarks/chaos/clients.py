@@ -48,15 +48,18 @@ class Clients:
 
     def __init__(self, ports: list[int], folder: Path, chance: random.Random) -> None:
         self._urls = [f"http://127.0.0.1:{port}" for port in ports]
-        self._folder, self._chance = folder, chance
+        self.folder, self.chance = folder, chance
         self.answers: Counter[int | str] = Counter()
         self.seen: list[Seen] = []
         self._http = httpx.AsyncClient(timeout=ANSWER_S)
 
+    async def prepare(self) -> None:
+        """Before the first fault."""
+
     async def run(self, count: int, at_once: int) -> None:
         """Until all jobs are final and looked through."""
         turn = asyncio.Semaphore(at_once)
-        self.seen = [self._planned(n) for n in range(count)]
+        self.seen = [self.planned(n) for n in range(count)]
 
         async def one(seen: Seen) -> None:
             async with turn:
@@ -65,14 +68,14 @@ class Clients:
         await asyncio.gather(*(one(seen) for seen in self.seen))
         await self._http.aclose()
 
-    def _planned(self, n: int) -> Seen:
+    def planned(self, n: int) -> Seen:
         kinds: list[Kind] = ["good"] * 6 + ["cancelled"] * 3 + ["refused"]
         kind: Kind = "poisoned" if n % 40 == 7 else kinds[n % 10]
         plan = {
-            "steps": self._chance.randint(8, 40),
+            "steps": self.chance.randint(8, 40),
             "step_s": 0.05,
             "seed": f"{n}",
-            "journal": str(self._folder / f"journal-{n}"),
+            "journal": str(self.folder / f"journal-{n}"),
             **({"refuse": True} if kind == "refused" else {}),
             **({"die_at": 3} if kind == "poisoned" else {}),
         }
@@ -80,41 +83,41 @@ class Clients:
 
     async def submit_and_follow(self, seen: Seen) -> None:
         """From its dataset to its result."""
-        await self._submit(seen)
+        await self.submit(seen)
         live = asyncio.create_task(self._follow(seen.job["id"]))
         if seen.kind == "cancelled":
-            await asyncio.sleep(self._chance.uniform(0, 4.0))
-            seen.state_at_cancel = (await self._json("POST", f"/v1/jobs/{seen.job['id']}/cancel"))["state"]
+            await asyncio.sleep(self.chance.uniform(0, 4.0))
+            seen.state_at_cancel = (await self.json("POST", f"/v1/jobs/{seen.job['id']}/cancel"))["state"]
         while seen.job["state"] not in FINAL:
-            seen.job = await self._json("GET", f"/v1/jobs/{seen.job['id']}?wait={LONG_POLL_S:g}")
+            seen.job = await self.json("GET", f"/v1/jobs/{seen.job['id']}?wait={LONG_POLL_S:g}")
         seen.events = await self._follow(seen.job["id"])
         if await live != seen.events:
             seen.faults.append("who followed live saw another history than who came later")
-        await self._look_through(seen)
+        await self.look_through(seen)
 
-    async def _submit(self, seen: Seen) -> None:
-        dataset = (await self._json("POST", "/v1/datasets", json={"name": "chaos"}))["id"]
+    async def submit(self, seen: Seen) -> None:
+        dataset = (await self.json("POST", "/v1/datasets", json={"name": "chaos"}))["id"]
         content = json.dumps(seen.plan).encode()
-        await self._json("PUT", f"/v1/datasets/{dataset}/files/plan.json", content=content)
-        await self._json("POST", f"/v1/datasets/{dataset}/finalize")
-        seen.job = await self._json(
+        await self.json("PUT", f"/v1/datasets/{dataset}/files/plan.json", content=content)
+        await self.json("POST", f"/v1/datasets/{dataset}/finalize")
+        seen.job = await self.json(
             "POST",
             "/v1/jobs",
             json={"dataset_id": dataset, "options": {"preset": "fast"}},
             headers={"Idempotency-Key": uuid.uuid4().hex},
         )
 
-    async def _json(self, method: str, path: str, **request: Any) -> dict[str, Any]:
-        answer = await self._call(method, path, **request)
+    async def json(self, method: str, path: str, **request: Any) -> dict[str, Any]:
+        answer = await self.call(method, path, **request)
         if answer.status_code >= 300:
             raise RuntimeError(f"{method} {path}: {answer.status_code} {answer.text}")
         found: dict[str, Any] = answer.json()
         return found
 
-    async def _call(self, method: str, path: str, **request: Any) -> httpx.Response:
+    async def call(self, method: str, path: str, **request: Any) -> httpx.Response:
         """The first answer that is not 'try again'."""
         while True:
-            url = self._chance.choice(self._urls)
+            url = self.chance.choice(self._urls)
             try:
                 answer = await self._http.request(method, url + path, **request)
             except httpx.TransportError as error:
@@ -123,25 +126,25 @@ class Clients:
                 self.answers[answer.status_code] += 1
                 if answer.status_code < 500:
                     return answer
-            await asyncio.sleep(self._chance.uniform(0.1, 0.5))
+            await asyncio.sleep(self.chance.uniform(0.1, 0.5))
 
     async def _follow(self, job_id: str) -> list[dict[str, Any]]:
         """The whole history by server-sent events, resumed wherever the stream broke."""
         events: list[dict[str, Any]] = []
         while not events or events[-1]["type"] not in FINAL:
             headers = {"Last-Event-ID": str(events[-1]["seq"])} if events else {}
-            url = f"{self._chance.choice(self._urls)}/v1/jobs/{job_id}/events"
+            url = f"{self.chance.choice(self._urls)}/v1/jobs/{job_id}/events"
             with contextlib.suppress(httpx.TransportError):
                 async with self._http.stream("GET", url, headers=headers) as answer:
                     await _collect(answer, events)
             await asyncio.sleep(0.1)
         return events
 
-    async def _look_through(self, seen: Seen) -> None:
+    async def look_through(self, seen: Seen) -> None:
         path = f"/v1/jobs/{seen.job['id']}/artifacts"
-        listed = (await self._json("GET", path))["items"]
+        listed = (await self.json("GET", path))["items"]
         for item in listed:
-            answer = await self._call("GET", f"{path}/{item['name']}")
+            answer = await self.call("GET", f"{path}/{item['name']}")
             if hashlib.sha256(answer.content).hexdigest() != item["sha256"]:
                 seen.faults.append(f"{item['name']} has other bytes than its digest says")
             if item["name"] == "report.json" and seen.job["state"] == "succeeded":

@@ -1,4 +1,7 @@
-"""What goes wrong, at random: processes killed, frozen and told to end, the database restarted and frozen."""
+"""What goes wrong, at random: processes killed, frozen and told to end, the database restarted and frozen.
+
+Around real jobs also a disk that fills, a store that refuses or falls silent, and a clock an hour off.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable
 
 from benchmarks.chaos.installation import Installation, Kept
+from benchmarks.chaos.surroundings import Surroundings
 
 
 class Faults:
@@ -40,6 +44,8 @@ class Faults:
             *(self._kill_api, self._end_api, self._freeze_api),
             *(self._restart_database, self._crash_database, self._freeze_database),
         ]
+        if self._installation.around is not None:
+            deck += [self._fill_disk, self._cut_store, self._silence_store, self._move_clock]
         self._chance.shuffle(deck)
         return deck
 
@@ -80,6 +86,24 @@ class Faults:
     async def _freeze_database(self) -> None:
         stall_s = self._installation.settings.stall_s
         await _freeze(self._installation.database_processes(), self._chance.uniform(0.2, 1.5) * stall_s)
+
+    @property
+    def _around(self) -> Surroundings:
+        assert self._installation.around is not None, "asked only where jobs are real"
+        return self._installation.around
+
+    async def _fill_disk(self) -> None:
+        await self._around.disk.fill(self._chance.uniform(0.5, 1.5) * self._installation.settings.stall_s)
+
+    async def _cut_store(self) -> None:
+        await self._around.store.refuse(self._chance.uniform(0.2, 1.0) * self._installation.settings.stall_s)
+
+    async def _silence_store(self) -> None:
+        stall_s = self._installation.settings.stall_s
+        await self._around.store.fall_silent(self._chance.uniform(0.2, 1.0) * stall_s)
+
+    async def _move_clock(self) -> None:
+        self._around.clock.jump(self._chance.choice((3600, -3600, 0)))
 
     async def _database_away(self, number: signal.Signals, away_s: float) -> None:
         postgres = self._installation.postgres

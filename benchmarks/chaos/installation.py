@@ -15,6 +15,7 @@ from pathlib import Path
 
 import psutil
 
+from benchmarks.chaos.surroundings import RESERVE_BYTES, Surroundings
 from biresnerf.wire.datasets import CheckReport
 from workers.database.embedded_postgres import EmbeddedPostgres
 from workers.database.migrate import migrate
@@ -79,13 +80,37 @@ class Kept:
         return self.process.pid if alive and self.process is not None else None
 
 
-class Installation:
-    """Starts all in ``folder``; `ports` are those of the API replicas. Use as an async context manager."""
+REAL_PROGRAMS = {name: Settings.model_fields[name].default for name in ("job_command", "check_command")}
 
-    def __init__(self, folder: Path, replicas: int, workers: int, **settings: object) -> None:
-        self.folder = folder
+
+def real_settings(around: Surroundings) -> dict[str, object]:
+    """What differs from `quick_settings` where jobs are real: loading their libraries takes all cores for seconds."""
+    waits = {"beat_s": 1.0, "stall_s": 8.0}
+    return {**REAL_PROGRAMS, **waits, "disk_reserve_bytes": RESERVE_BYTES, **around.store.settings()}
+
+
+class Installation:
+    """Starts all in ``folder``; `ports` are those of the API replicas. Use as an async context manager.
+
+    With ``around`` jobs and checks are real, files are in its store, all scratch folders on its disk, and the first
+    worker has its clock.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        replicas: int,
+        workers: int,
+        around: Surroundings | None = None,
+        **settings: object,
+    ) -> None:
+        self.folder, self.around = folder, around
+        data_dir = folder / "data"
+        if around is not None:
+            settings, data_dir = {**real_settings(around), **settings}, around.disk.folder / "data"
         self.postgres = EmbeddedPostgres(folder / "postgres")
-        self.settings = quick_settings(folder / "data", self.postgres.url, **settings)
+        self.settings = quick_settings(data_dir, self.postgres.url, **settings)
+        self._job_program = self.settings.job_command[-1]
         self.ports = [free_port() for _ in range(replicas)]
         self.replicas = [
             Kept(f"api{n}", (sys.executable, "-m", "service.server"), {"BIRESNERF_PORT": str(port)})
@@ -95,6 +120,8 @@ class Installation:
             Kept(f"worker{n}", (sys.executable, "-m", "workers.queue.slot", "--slot", f"w{n}"))
             for n in range(workers)
         ]
+        if around is not None:
+            self.workers[0].variables = around.clock.variables()
         self._keeping: list[asyncio.Task[None]] = []
         self._closing = False
 
@@ -145,7 +172,7 @@ class Installation:
                     stdin=asyncio.subprocess.DEVNULL,
                     stdout=output,
                     stderr=output,
-                    env=self._environment() | kept.variables,
+                    env=self.environment() | kept.variables,
                     start_new_session=True,
                     cwd=ROOT,
                 )
@@ -153,7 +180,8 @@ class Installation:
             await kept.process.wait()
             await asyncio.sleep(PAUSE_S)
 
-    def _environment(self) -> dict[str, str]:
+    def environment(self) -> dict[str, str]:
+        """Of each process."""
         said = {
             f"BIRESNERF_{name.upper()}": value if isinstance(value, str) else json.dumps(value)
             for name, value in self.settings.model_dump(
@@ -163,14 +191,21 @@ class Installation:
         return {**os.environ, **said, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
 
     def job_processes(self) -> list[int]:
-        """Pids of the processes that count."""
+        """Pids of the processes of jobs."""
         found = []
         for kept in self.workers:
             with contextlib.suppress(psutil.Error):
                 for child in psutil.Process(kept.pid).children(recursive=True) if kept.pid else ():
-                    if str(PROGRAM) in child.cmdline():
+                    if self._job_program in child.cmdline():
                         found.append(child.pid)
         return found
+
+    def stored_keys(self) -> set[str]:
+        """Of all files in the store."""
+        if self.around is not None:
+            return self.around.store.keys()
+        root = self.settings.files_dir
+        return {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
 
     def database_processes(self) -> list[int]:
         """Pids of the server and its backends."""

@@ -105,12 +105,8 @@ async def _queue(database: Database) -> list[str]:
 
 
 async def _store(installation: Installation, database: Database) -> list[str]:
-    root = installation.settings.files_dir
-    there = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()} - STORES_OWN
-    rows = await database.fetch(
-        "SELECT key FROM dataset_files UNION ALL"
-        " SELECT item ->> 'key' FROM jobs, jsonb_array_elements(artifacts) AS item"
-    )
+    there = await asyncio.to_thread(installation.stored_keys) - STORES_OWN
+    rows = await database.fetch("SELECT key FROM dataset_files UNION SELECT key FROM job_file_keys")
     known = {row["key"] for row in rows}
     lost = [f"lost: {key}" for key in sorted(known - there)]
     return lost + [f"nobody's: {key}" for key in sorted(there - known)]
