@@ -33,12 +33,12 @@ async def ready_dataset(calls: Calls) -> str:
     return dataset
 
 
-async def fill(database: Database, dataset: str, count: int) -> None:
-    """Jobs that wait already, older than all others, written straight into the tables."""
+async def fill(database: Database, dataset: str, count: int, first: int = 0) -> None:
+    """Jobs that wait already, older than all others, straight into the tables: numbers ``first`` to ``count``."""
     options = Jsonb({"preset": "fast"})
-    for first in range(0, count, 1000):
+    for begin in range(first, count, 1000):
         async with database.transaction() as connection:
-            for n in range(first, min(count, first + 1000)):
+            for n in range(begin, min(count, begin + 1000)):
                 job_id = f"job_0load{n:07}"
                 entry_id = await job_queue.enqueue(connection, job_id, "refine", order=0, held=False)
                 await connection.execute(

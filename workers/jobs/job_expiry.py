@@ -1,8 +1,12 @@
-"""What is kept of ended jobs, and for how long. Each function runs in the caller's transaction."""
+"""What is kept of ended jobs, and for how long. Each function runs in the caller's transaction.
+
+Dates are compared with now(): no index is of use for clock_timestamp(), which may change from row to row.
+"""
 
 from __future__ import annotations
 
 import logging
+from datetime import datetime
 
 from workers.database.database import Connection
 from workers.jobs.job_states import add_event
@@ -15,7 +19,7 @@ FORGET_CHECKPOINTS = "UPDATE jobs SET checkpoint = NULL WHERE checkpoint ->> 'pr
 
 
 async def date_jobs(connection: Connection, kept_s: float | None) -> None:
-    """Set the dates of expiry: ``kept_s`` after the end of each job, or none."""
+    """Set the dates of expiry of all jobs: ``kept_s`` after the end of each, or none."""
     await connection.execute(
         "UPDATE jobs SET expires_at = finished_at + make_interval(secs => %s)"
         " WHERE finished_at IS NOT NULL AND state <> 'expired'"
@@ -24,14 +28,36 @@ async def date_jobs(connection: Connection, kept_s: float | None) -> None:
     )
 
 
+async def date_new_jobs(connection: Connection, kept_s: float | None) -> None:
+    """Set the dates of jobs that ended since the last time."""
+    if kept_s is not None:
+        await connection.execute(
+            "UPDATE jobs SET expires_at = finished_at + make_interval(secs => %s)"
+            " WHERE finished_at IS NOT NULL AND expires_at IS NULL AND state <> 'expired'",
+            (kept_s,),
+        )
+
+
+async def datasets_used_since(connection: Connection, since: datetime) -> list[str]:
+    """Datasets of which a job was submitted or ended."""
+    rows = await connection.rows(
+        "SELECT dataset_id FROM jobs WHERE created_at > %s"
+        " UNION SELECT dataset_id FROM jobs WHERE finished_at > %s",
+        *(since, since),
+    )
+    return [row["dataset_id"] for row in rows]
+
+
 async def expire_jobs(connection: Connection, limit: int) -> int:
     """Expire the results that are due, at most ``limit``; returns how many."""
     due = await connection.rows(
-        "SELECT id, tenant, finished_at, artifacts FROM jobs WHERE expires_at <= clock_timestamp()"
+        "SELECT id, tenant, finished_at, artifacts FROM jobs WHERE expires_at <= now()"
         " AND state IN ('succeeded', 'failed', 'cancelled')"
         # An unfinished export or fork still reads the files.
-        " AND NOT EXISTS (SELECT 1 FROM jobs AS heir WHERE jobs.id IN (heir.parent, heir.forked_from)"
-        " AND heir.state IN ('queued', 'running'))"
+        " AND NOT EXISTS (SELECT 1 FROM jobs AS export WHERE export.parent = jobs.id"
+        " AND export.state IN ('queued', 'running'))"
+        " AND NOT EXISTS (SELECT 1 FROM jobs AS fork WHERE fork.forked_from = jobs.id"
+        " AND fork.state IN ('queued', 'running'))"
         " ORDER BY expires_at LIMIT %s FOR UPDATE SKIP LOCKED",
         limit,
     )
@@ -63,7 +89,7 @@ async def forget_keys(connection: Connection, kept_s: float) -> None:
     """Idempotency keys of jobs that ended so long ago can be used again."""
     await connection.execute(
         "UPDATE jobs SET idempotency_key = NULL WHERE idempotency_key IS NOT NULL"
-        " AND finished_at < clock_timestamp() - make_interval(secs => %s)",
+        " AND finished_at < now() - make_interval(secs => %s)",
         (kept_s,),
     )
 
@@ -71,7 +97,6 @@ async def forget_keys(connection: Connection, kept_s: float) -> None:
 async def delete_expired_jobs(connection: Connection, kept_s: float) -> None:
     """Delete the records of jobs that expired so long ago."""
     await connection.execute(
-        "DELETE FROM jobs WHERE state = 'expired'"
-        " AND expires_at < clock_timestamp() - make_interval(secs => %s)",
+        "DELETE FROM jobs WHERE state = 'expired' AND expires_at < now() - make_interval(secs => %s)",
         (kept_s,),
     )

@@ -8,11 +8,21 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
+import time
+from datetime import datetime, timedelta
 
 import psycopg
 
 from workers.database.database import Connection, Database
-from workers.jobs.job_expiry import date_jobs, delete_expired_jobs, expire_jobs, forget_keys
+from workers.jobs.job_expiry import (
+    datasets_used_since,
+    date_jobs,
+    date_new_jobs,
+    delete_expired_jobs,
+    expire_jobs,
+    forget_keys,
+)
 from workers.process.waiting import first_done
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
@@ -26,10 +36,16 @@ EXPIRY_LOCK = 7_201_606
 _DATE_DATASETS = """
     UPDATE datasets SET expires_at = due.at FROM (
         SELECT id, CASE WHEN coalesce(unfinished, 0) = 0 THEN
-            greatest(touched_at, used_at) + make_interval(secs => %s) END AS at
-        FROM datasets LEFT JOIN dataset_jobs ON dataset_id = id
-        WHERE state IN ('open', 'ready', 'rejected')) AS due
+            greatest(touched_at, used_at) + make_interval(secs => %(kept_s)s) END AS at
+        FROM datasets LEFT JOIN (SELECT * FROM dataset_jobs {used}) AS used ON dataset_id = id
+        WHERE state IN ('open', 'ready', 'rejected') {dated}) AS due
     WHERE due.id = datasets.id AND datasets.expires_at IS DISTINCT FROM due.at"""
+_DATE_ALL = _DATE_DATASETS.format(used="", dated="")
+_DATE_CHANGED = _DATE_DATASETS.format(used="WHERE dataset_id = ANY(%(ids)s)", dated="AND id = ANY(%(ids)s)")
+# All dates are looked over so often: a setting may have changed, a job's record may be gone.
+ALL_S = 3600.0
+# Changes of so long ago are looked at again: their transaction may have ended after the last round.
+OVERLAP_S = 600.0
 DAY_S = 86_400.0
 
 
@@ -38,6 +54,8 @@ class Expiry:
 
     def __init__(self, database: Database, settings: Settings) -> None:
         self._database, self._settings = database, settings
+        self._all_at = -math.inf
+        self._looked_at: datetime | None = None
 
     async def run(self, stop: asyncio.Event) -> None:
         """A round every ``expiry_s`` seconds until ``stop``."""
@@ -65,9 +83,19 @@ class Expiry:
         )
         async with self._database.transaction() as connection:
             if not await _mine(connection):
+                # The other one may have other settings, and end at any time.
+                self._looked_at = None
                 return False
-            await date_jobs(connection, results_s)
-            await connection.execute(_DATE_DATASETS, (datasets_s,))
+            now = await connection.value("SELECT clock_timestamp()")
+            if self._looked_at is None or time.monotonic() >= self._all_at:
+                self._all_at = time.monotonic() + ALL_S
+                await date_jobs(connection, results_s)
+                await connection.execute(_DATE_ALL, {"kept_s": datasets_s})
+            else:
+                await date_new_jobs(connection, results_s)
+                ids = await _changed_datasets(connection, self._looked_at - timedelta(seconds=OVERLAP_S))
+                await connection.execute(_DATE_CHANGED, {"kept_s": datasets_s, "ids": ids})
+        self._looked_at = now
         return True
 
     async def _expire_jobs(self) -> int:
@@ -75,7 +103,7 @@ class Expiry:
 
     async def _expire_datasets(self) -> int:
         rows = await self._database.fetch(
-            "SELECT id FROM datasets WHERE expires_at <= clock_timestamp()"
+            "SELECT id FROM datasets WHERE expires_at <= now()"
             " AND state IN ('open', 'ready', 'rejected') ORDER BY expires_at LIMIT %s",
             BATCH,
         )
@@ -122,11 +150,16 @@ class Expiry:
         await self._database.run(delete_expired_jobs, old_s)
         for sql in (
             "DELETE FROM datasets WHERE state = 'expired'"
-            " AND expires_at < clock_timestamp() - make_interval(secs => %s)"
+            " AND expires_at < now() - make_interval(secs => %s)"
             " AND NOT EXISTS (SELECT 1 FROM dataset_jobs WHERE dataset_id = datasets.id)",
-            "DELETE FROM webhook_deliveries WHERE finished_at < clock_timestamp() - make_interval(secs => %s)",
+            "DELETE FROM webhook_deliveries WHERE finished_at < now() - make_interval(secs => %s)",
         ):
             await self._database.fetch(sql, old_s)
+
+
+async def _changed_datasets(connection: Connection, since: datetime) -> list[str]:
+    touched = await connection.rows("SELECT id FROM datasets WHERE touched_at > %s", since)
+    return [*{row["id"] for row in touched} | set(await datasets_used_since(connection, since))]
 
 
 async def _mine(connection: Connection) -> bool:

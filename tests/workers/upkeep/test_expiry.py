@@ -138,6 +138,35 @@ async def test_a_dataset_goes_when_nothing_used_it_for_long(stores: Stores, sett
     assert (await stores.datasets.get(queued)).state == "expired"
 
 
+async def test_later_rounds_of_a_dispatcher_date_what_changed(stores: Stores, settings: Settings):
+    """The first looks at everything, the others at what was touched, submitted or ended since."""
+    dataset_id = await ready_dataset(stores, PLAN)
+    before = await finished_job(settings, stores, dataset_id)
+    async with open_database(settings.require_database_url(), connections=2) as database:
+        expiry = Expiry(database, settings)
+        await expiry.round()
+        aged(settings, "datasets", dataset_id, 1)
+        waiting, _ = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"))
+        ended, unused = await finished_job(settings, stores), await ready_dataset(stores, PLAN)
+        assert (await stores.jobs.get(ended)).expires_at is None
+        await expiry.round()
+        assert (await stores.datasets.get(dataset_id)).expires_at is None, "a job uses it"
+        assert (await stores.datasets.get(unused)).expires_at is not None
+        for job_id in (before, ended):
+            job = await stores.jobs.get(job_id)
+            assert job.expires_at is not None
+            assert (job.expires_at - job.finished_at).days == 7
+        await stores.jobs.cancel(waiting.id)
+        await expiry.round()
+        assert (await stores.datasets.get(dataset_id)).expires_at is not None
+        aged(settings, "jobs", ended, 8)
+        await expiry.round()
+        assert (await stores.jobs.get(ended)).state == "succeeded", "dated when it ended, a moment ago"
+        expiry = Expiry(database, settings)
+        await expiry.round()
+        assert (await stores.jobs.get(ended)).state == "expired", "the first round looks at everything"
+
+
 async def test_an_upload_that_goes_on_keeps_its_dataset(stores: Stores, settings: Settings):
     dataset = await stores.datasets.create("slow")
     aged(settings, "datasets", dataset.id, 30)
