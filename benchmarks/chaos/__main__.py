@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import contextlib
 import json
+import math
 import os
 import random
 import shutil
@@ -46,6 +47,7 @@ async def storm(
     every_s: float,
     seed: int,
     at_once: int = 8,
+    within_s: float = math.inf,
     around: Surroundings | None = None,
 ) -> tuple[list[Claim], dict[str, Any]]:
     """Run the jobs under faults; what has to hold, and what happened. With ``around`` they are real."""
@@ -59,7 +61,7 @@ async def storm(
         faults = Faults(installation, random.Random(seed + 1), every_s)
         failing = asyncio.create_task(faults.run(over))
         try:
-            await clients.run(jobs, at_once)
+            await clients.run(jobs, at_once, within_s)
         finally:
             over.set()
             await failing
@@ -105,6 +107,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=200)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--every", type=float, default=3.0, help="Seconds between two faults, on average.")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="After these no job is submitted.")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--output", type=Path, default=Path("chaos.json"))
     parser.add_argument("--real", action="store_true", help="Refine photos; more can fail then. Needs root.")
@@ -114,7 +117,14 @@ def main() -> int:
     begin = real_storm if asked.real else storm
     try:
         claims, happened = asyncio.run(
-            begin(folder, jobs=asked.jobs, workers=asked.workers, every_s=asked.every, seed=asked.seed)
+            begin(
+                folder,
+                jobs=asked.jobs,
+                workers=asked.workers,
+                every_s=asked.every,
+                seed=asked.seed,
+                within_s=60 * asked.minutes,
+            )
         )
     finally:
         if asked.keep:

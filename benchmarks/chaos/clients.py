@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import hashlib
 import json
+import math
 import random
 import time
 import uuid
@@ -56,16 +57,17 @@ class Clients:
     async def prepare(self) -> None:
         """Before the first fault."""
 
-    async def run(self, count: int, at_once: int) -> None:
-        """Until all jobs are final and looked through."""
-        turn = asyncio.Semaphore(at_once)
-        self.seen = [self.planned(n) for n in range(count)]
+    async def run(self, count: int, at_once: int, within_s: float = math.inf) -> None:
+        """Until all jobs are final and looked through; after ``within_s`` none is submitted any more."""
+        turn, end = asyncio.Semaphore(at_once), time.monotonic() + within_s
 
         async def one(seen: Seen) -> None:
             async with turn:
-                await self.submit_and_follow(seen)
+                if time.monotonic() < end:
+                    self.seen.append(seen)
+                    await self.submit_and_follow(seen)
 
-        await asyncio.gather(*(one(seen) for seen in self.seen))
+        await asyncio.gather(*(one(self.planned(n)) for n in range(count)))
         await self._http.aclose()
 
     def planned(self, n: int) -> Seen:

@@ -85,7 +85,7 @@ REAL_PROGRAMS = {name: Settings.model_fields[name].default for name in ("job_com
 
 def real_settings(around: Surroundings) -> dict[str, object]:
     """What differs from `quick_settings` where jobs are real: loading their libraries takes all cores for seconds."""
-    waits = {"beat_s": 1.0, "stall_s": 8.0}
+    waits = {"beat_s": 1.0, "stall_s": 6.0}
     return {**REAL_PROGRAMS, **waits, "disk_reserve_bytes": RESERVE_BYTES, **around.store.settings()}
 
 
