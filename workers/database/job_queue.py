@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, LiteralString
 
@@ -152,7 +152,9 @@ async def lock_taken(connection: Connection, entry_id: int) -> bool:
 
 async def put_back(connection: Connection, entry_id: int, in_s: float = 0) -> None:
     """Offer an entry again that a worker has."""
-    due = datetime.now(UTC) + timedelta(seconds=in_s) if in_s else ALWAYS
+    # By the database's clock, which the queue goes by: a worker's own may be an hour off.
+    later = "SELECT clock_timestamp() + make_interval(secs => %s)"
+    due = await connection.value(later, in_s) if in_s else ALWAYS
     await _manager(connection).retry_job_by_id_async(entry_id, retry_at=due)
     if not in_s:
         await connection.execute("SELECT offer_queue_entry(%s)", (entry_id,))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import signal
 from pathlib import Path
 
 import psutil
 import pytest
 
+from benchmarks.chaos.surroundings import WrongClock
 from tests.workers.conftest import SHORT_STALL, Counting, Slots, died
 from workers.engine import Stores
 from workers.settings.settings import Settings
@@ -132,6 +134,25 @@ async def test_a_job_that_does_not_fit_on_the_disk_says_so(
     first.terminate()
     first.wait()
     slots.start(settings, "a")
+    assert (await counting.until_final()).state == "succeeded"
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
+async def test_a_worker_whose_clock_is_an_hour_ahead_gives_a_job_back_for_now(
+    counting: Counting, settings: Settings, slots: Slots, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    clock = WrongClock(tmp_path)
+    clock.jump(3600)
+    with monkeypatch.context() as ahead:
+        for name, value in clock.variables().items():
+            ahead.setenv(name, value)
+        full = settings.model_copy(update={"disk_reserve_bytes": 2**60, **SHORT_STALL})
+        first = slots.start(full, "a")
+    await counting.submit(20, 0.01)
+    await counting.until(lambda job: "disk is full" in job.message)
+    first.terminate()
+    first.wait()
+    slots.start(settings, "b")
     assert (await counting.until_final()).state == "succeeded"
 
 
