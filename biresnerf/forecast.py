@@ -74,6 +74,10 @@ class Forecast:
         self._measured: set[Unit] = set()
         self._fraction = 0.0
 
+    def begins(self) -> None:
+        """What was until now, as the compilation of kernels, is no part of the run: the next one will not have it."""
+        self._began = time.monotonic()
+
     def continues(self, seconds: float) -> None:
         """The run has taken so long before it was interrupted."""
         self._earlier_s = seconds
@@ -177,10 +181,18 @@ def remembered_rates(device: str, threads: int) -> dict[Unit, float]:
     return rates | {unit: known[unit] for unit in rates if unit in known}
 
 
+def latest_machine() -> tuple[str, int] | None:
+    """The kind of device of the latest run here that was measured, and its threads; None if none was."""
+    names = [name.split(" ") for name in _read_rates()]
+    known = [(name[0], int(name[1])) for name in names if len(name) == 2 and name[1].isdecimal()]
+    return known[-1] if known else None
+
+
 def remember_rates(device: str, threads: int, rates: Mapping[Unit, float]) -> None:
     """Keep what a run measured, for the next. Where nothing can be written, nothing is kept."""
     all_rates = _read_rates()
-    known = all_rates.setdefault(f"{device} {threads}", {})
+    known = all_rates.pop(f"{device} {threads}", {})
+    all_rates[f"{device} {threads}"] = known  # the latest comes last
     for unit, rate in rates.items():
         known[unit] = rate if unit not in known else known[unit] + LEARNING * (rate - known[unit])
     path = cache_folder() / RATES_FILE

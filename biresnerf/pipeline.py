@@ -13,6 +13,7 @@ import torch
 from biresnerf.compile_kernels import compile_kernels
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.part_of_set import without_photos
 from biresnerf.data.photos.images import load_images
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
@@ -82,6 +83,7 @@ def refine_poses(
 
     strict = setup.options.bad_frames == "refuse"
     dataset = input if isinstance(input, Dataset) else read_dataset(Path(input), strict=strict)
+    dataset = without_photos(dataset, setup.options.leave_out)
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
     keep_to_budget(stages, started, setup.options.steps)
@@ -149,6 +151,7 @@ def _set_up(
     message = "loading kernels (the first run compiles them)"
     monitor.report(Progress(stage="preparing", message=message, options=options))
     compile_kernels(field=device.type == "cpu")
+    forecast.begins()
     return _Setup(folder, asked, options, device, threads, earlier, monitor)
 
 

@@ -141,6 +141,7 @@ def test_every_contract_has_a_violation_that_breaks_it():
         ("biresnerf.client", (*HEAVY, "pydantic_settings", "workers", "service")),
         ("workers.jobs.jobs", ("torch", "numba", "pycolmap")),
         ("workers.queue.slot", ("torch", "numba", "pycolmap")),
+        ("workers.datasets.shown_set", ("torch", "numba", "pycolmap")),
         ("service.app", ("torch", "numba", "pycolmap")),
     ],
 )

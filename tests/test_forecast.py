@@ -138,6 +138,17 @@ def test_the_first_step_counts_only_until_there_is_another_and_later_ones_alike(
     assert set(found.measured()) == {"coarse step"}
 
 
+def test_time_before_the_run_begins_is_no_part_of_it(monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr("biresnerf.forecast.time.monotonic", lambda: clock[0])
+    found = Forecast({**RATES, "image": 1.0})
+    clock[0] += 900  # kernels are compiled
+    found.begins()
+    found.left["mapping"] = 30
+    clock[0] += 10
+    assert found.now() == (0.25, 30)
+
+
 def test_a_machine_remembers_what_its_runs_measured(cache):
     assert remembered_rates("cpu", 2) == {unit: rate / 2 for unit, rate in RATES.items()}
     remember_rates("cpu", 2, {"coarse step": 0.1})

@@ -13,6 +13,7 @@ from workers.datasets.datasets import DatasetStore
 from workers.datasets.uploads import UploadStore
 from workers.jobs.job_updates import JobListener
 from workers.jobs.jobs import JobStore
+from workers.jobs.result_links import ResultLinkStore
 from workers.queue.janitor import Janitor
 from workers.settings.settings import Settings
 from workers.store.files import FileStore, open_files
@@ -41,7 +42,8 @@ class Stores:
     monitor: Monitor
     webhooks: WebhookStore
     janitor: Janitor  # not yet at work
-    share_key: bytes  # signs links to results
+    share_key: bytes  # signs links to files of results
+    links: ResultLinkStore
 
 
 @asynccontextmanager
@@ -70,8 +72,22 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
             keys = KeyStore(database)
             janitor = Janitor(database, files, settings)
             buckets = TokenBuckets(database)
+            links = ResultLinkStore(database)
             yield Stores(
-                jobs, datasets, files, uploads, keys, buckets, tenants, monitor, webhooks, janitor, share_key
+                *(
+                    jobs,
+                    datasets,
+                    files,
+                    uploads,
+                    keys,
+                    buckets,
+                    tenants,
+                    monitor,
+                    webhooks,
+                    janitor,
+                    share_key,
+                ),
+                links=links,
             )
         finally:
             listening.cancel()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from datetime import datetime
+from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field
@@ -21,6 +22,19 @@ LOG_NAME, POSES_NAME, REPORT_NAME = "log.txt", "poses.json", "report.json"
 CRASH_NAME = "crash.txt"  # beside the log, for the operator alone
 THUMBNAIL_NAME = "thumbnail.jpg"
 PREVIEW_FOLDER = "preview"  # of files that show how far a job is
+# What pages show of a dataset: beside the folder that is checked, and in the file store.
+SHOWN_FOLDER = "shown"
+PHOTO_LIST, PHOTO_SHEET, FIRST_PHOTO = "photos.json", "view/contact_sheet.jpg", "thumbnail.jpg"
+
+
+def shown_folder(checked: Path) -> Path:
+    """Where the check of the folder ``checked`` leaves what pages show."""
+    return checked.with_name(SHOWN_FOLDER)
+
+
+def shown_key(dataset_id: str) -> str:
+    """Where the store has the same."""
+    return f"datasets/{dataset_id}/{SHOWN_FOLDER}"
 
 
 def priority_name(number: int) -> PriorityName:

@@ -91,6 +91,9 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     bad_frames: Annotated[Literal["leave_out", "refuse"], Option("seeding", "Bad frames")] = Field(
         "leave_out", description="Frames whose photo, pose or lens is missing or broken, where most are good."
     )
+    leave_out: Annotated[Names, Option("seeding", "Photos to leave out", level="usual")] = Field(
+        (), max_length=10_000, description="Names of photos to treat as if they were not in the set."
+    )
     fixed: Annotated[Names, Option("coarse", "Photos to keep fixed", level="main")] = Field(
         (),
         max_length=10_000,

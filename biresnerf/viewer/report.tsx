@@ -80,7 +80,7 @@ function ReportPage({ data, licences }: { data: Embedded; licences: string }) {
 function Widgets({ data, points }: { data: Embedded; points: readonly PointLayer[] }) {
   const { poses, report, view } = data;
   const urlOf = useCallback((file: string) => data.files[file] ?? null, [data]);
-  const { names, cameras, centres, rows, cellOf } = useWidgetData(poses, report, view, urlOf);
+  const { names, cameras, centres, rows, cellOf, photoOf } = useWidgetData(poses, report, view, urlOf);
   const [selected, setSelected] = useState<number | null>(view?.views[0]?.image ?? (names.length > 0 ? 0 : null));
   const lines = useMemo(() => historyOf(data.history), [data]);
   const choice = { selected, onSelect: setSelected };
@@ -92,7 +92,7 @@ function Widgets({ data, points }: { data: Embedded; points: readonly PointLayer
       <div class="job-pictures">
         <div class="panel panel-scene">
           <h2>Cameras</h2>
-          <SceneView cameras={cameras} points={points} {...choice} />
+          <SceneView {...{ cameras, points, cellOf, photoOf, ...choice }} />
         </div>
         <div class="panel panel-compare">
           <h2>Before and after</h2>

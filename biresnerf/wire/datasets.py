@@ -8,12 +8,14 @@ from urllib.parse import quote
 
 from pydantic import ConfigDict, Field, StringConstraints
 
+from biresnerf.options.presets import PresetName
 from biresnerf.report import IntrinsicsSource
 from biresnerf.wire.base import NO_CONTROLS, Links, Page, Record
 from biresnerf.wire.problems import JobError
 
 DatasetState = Literal["open", "finalizing", "ready", "rejected", "expired"]
 UploadKind = Literal["archive", "file", "signed"]
+Row = tuple[float, float, float, float]
 UploadState = Literal["receiving", "received", "stored", "rejected"]
 
 
@@ -41,6 +43,12 @@ class CheckReport(Record):
     masks: int = Field(examples=[0])
     transparency: bool = Field(description="Whether images have an alpha channel.")
     warnings: tuple[str, ...] = Field(examples=[[]])
+    expected_s: dict[PresetName, float] = Field(
+        {},
+        examples=[{"fast": 95.0, "balanced": 340.0}],
+        description="Seconds that a job with each preset would take, by what the latest jobs there "
+        "measured, or general figures before there was one; on the machine that checked it.",
+    )
 
 
 class DatasetLinks(Links):
@@ -90,6 +98,46 @@ class NewDataset(Record):
         max_length=100_000,
         description="The files that will be sent; the response lists those that are missing.",
     )
+
+
+class CheckedPhoto(Record):
+    """A photo of a checked set."""
+
+    name: str = Field(examples=["images/0001.jpg"], description="As the set's file of poses calls it.")
+    camera: int = Field(examples=[0], description="Index in `cameras`.")
+    world_from_cam: tuple[Row, Row, Row] | None = Field(
+        examples=[[[1, 0, 0, 0.2], [0, 1, 0, 0], [0, 0, 1, -3.1]]],
+        description="The given pose: the upper three rows, OpenCV axes, in the input's world. Null: to be found.",
+    )
+    masked: bool = Field(examples=[False])
+
+
+class CheckedCamera(Record):
+    """A lens with a sensor."""
+
+    model: str = Field(examples=["OPENCV"], description="COLMAP's name.")
+    width: int = Field(examples=[1600])
+    height: int = Field(examples=[1200])
+    params: tuple[float, ...] = Field(
+        examples=[[1380.0, 1380.0, 800.0, 600.0, 0, 0, 0, 0]],
+        description="In COLMAP's order, px of the full size.",
+    )
+
+
+class PhotoSheet(Record):
+    """All photos, small, in the picture `photos.jpg`: photo i lies in row i // columns, in the middle of its cell."""
+
+    columns: int = Field(examples=[7])
+    cell_width: int = Field(examples=[96])
+    cell_height: int = Field(examples=[72])
+
+
+class PhotoList(Record):
+    """The photos of a checked set with the given poses."""
+
+    photos: tuple[CheckedPhoto, ...]
+    cameras: tuple[CheckedCamera, ...]
+    sheet: PhotoSheet | None = Field(description="Null for more than 4,000 photos.")
 
 
 class FileView(Record):

@@ -76,3 +76,37 @@ class ShareView(Record):
         ]
     )
     expires_at: datetime
+
+
+class NewLink(Record):
+    """A link to the page of a job."""
+
+    valid_s: int = Field(7 * 86_400, ge=60, le=90 * 86_400, description="How long it is valid.")
+
+
+class LinkView(Record):
+    """A link that shows one job, read-only, without an API key."""
+
+    id: str = Field(examples=["lnk_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
+    job_id: str = Field(examples=["job_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
+    created_at: datetime
+    expires_at: datetime
+
+
+class NewLinkView(LinkView):
+    """A link just created, with its secret."""
+
+    token: str = Field(
+        examples=["brl_5T0QAZ81M2_kq0h…"],
+        description="Shown once. Sent as a Bearer token it reads this job alone.",
+    )
+    page: str = Field(
+        examples=["/#/shared/job_01JD8Y3V1QKZ5M0C7W2N4T6XAB/brl_5T0QAZ81M2_kq0h…"],
+        description="The page's address, relative to the service. Browsers do not send the part after #.",
+    )
+
+
+class LinkList(Record):
+    """The living links to a job."""
+
+    items: tuple[LinkView, ...]

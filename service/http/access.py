@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import hmac
-import ipaddress
 import logging
 import re
 from contextlib import AbstractContextManager
@@ -22,12 +21,16 @@ from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from biresnerf.wire.results import LinkView
 from service.http.dependencies import Service, service_of
+from service.http.hosts import is_public_name, on_loopback
+from service.http.link_access import LINK_PREFIX, require_shown
 from service.http.problems import ProblemError, problem_of
 from service.http.rate_limits import Allowance, RateLimit
 from workers.datasets.datasets import DatasetStore
 from workers.datasets.uploads import UploadStore
 from workers.jobs.jobs import JobStore
+from workers.jobs.result_links import ResultLinkStore
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.tenants.api_keys import ALL_SCOPES, KeyRefused
@@ -53,11 +56,15 @@ _CHALLENGE = 'Bearer realm="biresnerf"'
 
 @dataclass(frozen=True)
 class Identity:
-    """The tenant and the scopes of a request. ``key_id`` is None where no key is needed."""
+    """The tenant and the scopes of a request. ``key_id`` is None where no key is needed.
+
+    ``link`` is that of the request, which then reads one job alone.
+    """
 
     tenant: str
     scopes: frozenset[KeyScope]
     key_id: str | None = None
+    link: LinkView | None = None
 
 
 @dataclass(frozen=True)
@@ -71,10 +78,12 @@ class Caller:
     tenant: str
     scopes: frozenset[KeyScope]
     client: str | None
+    link: LinkView | None
     jobs: JobStore
     datasets: DatasetStore
     uploads: UploadStore
     webhooks: WebhookStore
+    links: ResultLinkStore
 
     def require(self, scope: KeyScope) -> None:
         """Raises ``ProblemError`` (``scope_required``) if the caller lacks the scope."""
@@ -161,6 +170,12 @@ async def identify(service: Service, request: Request) -> Identity:
     bearer = _BEARER.fullmatch(text)
     if bearer is None:
         raise _unknown("The Authorization header is not of the form `Bearer brn_…`.")
+    if bearer[1].startswith(LINK_PREFIX):
+        found = await service.stores.links.recognise(bearer[1])
+        if found is None:
+            raise _unknown("The link is unknown, expired or revoked.")
+        require_shown(found.link.job_id, request.method, request.scope["path"])
+        return Identity(found.tenant, frozenset({"read"}), found.link.id, found.link)
     try:
         key = await service.stores.keys.recognise(bearer[1])
     except KeyRefused:
@@ -179,7 +194,7 @@ async def _anonymous(service: Service, request: Request) -> Identity:
             hint="Send the header `Authorization: Bearer brn_…`; `biresnerf keys create` makes a key.",
             headers={"WWW-Authenticate": _CHALLENGE},
         )
-    if service.settings.auth == "auto" and _is_public_name(request.url.hostname or ""):
+    if service.settings.auth == "auto" and is_public_name(request.url.hostname or ""):
         # DNS rebinding: a page's own host name may resolve to this machine, and would then be of the same site.
         raise ProblemError(
             "cross_site",
@@ -196,11 +211,6 @@ async def _needs_key(service: Service) -> bool:
     return service.settings.auth == "required"
 
 
-def _is_public_name(host: str) -> bool:
-    """Whether others control what the name resolves to: it has a dot and is no loopback address."""
-    return "." in host.rstrip(".") and not on_loopback(host)
-
-
 async def log_access(service: Service) -> None:
     """Logs at startup who can access the service."""
     settings = service.settings
@@ -212,16 +222,6 @@ async def log_access(service: Service) -> None:
                 log.warning(
                     "no API key exists yet, so no client has access; create one: biresnerf keys create NAME"
                 )
-
-
-def on_loopback(host: str) -> bool:
-    """Whether the address or name is this machine's alone."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
 
 
 async def may_scrape(service: Service, request: Request) -> bool:
@@ -276,11 +276,12 @@ async def _caller(
     service, identity = service_of(request), request.state.identity
     tenant, stores = identity.tenant, service.stores
     caller = Caller(
-        *(service, tenant, identity.scopes, request.state.client),
+        *(service, tenant, identity.scopes, request.state.client, identity.link),
         jobs=stores.jobs.for_tenant(tenant),
         datasets=stores.datasets.for_tenant(tenant),
         uploads=stores.uploads.for_tenant(tenant),
         webhooks=stores.webhooks.for_tenant(tenant),
+        links=stores.links.for_tenant(tenant),
     )
     for scope in needed.scopes:
         caller.require(scope)  # type: ignore[arg-type]

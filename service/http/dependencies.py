@@ -116,6 +116,7 @@ DatasetId = Annotated[str, PathParameter(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XA
 UploadId = Annotated[str, PathParameter(examples=["up_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
 WebhookId = Annotated[str, PathParameter(examples=["wh_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
 DeliveryId = Annotated[str, PathParameter(examples=["msg_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
+LinkId = Annotated[str, PathParameter(examples=["lnk_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
 IfNoneMatch = Annotated[str | None, Header()]
 
 

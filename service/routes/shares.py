@@ -1,4 +1,4 @@
-"""Signed links to single files of a result, for people and programs without a key."""
+"""Links for people and programs without a key: signed ones to single files, and revocable ones to a job's page."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from urllib.parse import quote
 from fastapi import APIRouter, Query
 from fastapi.responses import Response, StreamingResponse
 
-from biresnerf.wire.results import NewShare, ShareView
-from service.http.access import JobWriter
-from service.http.dependencies import CurrentService, JobId
+from biresnerf.wire.results import LinkList, LinkView, NewLink, NewLinkView, NewShare, ShareView
+from service.http.access import JobWriter, ReadCaller
+from service.http.dependencies import CurrentService, JobId, LinkId
 from service.http.problems import ProblemError, declared
 from service.intake.json_body import JsonRoute
 from service.responses.downloads import (
@@ -43,6 +43,39 @@ async def share_artifact(
     href = f"/v1/shared/{quote(job_id, safe='')}/{quote(artifact.name)}?expires={expires}&signature={signed}"
     response.headers["Location"] = href
     return ShareView(name=artifact.name, href=href, expires_at=datetime.fromtimestamp(expires, UTC))
+
+
+@router.post(
+    "/jobs/{job_id}/links", status_code=201, responses=declared("quota_exhausted", "result_not_ready")
+)
+async def create_link(
+    job_id: JobId,
+    caller: JobWriter,  # the link outlives the key that made it
+    body: NewLink,
+) -> NewLinkView:
+    """Creates a link that shows the page of this job to anyone who has it. It expires, and can be revoked."""
+    link, token = await caller.links.create(job_id, body.valid_s)
+    return NewLinkView(**link.model_dump(), token=token, page=f"/#/shared/{job_id}/{token}")
+
+
+@router.get("/jobs/{job_id}/links")
+async def list_links(job_id: JobId, caller: ReadCaller) -> LinkList:
+    """The links to the page of this job that are still valid."""
+    return LinkList(items=await caller.links.list(job_id))
+
+
+@router.delete("/jobs/{job_id}/links/{link_id}", status_code=204)
+async def revoke_link(job_id: JobId, link_id: LinkId, caller: JobWriter) -> None:
+    """Revokes a link: it opens nothing from the next request on."""
+    await caller.links.revoke(job_id, link_id)
+
+
+@router.get("/jobs/{job_id}/link")
+async def get_link(job_id: JobId, caller: ReadCaller) -> LinkView:
+    """The link with which this request was made."""
+    if caller.link is None:
+        raise ProblemError("not_found", "This request was not made with a link.")
+    return caller.link
 
 
 @router.get("/shared/{job_id}/{name:path}", response_class=StreamingResponse, responses=_SHARED)

@@ -3,21 +3,27 @@ import { render } from "preact";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { apiKey, keyRequired, setKey } from "./api/http";
 import { useStore } from "./api/store";
+import { ComparePage } from "./compare/page";
 import { JobPage } from "./job/page";
 import { JobsPage } from "./jobs/list";
+import { SharedPage } from "./job/shared_page";
 import { ErrorBoundary } from "./parts/error_boundary";
 import { KeyForm } from "./parts/key_form";
 import { DatasetPage } from "./upload/dataset_page";
 
 interface Route {
-  name: "jobs" | "job" | "dataset";
+  name: "jobs" | "job" | "dataset" | "compare" | "shared";
   id: string;
+  /** The second job of a comparison; the token of a link. */
+  other?: string;
 }
 
 function routeOf(hash: string): Route {
-  const [, kind, id] = hash.replace(/^#/, "").split("/");
+  const [, kind, id, other] = hash.replace(/^#/, "").split("/");
   if (kind === "jobs" && id) return { name: "job", id };
   if (kind === "datasets" && id) return { name: "dataset", id };
+  if (kind === "compare" && id && other) return { name: "compare", id, other };
+  if (kind === "shared" && id && other) return { name: "shared", id, other };
   return { name: "jobs", id: "" };
 }
 
@@ -45,11 +51,13 @@ function App() {
           BiResNeRF
         </a>
         <nav aria-label="Main">
-          <a href="#/" aria-current={route.name === "jobs" ? "page" : undefined}>
-            Jobs
-          </a>
+          {route.name !== "shared" && (
+            <a href="#/" aria-current={route.name === "jobs" ? "page" : undefined}>
+              Jobs
+            </a>
+          )}
           <a href="docs">API</a>
-          {key && (
+          {key && route.name !== "shared" && (
             <button class="plain-link" onClick={() => setKey(null)}>
               Forget the key
             </button>
@@ -60,7 +68,7 @@ function App() {
         {keyError !== null ? (
           <KeyForm error={keyError} />
         ) : (
-          <ErrorBoundary key={`${route.name} ${route.id} ${key}`}>
+          <ErrorBoundary key={`${route.name} ${route.id} ${route.other} ${route.name === "shared" || key}`}>
             <View {...route} />
           </ErrorBoundary>
         )}
@@ -69,7 +77,9 @@ function App() {
   );
 }
 
-function View({ name, id }: Route) {
+function View({ name, id, other = "" }: Route) {
+  if (name === "shared") return <SharedPage id={id} token={other} />;
+  if (name === "compare") return <ComparePage ids={[id, other]} />;
   if (name === "job") return <JobPage id={id} />;
   if (name === "dataset") return <DatasetPage id={id} />;
   return <JobsPage />;

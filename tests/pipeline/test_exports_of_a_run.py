@@ -46,8 +46,11 @@ def test_a_text_model_comes_back_in_both_forms_with_its_ids_and_points_of_the_re
     points = replace(exact.points, track_image_ids=10 * exact.points.track_image_ids, xyz=xyz)
     write_colmap_text(replace(exact, images=images, points=points), scene / "sparse/0")
 
-    options = tiny_run(start="given", verdict=False, exports=("kitti", "pinhole"))
+    options = tiny_run(
+        start="given", verdict=False, exports=("kitti", "pinhole"), leave_out=(f"images/{names[6]}",)
+    )
     report = refine_poses(scene, tmp_path / "out", options)
+    del images[70]
     model = read_colmap_model(tmp_path / "out/colmap/sparse/0")
     text = read_colmap_model(tmp_path / "out/colmap/sparse_txt/0")
     assert {i: image.name for i, image in model.images.items()} == {
@@ -73,6 +76,6 @@ def test_a_text_model_comes_back_in_both_forms_with_its_ids_and_points_of_the_re
     centres = np.stack(
         [rigid_inverse(matrix_of_pose(image.cam_from_world))[:3, 3] for image in model.images.values()]
     )
-    assert np.abs(centres - noisy[:, :3, 3]).max() > 1e-4
+    assert np.abs(centres - noisy[:6, :3, 3]).max() > 1e-4
     assert (tmp_path / "out/kitti.txt").is_file()
-    assert len(list((tmp_path / "out/pinhole/images").iterdir())) == 7
+    assert len(list((tmp_path / "out/pinhole/images").iterdir())) == len(report.images) == 6

@@ -278,6 +278,7 @@ class Tenant:
     upload: str
     webhook: str
     delivery: str
+    link: str
 
 
 @pytest.fixture(scope="session")
@@ -291,7 +292,8 @@ def tenants(closed: Running, scene: Path) -> Iterator[tuple[Tenant, Tenant]]:
         job = finished(http, submit(http, dataset)["id"])["id"]
         webhook = http.post("/v1/webhooks", json={"url": "http://127.0.0.1:9/in"}).json()["id"]
         delivery = http.post(f"/v1/webhooks/{webhook}/test").json()["id"]
-        made.append(Tenant(http, key, dataset, job, new_upload(http), webhook, delivery))
+        link = http.post(f"/v1/jobs/{job}/links", json={}).json()["id"]
+        made.append(Tenant(http, key, dataset, job, new_upload(http), webhook, delivery, link))
     yield made[0], made[1]
     for tenant in made:
         tenant.http.close()

@@ -41,6 +41,15 @@ DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 360, "height": 740}
 # On a machine that others use as well.
 PATIENCE_MS = 480_000
 expect.set_options(timeout=PATIENCE_MS)
+# The browser's own notifications, noted; and a user who looks at another window.
+LOOKS_ELSEWHERE = """
+    window.told = [];
+    Document.prototype.hasFocus = () => false;
+    const Own = window.Notification;
+    window.Notification = class extends Own {
+        constructor(title, more) { super(title, more); window.told.push(title); }
+    };
+"""
 # What of a page's accessibility may not be wrong.
 SERIOUS = {"serious", "critical"}
 

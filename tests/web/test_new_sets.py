@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,7 +37,50 @@ def test_a_sample_set_is_one_click_away(page: Page, service: Running) -> None:
     page.goto(service.url)
     page.get_by_role("button", name="Try a sample set").click()
     expect(check_row(page, "Images")).to_contain_text("24 images")
+    times = page.locator(".preset-time")
+    expect(times).to_have_count(4)
+    expect(times.first).to_have_text(re.compile(r"about \d+(\.\d)? (s|min|h) here"))
+    # It waits in the list, with its first photo, until its job is started.
+    page.goto(service.url)
+    waiting = page.get_by_role("region", name="Not started yet")
+    expect(waiting).to_contain_text("24 photos · ready to start")
+    page.wait_for_function("() => document.querySelector('.set-card img')?.naturalWidth > 0")
+    waiting.get_by_role("button", name="Delete sample").click()
+    expect(waiting).to_be_hidden()
     expect(page.get_by_role("button", name="Refine the poses")).to_be_visible()
+
+
+def test_a_checked_set_shows_its_photos_and_cameras_and_leaves_photos_out(
+    tab: Watched, service: Running, kitchen: Path, api: httpx.Client
+) -> None:
+    page = tab.page
+    page.goto(service.url)
+    drop(page, kitchen)
+    photos = page.get_by_role("button", name=re.compile("^Leave out "))
+    expect(photos).to_have_count(10)
+    expect(page.get_by_role("application")).to_have_attribute(
+        "aria-label", re.compile("^Picture of 10 cameras")
+    )
+    plan = page.get_by_role("region", name="What will happen")
+    expect(plan).to_contain_text("Your poses are the start.")
+    expect(plan).to_contain_text(re.compile(r"about \d+(\.\d)? (s|min|h) on this machine"))
+    stage, shown = page.get_by_role("application"), page.get_by_role("checkbox", name="Photos", exact=True)
+    shown.uncheck()
+    bare = stage.screenshot()
+    shown.check()
+    while stage.screenshot() == bare:  # until the picture of all photos has arrived
+        page.wait_for_timeout(100)
+    photos.nth(3).click()
+    expect(plan).to_contain_text("1 photo of 10 is left out.")
+    expect(photos.nth(3)).to_have_attribute("aria-pressed", "true")
+    tab.screenshot("checked-set")
+    assert tab.serious_findings() == []
+    with page.expect_response(lambda sent: sent.url.endswith("/v1/jobs")) as sent:
+        page.get_by_role("button", name="Refine the poses").click()
+    job = sent.value.json()
+    assert job["options"] == {"preset": "balanced", "leave_out": ["./train/r_3"]}
+    api.post(f"/jobs/{job['id']}/cancel")
+    assert tab.complaints == []
 
 
 def a_pdf(folder: Path) -> None:

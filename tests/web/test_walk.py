@@ -5,19 +5,21 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import shlex
-import subprocess
-import sys
+import re
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import httpx
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, expect
 
 from tests.service.conftest import Running, operator
-from tests.web.conftest import Watched, again, another_job, curve_steps
+from tests.web.comparison import expect_compared
+from tests.web.conftest import LOOKS_ELSEWHERE, Watched, again, another_job, curve_steps
+from tests.web.download_lines import expect_lines_to_bring_the_same
+from tests.web.photo_over_view import expect_photo_over_the_view
+from tests.web.sharing import expect_a_link_to_show_the_page_until_it_is_revoked
 
 
 def test_progress_is_live_and_a_reload_keeps_the_curves(desktop: Watched, job_url: str) -> None:
@@ -31,6 +33,14 @@ def test_progress_is_live_and_a_reload_keeps_the_curves(desktop: Watched, job_ur
         "was => Number(document.querySelector('[role=progressbar]').getAttribute('aria-valuenow')) > was",
         arg=share,
     )
+    # One bar, as long as the share of the whole run that is done, and what it does now.
+    expect(page.get_by_role("progressbar")).to_have_count(1)
+    filled = (
+        "e => { const [b, f] = [e, e.firstChild]; return [f.style.width, b.getAttribute('aria-valuenow')] }"
+    )
+    width, now = bar.evaluate(filled)
+    assert int(float(width.removesuffix("%"))) == int(now)
+    expect(page.locator(".run-words")).to_contain_text(re.compile(r"\d+ % · \d+(\.\d)? (s|min|h) left"))
     page.reload()
     # The page asks for the events again, which takes a moment. Live events alone would begin later.
     while curve_steps(page)[1] < shown[1]:
@@ -43,13 +53,12 @@ def test_the_slider_goes_from_the_inputs_poses_to_the_refined_ones(
 ) -> None:
     page = desktop.page
     slider = page.get_by_role("slider", name="From the input's poses to the refined ones")
-    stage = page.get_by_role("application")
     slider.press("End")
-    refined = stage.screenshot()
+    refined = (stage := page.get_by_role("application")).screenshot()
     slider.press("Home")
-    assert slider.input_value() == "0"
     assert stage.screenshot() != refined
     slider.press("End")
+    expect_photo_over_the_view(page)
 
 
 def test_the_swipe_uncovers_the_view_before_and_the_photo(desktop: Watched, done: dict[str, Any]) -> None:
@@ -126,24 +135,7 @@ def test_downloads_are_the_artifacts_to_the_byte(desktop: Watched, digests: dict
 def test_the_lines_beside_a_download_bring_the_same(
     desktop: Watched, digests: dict[str, str], tmp_path: Path
 ) -> None:
-    page = desktop.page
-    row = page.get_by_role("listitem").filter(has_text="For COLMAP").first
-    row.get_by_role("button", name="curl, Python").click()
-    python = row.get_by_label("Python", exact=True).inner_text()
-    subprocess.run([sys.executable, "-c", python], cwd=tmp_path, check=True)
-    brought = tmp_path / "result"
-    found = {
-        path.relative_to(brought).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in brought.rglob("*")
-        if path.is_file()
-    }
-    assert found == {name: sha for name, sha in digests.items() if name.startswith("colmap/sparse/")}
-    row = page.get_by_role("listitem").filter(has_text="For nerfstudio")
-    row.get_by_role("button", name="curl, Python").click()
-    curl = row.get_by_label("curl", exact=True).inner_text()
-    subprocess.run(shlex.split(curl), cwd=tmp_path, check=True, capture_output=True)
-    sent = (tmp_path / "transforms_nerfstudio.json").read_bytes()
-    assert hashlib.sha256(sent).hexdigest() == digests["transforms_nerfstudio.json"]
+    expect_lines_to_bring_the_same(desktop.page, digests, tmp_path)
 
 
 def test_a_form_that_is_not_there_is_written_on_demand(desktop: Watched, done: dict[str, Any]) -> None:
@@ -168,7 +160,7 @@ def test_all_of_it_can_be_reached_by_keyboard(desktop: Watched, done: dict[str, 
     page = desktop.page
     page.get_by_role("link", name="Jobs").focus()
     reached = []
-    for _ in range(12):
+    for _ in range(30):
         page.keyboard.press("Tab")
         reached.append(page.evaluate("document.activeElement.textContent"))
         if "kitchen" in reached[-1]:
@@ -223,6 +215,8 @@ def test_a_job_is_run_again_ended_and_deleted(
     tab: Watched, job_url: str, done: dict[str, Any], api: httpx.Client
 ) -> None:
     page = tab.page
+    page.context.grant_permissions(["notifications"])
+    page.add_init_script(LOOKS_ELSEWHERE)
     dialog = again(page, job_url)
     dialog.get_by_text("More options").click()
     steps = dialog.get_by_label("Steps", exact=True)
@@ -233,9 +227,11 @@ def test_a_job_is_run_again_ended_and_deleted(
     job = another_job(page, job_url)
     options = api.get(f"/jobs/{job}").json()["options"]
     assert options == {**done["options"], "steps": 20000}
+    page.get_by_label("Notify me when it ends").check()
     page.get_by_role("button", name="Cancel", exact=True).click()
     page.get_by_role("button", name="Cancel and keep nothing").click()
     expect(page.get_by_role("heading", level=1)).to_contain_text("cancelled")
+    assert page.evaluate("window.told") == ["kitchen: cancelled"]
     page.get_by_role("button", name="Delete", exact=True).click()
     page.get_by_role("button", name="Delete it").click()
     page.wait_for_url("**/#/")
@@ -267,13 +263,16 @@ def test_a_fork_goes_on_after_stage_1_and_its_end_on_request_leaves_a_partial_re
     page.get_by_text("Options and times").click()
     expect(page.get_by_role("link", name=done["id"])).to_be_visible()
     tab.screenshot("job-partial")
+    page.goto(job_url.partition("#")[0])
+    expect_compared(page, api, done["id"], fork)
+    tab.screenshot("compared")
     assert tab.serious_findings() == []
     assert tab.complaints == []
 
 
 # Last: from then on the service asks everybody for a key.
-def test_a_service_with_keys_is_used_with_one(
-    tab: Watched, service: Running, job_url: str, done: dict[str, Any]
+def test_a_service_with_keys_is_used_with_one_and_a_result_is_shared_without(
+    tab: Watched, browser: Browser, service: Running, job_url: str, done: dict[str, Any]
 ) -> None:
     with ThreadPoolExecutor(1) as aside:  # Playwright's own loop runs in this thread
         made = aside.submit(operator, service.data_dir, "keys", "create", "page", "--tenant", "local")
@@ -294,4 +293,5 @@ def test_a_service_with_keys_is_used_with_one(
     assert coming.value.suggested_filename == "transforms_nerfstudio.json"
     page.reload()
     expect(page.get_by_role("heading", name="Downloads")).to_be_visible()
+    expect_a_link_to_show_the_page_until_it_is_revoked(browser, page, service.url)
     assert tab.outside == []

@@ -18,13 +18,15 @@ from psycopg.types.json import Jsonb
 
 from biresnerf.wire.datasets import CheckReport
 from biresnerf.wire.problems import JobError
-from workers.database.database import Database
+from workers.database.database import Connection, Database
 from workers.process.turns import Turns
 from workers.process.waiting import retry_while_unavailable
+from workers.records import shown_folder, shown_key
 from workers.run.child import Child, log_tail
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
+from workers.store.trash import discard, forget
 
 log = logging.getLogger(__name__)
 
@@ -92,21 +94,17 @@ class Checker:
             )
         )
         renewing = asyncio.create_task(self._renew(dataset_id, token))
+        shown = shown_key(dataset_id)
         try:
+            # Until the outcome is recorded: this process may be killed, or the dataset deleted, before that.
+            await retry_while_unavailable(
+                lambda: self._database.run(discard, shown, after_s=self._settings.upload_expiry_s)
+            )
             files = [(row["key"], row["path"]) for row in rows]
-            outcome = await check_files(self._files, files, self._settings)
+            outcome = await check_files(self._files, files, self._settings, shown)
         finally:
             renewing.cancel()
-        found = Jsonb(outcome.model_dump(mode="json"))
-        await retry_while_unavailable(
-            lambda: self._database.fetch(
-                "UPDATE datasets SET state = %s, report = %s, error = %s, revision = revision + 1,"
-                " check_token = NULL, check_until = NULL"
-                " WHERE id = %s AND state = 'finalizing' AND check_token = %s",
-                *(("rejected", None, found) if isinstance(outcome, JobError) else ("ready", found, None)),
-                *(dataset_id, token),
-            )
-        )
+        await retry_while_unavailable(lambda: self._database.run(_record, dataset_id, token, outcome))
 
     async def _renew(self, dataset_id: str, token: uuid.UUID) -> None:
         while True:
@@ -115,10 +113,28 @@ class Checker:
                 await self._take(dataset_id, token)
 
 
+async def _record(
+    connection: Connection, dataset_id: str, token: uuid.UUID, outcome: CheckReport | JobError
+) -> None:
+    """Write the outcome down, unless another process has the lease by now."""
+    found = Jsonb(outcome.model_dump(mode="json"))
+    ours = await connection.row(
+        "UPDATE datasets SET state = %s, report = %s, error = %s, revision = revision + 1,"
+        " check_token = NULL, check_until = NULL"
+        " WHERE id = %s AND state = 'finalizing' AND check_token = %s RETURNING id",
+        *(("rejected", None, found) if isinstance(outcome, JobError) else ("ready", found, None)),
+        *(dataset_id, token),
+    )
+    if ours and isinstance(outcome, CheckReport):
+        await forget(connection, shown_key(dataset_id))
+
+
 async def check_files(
-    files: FileStore, members: Sequence[tuple[str, str]], settings: Settings
+    files: FileStore, members: Sequence[tuple[str, str]], settings: Settings, shown: str
 ) -> CheckReport | JobError:
     """Run the check program on the files, given as (key, path). Its crash or timeout rejects them too.
+
+    What pages show of a good set is stored below the key ``shown``.
 
     Where it is killed (perhaps by the kernel, because another process took too much memory) it is tried once more.
     """
@@ -134,6 +150,10 @@ async def check_files(
         if killed:
             log.warning("the check of %d files was killed; trying once more", len(members))
             outcome, _ = await _run(dataset, folder / "log.txt", settings)
+        if isinstance(outcome, CheckReport):
+            made = shown_folder(dataset)
+            for path in sorted(path for path in made.rglob("*") if path.is_file()):
+                await files.put_path(f"{shown}/{path.relative_to(made).as_posix()}", path)
         return outcome
     finally:
         shutil.rmtree(folder, ignore_errors=True)

@@ -1,8 +1,8 @@
 """The program that validates a dataset: `python -m workers.datasets.dataset_check_process FOLDER`.
 
 Writes one line of JSON to standard output: ``{"report": {...}}`` (exit status 0), or ``{"error": a fault}``
-(exit status 2). It reads what strangers sent, so it confines itself
-first: memory, CPU time, no files written. Loads neither torch nor pycolmap; poses that are missing are
+(exit status 2), and leaves in a folder beside it what pages show of the set. It reads what strangers sent, so it
+confines itself first: memory, CPU time, size of files. Loads neither torch nor pycolmap; poses that are missing are
 found by the job, not here.
 """
 
@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from biresnerf.errors import InputError
+from workers.records import shown_folder
 
 EXIT_INPUT_ERROR = 2
 # Address space: numpy and Pillow, and four decoders with pictures of up to 150 million pixels.
 MEMORY_BYTES = 6 * 2**30
 CPU_S = 3600
-# Decoded in full, then kept as thumbnails: the check needs no pixels afterwards.
-THUMBNAIL_PX = 16
+FILE_BYTES = 64 * 2**20
 
 
 def main(folder: Path) -> int:
@@ -30,7 +30,7 @@ def main(folder: Path) -> int:
     answer_to = os.dup(1)
     os.dup2(2, 1)  # whatever a library prints must not mix with the answer
     try:
-        answer: dict[str, Any] = {"report": check(folder)}
+        answer: dict[str, Any] = {"report": check(folder, shown_folder(folder))}
         status = 0
     except InputError as error:
         where = error.where.replace(f"{folder}/", "").replace(str(folder), "the dataset")
@@ -41,8 +41,8 @@ def main(folder: Path) -> int:
     return status
 
 
-def check(folder: Path) -> dict[str, Any]:
-    """Read everything in ``folder`` and decode every image; returns what was found.
+def check(folder: Path, shown: Path) -> dict[str, Any]:
+    """Read everything in ``folder`` and decode every image; returns what was found, and writes ``shown`` for pages.
 
     Raises:
         InputError: what is wrong, with which file, and a hint.
@@ -50,9 +50,11 @@ def check(folder: Path) -> dict[str, Any]:
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.photos.images import load_images
     from biresnerf.data.photos.turning_object import turning_notes
+    from workers.datasets.shown_set import expected_seconds, small_side, write_shown
 
     dataset = read_dataset(folder, within=folder)
-    images = load_images(dataset, THUMBNAIL_PX)
+    images = load_images(dataset, small_side(len(dataset)))
+    write_shown(dataset, images, shown)
     posed = int(dataset.posed.sum())
     return {
         "images": len(dataset),
@@ -66,6 +68,7 @@ def check(folder: Path) -> dict[str, Any]:
         "masks": sum(frame.mask is not None for frame in dataset.frames),
         "transparency": images.alpha is not None,
         "warnings": [*dataset.warnings, *turning_notes(dataset)],
+        "expected_s": expected_seconds(dataset, unbounded=images.background is None),
     }
 
 
@@ -75,6 +78,7 @@ def confine() -> None:
         (resource.RLIMIT_AS, MEMORY_BYTES),
         (resource.RLIMIT_CPU, CPU_S),
         (resource.RLIMIT_CORE, 0),
+        (resource.RLIMIT_FSIZE, FILE_BYTES),
         (resource.RLIMIT_NOFILE, 256),
     ):
         _, most = resource.getrlimit(kind)

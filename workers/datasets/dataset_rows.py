@@ -24,6 +24,11 @@ DATASET = """
         FROM dataset_files WHERE dataset_id = datasets.id) AS total ON true"""
 # With the store's tenant as parameter; none for all tenants.
 MINE = "datasets.tenant = coalesce(%s, datasets.tenant)"
+# Waits for its first job.
+UNUSED = (
+    "(state IN ('open', 'finalizing', 'ready')"
+    " AND NOT EXISTS (SELECT 1 FROM dataset_jobs WHERE dataset_id = datasets.id))"
+)
 # Files of the manifest that lack, and a key where the same tenant's same bytes lie.
 KNOWN = f"""
     SELECT DISTINCT ON (entry.path) entry.path, file.key, file.size, file.sha256

@@ -19,6 +19,7 @@ from workers.datasets.dataset_rows import (
     DATASET,
     KNOWN,
     MINE,
+    UNUSED,
     file_key,
     lock_dataset,
     record_file,
@@ -28,7 +29,7 @@ from workers.datasets.dataset_rows import (
 from workers.jobs.job_rows import jobs_of_dataset
 from workers.jobs.quotas import require_byte_quota
 from workers.process.waiting import retry_while_unavailable
-from workers.records import NEWEST_FIRST, DatasetFile, newest_first, page_of, record_from_row
+from workers.records import NEWEST_FIRST, DatasetFile, newest_first, page_of, record_from_row, shown_key
 from workers.settings.errors import Conflict, Expired, LimitReached, NotFound
 from workers.settings.settings import Settings
 from workers.store.files import FileStore, StoredFile
@@ -73,12 +74,19 @@ class DatasetStore(OwnedStore):
             return await self._required(connection, dataset_id)
 
     async def list(
-        self, *, state: DatasetState | None = None, limit: int = 50, cursor: str | None = None
+        self,
+        *,
+        state: DatasetState | None = None,
+        unused: bool = False,
+        limit: int = 50,
+        cursor: str | None = None,
     ) -> Page[DatasetView]:
-        """Datasets, newest first; raises `InputError` (``bad_cursor``)."""
+        """Datasets, newest first; ``unused`` ones wait for their first job. Raises `InputError` (``bad_cursor``)."""
         rows = await self._database.fetch(
-            DATASET + f" WHERE {MINE} AND (%s::text IS NULL OR state = %s)" + NEWEST_FIRST,
-            *(self._tenant, state, state, *newest_first(cursor, limit)),
+            DATASET
+            + f" WHERE {MINE} AND (%s::text IS NULL OR state = %s) AND (NOT %s OR {UNUSED})"
+            + NEWEST_FIRST,
+            *(self._tenant, state, state, unused, *newest_first(cursor, limit)),
         )
         return page_of((record_from_row(DatasetView, row) for row in rows), limit)
 
@@ -223,6 +231,18 @@ class DatasetStore(OwnedStore):
             sql = FILE + " WHERE dataset_id = %s AND path > %s ORDER BY path LIMIT %s"
             rows = await connection.rows(sql, dataset_id, after, limit + 1)
         return page_of(map(DatasetFile.model_validate, rows), limit, ("path",))
+
+    async def shown(self, dataset_id: str, name: str) -> bytes:
+        """A file that shows a checked dataset; raises `NotFound`, `Expired`."""
+        if (await self.get(dataset_id)).state == "expired":
+            raise Expired(f"The files of dataset {dataset_id} were not used for long and are gone.")
+        key = f"{shown_key(dataset_id)}/{name}"
+        try:
+            return b"".join([chunk async for chunk in self._files.read(key)])
+        except NotFound:
+            raise NotFound(
+                f"Dataset {dataset_id} has no pictures: they are made when it is checked."
+            ) from None
 
     async def finalize(self, dataset_id: str) -> DatasetView:
         """Freeze the content: ``open`` becomes ``finalizing`` (other states come back as they are).

@@ -42,6 +42,11 @@ async def rescue(connection: Connection, folder: str) -> None:
         )
 
 
+async def forget(connection: Connection, folder: str) -> None:
+    """Keep a folder that was to be deleted, where it may be gone already without harm."""
+    await connection.execute("DELETE FROM trash WHERE prefix = %s", (folder,))
+
+
 async def delete_unless_rescued(database: Database, files: FileStore, folder: str) -> None:
     """Delete a listed folder now; where the database is away, a janitor does it in its time."""
     listed = "UPDATE trash SET not_before = clock_timestamp() WHERE prefix = %s RETURNING id"

@@ -37,6 +37,7 @@ def inspect_command(
     """
     asked = parse_options({**settings, **({"preset": preset} if preset else {})})
     from biresnerf.data.formats.read_dataset import read_dataset
+    from biresnerf.data.model.part_of_set import without_photos
     from biresnerf.data.photos.images import load_images
     from biresnerf.data.photos.turning_object import turning_notes
     from biresnerf.field.backends import resolve_here
@@ -44,6 +45,7 @@ def inspect_command(
     options, _ = resolve_here(asked)
     dataset = read_dataset(input_path)
     missing_names = sorted(set(options.fixed) - {*dataset.names, *dataset.file_names})
+    dataset = without_photos(dataset, options.leave_out)
     if pixels:
         load_images(dataset, options.max_image_size, options.background)
     wanted = {**plan(dataset, options), "seconds": expected_seconds(dataset, asked)}

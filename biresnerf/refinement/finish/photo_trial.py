@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.workload import PHOTO_TRIALS
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.views.compare_rigs import Effort, Rig, compare_placed
@@ -15,9 +16,6 @@ from biresnerf.refinement.views.motion import moved_px
 
 logger = logging.getLogger(__name__)
 
-# Trials as long as the verdict's, or that end early, cannot tell wrong poses that agree with each other from bent ones
-# (docs/estimator.md).
-TIMES = 2
 # In px at working size. Poses nearer to the truth than this predict unseen photos as well as it does (docs/verdict.md).
 UNSEEN_PX = 0.5
 
@@ -46,7 +44,7 @@ def photos_object(stages: TwoStages, unit_from_cam: NDArray[np.float64], cameras
     with stages.timed("adjusting", "checking"):
         found = compare_placed(
             present, other, scene, optimiser, ~scene.start.guessed, stages.monitor.should_stop,
-            effort=Effort(TIMES, rounds_most=1, looks=(1.0,)),
+            effort=Effort(PHOTO_TRIALS, rounds_most=1, looks=(1.0,)),
         )  # fmt: skip
         stages.forecast.took(found.work if found else 0.0)
     if found is None:

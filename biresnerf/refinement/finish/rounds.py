@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
+from biresnerf.data.workload import FIRST_ROUND, LEARNING
 from biresnerf.forecast import Phase
 from biresnerf.refinement.finish.adjust_cameras import adjust_cameras
 from biresnerf.refinement.finish.outcome import Finish
-from biresnerf.refinement.finish.work_ahead import FIRST_ROUND, LEARNING, work_ahead
+from biresnerf.refinement.finish.work_ahead import work_ahead
 from biresnerf.refinement.stages.two_stages import TwoStages
 
 AFTER: tuple[Phase, ...] = ("evaluating", "judging")  # phases of the run that follow

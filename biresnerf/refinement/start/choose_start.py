@@ -14,16 +14,16 @@ import torch
 
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.data.workload import LOOKS, TRIAL_STEPS
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refinement.start.forward_facing import find_forward_facing
 from biresnerf.refinement.start.turntable import start_on_turntable
-from biresnerf.refinement.views.pose_trials import LOOKS, PoseTrials, Trial, trial_views
+from biresnerf.refinement.views.pose_trials import PoseTrials, Trial, trial_views
 from biresnerf.report import TrialReport
 
 logger = logging.getLogger(__name__)
 
-TRIAL_STEPS = 200
 MARGIN_DB = 0.3  # less is a tie
 # A set of poses that is right is better by more than this: 2.4 to 8 dB over noisy ones on ten sets, 1.6 on kitchen25.
 # One that is consistent but wrong is not: 0.2 and 1.2 dB on coffee, a symmetric thing.

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.data.workload import can_be_adjusted
 from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
@@ -18,8 +19,6 @@ from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.scene.scene_depth import matched_depth
 from biresnerf.refinement.scene.scene_frame import scene_frame
 
-# Cameras. Their system is dense: 1,000 take five minutes of one core and 1.9 GB.
-LEAST_ADJUSTED, MOST_ADJUSTED = 3, 1000
 # Where matches placed most cameras, stage 1 has only to form the field: its lengths shrink to this share.
 MATCHED_COARSE_SHARE = 2 / 3
 
@@ -48,7 +47,7 @@ def adjusts_cameras(dataset: Dataset, method: Method) -> bool:
 
     Not by methods of others.
     """
-    return method.robust_extensions and LEAST_ADJUSTED <= len(dataset) <= MOST_ADJUSTED
+    return method.robust_extensions and can_be_adjusted(len(dataset))
 
 
 def pose_mobility(start: InitialPoses) -> NDArray[np.float64]:

@@ -10,13 +10,14 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
+from biresnerf.data.workload import LOOKS
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.adjustment.paired import paired
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.views.held_out_views import ROUNDS_MOST, unseen_rounds
-from biresnerf.refinement.views.pose_trials import LOOKS, PoseTrials, TrialScores, joined
+from biresnerf.refinement.views.pose_trials import PoseTrials, TrialScores, joined
 from biresnerf.report import HeldOutEvidence
 
 Array = NDArray[np.float64]

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
+from biresnerf.data.workload import OPEN_STEP, OPEN_STEPS
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import ResolvedOptions
@@ -27,13 +28,7 @@ from biresnerf.refinement.views.evaluation import render_view
 from biresnerf.refinement.views.image_metrics import psnr, ssim
 
 SAMPLES = 1 << 14  # a step
-# Until a field of an open scene has formed, good poses predict unseen views no better than bad ones (fountain-P11: no
-# difference after 200 steps, 4 dB after 400).
-OPEN_STEPS = 2  # times the steps of a scene with a background
-OPEN_STEP = 1.6  # times the work of a step of one, as measured (docs/speed.md)
 ONE_IN, VIEWS_MOST = 5, 16  # unseen views: one in so many, but no more than that
-# Shares of a training after which fields are compared. What differs clearly differs more and more (docs/verdict.md).
-LOOKS = (0.25, 0.5, 1.0)
 RAYS_PER_STEP = 100  # pixels of all unseen views that are rendered at the end, for each step of the training
 
 

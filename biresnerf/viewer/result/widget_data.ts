@@ -1,6 +1,6 @@
 // Prepares the files of a result for the widgets, which fetch nothing themselves.
 import { useMemo } from "preact/hooks";
-import type { HistoryLine, ImageReport, PosesDocument, Report, ShownPoints, ViewFile } from "schemas";
+import type { ContactSheet, HistoryLine, ImageReport, PosesDocument, Report, ShownPoints, ViewFile } from "schemas";
 import { type Flag, FLAGS } from "../widgets/words";
 import { bordersOf, centreOf, length, type Matrix, minus, type Triple, turnDeg } from "./poses";
 
@@ -59,6 +59,9 @@ export interface ImageRow {
   readonly why_unknown: string | null;
   readonly flags: readonly Flag[];
 }
+
+/** How photos are laid out in one picture. */
+type Sheet = Pick<ContactSheet, "columns" | "cell_width" | "cell_height">;
 
 /** Where an image's picture lies in the contact sheet. */
 export interface SheetCell {
@@ -144,6 +147,11 @@ function cellsOf(view: ViewFile | null, images: number, urlOf: UrlOf): (image: n
   const sheet = view?.contact_sheet;
   const url = sheet ? urlOf(sheet.file) : null;
   if (!sheet || !url) return () => null;
+  return cellsIn(sheet, url, images);
+}
+
+/** Where each of so many photos lies in the picture at `url`. */
+export function cellsIn(sheet: Sheet, url: string, images: number): (image: number) => SheetCell {
   const rows = Math.ceil(images / sheet.columns);
   return (image) => ({
     url,
@@ -163,5 +171,12 @@ export function useWidgetData(poses: PosesDocument | null, report: Report | null
   const centres = useMemo(() => cameras.map(({ after }) => centreOf(after)), [cameras]);
   const rows = useMemo(() => (report ? rowsOf(report) : []), [report]);
   const cellOf = useMemo(() => cellsOf(view, names.length, urlOf), [view, names, urlOf]);
-  return { names, cameras, centres, rows, cellOf };
+  const photoOf = useMemo(() => {
+    const rendered = new Map(view?.views.map(({ image, pictures }) => [image, pictures.photo]));
+    return (image: number) => {
+      const file = rendered.get(image);
+      return file === undefined ? null : urlOf(file);
+    };
+  }, [view, urlOf]);
+  return { names, cameras, centres, rows, cellOf, photoOf };
 }

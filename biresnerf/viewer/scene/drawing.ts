@@ -1,38 +1,39 @@
 // The three-dimensional view: its objects, its viewpoint, and which camera is under the pointer.
 import {
-  BufferGeometry, Group, LineBasicMaterial, LineSegments, Mesh, type MeshBasicMaterial, PerspectiveCamera, type Points,
-  type PointsMaterial, Scene, Vector3, WebGLRenderer,
+  BufferGeometry, Group, LineBasicMaterial, LineSegments, Mesh, type MeshBasicMaterial, type Points, type PointsMaterial,
+  Scene, Vector3, WebGLRenderer,
 } from "three";
-import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { axisOf, between, centreOf, type Matrix, medianOf, minus, plus, spreadOf, type Triple } from "../result/poses";
 import type { PointLayer, SceneCamera } from "../result/widget_data";
 import { Ellipsoids } from "./ellipsoids";
+import { Eye, VIEW_DEG } from "./eye";
 import { Frusta, VERTICES } from "./frusta";
-import { cloudOf, type Look, overviewOf, pathsOf, upwardsOf, type Viewpoint } from "./geometry";
+import { cloudOf, gridBelow, type Look, nearPoints, overviewOf, pathsOf, upwardsOf, type Viewpoint } from "./geometry";
+import { Photos } from "./photo_planes";
 
-const VIEW_DEG = 45;
 const PICK_PX = 14;
-const FLIGHT_MS = 350;
 
 export class SceneDrawing {
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
   private readonly world = new Group();
-  private readonly eye = new PerspectiveCamera(VIEW_DEG, 1, 0.001, 1000);
-  private readonly controls: OrbitControls;
+  private readonly eye: Eye;
   private readonly before: Frusta;
   private readonly after: Frusta;
   private readonly chosen: Frusta;
   private readonly chosenSides: Mesh;
   private readonly paths: LineSegments;
   private readonly ellipsoids: Ellipsoids;
+  private readonly photos: Photos;
+  private grid: LineSegments | null = null;
   private points: Points | null = null;
   private layer: PointLayer | null = null;
   private look: Look | null = null;
-  private flight = 0;
   private frame = 0;
   private through: number | null = null;
   private placed = false;
+  /** Whether the user has turned the view: it then stays where it is. */
+  private touched = false;
   readonly origin: Triple;
   readonly spread: number;
 
@@ -58,6 +59,7 @@ export class SceneDrawing {
     this.paths = new LineSegments(new BufferGeometry(), new LineBasicMaterial({ vertexColors: true }));
     this.paths.frustumCulled = false;
     this.ellipsoids = new Ellipsoids(cameras, this.origin);
+    this.photos = new Photos(cameras, this.draw);
     for (const [index, camera] of cameras.entries()) {
       this.after.place(index, camera.after);
       if (camera.before) this.before.place(index, camera.before);
@@ -66,21 +68,22 @@ export class SceneDrawing {
     // Scaled to a size of about one, whatever the input's unit: depth buffers have few digits.
     this.world.scale.setScalar(1 / this.spread);
     this.world.add(this.before.lines, this.after.lines, this.paths, this.ellipsoids.lines, this.chosen.lines, this.chosenSides);
+    this.world.add(...this.photos.meshes);
+    this.photos.follow(this.after);
     this.chosen.lines.renderOrder = 2;
     this.scene.add(this.world);
 
-    this.eye.up.set(...upwardsOf(cameras));
-    this.controls = new OrbitControls(this.eye, this.renderer.domElement);
-    this.controls.addEventListener("change", this.draw);
-    this.controls.addEventListener("start", this.leave);
+    this.eye = new Eye(this.renderer.domElement, upwardsOf(cameras), this.draw, this.leave);
     this.overview(false);
   }
 
   /** Shows everything, from the side and slightly above. */
   overview(animated: boolean): void {
     const side = new Vector3(...(this.cameras[0] ? axisOf(this.cameras[0].after, 0) : [1, 0, 0]));
-    const { at, target } = overviewOf(this.shownPoints(), this.eye.up, side, this.eye.aspect || 1, VIEW_DEG);
-    this.fly(at, target, VIEW_DEG, animated);
+    const { at, target } = overviewOf([...this.shownPoints(), ...this.scenePoints()], this.eye.up, side, this.eye.camera.aspect || 1, VIEW_DEG);
+    this.through = null;
+    this.eye.fly(at, target, VIEW_DEG, animated);
+    this.updateSelected();
   }
 
   /** Corners of all cameras before and after, in drawn units. */
@@ -95,16 +98,21 @@ export class SceneDrawing {
     return all;
   }
 
+  /** Some points of the scene in drawn units, without the far ones. */
+  private scenePoints(): Vector3[] {
+    return this.layer ? nearPoints(this.layer, (at) => this.drawnPoint(at)) : [];
+  }
+
   /** Looks through a camera, until the controls are used. */
   lookThrough(index: number, animated: boolean): void {
     const camera = this.cameras[index];
     if (!camera) return;
     const pose = this.poseAt(camera);
     const [left, top, right, bottom] = camera.borders;
-    const high = 2 * Math.atan(Math.max(-top, bottom, Math.max(-left, right) / (this.eye.aspect || 1)));
+    const high = 2 * Math.atan(Math.max(-top, bottom, Math.max(-left, right) / (this.eye.camera.aspect || 1)));
     const at = this.drawnPoint(centreOf(pose));
     const ahead = new Vector3(...axisOf(pose, 2));
-    this.fly(at, at.clone().add(ahead), Math.min(120, (1.1 * high * 180) / Math.PI), animated, pose);
+    this.eye.fly(at, at.clone().add(ahead), Math.min(120, (1.1 * high * 180) / Math.PI), animated, pose);
     this.through = index;
     this.updateSelected();
   }
@@ -116,42 +124,14 @@ export class SceneDrawing {
   }
 
   private readonly leave = (): void => {
-    cancelAnimationFrame(this.flight);
+    this.touched = true;
+    this.eye.stop();
     if (this.through === null) return;
     this.through = null;
-    this.eye.fov = VIEW_DEG;
-    this.eye.updateProjectionMatrix();
+    this.eye.widen();
     this.onLeave();
     this.updateSelected();
   };
-
-  private fly(to: Vector3, target: Vector3, fov: number, animated: boolean, pose?: Matrix): void {
-    cancelAnimationFrame(this.flight);
-    this.through = null;
-    const from = { at: this.eye.position.clone(), target: this.controls.target.clone(), fov: this.eye.fov };
-    const began = performance.now();
-    const step = (now: number): void => {
-      const share = animated ? Math.min(1, (now - began) / FLIGHT_MS) : 1;
-      const eased = share * share * (3 - 2 * share);
-      this.eye.position.lerpVectors(from.at, to, eased);
-      this.controls.target.lerpVectors(from.target, target, eased);
-      this.eye.fov = from.fov + eased * (fov - from.fov);
-      this.eye.updateProjectionMatrix();
-      this.controls.update();
-      if (share === 1 && pose) this.rollTo(pose);
-      this.draw();
-      if (share < 1) this.flight = requestAnimationFrame(step);
-    };
-    if (animated) this.flight = requestAnimationFrame(step);
-    else step(began);
-  }
-
-  /** Rolls the view with the camera, which orbit controls cannot. */
-  private rollTo(pose: Matrix): void {
-    const [x, y, z] = [axisOf(pose, 0), axisOf(pose, 1), axisOf(pose, 2)];
-    this.eye.matrix.makeBasis(new Vector3(...x), new Vector3(...y).negate(), new Vector3(...z).negate());
-    this.eye.quaternion.setFromRotationMatrix(this.eye.matrix);
-  }
 
   private drawnPoint(p: Triple): Vector3 {
     return new Vector3(...minus(p, this.origin)).divideScalar(this.spread);
@@ -167,6 +147,7 @@ export class SceneDrawing {
     this.look = look;
     if (last?.share !== look.share) {
       this.cameras.forEach((camera, index) => this.after.place(index, this.poseAt(camera)));
+      this.photos.follow(this.after);
     }
     if (last?.colours !== look.colours) {
       look.colours.forEach((colour, index) => {
@@ -184,18 +165,29 @@ export class SceneDrawing {
     }
     if (last?.exaggerated !== look.exaggerated || last.colours !== look.colours) this.ellipsoids.show(look);
     if (this.layer !== look.layer) this.drawPoints(look.layer);
+    if (last?.gridColour !== look.gridColour) this.drawGrid(look);
     if (this.through !== null && last?.share !== look.share) this.lookThrough(this.through, false);
     this.draw();
+  }
+
+  private drawGrid(look: Look): void {
+    if (this.grid) {
+      this.grid.removeFromParent().geometry.dispose();
+      (this.grid.material as LineBasicMaterial).dispose();
+    }
+    this.grid = gridBelow([...this.shownPoints(), ...this.scenePoints()], this.eye.up, look.gridColour);
+    this.scene.add(this.grid);
   }
 
   private choose(look: Look): void {
     const camera = look.selected === null ? undefined : this.cameras[look.selected];
     const visible = camera !== undefined && this.through === null;
     this.chosen.lines.visible = this.chosenSides.visible = visible;
-    if (!camera) return;
+    if (!camera) return this.photos.show(look, null, this.chosen);
     this.chosen.become(camera);
     this.chosen.place(0, this.poseAt(camera));
     this.chosen.paint(0, look.selectedColour);
+    this.photos.show(look, this.through, this.chosen);
   }
 
   private drawPoints(layer: PointLayer | null): void {
@@ -209,6 +201,8 @@ export class SceneDrawing {
     this.points = cloudOf(layer);
     this.points.position.set(...minus(layer.origin, this.origin));
     this.world.add(this.points);
+    if (this.look) this.drawGrid(this.look);
+    if (!this.touched && this.through === null) this.overview(false);
   }
 
   /** Size in CSS pixels. */
@@ -216,7 +210,6 @@ export class SceneDrawing {
     if (width === 0 || height === 0) return;
     this.renderer.setSize(width, height);
     this.eye.aspect = width / height;
-    this.eye.updateProjectionMatrix();
     if (!this.placed) this.overview(false);
     this.placed = true;
     this.draw();
@@ -240,8 +233,8 @@ export class SceneDrawing {
   /** Position of a vertex in the view, CSS pixels; null if it is behind the viewer. */
   onScreen(index: number, vertex: number): [number, number] | null {
     const { clientWidth, clientHeight } = this.renderer.domElement;
-    this.eye.updateMatrixWorld();
-    const at = new Vector3(...this.after.drawn(index, vertex)).divideScalar(this.spread).project(this.eye);
+    this.eye.camera.updateMatrixWorld();
+    const at = new Vector3(...this.after.drawn(index, vertex)).divideScalar(this.spread).project(this.eye.camera);
     return Math.abs(at.z) > 1 ? null : [((at.x + 1) / 2) * clientWidth, ((1 - at.y) / 2) * clientHeight];
   }
 
@@ -258,12 +251,12 @@ export class SceneDrawing {
   /** The viewpoint in the world, to restore it in another drawing. */
   viewpoint(): Viewpoint {
     const inWorld = (p: Vector3) => plus(p.clone().multiplyScalar(this.spread).toArray(), this.origin);
-    return { at: inWorld(this.eye.position), target: inWorld(this.controls.target) };
+    return { at: inWorld(this.eye.camera.position), target: inWorld(this.eye.controls.target) };
   }
 
   setViewpoint({ at, target }: Viewpoint): void {
-    this.placed = true;
-    this.fly(this.drawnPoint(at), this.drawnPoint(target), VIEW_DEG, false);
+    this.placed = this.touched = true;
+    this.eye.fly(this.drawnPoint(at), this.drawnPoint(target), VIEW_DEG, false);
   }
 
   /** Draws at the next frame, once. */
@@ -271,16 +264,17 @@ export class SceneDrawing {
     if (this.frame) return;
     this.frame = requestAnimationFrame(() => {
       this.frame = 0;
-      this.renderer.render(this.scene, this.eye);
+      this.renderer.render(this.scene, this.eye.camera);
     });
   };
 
   dispose(): void {
     cancelAnimationFrame(this.frame);
-    cancelAnimationFrame(this.flight);
-    this.controls.dispose();
+    this.eye.dispose();
     this.drawPoints(null);
-    for (const drawn of [this.before, this.after, this.chosen, this.ellipsoids]) drawn.dispose();
+    for (const drawn of [this.before, this.after, this.chosen, this.ellipsoids, this.photos]) drawn.dispose();
+    this.grid?.geometry.dispose();
+    (this.grid?.material as LineBasicMaterial | undefined)?.dispose();
     this.chosenSides.geometry.dispose();
     (this.chosenSides.material as MeshBasicMaterial).dispose();
     this.paths.geometry.dispose();

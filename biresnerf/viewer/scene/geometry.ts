@@ -1,7 +1,7 @@
 // Geometry of the three-dimensional view: the first viewpoint, point clouds, and lines between poses.
-import { BufferAttribute, BufferGeometry, Points, PointsMaterial, Vector3 } from "three";
+import { BufferAttribute, BufferGeometry, LineBasicMaterial, LineSegments, Points, PointsMaterial, Vector3 } from "three";
 import { axisOf, centreOf, length, minus, type Triple } from "../result/poses";
-import type { PointLayer, SceneCamera } from "../result/widget_data";
+import type { PointLayer, SceneCamera, SheetCell } from "../result/widget_data";
 import type { Colour } from "./colours";
 import { srgb } from "./frusta";
 
@@ -15,6 +15,14 @@ export interface Look {
   readonly selectedColour: Colour;
   readonly selected: number | null;
   readonly layer: PointLayer | null;
+  readonly gridColour: Colour;
+  /** Whether photos are shown in the frusta, cut from the contact sheet. */
+  readonly photos: boolean;
+  readonly cellOf: (image: number) => SheetCell | null;
+  /** A photo's own picture, larger than in the contact sheet, if there is one. */
+  readonly photoOf: (image: number) => string | null;
+  /** Opacity of the photo over the view through its camera. */
+  readonly overlay: number;
   /** How many times too large the uncertainty of the positions is drawn; 0 if it is not. */
   readonly exaggerated: number;
 }
@@ -71,6 +79,47 @@ export function overviewOf(
 export function quantile(values: readonly number[], part: number): number {
   const sorted = [...values].sort((a, b) => a - b);
   return sorted[Math.floor(part * (sorted.length - 1))] ?? 0;
+}
+
+// Of the scene, to find the first view: so many points, without the farthest.
+const POINTS_FRAMED = 300;
+const NEAR_SHARE = 0.8;
+
+/** Some of a layer's points as `drawn`, without the far ones. */
+export function nearPoints({ positions, origin }: PointLayer, drawn: (at: Triple) => Vector3): Vector3[] {
+  const every = 3 * Math.max(1, Math.floor(positions.length / 3 / POINTS_FRAMED));
+  const some: Vector3[] = [];
+  for (let i = 0; i + 2 < positions.length; i += every) {
+    some.push(drawn([origin[0] + (positions[i] ?? 0), origin[1] + (positions[i + 1] ?? 0), origin[2] + (positions[i + 2] ?? 0)]));
+  }
+  const far = quantile(some.map((point) => point.length()), NEAR_SHARE);
+  return some.filter((point) => point.length() <= far);
+}
+
+const GRID_LINES = 10; // on each side of the middle
+
+/** A level grid below what is seen, in drawn units. */
+export function gridBelow(seen: readonly Vector3[], up: Vector3, [r, g, b]: Colour): LineSegments {
+  const middle = seen.reduce((sum, point) => sum.add(point), new Vector3()).divideScalar(Math.max(1, seen.length));
+  const lowest = quantile(seen.map((point) => point.dot(up)), 0.02);
+  const reach = 1.3 * quantile(seen.map((point) => point.distanceTo(middle)), 0.98);
+  middle.addScaledVector(up, lowest - middle.dot(up));
+  const along = new Vector3(up.y, up.z, up.x).addScaledVector(up, -(up.y * up.x + up.z * up.y + up.x * up.z)).normalize();
+  const across = new Vector3().crossVectors(up, along);
+  const positions: number[] = [];
+  for (let line = -GRID_LINES; line <= GRID_LINES; line++) {
+    for (const [one, other] of [[along, across], [across, along]] as const) {
+      for (const end of [-1, 1]) {
+        const at = middle.clone().addScaledVector(one, (line / GRID_LINES) * reach).addScaledVector(other, end * reach);
+        positions.push(at.x, at.y, at.z);
+      }
+    }
+  }
+  const geometry = new BufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(new Float32Array(positions), 3));
+  const material = new LineBasicMaterial({ transparent: true, opacity: 0.5, depthWrite: false });
+  material.color.setRGB(...srgb(r, g, b));
+  return new LineSegments(geometry, material);
 }
 
 export function cloudOf(layer: PointLayer): Points {

@@ -9,6 +9,7 @@ interface SceneChoice {
   readonly lines: 0 | 1 | 10;
   readonly before: boolean;
   readonly uncertainty: boolean;
+  readonly photos: boolean;
   readonly by: ColourBy;
   /** The upper end of each colour scale. */
   readonly caps: Readonly<Partial<Record<ColourBy, number>>>;
@@ -16,7 +17,7 @@ interface SceneChoice {
   readonly layer: string | null;
 }
 
-export const FIRST_CHOICE: SceneChoice = { lines: 1, before: true, uncertainty: true, by: "moved_deg", caps: {}, layer: null };
+export const FIRST_CHOICE: SceneChoice = { lines: 1, before: true, uncertainty: true, photos: true, by: "moved_deg", caps: {}, layer: null };
 
 const COLOURS = (["moved_deg", "moved_units", "delta_psnr", "source"] as const).map((value) => {
   const { label, unit } = scaleOf(value, 1);
@@ -47,14 +48,18 @@ export function SceneControls(props: {
   spread: number;
   /** How many times too large ellipsoids are; null if there are none. */
   exaggerated: number | null;
+  /** Whether there are poses before and after. */
+  compared: boolean;
+  /** Whether there are photos for the frusta. */
+  pictured: boolean;
 }) {
-  const { choice, onChange, points, spread, exaggerated } = props;
+  const { choice, onChange, points, spread, exaggerated, compared } = props;
   const scale = scaleOf(choice.by, spread);
   const caps = [...scale.caps].sort((a, b) => a - b);
   return (
     <div class="scene-controls">
-      <Pick<ColourBy> label="Colour" value={choice.by} onChange={(by) => onChange({ by })} options={COLOURS} />
-      {caps.length > 0 && (
+      {compared && <Pick<ColourBy> label="Colour" value={choice.by} onChange={(by) => onChange({ by })} options={COLOURS} />}
+      {compared && caps.length > 0 && (
         <Pick
           label="up to"
           value={capOf(choice, spread)}
@@ -62,16 +67,18 @@ export function SceneControls(props: {
           options={caps.map((value) => ({ value, text: `${value} ${scale.unit}` }))}
         />
       )}
-      <Choice
-        label="Lines"
-        value={choice.lines}
-        onChange={(lines) => onChange({ lines })}
-        options={[
-          { value: 0, text: "off" },
-          { value: 1, text: "×1" },
-          { value: 10, text: "×10" },
-        ]}
-      />
+      {compared && (
+        <Choice
+          label="Lines"
+          value={choice.lines}
+          onChange={(lines) => onChange({ lines })}
+          options={[
+            { value: 0, text: "off" },
+            { value: 1, text: "×1" },
+            { value: 10, text: "×10" },
+          ]}
+        />
+      )}
       {points.length > 0 && (
         <Pick
           label="Points"
@@ -83,7 +90,8 @@ export function SceneControls(props: {
           ]}
         />
       )}
-      <Switch label="Input" on={choice.before} onChange={(before) => onChange({ before })} />
+      {props.pictured && <Switch label="Photos" on={choice.photos} onChange={(photos) => onChange({ photos })} />}
+      {compared && <Switch label="Input" on={choice.before} onChange={(before) => onChange({ before })} />}
       {exaggerated !== null && (
         <Switch
           label={exaggerated === 1 ? "Uncertainty" : `Uncertainty ×${exaggerated}`}

@@ -1,7 +1,7 @@
 // Cameras before and after, in three dimensions; a table takes their place if the browser has no WebGL.
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { between, centreOf, medianOf, spreadOf, turnDeg } from "../result/poses";
-import type { PointLayer, SceneCamera } from "../result/widget_data";
+import type { PointLayer, SceneCamera, SheetCell } from "../result/widget_data";
 import { Button, ImageStepper, Slider } from "../widgets/controls";
 import { fixed, short } from "../widgets/numbers";
 import { themeColour, useDark, useReducedMotion } from "../widgets/theme";
@@ -19,15 +19,24 @@ interface SceneViewProps {
   /** Index of the selected image. */
   readonly selected: number | null;
   readonly onSelect: (image: number | null) => void;
+  /** Where a photo lies in the contact sheet, to show it in its frustum. */
+  readonly cellOf?: (image: number) => SheetCell | null;
+  /** A photo's own picture, larger than that, if there is one. */
+  readonly photoOf?: (image: number) => string | null;
 }
 
 const NO_POINTS: readonly PointLayer[] = [];
+const NONE = () => null;
 
-export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: SceneViewProps) {
+export function SceneView(props: SceneViewProps) {
+  const { cameras, points = NO_POINTS, selected, onSelect, cellOf = NONE, photoOf = NONE } = props;
   const [dark, still] = [useDark(), useReducedMotion()];
   const [share, setShare] = useState(1);
   const [choice, setChoice] = useState(FIRST_CHOICE);
   const [through, setThrough] = useState(false);
+  const [overlay, setOverlay] = useState(0.5);
+  const compared = useMemo(() => cameras.some(({ before }) => before !== null), [cameras]);
+  const pictured = cameras.length > 0 && cellOf(0) !== null;
   const host = useRef<HTMLDivElement>(null);
 
   const spread = useMemo(() => {
@@ -38,22 +47,23 @@ export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: S
   const cap = capOf(choice, spread);
   const painted = useMemo(
     () => ({
-      colours: cameras.map((camera) => colourOf(camera, choice.by, cap, kinds, dark)),
+      colours: cameras.map((camera) => colourOf(camera, compared ? choice.by : "source", cap, kinds, dark)),
+      gridColour: hexColour(themeColour("--line-strong")),
       beforeColour: hexColour(themeColour("--before")),
       selectedColour: hexColour(themeColour("--accent")),
     }),
-    [cameras, choice.by, cap, kinds, dark],
+    [cameras, compared, choice.by, cap, kinds, dark],
   );
   const layer = layerOf(points, choice.layer);
-  const { lines, before } = choice;
+  const { lines, before, photos } = choice;
   const times = useMemo(() => {
     const some = cameras.some((camera) => camera.uncertainty?.position != null);
     return some ? exaggerationOf(cameras, spread / Math.sqrt(Math.max(4, cameras.length))) : null;
   }, [cameras, spread]);
   const exaggerated = choice.uncertainty ? (times ?? 0) : 0;
   const look = useMemo<Look>(
-    () => ({ ...painted, lines, before, layer, share, selected, exaggerated }),
-    [painted, lines, before, layer, share, selected, exaggerated],
+    () => ({ ...painted, lines, before, layer, share, selected, exaggerated, photos, cellOf, photoOf, overlay }),
+    [painted, lines, before, layer, share, selected, exaggerated, photos, cellOf, photoOf, overlay],
   );
   const { drawing, failed } = useScene(host, cameras, look, () => setThrough(false));
   useEffect(() => {
@@ -69,7 +79,7 @@ export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: S
   return (
     <section class="scene" aria-label="Cameras in three dimensions">
       <SceneControls
-        {...{ choice, points, spread }}
+        {...{ choice, points, spread, compared, pictured }}
         exaggerated={times}
         onChange={(changed) => setChoice({ ...choice, ...changed })}
       />
@@ -93,18 +103,27 @@ export function SceneView({ cameras, points = NO_POINTS, selected, onSelect }: S
           event.preventDefault();
         }}
       >
-        <Legend {...{ by: choice.by, cap, kinds, dark }} unknown={cameras.some((camera) => camera.delta_psnr === null)} />
+        <Legend {...{ by: compared ? choice.by : "source", cap, kinds, dark }} unknown={cameras.some((camera) => camera.delta_psnr === null)} />
       </div>
-      <label class="scene-slider">
-        <span>Input</span>
-        <Slider
-          value={share}
-          label="From the input's poses to the refined ones"
-          text={share === 0 ? "input" : share === 1 ? "refined" : `${Math.round(100 * share)} % of the way`}
-          onChange={setShare}
-        />
-        <span>Refined</span>
-      </label>
+      {compared && (
+        <label class="scene-slider">
+          <span>Input</span>
+          <Slider
+            value={share}
+            label="From the input's poses to the refined ones"
+            text={share === 0 ? "input" : share === 1 ? "refined" : `${Math.round(100 * share)} % of the way`}
+            onChange={setShare}
+          />
+          <span>Refined</span>
+        </label>
+      )}
+      {through && pictured && (
+        <label class="scene-slider">
+          <span>Points</span>
+          <Slider value={overlay} label="Photo over the view" text={`${Math.round(100 * overlay)} % photo`} onChange={setOverlay} />
+          <span>Photo</span>
+        </label>
+      )}
       <div class="scene-foot">
         <ImageStepper names={cameras.map((camera) => camera.name)} selected={selected} onSelect={onSelect} />
         <Button disabled={!chosen} pressed={through} onClick={() => (through ? back() : setThrough(true))}>

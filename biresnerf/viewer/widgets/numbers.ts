@@ -31,3 +31,10 @@ export function duration(seconds: number): string {
     ? `${minutes} min ${String(whole % 60).padStart(2, "0")} s`
     : `${Math.floor(minutes / 60)} h ${String(minutes % 60).padStart(2, "0")} min`;
 }
+
+/** A predicted time, no more exact than it is. */
+export function roughly(seconds: number): string {
+  if (seconds < 55) return `${Math.max(5, 5 * Math.round(seconds / 5))} s`;
+  const minutes = seconds / 60;
+  return minutes < 90 ? `${minutes.toFixed(0)} min` : `${(minutes / 60).toFixed(1)} h`;
+}

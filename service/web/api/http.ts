@@ -17,6 +17,15 @@ export function setKey(key: string | null): void {
   keyRequired.set(null);
 }
 
+/** Whether the page shows one job to somebody with a link, who can change nothing. */
+export const shared = new Store(false);
+
+/** Uses a link's token in the place of a key until it is left; null goes back to the key. */
+export function setLink(token: string | null): void {
+  shared.set(token !== null);
+  apiKey.set(token ?? sessionStorage.getItem(KEY_ITEM));
+}
+
 interface ProblemFields {
   status: number;
   code: string;
@@ -70,7 +79,7 @@ export function withKey(headers: Record<string, string> = {}): Record<string, st
 
 /** Has the page ask for a key if the problem is that one is missing or wrong. */
 export function checkKey(problem: Problem): Problem {
-  if (problem.status === 401) keyRequired.set(problem.code === "invalid_api_key" ? problem.detail : "");
+  if (problem.status === 401 && !shared.value) keyRequired.set(problem.code === "invalid_api_key" ? problem.detail : "");
   return problem;
 }
 

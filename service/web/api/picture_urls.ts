@@ -2,11 +2,38 @@
 // from memory.
 import { useEffect, useState } from "preact/hooks";
 import { address, apiKey, request } from "./http";
+import { useStore } from "./store";
 
 /** Most fetched pictures that are kept; the oldest go first. */
 const CACHE_MAX = 400;
 const cached = new Map<string, string>();
 const pending = new Map<string, Promise<string | null>>();
+
+/** The URL of a picture that the service itself serves, once it can be shown. */
+export function useServed(path: string | null): string | null {
+  const key = useStore(apiKey);
+  const [url, setUrl] = useState<string | null>(null);
+  useEffect(() => {
+    setUrl(null);
+    if (!path) return;
+    if (!key) return setUrl(address(path));
+    let made: string | null = null;
+    let gone = false;
+    void request("GET", path).then(
+      async (response) => {
+        if (gone) return;
+        made = URL.createObjectURL(await response.blob());
+        setUrl(made);
+      },
+      () => {}, // shown as missing
+    );
+    return () => {
+      gone = true;
+      if (made) URL.revokeObjectURL(made);
+    };
+  }, [path, key]);
+  return url;
+}
 
 /** The URL of an artifact on the service itself, not in its bucket: the page loads nothing from other hosts. */
 export function artifactUrl(href: string, version = ""): string {

@@ -3,14 +3,15 @@ import { useState } from "preact/hooks";
 import type { ArtifactView, JobView, ShareView } from "schemas";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
 import { useAttempt } from "../api/hooks";
-import { address, apiKey, pause, request, requestJson } from "../api/http";
+import { address, apiKey, pause, request, requestJson, shared } from "../api/http";
 import { artifactUrl } from "../api/picture_urls";
 import { useStore } from "../api/store";
 import { isOver } from "../jobs/state";
 import { CopyButton } from "../parts/copy_button";
-import { bytes, percent } from "../parts/format";
+import { bytes } from "../parts/format";
 import { ProblemBox } from "../parts/problem_box";
 import { type Consumer, CONSUMERS, curlLines, filesFor, pythonLines } from "./consumers";
+import { save, saveZip } from "./save";
 
 const SHARED_S = 7 * 86_400;
 
@@ -25,7 +26,8 @@ export function Downloads({ job, artifacts, onNewFiles }: Props) {
   // Further formats are written from poses.json, which a preview does not have.
   const exportable = results.some(({ name }) => name === "poses.json");
   const rows = CONSUMERS.map((consumer) => ({ consumer, files: filesFor(consumer, results) }));
-  const shown = rows.filter(({ consumer, files }) => files.length || (consumer.exported && exportable));
+  const guest = useStore(shared);
+  const shown = rows.filter(({ consumer, files }) => files.length || (consumer.exported && exportable && !guest));
   return (
     <ul class="downloads">
       {shown.map(({ consumer, files }) => (
@@ -55,7 +57,7 @@ function Row({ job, consumer, files, onNewFiles }: RowProps) {
       else await exported(job, consumer, setStatus, onNewFiles);
     });
     setStatus("");
-    if (!done) setOpen(files.length > 0); // curl and Python may succeed where the page failed
+    if (!done) setOpen(files.length > 0 && !shared.value); // curl and Python may succeed where the page failed
   };
   const size = files.reduce((sum, file) => sum + file.size, 0);
   return (
@@ -70,7 +72,7 @@ function Row({ job, consumer, files, onNewFiles }: RowProps) {
             <span class="soft number">
               {single ? baseName(single) : count(files.length, "file")} · {bytes(size)}
             </span>
-            <button
+            {!shared.value && <button
               type="button"
               class="plain-link"
               aria-expanded={open}
@@ -78,7 +80,7 @@ function Row({ job, consumer, files, onNewFiles }: RowProps) {
               onClick={() => setOpen(!open)}
             >
               curl, Python
-            </button>
+            </button>}
           </>
         )}
         {single && !keyed ? (
@@ -156,31 +158,8 @@ async function saveOne(file: ArtifactView): Promise<void> {
   save(await answer.blob(), baseName(file));
 }
 
-/** All files as one zip, packed as they arrive: none is held in memory whole. */
-async function saveAll(job: JobView, consumer: Consumer, files: ArtifactView[], say: (text: string) => void) {
-  const { downloadZip } = await import("client-zip");
-  let failure: unknown; // a stream passes on no error but its own
-  async function* fetched() {
-    for (const [index, file] of files.entries()) {
-      say(`Fetching ${percent(index / files.length)}`);
-      try {
-        yield { name: file.name, input: await request("GET", `${file.href}?redirect=false`) };
-      } catch (error) {
-        failure = error;
-        throw error;
-      }
-    }
-  }
-  const zip = await downloadZip(fetched()).blob().catch((error) => {
-    throw failure ?? error;
-  });
-  save(zip, `${job.labels.name ?? job.id}-${consumer.files.replaceAll("/", "-")}.zip`.replace("-.zip", ".zip"));
-}
-
-function save(content: Blob, name: string): void {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(content);
-  link.download = name;
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+/** All files of a consumer as one zip. */
+function saveAll(job: JobView, consumer: Consumer, files: readonly ArtifactView[], say: (text: string) => void): Promise<void> {
+  const name = `${job.labels.name ?? job.id}-${consumer.files.replaceAll("/", "-")}.zip`.replace("-.zip", ".zip");
+  return saveZip(files, name, say);
 }

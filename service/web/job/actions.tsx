@@ -1,91 +1,28 @@
 // What can be done with a job: cancel it, run it again with other options, delete it, copy its link.
-import type { ComponentChildren } from "preact";
-import { useEffect, useRef, useState } from "preact/hooks";
+import { useEffect, useState } from "preact/hooks";
 import type { JobView } from "schemas";
-import { useAttempt } from "../api/hooks";
-import { type Problem, requestJson } from "../api/http";
+import { requestJson, shared } from "../api/http";
 import { Store, useStore } from "../api/store";
 import { isOver } from "../jobs/state";
 import { OptionsForm } from "../options/form";
 import type { Values } from "../options/schema";
 import { CopyButton } from "../parts/copy_button";
-import { ProblemBox } from "../parts/problem_box";
+import { DialogButton } from "../parts/dialog_button";
+import { Share } from "./share";
 
 /** Set by other parts of the page to open the dialog for another run with these options. */
 export const runAgainRequest = new Store<{ job: string; values: Values } | null>(null);
 
 export function Actions({ job }: { job: JobView }) {
+  if (useStore(shared)) return null;
   return (
     <div class="actions">
-      <CopyButton text={location.href} what="the address of this page" label="Copy link" />
+      <CopyButton text={location.href} what="the address of this page" label="Copy address" />
+      {(job.state === "succeeded" || (job.state === "cancelled" && job.partial)) && <Share job={job} />}
       {!isOver(job) && <Cancel job={job} />}
       {job.kind === "refine" && <RunAgain job={job} />}
       {isOver(job) && <Delete job={job} />}
     </div>
-  );
-}
-
-interface Choice {
-  label: string;
-  tone?: string;
-  run: () => Promise<void>;
-}
-
-/** A button and the dialog that it opens, which closes when what the user chose there is done. */
-function DialogButton(props: {
-  button: string;
-  title: string;
-  tone?: string;
-  wide?: boolean;
-  choices: readonly Choice[];
-  /** The last button, which only closes the dialog. */
-  dismiss: string;
-  /** Opens the dialog too, whenever it changes. */
-  request?: object | null;
-  children: (problem: Problem | null) => ComponentChildren;
-}) {
-  const dialog = useRef<HTMLDialogElement>(null);
-  const [open, setOpen] = useState(false);
-  const { attempt, busy, problem } = useAttempt();
-  const close = () => dialog.current?.close();
-  const show = () => {
-    setOpen(true);
-    if (!dialog.current?.open) dialog.current?.showModal();
-  };
-  useEffect(() => {
-    if (props.request) show();
-  }, [props.request]);
-  return (
-    <>
-      <button type="button" class={`act small ${props.tone ?? ""}`} onClick={show}>
-        {props.button}
-      </button>
-      <dialog
-        ref={dialog}
-        class={props.wide ? "wide" : ""}
-        aria-label={props.title}
-        onClose={() => setOpen(false)}
-        onClick={(event) => event.target === dialog.current && close()}
-      >
-        {open && (
-          <div class="dialog-body">
-            <h2>{props.title}</h2>
-            {props.children(problem)}
-            {problem && <ProblemBox problem={problem} />}
-            <p class="dialog-acts">
-              {props.choices.map(({ label, tone = "", run }) => (
-                <button key={label} class={`act ${tone}`} disabled={busy} onClick={async () => (await attempt(run)) && close()}>
-                  {label}
-                </button>
-              ))}
-              <button class="act" onClick={close}>
-                {props.dismiss}
-              </button>
-            </p>
-          </div>
-        )}
-      </dialog>
-    </>
   );
 }
 

@@ -4,6 +4,7 @@ import type { JobView } from "schemas";
 import type { ImageRow } from "../../../biresnerf/viewer/result/widget_data";
 import type { ImageTableProps } from "../../../biresnerf/viewer/widgets/image_table";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
+import { shared } from "../api/http";
 import { isOver } from "../jobs/state";
 import { CopyButton } from "../parts/copy_button";
 import { runAgainRequest } from "./actions";
@@ -25,7 +26,7 @@ export function Images({ job, widgets, ...table }: Props) {
   const fix = () => runAgainFixed(job, given);
   return (
     <>
-      <widgets.ImageTable {...table} {...(isOver(job) && { ticked, onTick: tick })} />
+      <widgets.ImageTable {...table} {...(isOver(job) && !shared.value && { ticked, onTick: tick })} />
       {chosen.length > 0 && (
         <p class="ticked" role="status">
           {count(chosen.length, "image")} selected

@@ -2,9 +2,10 @@
 import type { ArtifactList, ArtifactView, JobView, PosesDocument, Report, SeedingPreview, ViewFile } from "schemas";
 import { type CurvePoint, historyOf, type PointLayer, pointsOf } from "../../../biresnerf/viewer/result/widget_data";
 import { followJob, type JobEvent } from "../api/events";
-import { asProblem, pause, type Problem, request, requestJson } from "../api/http";
+import { asProblem, pause, type Problem, request, requestJson, shared } from "../api/http";
 import { Store } from "../api/store";
 import { isOver } from "../jobs/state";
+import { notifyOfEnds } from "../parts/notify";
 
 export interface LiveState {
   job: JobView | null;
@@ -67,6 +68,7 @@ export class LiveJob extends Store<LiveState> {
     try {
       await this.waitForJob();
       await this.refresh();
+      if (shared.value) return; // links open what a job has, not what happens to it
       const handlers = { onProgress: this.progress, onEvent: this.event, onConnection: this.connection };
       await followJob(this.id, handlers, this.stop.signal);
     } catch (error) {
@@ -99,6 +101,7 @@ export class LiveJob extends Store<LiveState> {
     const line = lineOf(job, last);
     if (line) this.live.push(line);
     const ended = isOver(job) && this.value.job !== null && !isOver(this.value.job);
+    if (this.value.job) notifyOfEnds([this.value.job], [job]);
     this.change({ job, history: [...this.recorded, ...this.live] });
     if (ended) void this.refresh();
   };

@@ -2,11 +2,13 @@
 import { useEffect, useMemo, useState } from "preact/hooks";
 import type { JobView } from "schemas";
 import { duration } from "../../../biresnerf/viewer/widgets/numbers";
+import { shared } from "../api/http";
 import { pictureUrl } from "../api/picture_urls";
 import { useStore } from "../api/store";
 import { Downloads } from "../downloads/downloads";
-import { Chip, isOver, type Stage, STAGE_WORDS, StageBar, titleOf } from "../jobs/state";
+import { Chip, isOver, ProgressBar, type Stage, STAGE_WORDS, titleOf } from "../jobs/state";
 import { moment } from "../parts/format";
+import { NotifySwitch } from "../parts/notify";
 import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 import { Actions } from "./actions";
@@ -22,6 +24,7 @@ export function JobPage({ id }: { id: string }) {
     return () => live.close();
   }, [live]);
   const seen = useStore(live);
+  const guest = useStore(shared);
   const { job, problem } = seen;
   useTitle(job ? `${titleOf(job)} · ${job.verdict ?? job.state}` : "Job");
   if (!job) return problem ? <ProblemBox problem={problem} /> : <p class="soft">Loading …</p>;
@@ -34,7 +37,7 @@ export function JobPage({ id }: { id: string }) {
       <Views seen={seen} />
       <Files live={live} seen={seen} />
       <Facts job={job} seen={seen} />
-      <LogView job={job} />
+      {!guest && <LogView job={job} />}
     </article>
   );
 }
@@ -48,8 +51,10 @@ function Head({ job, seen }: { job: JobView; seen: LiveState }) {
         </h1>
         <Actions job={job} />
       </div>
-      <StageBar job={job} named />
+      <ProgressBar job={job} />
       {!isOver(job) && <LiveNumbers job={job} connected={seen.connected} />}
+      {!isOver(job) && <NotifySwitch />}
+      {!shared.value && job.expires_at && job.state !== "expired" && <p class="soft">Its files are kept until {moment(job.expires_at)}.</p>}
     </header>
   );
 }
@@ -121,8 +126,8 @@ function Facts({ job, seen }: { job: JobView; seen: LiveState }) {
       </summary>
       <dl class="facts">
         <Fact name="Job" value={job.id} />
-        <Fact name="Image set" value={job.dataset_id} link={`#/datasets/${job.dataset_id}`} />
-        {job.forked_from && <Fact name="Forked from" value={job.forked_from} link={`#/jobs/${job.forked_from}`} />}
+        {!shared.value && <Fact name="Image set" value={job.dataset_id} link={`#/datasets/${job.dataset_id}`} />}
+        {!shared.value && job.forked_from && <Fact name="Forked from" value={job.forked_from} link={`#/jobs/${job.forked_from}`} />}
         <Fact name="Submitted" value={moment(job.created_at)} />
         {job.expires_at && <Fact name="Kept until" value={moment(job.expires_at)} />}
         {seconds.map(([stage, s]) => (

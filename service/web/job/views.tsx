@@ -4,8 +4,11 @@ import { useState } from "preact/hooks";
 import type { ArtifactView, JobView, PosesDocument, ViewFile } from "schemas";
 import { type UrlOf, useWidgetData } from "../../../biresnerf/viewer/result/widget_data";
 import { once, useLoaded } from "../api/hooks";
+import { shared } from "../api/http";
+import { useStore } from "../api/store";
 import { isOver } from "../jobs/state";
 import { ProblemBox } from "../parts/problem_box";
+import { useSetPhotos } from "../upload/set_photos";
 import { holdActions, Images } from "./images";
 import type { LiveState } from "./live_job";
 import { Seeding } from "./seeding";
@@ -13,25 +16,28 @@ import { Seeding } from "./seeding";
 export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
   const { poses, report, view, points, history } = seen;
   const job = seen.job!;
+  const guest = useStore(shared);
   const over = isOver(job);
   const { value: widgets, problem } = useLoaded(() => import("./widgets"), once, []);
   const [chosen, setChosen] = useState<number | null | undefined>(undefined);
   const first = view?.views[0]?.image ?? (poses?.images.length ? 0 : null);
   const choice = { selected: chosen === undefined ? first : chosen, onSelect: setChosen };
-  const { names, cameras, centres, rows, cellOf } = useWidgetData(poses, report, view, urlOf);
+  const { names, cameras, centres, rows, cellOf: ownCellOf, photoOf } = useWidgetData(poses, report, view, urlOf);
+  const setCellOf = useSetPhotos(guest ? null : job.dataset_id, names);
+  const cellOf = view?.contact_sheet ? ownCellOf : setCellOf;
   if (problem) return <ProblemBox problem={problem} />;
   if (over && !poses && !history.length) return null;
   return (
     <>
       {widgets && report && over && (
         <div class="panel">
-          <widgets.ResultSummary {...{ report, rows, cellOf }} onSelect={setChosen} actionsOf={holdActions(job)} />
+          <widgets.ResultSummary {...{ report, rows, cellOf }} onSelect={setChosen} {...(!guest && { actionsOf: holdActions(job) })} />
         </div>
       )}
       <div class="job-pictures">
         <Panel name="Cameras" kind="panel-scene">
           {widgets && poses ? (
-            <widgets.SceneView cameras={cameras} points={points} {...choice} />
+            <widgets.SceneView {...{ cameras, points, cellOf, photoOf, ...choice }} />
           ) : (
             <Placeholder job={job} for="cameras" />
           )}

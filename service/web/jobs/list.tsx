@@ -1,44 +1,44 @@
-// The list of jobs, newest first, kept up to date.
-import { useEffect, useState } from "preact/hooks";
-import type { JobList, JobView } from "schemas";
+// The list of jobs, kept up to date: those that run first.
+import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import type { JobView } from "schemas";
 import { Pick } from "../../../biresnerf/viewer/widgets/controls";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
 import { useLoaded } from "../api/hooks";
-import { requestJson } from "../api/http";
-import { usePicture } from "../api/picture_urls";
+import { usePicture, useServed } from "../api/picture_urls";
 import { moment } from "../parts/format";
+import { notifyOfEnds } from "../parts/notify";
 import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 import { DropZone } from "../upload/drop";
-import { Chip, isOver, type JobState, StageBar, STATE_WORDS, titleOf } from "./state";
+import { type Jobs, lasting, loadJobs, ORDERS, type Order, PAGE, SEARCHED_MAX, type Wish } from "./load_jobs";
+import { Selection } from "./selection";
+import { Chip, type JobState, ProgressBar, STATE_WORDS, titleOf } from "./state";
+import { WaitingSets } from "./waiting_sets";
 
-/** Jobs per page of the list, and at most per request. */
-const PAGE = 24;
-const REQUEST_MAX = 200;
-/** Between two requests while jobs run, and while none does. */
-const BUSY_MS = 1500;
-const IDLE_MS = 8000;
-
-/** Filter, length and scroll position, kept for the way back from a job. */
-const listView = { state: "" as JobState | "", wanted: PAGE, scroll: 0 };
+/** Filter, order, search, length and scroll position, kept for the way back from a job. */
+const listView = { wish: { state: "", order: "newest", search: "", wanted: PAGE } as Wish, scroll: 0 };
 
 export function JobsPage() {
-  const [state, setState] = useState(listView.state);
-  const [wanted, setWanted] = useState(listView.wanted);
+  const [wish, setWish] = useState(listView.wish);
+  const [version, setVersion] = useState(0);
   // All that are shown: the running one may be older than many that wait.
-  const { value: found, problem } = useLoaded((signal) => newest(state, wanted, signal), lasting, [state, wanted]);
+  const { value: found, problem } = useLoaded((signal) => loadJobs(wish, signal), lasting, [wish, version]);
   useTitle("Jobs");
+  const seen = useRef<readonly JobView[]>([]);
   useEffect(() => {
-    Object.assign(listView, { state, wanted });
-  }, [state, wanted]);
+    if (!found) return;
+    notifyOfEnds(seen.current, found.jobs);
+    seen.current = found.jobs;
+  }, [found]);
+  useEffect(() => {
+    listView.wish = wish;
+  }, [wish]);
   useEffect(() => {
     if (found) scrollTo(0, listView.scroll);
     listView.scroll = 0;
   }, [found !== null]);
-  const choose = (chosen: JobState | "") => {
-    setState(chosen);
-    setWanted(PAGE);
-  };
+  const change = (part: Partial<Wish>) => setWish({ ...wish, wanted: PAGE, ...part });
+  const asked = wish.state !== "" || wish.search !== "";
   return (
     <>
       <div class="lead">
@@ -48,45 +48,86 @@ export function JobsPage() {
         </p>
       </div>
       <DropZone />
+      <WaitingSets />
       {problem && <ProblemBox problem={problem} />}
       {!found && !problem && <div class="cards" aria-busy="true" />}
-      {found && (found.jobs.length > 0 || state) && (
+      {found && (found.jobs.length > 0 || asked) && (
         <section aria-labelledby="jobs-heading">
           <div class="jobs-head">
             <h2 id="jobs-heading">Jobs</h2>
-            <Pick label="Show" value={state} onChange={choose} options={CHOICES} />
+            <Pick label="Show" value={wish.state} onChange={(state) => change({ state })} options={CHOICES} />
+            <Pick label="Order" value={wish.order} onChange={(order) => change({ order })} options={ORDER_CHOICES} />
+            <label class="pick">
+              <span>Find</span>
+              <input type="search" value={wish.search} placeholder="name" onInput={(event) => change({ search: event.currentTarget.value })} />
+            </label>
             <span class="soft" role="status">
-              {found.more ? `newest ${found.jobs.length}` : count(found.jobs.length, "job")}
+              {found.cut ? `of the newest ${SEARCHED_MAX}` : found.more ? `${found.jobs.length} shown` : count(found.jobs.length, "job")}
             </span>
           </div>
-          <Cards {...found} onOlder={() => setWanted(found.jobs.length + PAGE)} />
+          <Cards
+            {...found}
+            onMore={() => change({ wanted: found.jobs.length + PAGE })}
+            onChanged={() => setVersion((n) => n + 1)}
+          />
         </section>
       )}
-      {found && found.jobs.length === 0 && (
-        <p class="soft empty">
-          {found.state ? `No job is ${STATE_WORDS[found.state]}.` : "No jobs yet. Drop an image set above to start."}
-        </p>
-      )}
+      {found && found.jobs.length === 0 && <p class="soft empty">{emptyWords(found.wish)}</p>}
     </>
   );
 }
 
-function Cards({ jobs, more, onOlder }: Jobs & { onOlder: () => void }) {
+function emptyWords({ state, search }: Wish): string {
+  if (search) return `No job is called “${search}”.`;
+  return state ? `No job is ${STATE_WORDS[state]}.` : "No jobs yet. Drop an image set above to start.";
+}
+
+function Cards({ jobs, more, onMore, onChanged }: Jobs & { onMore: () => void; onChanged: () => void }) {
+  const [ticked, setTicked] = useState<ReadonlySet<string>>(new Set());
+  const selected = useMemo(() => jobs.filter(({ id }) => ticked.has(id)), [jobs, ticked]);
+  const tick = (id: string, on: boolean) => {
+    setTicked((before) => new Set(on ? [...before, id] : [...before].filter((other) => other !== id)));
+  };
   return (
     <>
+      <label class="tick-all">
+        <input
+          type="checkbox"
+          checked={jobs.length > 0 && selected.length === jobs.length}
+          onChange={(event) => setTicked(new Set(event.currentTarget.checked ? jobs.map(({ id }) => id) : []))}
+        />
+        Select all
+      </label>
       <ul class="cards">
         {jobs.map((job) => (
-          <li key={job.id}>
+          <li key={job.id} class="job-item">
+            <label class="tick-job">
+              <input
+                type="checkbox"
+                aria-label={`Select ${titleOf(job)}`}
+                checked={ticked.has(job.id)}
+                onChange={(event) => tick(job.id, event.currentTarget.checked)}
+              />
+            </label>
             <JobCard job={job} />
           </li>
         ))}
       </ul>
       {more && (
         <p class="more">
-          <button class="act" onClick={onOlder}>
-            Older jobs
+          <button class="act" onClick={onMore}>
+            More jobs
           </button>
         </p>
+      )}
+      {selected.length > 0 && (
+        <Selection
+          selected={selected}
+          onDone={() => {
+            setTicked(new Set());
+            onChanged();
+          }}
+        />
       )}
     </>
   );
@@ -96,9 +137,12 @@ const CHOICES: readonly { value: JobState | ""; text: string }[] = [
   { value: "", text: "all" },
   ...Object.entries(STATE_WORDS).map(([value, text]) => ({ value: value as JobState, text })),
 ];
+const ORDER_CHOICES = Object.entries(ORDERS).map(([value, text]) => ({ value: value as Order, text }));
 
 function JobCard({ job }: { job: JobView }) {
-  const picture = usePicture(job.thumbnail && `v1/jobs/${job.id}/artifacts/${job.thumbnail}`, job.stage ?? "");
+  const own = usePicture(job.thumbnail && `v1/jobs/${job.id}/artifacts/${job.thumbnail}`, job.stage ?? "");
+  const photo = useServed(job.thumbnail || job.state === "expired" ? null : `v1/datasets/${job.dataset_id}/thumbnail.jpg`);
+  const picture = own ?? photo;
   return (
     <a class="card job-card" href={`#/jobs/${job.id}`} onClick={() => (listView.scroll = scrollY)}>
       <span class="thumbnail">{picture && <img src={picture} alt="" width={96} height={72} loading="lazy" />}</span>
@@ -107,37 +151,12 @@ function JobCard({ job }: { job: JobView }) {
           <strong>{titleOf(job)}</strong>
           <Chip job={job} />
         </span>
-        <StageBar job={job} />
+        <ProgressBar job={job} />
         <span class="soft job-foot">
           {moment(job.created_at)} · {String(job.options.preset ?? "balanced")}
+          {job.expires_at && job.state !== "expired" && ` · kept until ${moment(job.expires_at)}`}
         </span>
       </span>
     </a>
   );
-}
-
-interface Jobs {
-  state: JobState | "";
-  jobs: JobView[];
-  /** Whether there are older jobs. */
-  more: boolean;
-}
-
-/** The newest jobs in a state; "" stands for all states. */
-async function newest(state: JobState | "", wanted: number, signal: AbortSignal): Promise<Jobs> {
-  const jobs: JobView[] = [];
-  let cursor: string | null = null;
-  do {
-    const limit = String(Math.min(REQUEST_MAX, wanted - jobs.length));
-    const asked = new URLSearchParams({ limit, ...(state && { state }), ...(cursor && { cursor }) });
-    const page: JobList = await requestJson<JobList>("GET", `v1/jobs?${asked}`, { signal });
-    jobs.push(...page.items);
-    cursor = page.next_cursor;
-  } while (cursor && jobs.length < wanted);
-  return { state, jobs, more: cursor !== null };
-}
-
-/** How long the list is shown before it is loaded again: the longer it is, the longer. */
-function lasting({ jobs }: Jobs): number {
-  return jobs.every(isOver) ? IDLE_MS : BUSY_MS * Math.ceil(jobs.length / PAGE);
 }

@@ -1,7 +1,7 @@
-// A job's state in words, as a chip and as a bar of stages.
+// A job's state in words, as a chip and as one bar over all of its run.
 import type { JobView } from "schemas";
 import { VerdictChip } from "../../../biresnerf/viewer/widgets/controls";
-import { duration } from "../../../biresnerf/viewer/widgets/numbers";
+import { duration, roughly } from "../../../biresnerf/viewer/widgets/numbers";
 import { percent } from "../parts/format";
 
 export type JobState = JobView["state"];
@@ -15,7 +15,15 @@ export const STAGE_WORDS: Record<Stage, string> = {
   evaluating: "Evaluating",
   exporting: "Writing",
 };
-const STAGES = Object.keys(STAGE_WORDS) as Stage[];
+/** What a running job does now. */
+const NOW: Record<Stage, string> = {
+  preparing: "Reading the photos",
+  seeding: "Looking for poses to start from",
+  coarse: "Moving the cameras",
+  fine: "Refining cameras and detail",
+  evaluating: "Testing the refined poses",
+  exporting: "Writing the files",
+};
 export const STATE_WORDS = {
   queued: "waiting",
   running: "running",
@@ -44,48 +52,48 @@ export function Chip({ job }: { job: JobView }) {
   return <span class={`chip chip-${tone}`}>{job.partial ? "partial result" : words}</span>;
 }
 
-/** Stage, step and time left in one line. */
+/** What it does now, the step and the time left, in one line. */
 function progressWords(job: JobView): string {
   if (job.state === "queued") return job.queue_position ? `Number ${job.queue_position} in the queue` : "Waiting";
   if (job.state !== "running") {
     const took = job.started_at && job.finished_at && Date.parse(job.finished_at) - Date.parse(job.started_at);
     return took ? `${STATE_WORDS[job.state]} after ${duration(took / 1000)}` : STATE_WORDS[job.state];
   }
-  const { step, steps_total, eta_s } = job.progress;
-  const parts = [job.stage ? STAGE_WORDS[job.stage] : "Starting"];
+  const { step, steps_total } = job.progress;
+  const parts = [job.stage ? NOW[job.stage] : "Starting"];
   if (job.message) parts.push(job.message);
   if (steps_total && (job.stage === "coarse" || job.stage === "fine")) parts.push(`step ${step} of ${steps_total}`);
-  if (eta_s !== null) parts.push(`${duration(eta_s)} left`);
   return parts.join(" · ");
 }
 
-export function StageBar({ job, named = false }: { job: JobView; named?: boolean }) {
-  const now = job.stage ? STAGES.indexOf(job.stage) : -1;
-  const done = job.state === "succeeded" ? STAGES.length : now;
-  const tone = job.state === "failed" ? "bad" : job.state === "cancelled" ? "idle" : "";
+/** How much of the whole run is done, verdict and files included, and how long the rest takes. */
+export function ProgressBar({ job }: { job: JobView }) {
+  const over = isOver(job);
+  const { eta_s, fraction } = job.progress;
+  const share = job.state === "succeeded" ? 1 : fraction;
+  const left = over || eta_s === null ? "" : `${roughly(eta_s)} left`;
+  const tone = job.state === "failed" ? "bad" : over && job.state !== "succeeded" ? "idle" : "";
   return (
-    <div class={`stages ${tone} ${named ? "named" : ""}`}>
+    <div class={`run ${tone}`}>
       <div
-        class="stage-track"
+        class="run-track"
         role="progressbar"
         aria-label={`Progress of ${titleOf(job)}`}
         aria-valuemin={0}
         aria-valuemax={100}
-        aria-valuenow={Math.floor(100 * (job.state === "succeeded" ? 1 : job.progress.fraction))}
-        aria-valuetext={progressWords(job)}
+        aria-valuenow={Math.floor(100 * share)}
+        aria-valuetext={[progressWords(job), percent(share), left].filter(Boolean).join(", ")}
       >
-        {STAGES.map((stage, place) => (
-          <span
-            key={stage}
-            class={place < done ? "past" : place === now && !isOver(job) ? "present" : place === now ? "ended" : ""}
-          >
-            {named && <span class="stage-name">{STAGE_WORDS[stage]}</span>}
-          </span>
-        ))}
+        <span style={{ width: `${100 * share}%` }} />
       </div>
-      <p class="stage-words">
+      <p class="run-words">
         <span>{progressWords(job)}</span>
-        {!isOver(job) && <span class="number">{percent(job.progress.fraction)}</span>}
+        {!over && (
+          <span class="number">
+            {percent(share)}
+            {left && ` · ${left}`}
+          </span>
+        )}
       </p>
     </div>
   );

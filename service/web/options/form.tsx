@@ -1,6 +1,7 @@
 // Preset and options, from the service's description of them.
 import { useMemo } from "preact/hooks";
-import type { FieldProblem, OptionsView } from "schemas";
+import type { CheckReport, FieldProblem, OptionsView } from "schemas";
+import { roughly } from "../../../biresnerf/viewer/widgets/numbers";
 import { once, useLoaded } from "../api/hooks";
 import { requestJson } from "../api/http";
 import { ProblemBox } from "../parts/problem_box";
@@ -18,6 +19,8 @@ interface Props {
   onChange: (change: (values: Values) => Values) => void;
   /** Values of the fields that are left empty; without it, those of the preset. */
   base?: Values;
+  /** Seconds that a job with each preset would take, as far as known. */
+  expected?: CheckReport["expected_s"];
   problems?: readonly FieldProblem[];
 }
 
@@ -32,7 +35,7 @@ function loadOptions(): Promise<OptionsView> {
   return loaded;
 }
 
-export function OptionsForm({ values, onChange, base, problems = [] }: Props) {
+export function OptionsForm({ values, onChange, base, expected = {}, problems = [] }: Props) {
   const { value: view, problem } = useLoaded(loadOptions, once, []);
   const fields = useMemo(() => view && fieldsOf(view.json_schema), [view]);
   if (problem) return <ProblemBox problem={problem} />;
@@ -58,16 +61,20 @@ export function OptionsForm({ values, onChange, base, problems = [] }: Props) {
     <div class="options">
       <fieldset class="presets">
         <legend>Preset</legend>
-        {Object.entries(view.presets).map(([name, filled]) => (
+        {Object.entries(view.presets).map(([name, filled]) => {
+          const seconds = expected[name as keyof typeof expected];
+          return (
           <label key={name} class={name === preset ? "preset chosen" : "preset"}>
             <input type="radio" name="preset" checked={name === preset} onChange={() => set("preset", name)} />
             <strong>{name[0]!.toUpperCase() + name.slice(1)}</strong>
             <span>{PRESET_WORDS[name]}</span>
+            {seconds !== undefined && <span class="preset-time">about {roughly(seconds)} here</span>}
             <span class="soft">
               {filled.steps} steps at {filled.max_image_size} px ({view.presets_on_gpu[name as keyof OptionsView["presets"]]?.max_image_size} px on a GPU)
             </span>
           </label>
-        ))}
+          );
+        })}
       </fieldset>
       <div class="fields">{fields.main.map(row)}</div>
       <details>

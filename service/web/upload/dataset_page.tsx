@@ -1,18 +1,16 @@
-// An image set: its upload, its check, and the form that submits a job.
+// An image set: its upload, its check, and the job to make of it.
 import { useState } from "preact/hooks";
-import type { DatasetView, JobView } from "schemas";
+import type { DatasetView } from "schemas";
 import { count, duration } from "../../../biresnerf/viewer/widgets/numbers";
-import { useAttempt, useLoaded } from "../api/hooks";
+import { useLoaded } from "../api/hooks";
 import { requestJson } from "../api/http";
 import { Store, useStore } from "../api/store";
-import { nameLabel } from "../jobs/state";
-import { OptionsForm } from "../options/form";
-import type { Values } from "../options/schema";
 import { bytes, percent } from "../parts/format";
 import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 import { CheckTable } from "./check_table";
 import { DropZone } from "./drop";
+import { NewJob } from "./new_job";
 import { ResumeUpload } from "./resume_upload";
 import { transfers } from "./send";
 import type { Transfer } from "./transfer";
@@ -42,7 +40,7 @@ export function DatasetPage({ id }: { id: string }) {
         <ProblemBox problem={dataset.error} heading="The image set was rejected" />
       )}
       {dataset.state === "rejected" && <DropZone compact />}
-      {dataset.state === "ready" && <Submit dataset={dataset} />}
+      {dataset.state === "ready" && <NewJob dataset={dataset} />}
     </div>
   );
 }
@@ -78,33 +76,5 @@ function Progress({ transfer }: { transfer: Transfer }) {
         {!transfer.waiting && transfer.known > 0 && `${count(transfer.known, "file")} already on the service`}
       </p>
     </section>
-  );
-}
-
-function Submit({ dataset }: { dataset: DatasetView }) {
-  const [values, setValues] = useState<Values>({ preset: "balanced" });
-  const { attempt, busy, problem } = useAttempt();
-  const submit = async () => {
-    const json = { dataset_id: dataset.id, options: values, labels: nameLabel(dataset.name) };
-    location.hash = `#/jobs/${(await requestJson<JobView>("POST", "v1/jobs", { json })).id}`;
-  };
-  return (
-    <form
-      class="card"
-      aria-label="Options"
-      onSubmit={(event) => {
-        event.preventDefault();
-        void attempt(submit);
-      }}
-    >
-      <h2>Options</h2>
-      <OptionsForm values={values} onChange={setValues} problems={problem?.errors ?? []} />
-      {problem && <ProblemBox problem={problem} />}
-      <p class="submit">
-        <button class="act primary" disabled={busy}>
-          {busy ? "Submitting …" : "Refine the poses"}
-        </button>
-      </p>
-    </form>
   );
 }

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from biresnerf.data.workload import FIRST_ROUND, LEARNING
 from biresnerf.refinement.finish import rounds
 from biresnerf.refinement.finish.adjust_cameras import adjust_cameras
-from biresnerf.refinement.finish.rounds import FIRST_ROUND, LEARNING, run_stage_2
+from biresnerf.refinement.finish.rounds import run_stage_2
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
 from biresnerf.refinement.stages.two_stages import TwoStages

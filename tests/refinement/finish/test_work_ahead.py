@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 
 from biresnerf.data.points.tracks import Tracks
+from biresnerf.data.workload import FIRST_ROUND, LEARNING, step_weights
 from biresnerf.forecast import Forecast
-from biresnerf.refinement.finish.work_ahead import (
-    FIRST_ROUND,
-    LEARNING,
-    expect_rest,
-    expect_run,
-    step_weights,
-    work_ahead,
-)
+from biresnerf.refinement.finish.work_ahead import expect_rest, expect_run, work_ahead
 from biresnerf.refinement.stages.two_stages import TwoStages
 from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
 

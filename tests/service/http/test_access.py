@@ -93,13 +93,15 @@ def address(path: str, owner: Tenant) -> str:
     values = {
         **{"dataset_id": owner.dataset, "job_id": owner.job, "upload_id": owner.upload},
         **{"path": "transforms.json", "name": "report.json"},
-        **{"webhook_id": owner.webhook, "delivery_id": owner.delivery},
+        **{"webhook_id": owner.webhook, "delivery_id": owner.delivery, "link_id": owner.link},
     }
     return re.sub(r"\{(\w+)(:\w+)?\}", lambda match: values[match[1]], path)
 
 
 def ids_of(owner: Tenant) -> dict[str, str]:
-    return {name: getattr(owner, name) for name in ("dataset", "job", "upload", "webhook", "delivery")}
+    return {
+        name: getattr(owner, name) for name in ("dataset", "job", "upload", "webhook", "delivery", "link")
+    }
 
 
 @pytest.mark.parametrize(("method", "path"), [(method, path) for method, path, _ in GUARDED])

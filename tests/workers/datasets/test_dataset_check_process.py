@@ -3,13 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+from unittest.mock import ANY
 
+import numpy as np
 import pytest
+from PIL import Image
 
+from biresnerf.cores import usable_cores
+from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.errors import InputError
+from biresnerf.forecast import RATES, remember_rates
+from biresnerf.options.presets import PRESETS
+from biresnerf.wire.datasets import PhotoList
 from tests.data.formats.simple import trajectories
 from tests.data.scenes import nerfstudio_scene, save, write_image
-from workers.datasets.dataset_check_process import check
+from workers.datasets import dataset_check_process
+from workers.records import FIRST_PHOTO, PHOTO_LIST, PHOTO_SHEET, shown_folder
+
+TIMES = dict.fromkeys(PRESETS, ANY)
+
+
+def check(folder: Path) -> dict[str, Any]:
+    return dataset_check_process.check(folder, shown_folder(folder))
 
 
 def test_what_was_found_is_counted(tmp_path: Path) -> None:
@@ -19,7 +35,53 @@ def test_what_was_found_is_counted(tmp_path: Path) -> None:
         "images": 4, "with_pose": 3, "without_pose": 1, "poses": "partial", "cameras": 1,
         "camera_models": ["PINHOLE"], "intrinsics": ["given"], "format": "colmap", "masks": 1, "transparency": False,
         "warnings": ["1 of 4 images have no pose yet: d.png", "masks were found for 1 of 4 images"],
+        "expected_s": TIMES,
     }  # fmt: skip
+
+
+def test_what_pages_show_is_left_beside_the_set(tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    trajectories.colmap_set(folder, registered=3)
+    write_image(folder / "masks/a.png.png", mode="L")
+    check(folder)
+    shown = shown_folder(folder)
+    found = PhotoList.model_validate_json((shown / PHOTO_LIST).read_bytes())
+    dataset = read_dataset(folder)
+    assert [photo.name for photo in found.photos] == list(dataset.names)
+    assert [photo.masked for photo in found.photos] == [True, False, False, False]
+    assert found.photos[3].world_from_cam is None
+    for photo, frame in zip(found.photos[:3], dataset.frames, strict=False):
+        np.testing.assert_allclose(photo.world_from_cam, frame.world_from_cam[:3])
+    (lens,) = dataset.cameras
+    assert [(one.model, one.params) for one in found.cameras] == [(lens.model, tuple(lens.params))]
+    assert found.sheet is not None
+    wide, high = found.sheet.cell_width, found.sheet.cell_height
+    photos = [np.asarray(Image.open(frame.path).convert("L"), float) for frame in dataset.frames]
+    sheet = Image.open(shown / PHOTO_SHEET).convert("L")
+    assert sheet.size == (found.sheet.columns * wide, -(-4 // found.sheet.columns) * high)
+    for index in range(4):
+        row, column = divmod(index, found.sheet.columns)
+        cell = sheet.crop((column * wide, row * high, (column + 1) * wide, (row + 1) * high))
+        apart = [np.abs(np.asarray(cell, float) - photo).mean() for photo in photos]
+        assert np.argmin(apart) == index
+    with Image.open(shown / FIRST_PHOTO) as first, Image.open(dataset.frames[0].path) as photo:
+        assert first.size == photo.size
+
+
+def test_the_expected_time_is_that_of_the_latest_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    trajectories.colmap_set(tmp_path / "set")
+    general = check(tmp_path / "set")["expected_s"]
+    assert 0 < general["fast"] < general["balanced"] < general["quality"]
+    remember_rates("cuda", 8, {unit: rate / 1000 for unit, rate in RATES.items()})
+    remember_rates("cpu", 2, {unit: 10 * rate for unit, rate in RATES.items()})
+    slower = check(tmp_path / "set")["expected_s"]
+    cores = usable_cores()
+    assert slower == {preset: pytest.approx(10 * cores * seconds) for preset, seconds in general.items()}
+    remember_rates("cuda", 8, {unit: rate / 1000 for unit, rate in RATES.items()})
+    assert check(tmp_path / "set")["expected_s"]["fast"] < general["fast"]
 
 
 def test_images_alone_are_decoded_and_have_no_pose(tmp_path: Path) -> None:

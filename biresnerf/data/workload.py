@@ -1,0 +1,141 @@
+"""How much work a run has before it, in the units of its forecast: from counts and sizes alone, without torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.seeding.map_images import (
+    ALL_PAIRS_UP_TO,
+    BY_LIKENESS,
+    BY_NAME,
+    GUIDED_ALL_PAIRS_UP_TO,
+    NEIGHBOURS,
+    chosen_pairs,
+    pair_count,
+    thoroughness,
+)
+from biresnerf.data.seeding.match_poses import can_match
+from biresnerf.forecast import UNITS, Phase, Unit
+from biresnerf.options.refine_options import ResolvedOptions, SeedingEffort
+
+# Shares of all steps: where cameras are adjusted first, and how long the field then learns at their poses. The first is
+# soon enough: on the demo scene cameras adjusted after half of the steps end as exact as after all (docs/estimator.md).
+FIRST_ROUND, LEARNING = 0.5, 0.25
+# Cameras. Their system is dense: 1,000 take five minutes of one core and 1.9 GB.
+LEAST_ADJUSTED, MOST_ADJUSTED = 3, 1000
+# Shares of a training after which fields are compared. What differs clearly differs more and more (docs/verdict.md).
+LOOKS = (0.25, 0.5, 1.0)
+TRIAL_STEPS = 200  # of those that choose the start
+# Times the verdict's steps, to choose between photos and matches: shorter trials cannot tell wrong poses that agree
+# with each other from bent ones (docs/estimator.md).
+PHOTO_TRIALS = 2
+# Until a field of an open scene has formed, good poses predict unseen views no better than bad ones (fountain-P11: no
+# difference after 200 steps, 4 dB after 400).
+OPEN_STEPS = 2  # times the steps of a scene with a background
+OPEN_STEP = 1.6  # times the work of a step of one, as measured (docs/speed.md)
+# As measured (docs/speed.md): the rendering of a scene with a background against one without; an adjustment's
+# work in thousands of observations of tracks, how many a photo has, and the work without any.
+OPEN_EVALUATION, OBSERVATIONS, ADJUSTMENT = 3.0, 1200, 20.0
+# Features of a megapixel, and the time for a small photo's.
+FEATURES_OF_MEGAPIXEL, THOROUGH = 10_000, 4.0
+SAMPLES = 1 << 15  # of a step of weight 1, with 8 levels in stage 2
+
+
+@dataclass(frozen=True)
+class Workload:
+    """All of a run.
+
+    Attributes:
+        amounts: work in each phase, in its unit.
+        step_weights: units of work in a step of either stage.
+        share: of the steps asked for, how many will be taken.
+    """
+
+    amounts: Mapping[Phase, float]
+    step_weights: Mapping[Phase, float]
+    share: float
+
+    def seconds(self, rates: Mapping[Unit, float]) -> float:
+        """How long it takes where a unit of work takes so long."""
+        return sum(amount * rates[UNITS[phase]] for phase, amount in self.amounts.items())
+
+
+def workload(dataset: Dataset, options: ResolvedOptions, *, unbounded: bool, adjusts: bool) -> Workload:
+    """All of a run, as far as it is known before its features are.
+
+    Args:
+        unbounded: whether photos show surroundings.
+        adjusts: whether all cameras are adjusted at the end.
+    """
+    matched = options.start in ("auto", "colmap") and can_match()
+    weights = step_weights(options, unbounded=unbounded)
+    share = steps_share(matched=matched and adjusts)
+    coarse = options.coarse_steps_max
+    amounts: dict[Phase, float] = {
+        "coarse": coarse * weights["coarse"],
+        "fine": (round(share * options.steps) - coarse) * weights["fine"],
+    }
+    if matched:
+        amounts |= _matching(dataset, options.seeding_effort)
+    if matched and options.start == "auto" and dataset.posed.any():
+        amounts["trying"] = LOOKS[0] * _trial(TRIAL_STEPS, unbounded=unbounded)
+    each = ADJUSTMENT + matched * OBSERVATIONS * len(dataset) / 1000 if adjusts else 0.0
+    amounts |= after_steps(options, unbounded, adjusting=2 * each, checks=matched and adjusts)
+    return Workload(amounts, weights, share)
+
+
+def can_be_adjusted(count: int) -> bool:
+    """Whether so many cameras can be adjusted all at once."""
+    return LEAST_ADJUSTED <= count <= MOST_ADJUSTED
+
+
+def step_weights(options: ResolvedOptions, *, unbounded: bool) -> dict[Phase, float]:
+    """Work of a step in either stage."""
+    weight = options.samples_per_step / SAMPLES * (OPEN_STEP if unbounded else 1.0)
+    return {"coarse": weight, "fine": weight * (0.5 + options.reconstruction_levels / 16)}
+
+
+def steps_share(*, matched: bool) -> float:
+    """Of the steps asked for, how many will be taken: mostly, matches move the cameras, which then stand still."""
+    return FIRST_ROUND + LEARNING if matched else 1.0
+
+
+def after_steps(
+    options: ResolvedOptions, unbounded: bool, *, adjusting: float, checks: bool
+) -> dict[Phase, float]:
+    """Work in the phases after the steps."""
+    trial = _trial(options.trial_steps, unbounded=unbounded)
+    return {
+        "adjusting": adjusting,
+        "checking": PHOTO_TRIALS * trial if checks else 0.0,
+        "evaluating": OPEN_EVALUATION if unbounded else 1.0,
+        # the first look of the first round decides mostly
+        "judging": LOOKS[0] * trial if options.verdict else 0.0,
+    }
+
+
+def _matching(dataset: Dataset, effort: SeedingEffort) -> dict[Phase, float]:
+    """What COLMAP has before it, as far as it is known before its features are."""
+    count, guided = len(dataset), dataset.posed.all()
+    all_up_to = GUIDED_ALL_PAIRS_UP_TO if guided else ALL_PAIRS_UP_TO
+    chosen = chosen_pairs(count, NEIGHBOURS if guided else BY_NAME + BY_LIKENESS)
+    pairs = pair_count(dataset, None) if count <= all_up_to else chosen
+    asked = thoroughness(dataset, effort, pairs)
+    if asked["likeliest"] is not None:
+        pairs = min(pairs, chosen_pairs(count, asked["likeliest"]))
+    sizes = [dataset.camera_of(i) for i in range(count)]
+    shrunk = [min(1.0, asked["widest_image"] / max(camera.width, camera.height)) for camera in sizes]
+    pixels = sum(c.width * c.height * share**2 for c, share in zip(sizes, shrunk, strict=True)) / 1e6
+    features = min(asked["most_features"], FEATURES_OF_MEGAPIXEL * pixels / count)
+    return {
+        "features": pixels * (THOROUGH if asked["thorough"] else 1.0),
+        "matching": pairs * features**2 / 1e9,
+        "mapping": count,
+    }
+
+
+def _trial(steps: int, *, unbounded: bool) -> float:
+    """Work of two trainings of so many steps."""
+    return 2 * steps * (OPEN_STEPS * OPEN_STEP if unbounded else 1.0)

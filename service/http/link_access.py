@@ -1,0 +1,18 @@
+"""What a link to a job's page opens: that job to read, without its log, and nothing else."""
+
+from __future__ import annotations
+
+import re
+
+from service.http.problems import ProblemError
+
+LINK_PREFIX = "brl_"
+_SHOWN = re.compile(r"(/(artifacts|artifacts/(?!log\.txt$).+|report|link))?", re.DOTALL)
+
+
+def require_shown(job_id: str, method: str, path: str) -> None:
+    """Raises ``ProblemError`` (``not_found``) unless a link to the job opens this."""
+    base = f"/v1/jobs/{job_id}"
+    shown = path.startswith(base) and _SHOWN.fullmatch(path[len(base) :])
+    if method not in ("GET", "HEAD") or not shown:
+        raise ProblemError("not_found", "The link does not open this address.")

@@ -1,0 +1,46 @@
+// The curves of two runs in one chart.
+import { useEffect, useRef } from "preact/hooks";
+import uPlot from "uplot";
+import { fixed } from "../../../biresnerf/viewer/widgets/numbers";
+import { themeColour, useDark } from "../../../biresnerf/viewer/widgets/theme";
+import { titleOf } from "../jobs/state";
+import type { Side } from "./page";
+
+const HEIGHT_PX = 260;
+const COLOURS = ["--curve-1", "--curve-2"] as const;
+
+export function OverlaidCurves({ sides }: { sides: readonly [Side, Side] }) {
+  const dark = useDark();
+  const host = useRef<HTMLDivElement>(null);
+  useEffect(() => {
+    const element = host.current;
+    if (!element) return;
+    const tables = sides.map(({ history }): uPlot.AlignedData => [history.map(({ step }) => step), history.map(({ psnr }) => psnr)]);
+    const [text, line] = [themeColour("--text-soft"), themeColour("--line")];
+    const axis = { stroke: text, font: "11px system-ui, sans-serif", ticks: { stroke: line, width: 1, size: 4 }, grid: { stroke: line, width: 1 } };
+    const made = new uPlot(
+      {
+        ...{ width: element.clientWidth, height: HEIGHT_PX, legend: { show: false } },
+        scales: { x: { time: false } },
+        axes: [axis, { ...axis, label: "PSNR (dB)", labelSize: 16, size: 46 }],
+        series: [
+          {},
+          ...sides.map(({ job }, index): uPlot.Series => ({
+            ...{ label: titleOf(job), stroke: themeColour(COLOURS[index] ?? COLOURS[0]), width: 1.75 },
+            ...{ points: { show: false }, spanGaps: true },
+          })),
+        ],
+      },
+      uPlot.join(tables),
+      element,
+    );
+    const observer = new ResizeObserver(() => made.setSize({ width: element.clientWidth, height: HEIGHT_PX }));
+    observer.observe(element);
+    return () => {
+      observer.disconnect();
+      made.destroy();
+    };
+  }, [sides, dark]);
+  const ends = sides.map(({ job, history }) => `${titleOf(job)}: ${fixed(history.at(-1)?.psnr ?? null, 1)} dB at step ${history.at(-1)?.step ?? 0}`);
+  return <div ref={host} class="overlaid" role="img" aria-label={`PSNR of the training views. ${ends.join(". ")}.`} />;
+}

@@ -1,0 +1,87 @@
+// A checked set before its job: photos, given cameras, what will happen, and the form that submits the job.
+import { useMemo, useState } from "preact/hooks";
+import type { DatasetView, JobView } from "schemas";
+import { bordersOf } from "../../../biresnerf/viewer/result/poses";
+import type { SceneCamera } from "../../../biresnerf/viewer/result/widget_data";
+import { once, useAttempt, useLoaded } from "../api/hooks";
+import { requestJson } from "../api/http";
+import { nameLabel } from "../jobs/state";
+import { OptionsForm } from "../options/form";
+import type { Values } from "../options/schema";
+import { ProblemBox } from "../parts/problem_box";
+import { Photos } from "./photos";
+import { Plan } from "./plan";
+import { type SetPhotos, useSet } from "./set_photos";
+
+export function NewJob({ dataset }: { dataset: DatasetView }) {
+  const [values, setValues] = useState<Values>({ preset: "balanced" });
+  const { attempt, busy, problem } = useAttempt();
+  const photos = useSet(dataset.id);
+  const report = dataset.report!;
+  const named = values.leave_out;
+  const leftOut = useMemo(() => new Set(Array.isArray(named) ? named.map(String) : []), [named]);
+  const leaveOut = (names: ReadonlySet<string>) => {
+    setValues(({ leave_out: _, ...others }) => (names.size ? { ...others, leave_out: [...names] } : others));
+  };
+  const submit = async () => {
+    const json = { dataset_id: dataset.id, options: values, labels: nameLabel(dataset.name) };
+    location.hash = `#/jobs/${(await requestJson<JobView>("POST", "v1/jobs", { json })).id}`;
+  };
+  return (
+    <>
+      {photos && (
+        <div class="set-views">
+          <Photos photos={photos} leftOut={leftOut} onChange={leaveOut} />
+          {report.with_pose > 0 && <Cameras photos={photos} />}
+        </div>
+      )}
+      <Plan report={report} values={values} leftOut={leftOut.size} />
+      <form
+        class="card"
+        aria-label="Options"
+        onSubmit={(event) => {
+          event.preventDefault();
+          void attempt(submit);
+        }}
+      >
+        <h2>Options</h2>
+        <OptionsForm values={values} onChange={setValues} expected={report.expected_s} problems={problem?.errors ?? []} />
+        {problem && <ProblemBox problem={problem} />}
+        <p class="submit">
+          <button class="act primary" disabled={busy}>
+            {busy ? "Submitting …" : "Refine the poses"}
+          </button>
+        </p>
+      </form>
+    </>
+  );
+}
+
+/** The given cameras in three dimensions; the code for it is loaded for sets that have poses. */
+function Cameras({ photos: { list, cellOf } }: { photos: SetPhotos }) {
+  const { value: widgets } = useLoaded(() => import("../job/widgets"), once, []);
+  const [selected, setSelected] = useState<number | null>(null);
+  const posed = useMemo(() => list.photos.flatMap(({ world_from_cam }, index) => (world_from_cam ? [index] : [])), [list]);
+  const cameras = useMemo<SceneCamera[]>(() => {
+    const borders = list.cameras.map(bordersOf);
+    return posed.map((index) => {
+      const { name, camera, world_from_cam } = list.photos[index]!;
+      const pose = world_from_cam!;
+      return {
+        ...{ name, before: null, after: pose, returned: pose, source: "given", borders: borders[camera]! },
+        ...{ moved_deg: 0, moved_units: 0, delta_psnr: null, flags: [], uncertainty: null },
+      };
+    });
+  }, [list, posed]);
+  const cellOfPosed = useMemo(() => (camera: number) => cellOf(posed[camera]!), [cellOf, posed]);
+  return (
+    <section class="card panel-scene" aria-labelledby="given-heading">
+      <h2 id="given-heading">Given cameras</h2>
+      {widgets ? (
+        <widgets.SceneView cameras={cameras} cellOf={cellOfPosed} selected={selected} onSelect={setSelected} />
+      ) : (
+        <p class="waiting soft">Loading …</p>
+      )}
+    </section>
+  );
+}

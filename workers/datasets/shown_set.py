@@ -1,0 +1,62 @@
+"""What pages show of a checked set before it is refined: its photos, given cameras, and how long a job will take."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from biresnerf.cores import usable_cores
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.photos.images import ImageSet, load_images
+from biresnerf.data.show.view_pictures import CELL_PX, THUMBNAIL_PX, write_contact_sheet, write_thumbnail
+from biresnerf.data.workload import can_be_adjusted, workload
+from biresnerf.forecast import latest_machine, remembered_rates
+from biresnerf.options.presets import PRESETS, ComputeDevice, PresetName
+from biresnerf.options.refine_options import RefineOptions
+from biresnerf.wire.datasets import CheckedCamera, CheckedPhoto, PhotoList, PhotoSheet
+from workers.records import FIRST_PHOTO, PHOTO_LIST
+
+SMALLEST_PX = 16  # of sets with too many photos to show
+
+
+def small_side(count: int) -> int:
+    """Long side, px, at which so many photos are shown."""
+    return next((side for most, side in CELL_PX if count <= most), SMALLEST_PX)
+
+
+def write_shown(dataset: Dataset, images: ImageSet, folder: Path) -> None:
+    """The list of photos with their poses, all photos in one picture, and the first one, into ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    sheet = write_contact_sheet(images, folder)
+    first = load_images(replace(dataset, frames=dataset.frames[:1]), THUMBNAIL_PX)
+    write_thumbnail(first.image(0), folder / FIRST_PHOTO)
+    photos = PhotoList(
+        photos=tuple(
+            CheckedPhoto(
+                name=frame.name,
+                camera=frame.camera,
+                world_from_cam=None if frame.world_from_cam is None else frame.world_from_cam[:3].tolist(),
+                masked=frame.mask is not None,
+            )
+            for frame in dataset.frames
+        ),
+        cameras=tuple(
+            CheckedCamera(model=one.model, width=one.width, height=one.height, params=tuple(one.params))
+            for one in dataset.cameras
+        ),
+        sheet=sheet and PhotoSheet(**sheet.model_dump(exclude={"file"})),
+    )
+    (folder / PHOTO_LIST).write_text(photos.model_dump_json(), "utf-8")
+
+
+def expected_seconds(dataset: Dataset, *, unbounded: bool) -> dict[PresetName, float]:
+    """Seconds that a job with each preset would take, on a machine as that of the latest job here."""
+    kind, threads = latest_machine() or ("cpu", usable_cores())
+    device: ComputeDevice = "cuda" if kind == "cuda" else "cpu"
+    rates, adjusts = remembered_rates(device, threads), can_be_adjusted(len(dataset))
+    return {
+        preset: workload(
+            dataset, RefineOptions(preset=preset).resolved(device), unbounded=unbounded, adjusts=adjusts
+        ).seconds(rates)
+        for preset in PRESETS
+    }
