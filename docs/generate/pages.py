@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from docs.generate.badges import badges
 from docs.generate.commands_page import commands_page
 from docs.generate.conventions_picture import conventions_svg
 from docs.generate.format_tables import format_page, page_formats
@@ -38,6 +39,7 @@ def _writers() -> dict[Path, Callable[[], str]]:
         ROOT / "docs/result.schema.json": result_schema,
         ROOT / "docs/openapi.json": openapi_document,
         ROOT / "docs/pictures/conventions.svg": conventions_svg,
+        **badges(ROOT),
         **{walk.with_suffix(".ipynb"): partial(notebook, walk) for walk in walks},
     }
 

@@ -28,6 +28,8 @@ OTHERS = (
     "python gaussian-splatting/",
     "cp ",
     "cd ",
+    "git clone ",
+    ". .venv/bin/activate",
     "mkdir ",
 )
 _METHOD = re.compile(r"-X\s*([A-Z]+)")

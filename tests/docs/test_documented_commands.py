@@ -22,6 +22,8 @@ COMMANDS = all_commands()
 # Beginnings of commands that are not run here, and why. Their form is checked all the same.
 NOT_RUN = {
     "make ": "develops the project: tests, measurements, tools; CI runs lint, test and demo",
+    "git clone": "an address that stands for the project's own",
+    ". .venv/bin/activate": "the environment that `make setup` makes",
     "pip install": "changes the environment; CI installs from scratch",
     "docker ": "needs Docker: tests/deploy/compose_check.sh runs the file with podman, as root",
     "TLS_CERTIFICATE=": "needs Docker and a certificate",

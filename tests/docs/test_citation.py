@@ -1,0 +1,45 @@
+"""What is said of the project in one file is what is said of it in the others."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+
+import biresnerf
+from docs.generate.pages import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+# Until the project has an address of its own; to be replaced in all files at once.
+ADDRESS = PROJECT["urls"]["Homepage"]
+
+
+def said(key: str) -> str:
+    found = re.search(rf"^{key}: (.+)$", (ROOT / "CITATION.cff").read_text("utf-8"), flags=re.M)
+    assert found is not None
+    return found[1]
+
+
+def test_the_citation_is_of_this_version_and_licence():
+    assert said("version") == PROJECT["version"] == biresnerf.__version__
+    assert said("license") == PROJECT["license"]
+    assert said("abstract") == PROJECT["description"]
+
+
+def test_all_files_name_one_address():
+    assert said("repository-code") == ADDRESS
+    assert all(url.startswith(ADDRESS) for url in PROJECT["urls"].values())
+    for page in ("README.md", "docs/quick-start.md"):
+        assert set(re.findall(r"git clone (\S+)", (ROOT / page).read_text("utf-8"))) == {ADDRESS}
+
+
+def test_badges_say_what_the_package_says():
+    readme = (ROOT / "README.md").read_text("utf-8")
+    for name, value in {
+        "version": PROJECT["version"],
+        "python": "3.11",
+        "licence": PROJECT["license"],
+    }.items():
+        shown = re.search(rf"!\[([^\]]+)\]\(docs/pictures/badge_{name}\.svg\)", readme)
+        assert shown is not None
+        assert shown[1] == f"{name} {value}"
+        assert f">{value}</text>" in (ROOT / f"docs/pictures/badge_{name}.svg").read_text("utf-8")
