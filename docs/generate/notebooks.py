@@ -1,4 +1,4 @@
-"""The walks of examples/ as notebooks: their cells, split at ``# %%``, without outputs."""
+"""The scripts of examples/ as notebooks: their cells, split at ``# %%``; outputs stay as long as the code does."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ _CELL = re.compile(r"^# %%(?P<markdown> \[markdown\])?\n", re.MULTILINE)
 
 
 def notebook(script: Path) -> str:
-    """The script as a notebook of format 4.5; what stands before its first cell (its docstring) is left out."""
+    """The script as a notebook of format 4.5; what stands before its first cell (its docstring) is left out.
+
+    If the notebook that is there has the same code, its outputs are kept.
+    """
     text = script.read_text("utf-8")
     marks = list(_CELL.finditer(text))
     ends = [mark.start() for mark in marks[1:]] + [len(text)]
@@ -18,6 +21,9 @@ def notebook(script: Path) -> str:
         _cell(index, mark["markdown"] is not None, text[mark.end() : end].strip("\n"))
         for index, (mark, end) in enumerate(zip(marks, ends, strict=True))
     ]
+    there = script.with_suffix(".ipynb")
+    if there.is_file():
+        _keep_outputs(cells, json.loads(there.read_text("utf-8"))["cells"])
     document = {
         "cells": cells,
         "metadata": {
@@ -28,6 +34,22 @@ def notebook(script: Path) -> str:
         "nbformat_minor": 5,
     }
     return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+
+
+def _keep_outputs(cells: list[dict[str, object]], before: list[dict[str, object]]) -> None:
+    """Take over what the cells printed and drew; nothing where the code of any has changed."""
+
+    def code(some: list[dict[str, object]]) -> list[object]:
+        return [cell["source"] for cell in some if cell["cell_type"] == "code"]
+
+    if code(cells) != code(before):
+        return
+    ran = iter([cell for cell in before if cell["cell_type"] == "code"])
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            cell.update(
+                {key: value for key, value in next(ran).items() if key in ("execution_count", "outputs")}
+            )
 
 
 def _cell(index: int, markdown: bool, text: str) -> dict[str, object]:

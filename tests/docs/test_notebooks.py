@@ -6,9 +6,11 @@ import json
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
+from docs.generate.notebooks import notebook
 from docs.generate.pages import ROOT
 from tests.docs.small_runs import small_runs
 
@@ -20,18 +22,45 @@ pytestmark = pytest.mark.slow
 def test_a_notebook_runs_from_its_first_cell_to_its_last(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    notebook = ROOT / "examples" / f"{name}.ipynb"
+    path = ROOT / "examples" / f"{name}.ipynb"
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(notebook.parent)
+    monkeypatch.syspath_prepend(path.parent)
     # A kernel has arguments of its own, which are none of the walk's.
     monkeypatch.setattr(sys, "argv", ["ipykernel_launcher.py", "-f", "kernel-1.json"])
     monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
     namespace = {"__name__": "__main__"}
     with small_runs():
-        for cell in json.loads(notebook.read_text("utf-8"))["cells"]:
+        for cell in json.loads(path.read_text("utf-8"))["cells"]:
             if cell["cell_type"] == "code":
-                exec(compile("".join(cell["source"]), notebook.name, "exec"), namespace)
+                exec(compile("".join(cell["source"]), path.name, "exec"), namespace)
     assert (tmp_path / name / "refined" / "report.json").is_file()
     said = capsys.readouterr().out
     assert "of which the COLMAP model in sparse/0 has 4" in said
     assert [line.split()[0] for line in said.splitlines()[-2:]] == ["given", "refined"]
+
+
+def code_cells(text: str) -> list[dict[str, Any]]:
+    return [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
+
+
+def written(folder: Path, code: str) -> Path:
+    script = folder / "small.py"
+    script.write_text(f'"""Small."""\n\n# %% [markdown]\n# # Small\n\n# %%\n{code}\n')
+    return script
+
+
+def test_a_kernel_runs_a_notebook_and_what_it_shows_stays_as_long_as_its_code(tmp_path: Path) -> None:
+    pytest.importorskip("nbclient")
+    from docs.generate.run_notebooks import executed
+
+    script = written(tmp_path, "import sys\nprint(2 + 3)\nprint('the bar', file=sys.stderr)\n7 * 6")
+    done = executed(notebook(script))
+    (cell,) = code_cells(done)
+    assert [output["output_type"] for output in cell["outputs"]] == ["stream", "execute_result"]
+    assert cell["outputs"][0]["text"] == ["5\n"]
+    assert cell["outputs"][1]["data"]["text/plain"] == ["42"]
+    script.with_suffix(".ipynb").write_text(done)
+    assert notebook(script) == done
+    assert code_cells(notebook(written(tmp_path, "7 * 7")))[0]["outputs"] == []
+    with pytest.raises(Exception, match="ZeroDivisionError"):
+        executed(notebook(written(tmp_path, "1 / 0")))
