@@ -86,6 +86,10 @@ class Clients:
     async def submit_and_follow(self, seen: Seen) -> None:
         """From its dataset to its result."""
         await self.submit(seen)
+        await self.see_through(seen)
+
+    async def see_through(self, seen: Seen) -> None:
+        """From its place in the queue to its result."""
         live = asyncio.create_task(self._follow(seen.job["id"]))
         if seen.kind == "cancelled":
             await asyncio.sleep(self.chance.uniform(0, 4.0))
@@ -98,6 +102,7 @@ class Clients:
         await self.look_through(seen)
 
     async def submit(self, seen: Seen) -> None:
+        """Its dataset, and its place in the queue."""
         dataset = (await self.json("POST", "/v1/datasets", json={"name": "chaos"}))["id"]
         content = json.dumps(seen.plan).encode()
         await self.json("PUT", f"/v1/datasets/{dataset}/files/plan.json", content=content)
