@@ -10,6 +10,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[2]
 SHOWN = (
     "*.md",
+    "CITATION.cff",
     "docs/*.md",
     "docs/*.json",
     "docs/pictures/*",
