@@ -10,7 +10,7 @@ ARG PYTHON_IMAGE=docker.io/library/python:3.11-slim-bookworm
 # What is to be installed, in a stage of its own: a change of pyproject.toml that asks for no other library installs
 # none again.
 FROM ${PYTHON_IMAGE} AS requirements
-ARG EXTRAS=service,colmap,otel
+ARG EXTRAS=service,colmap,photos,otel
 WORKDIR /requirements
 COPY pyproject.toml constraints.txt /
 RUN cp /constraints.txt . && python -c "import tomllib; project = tomllib.load(open('/pyproject.toml', 'rb'))['project']; \

@@ -115,6 +115,16 @@ def colmap() -> Found:
     )
 
 
+def photos() -> Found:
+    """What reads photos that Pillow alone does not."""
+    from biresnerf.data.photos.kinds.photo_kinds import INSTALL, PHOTO_KINDS, is_readable
+
+    unread = [kind.name for kind in PHOTO_KINDS if not is_readable(kind)]
+    if unread:
+        return Found("photos", "missing", f"{', '.join(unread)} cannot be read", INSTALL)
+    return Found("photos", "good", f"{', '.join(kind.name for kind in PHOTO_KINDS)} can be read")
+
+
 def video() -> Found:
     """The encoder for the orbit video."""
     import imageio_ffmpeg
@@ -144,7 +154,7 @@ def scratch() -> Found:
     return Found("work files", "broken", detail, "Free some space, or set TMPDIR to another folder.")
 
 
-CHECKS: Sequence[Check] = (versions, processor, kernels, gpu, colmap, video, report_page, scratch)
+CHECKS: Sequence[Check] = (versions, processor, kernels, gpu, colmap, photos, video, report_page, scratch)
 
 
 def _in_child(name: str, code: str, limit_s: float, hint: str) -> str | Found:

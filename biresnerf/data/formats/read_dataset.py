@@ -43,7 +43,8 @@ def read_dataset(path: Path, within: Path | None = None, *, strict: bool = False
         dataset = codec.bind(without_problems(parsed, strict=strict), contents.root, within)
     for index, frame in enumerate(dataset.frames):
         refuse_unfit_mask(frame, dataset.camera_of(index))
-    return replace(dataset, warnings=(*contents.notes, *left_out_notes(contents.root), *dataset.warnings))
+    left_out = left_out_notes(contents.root, [frame.path for frame in dataset.frames])
+    return replace(dataset, warnings=(*contents.notes, *left_out, *dataset.warnings))
 
 
 def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:

@@ -10,6 +10,7 @@ from PIL import Image
 
 from biresnerf.data.model.dataset import Frame
 from biresnerf.data.photos.image_files import DAMAGED, header_of, open_image
+from biresnerf.data.photos.kinds.linear_light import eight_bit
 from biresnerf.data.photos.orientation import INVERSE, turned, turned_size
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
@@ -20,6 +21,8 @@ _ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})
 
 def decode(frame: Frame, camera: Camera) -> NDArray[np.uint8]:
     """The frame's pixels, uint8 [h, w, 3] or [h, w, 4] (straight alpha); 16-bit and grey become 8-bit RGB.
+
+    Light as floating-point numbers becomes colours by the rule of `kinds.linear_light`, RAW photos by `kinds.raw_file`.
 
     Of several pages or frames in one file it is the first. Wide colour spaces are taken as they are.
 
@@ -60,7 +63,9 @@ def _eight_bit(image: Image.Image, name: str) -> NDArray[np.uint8]:
         # 65535 becomes 255: the full range, rounded.
         grey = ((np.asarray(image).astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
         return np.repeat(grey[..., None], 3, axis=2)
-    if image.mode in ("I", "F"):
+    if image.mode == "F":
+        return np.repeat(eight_bit(np.asarray(image)[..., None], name), 3, axis=2)
+    if image.mode == "I":
         raise InputError(
             "image_format_unsupported",
             "holds 32-bit numbers, which are no colours.",

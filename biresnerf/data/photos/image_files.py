@@ -7,17 +7,28 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from PIL import Image
 from PIL.TiffImagePlugin import TiffImageFile
 
+from biresnerf.data.photos.kinds import linear_light, raw_file
+from biresnerf.data.photos.kinds.photo_kinds import (
+    HEIC,
+    RAW_SUFFIXES,
+    image_suffixes,
+    install_hint,
+    is_readable,
+)
 from biresnerf.errors import InputError
 
-IMAGE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
-# The order in which a name without extension is tried (NeRF-synthetic is PNG).
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+# What COLMAP and other programs read, too; the others are decoded for them.
+PLAIN_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
+_MORE_FORMATS = (
+    "AVIF", linear_light.ExrFile.format, linear_light.RadianceFile.format, linear_light.FloatTiffFile.format,
+)  # fmt: skip
 MAX_IMAGE_PIXELS = 150_000_000  # beyond any camera; a guard against files that unpack to gigabytes
 EXIF_ORIENTATION = 0x0112
 _TIFF_WIDTH, _TIFF_HEIGHT = 0x0100, 0x0101
@@ -30,7 +41,7 @@ _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # inch, cm, mm, um
 # What Pillow raises on damaged files, gathered from its own fuzz corpus.
 DAMAGED: tuple[type[Exception], ...] = (
     *(OSError, SyntaxError, ValueError, EOFError, TypeError, KeyError, IndexError, OverflowError),
-    *(AttributeError, MemoryError, struct.error, zlib.error, Image.DecompressionBombError),
+    *(AttributeError, MemoryError, RuntimeError, struct.error, zlib.error, Image.DecompressionBombError),
 )
 
 T = TypeVar("T")
@@ -79,7 +90,7 @@ def quiet_pillow() -> Iterator[None]:
 
 def is_image_name(path: Path) -> bool:
     """Whether the extension is one of an image format that can be read."""
-    return path.suffix.lower() in IMAGE_SUFFIXES
+    return path.suffix.lower() in image_suffixes()
 
 
 def find_image(folder: Path, name: str) -> Path | None:
@@ -92,7 +103,7 @@ def find_image(folder: Path, name: str) -> Path | None:
             path = folder / spelling
             if path.is_file():
                 return path
-            for suffix in IMAGE_SUFFIXES:
+            for suffix in image_suffixes():
                 for variant in (suffix, suffix.upper()):
                     candidate = path.with_name(path.name + variant) if path.name else path
                     if candidate.is_file():
@@ -103,9 +114,13 @@ def find_image(folder: Path, name: str) -> Path | None:
 
 
 def open_image(path: Path, name: str) -> Image.Image:
-    """The opened, not yet decoded image. Raises InputError ``not_an_image`` or ``image_too_large``."""
+    """The opened, not yet decoded image. Raises InputError ``not_an_image`` or ``image_too_large``.
+
+    Its content says of which format it is. Only RAW photos are known by their names: most are TIFF files otherwise, of
+    which Pillow would take the preview.
+    """
     try:
-        image = Image.open(path, formats=IMAGE_FORMATS)
+        image = Image.open(path, formats=_formats_for(path))
     except Image.DecompressionBombError:
         raise _too_large(name) from None
     except DAMAGED as error:
@@ -118,7 +133,8 @@ def open_image(path: Path, name: str) -> Image.Image:
             "not_an_image",
             what,
             where=name,
-            hint="Replace it by a PNG, JPEG, WebP, TIFF or BMP file, or remove its frame.",
+            hint=install_hint(path)
+            or "Replace it by a PNG, JPEG, WebP, TIFF or BMP file, or remove its frame.",
         ) from None
     if image.format == "TIFF":
         # Without a file name it is not mapped into memory: Pillow maps a turned TIFF with its sides exchanged.
@@ -127,6 +143,27 @@ def open_image(path: Path, name: str) -> Image.Image:
         image.close()
         raise _too_large(name)
     return image
+
+
+def _formats_for(path: Path) -> tuple[str, ...]:
+    return (raw_file.RawFile.format,) if path.suffix.lower() in RAW_SUFFIXES else _all_but_raw()
+
+
+@cache
+def _all_but_raw() -> tuple[str, ...]:
+    if not is_readable(HEIC):
+        return PLAIN_FORMATS + _MORE_FORMATS
+    import pillow_heif
+
+    pillow_heif.options.DECODE_THREADS = 1  # photos are decoded side by side already
+    pillow_heif.register_heif_opener()
+    return (*PLAIN_FORMATS, "HEIF", *_MORE_FORMATS)
+
+
+def is_plain(path: Path, name: str) -> bool:
+    """Whether an image is of a format and of numbers that other programs read, too. Raises as `open_image`."""
+    with quiet_pillow(), open_image(path, name) as image:
+        return image.format in (*PLAIN_FORMATS, "MPO") and image.mode != "F"
 
 
 def read_header(path: Path, name: str) -> ImageHeader:
@@ -161,7 +198,7 @@ def stored_size(image: Image.Image) -> tuple[int, int]:
 
 def _holds_several(image: Image.Image) -> bool:
     # Phones put previews and depth maps behind a JPEG; they are no pages of it.
-    return image.format in ("TIFF", "WEBP", "PNG") and bool(getattr(image, "is_animated", False))
+    return image.format in ("TIFF", "WEBP", "PNG", "AVIF") and bool(getattr(image, "is_animated", False))
 
 
 def _with_exif(header: ImageHeader, exif: Image.Exif) -> ImageHeader:

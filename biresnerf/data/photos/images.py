@@ -15,6 +15,7 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_files import quiet_pillow
+from biresnerf.data.photos.kinds.photo_kinds import PLAIN_SUFFIXES
 from biresnerf.data.photos.masks import load_mask, shrink_mask
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import Background
@@ -24,6 +25,7 @@ _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 # Every core decodes, as far as all full-size pictures held at once fit into this.
 _DECODING_BYTES = 2**30
 _DECODING_BYTES_PER_PX = 16  # RGBA, and the three copies that Pillow makes on the way to an array
+_DEVELOPING_BYTES_PER_PX = 32  # RAW and floating-point numbers take as many
 # A set of opaque images shows its scene before plain black or white:
 BLACK_BELOW = 24  # of 255: sensors and JPEG leave some light in black
 WHITE_ABOVE = 250  # of 255: bright walls and skies stay below it or vary
@@ -131,10 +133,7 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
         if mask is not None:
             counts[part] = shrink_mask(mask, *sizes[index]).reshape(-1)
 
-    largest = max(camera.width * camera.height for camera in dataset.cameras)
-    fitting = _DECODING_BYTES // (largest * _DECODING_BYTES_PER_PX)
-    threads = max(1, min(usable_cores(), len(dataset), fitting))
-    with quiet_pillow(), ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
+    with quiet_pillow(), ThreadPoolExecutor(decoding_threads(dataset), thread_name_prefix="decode") as pool:
         pending = [pool.submit(fill, index) for index in range(len(dataset))]
         try:
             for job in pending:
@@ -148,6 +147,14 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
         pixels, None if opaque else alpha, offsets, widths, heights, cameras, None, counts if masked else None
     )
     return _with_background(images, background, behind)
+
+
+def decoding_threads(dataset: Dataset) -> int:
+    """How many photos may be decoded at once: one on each core, as far as memory allows."""
+    largest = max(camera.width * camera.height for camera in dataset.cameras)
+    plain = all(frame.path.suffix.lower() in PLAIN_SUFFIXES for frame in dataset.frames)
+    each = largest * (_DECODING_BYTES_PER_PX if plain else _DEVELOPING_BYTES_PER_PX)
+    return max(1, min(usable_cores(), len(dataset), _DECODING_BYTES // each))
 
 
 def _with_background(images: ImageSet, background: Background, behind: tuple[float, ...]) -> ImageSet:

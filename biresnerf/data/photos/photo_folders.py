@@ -6,9 +6,11 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 
 from biresnerf.data.photos.image_files import is_image_name
+from biresnerf.data.photos.kinds.photo_kinds import INSTALL, KIND_OF, PHOTO_KINDS, is_readable
 from biresnerf.errors import InputError
 
 IMAGE_FOLDER = "images"
@@ -23,16 +25,8 @@ _NO_PHOTOS = frozenset(
 _NO_PHOTO = re.compile(
     r"^(dynamic_mask_.*|.*[._-](depth|normal|mask|sensor_depth|confidence)\.(png|tiff?))$", re.I
 )
-# What holds pictures, but none that is read: the kind by the extension.
-_KINDS = {
-    "HEIC": (".heic", ".heif"),
-    "AVIF": (".avif",),
-    "RAW": (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"),
-    "GIF": (".gif",),
-    "EXR or HDR": (".exr", ".hdr"),
-    "video": (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"),
-}
-_KIND_OF = {suffix: kind for kind, suffixes in _KINDS.items() for suffix in suffixes}
+# Pictures that no extra reads, by their extension.
+_NEVER_READ = {".gif": "GIF"} | dict.fromkeys((".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"), "video")
 _MOST_ENTRIES = 100_000  # looked at for a message
 
 
@@ -102,13 +96,40 @@ def visible(folder: Path) -> list[Path]:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """The photos in ``folder`` itself, sorted; masks and depth maps that are called so are none."""
-    return [path for path in visible(folder) if is_photo_name(path.name) and path.is_file()]
+    """The photos in ``folder`` itself, sorted, each once; masks and depth maps that are called so are none."""
+    return _once([path for path in visible(folder) if is_photo_name(path.name) and path.is_file()])
 
 
 def images_below(folder: Path) -> list[Path]:
     """The photos in ``folder`` and its folders, sorted, as for `images_in`."""
-    return sorted(path for path in _files_below(folder) if is_photo_name(path.name))
+    return _once(sorted(path for path in _files_below(folder) if is_photo_name(path.name)))
+
+
+def _once(paths: Sequence[Path]) -> list[Path]:
+    """The photos but those that are there in a kind that more programs read."""
+    doubles = doubled(paths)
+    return [path for path in paths if path not in doubles]
+
+
+def doubled(paths: Iterable[Path]) -> dict[Path, Path]:
+    """Photos that lie beside the same photo in another kind (HEIC and JPEG), with the one that is used instead.
+
+    The same name in the same folder is the same photo, unless both are PNG, JPEG and the like.
+    """
+    same: dict[tuple[Path, str], list[Path]] = defaultdict(list)
+    for path in paths:
+        same[path.parent, path.stem.casefold()].append(path)
+    found: dict[Path, Path] = {}
+    for group in same.values():
+        first = min(group, key=_preference)
+        found |= {path: first for path in group if path != first and _preference(path)}
+    return found
+
+
+def _preference(path: Path) -> int:
+    """0 for what every program reads, then by the order of kinds."""
+    kind = KIND_OF.get(path.suffix.lower())
+    return 0 if kind is None else 1 + PHOTO_KINDS.index(kind)
 
 
 def is_photo_name(name: str) -> bool:
@@ -127,22 +148,41 @@ def _files_below(folder: Path) -> Iterator[Path]:
 def pictures_left_out(folder: Path) -> dict[str, list[str]]:
     """The names of pictures and videos in or below ``folder`` that are not read, by their kind."""
     found: dict[str, list[str]] = defaultdict(list)
-    for count, path in enumerate(_files_below(folder)):
-        kind = _KIND_OF.get(path.suffix.lower())
+    for path in islice(_files_below(folder), _MOST_ENTRIES):
+        kind = _unread_kind(path)
         if kind is not None:
             found[kind].append(path.relative_to(folder).as_posix())
-        if count > _MOST_ENTRIES:
-            break
     return {kind: sorted(names) for kind, names in sorted(found.items())}
 
 
-def left_out_notes(folder: Path) -> tuple[str, ...]:
-    """A note for each kind of picture in or below ``folder`` that is not read."""
-    return tuple(
+def _unread_kind(path: Path) -> str | None:
+    kind = KIND_OF.get(path.suffix.lower())
+    if kind is not None:
+        return None if is_readable(kind) else kind.name
+    return _NEVER_READ.get(path.suffix.lower())
+
+
+def left_out_notes(folder: Path, used: Iterable[Path] = ()) -> tuple[str, ...]:
+    """A note for each kind of picture in or below ``folder`` that is not read; those ``used`` are never meant."""
+    notes = [
         f"{len(names)} {kind} {'file is' if len(names) == 1 else 'files are'} not read and left out: "
-        f"{few_names(names, 3)}"
+        f"{few_names(names, 3)}{_how_to_read(kind)}"
         for kind, names in pictures_left_out(folder).items()
-    )
+    ]
+    photos = [path for path in islice(_files_below(folder), _MOST_ENTRIES) if is_photo_name(path.name)]
+    taken = {path.absolute() for path in used}
+    doubles = [
+        f"{one.relative_to(folder).as_posix()} ({other.name} is used)"
+        for one, other in sorted(doubled(photos).items())
+        if one.absolute() not in taken
+    ]
+    if doubles:
+        notes.append(f"{len(doubles)} photos are there in two kinds and count once: {few_names(doubles, 3)}")
+    return tuple(notes)
+
+
+def _how_to_read(kind: str) -> str:
+    return f" ({INSTALL})" if any(kind == one.name for one in PHOTO_KINDS) else ""
 
 
 def unused_image_notes(paths: Sequence[Path], others: Iterable[Path] = ()) -> list[str]:
@@ -179,11 +219,13 @@ def no_images(root: Path, what: str) -> InputError:
     if kinds:
         seen = "; ".join(f"{len(names)} {kind} ({few_names(names, 3)})" for kind, names in kinds.items())
         hint = "Save them as PNG or JPEG, at full size; from a video, save sharp frames that overlap."
+        if any(_how_to_read(kind) for kind in kinds):
+            hint = f"Run `{INSTALL}`, or save them as PNG or JPEG, at full size."
         return InputError("no_images", f"{what} that is read: {seen}.", where=str(root), hint=hint)
     seen = few_names((path.name + "/" * path.is_dir() for path in visible(root)), 8)
     return InputError(
         "no_images",
         f"{what} that is read: it holds {seen or 'nothing'}.",
         where=str(root),
-        hint="Put photos (PNG, JPEG, WebP, TIFF, BMP) there or into images/, and poses in a form of docs/formats.md.",
+        hint="Put photos (JPEG, PNG, HEIC, RAW, TIFF) there or into images/, and poses in a form of docs/formats.md.",
     )

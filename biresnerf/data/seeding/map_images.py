@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.model.image_order import natural_order, pose_distances
 from biresnerf.data.photos.decode import decode
+from biresnerf.data.photos.image_files import is_plain, quiet_pillow
 from biresnerf.data.photos.image_likeness import likeness
+from biresnerf.data.photos.images import decoding_threads
 from biresnerf.data.photos.masks import write_masks
 from biresnerf.data.points.tracks import KEPT, keep_tracks
 from biresnerf.data.seeding.colmap_child import DATABASE
@@ -54,6 +57,8 @@ WIDEST_LOW, MOST_FEATURES_LOW = 800, 1024
 # Small photos have few features. Affine shapes and pooled scales then place more cameras, and cost three times as much;
 # from 400 px on they rarely gain anything. In px, of the long side and of all photos.
 THOROUGH_BELOW, THOROUGH_UP_TO = 400, 10e6
+
+_QUICKLY = 1  # PNG's compression of photos that are written for COLMAP, and removed after
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,18 +155,29 @@ def lay_out(dataset: Dataset, work: Path) -> dict[str, Any]:
 
 def _numbered(dataset: Dataset) -> list[str]:
     """COLMAP's list of pairs knows no spaces, so photos go by numbers there."""
-    suffixes = (frame.path.suffix if frame.orientation == 1 else ".png" for frame in dataset.frames)
+    suffixes = (frame.path.suffix if _as_it_is(frame) else ".png" for frame in dataset.frames)
     return [f"{i:06}{suffix}" for i, suffix in enumerate(suffixes)]
 
 
+def _as_it_is(frame: Frame) -> bool:
+    """Whether COLMAP takes the file itself: it reads plain photos, and takes their pixels as they are stored."""
+    return frame.orientation == 1 and is_plain(frame.path, frame.name)
+
+
 def _link_photos(dataset: Dataset, names: list[str], folder: Path) -> None:
-    """COLMAP takes pixels as they are stored: photos that are meant turned are written so."""
     folder.mkdir()
-    for i, (name, frame) in enumerate(zip(names, dataset.frames, strict=True)):
-        if frame.orientation == 1:
+    plain = [_as_it_is(frame) for frame in dataset.frames]
+
+    def lay(index: int) -> None:
+        name, frame = names[index], dataset.frames[index]
+        if plain[index]:
             (folder / name).symlink_to(frame.path.resolve())
         else:
-            Image.fromarray(decode(frame, dataset.camera_of(i))).save(folder / name)
+            photo = Image.fromarray(decode(frame, dataset.camera_of(index)))
+            photo.save(folder / name, compress_level=_QUICKLY)
+
+    with quiet_pillow(), ThreadPoolExecutor(decoding_threads(dataset), thread_name_prefix="lay-out") as pool:
+        list(pool.map(lay, range(len(dataset))))
 
 
 def _request_images(dataset: Dataset, names: list[str]) -> dict[str, Any]:

