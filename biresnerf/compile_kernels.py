@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from biresnerf.data.points.tracks import Tracks
+from biresnerf.field.backends import directions_for
 from biresnerf.field.cpu.compile_kernels import compile_field_kernels
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
@@ -19,7 +20,7 @@ from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
 from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PatchPhotos, PosePrior
 from biresnerf.refinement.adjustment.patch_points import Surfaces, find_patches
 from biresnerf.refinement.kernels.draw_pixels import draw_pixels
-from biresnerf.refinement.optimise.cast_rays import cast_rays
+from biresnerf.refinement.optimise.cast_rays import cast_rays, viewing_directions
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
 logger = logging.getLogger(__name__)
@@ -47,8 +48,10 @@ def _cast_one_ray() -> None:
     draw_pixels(
         np.zeros(1, np.float32), nowhere, one, 1, np.ones((1, 2), np.int64), one, photo, one, nowhere, colour
     )
-    poses = PoseParameters(torch.eye(4)[None], 1.0, torch.device("cpu"))
-    _, direction = cast_rays(poses.matrices(), torch.zeros(1, dtype=torch.int64), torch.ones(1, 3))
+    cpu, camera = torch.device("cpu"), torch.zeros(1, dtype=torch.int64)
+    lens = Intrinsics.from_cameras([Camera("PINHOLE", SIZE, SIZE, (SIZE, SIZE, SIZE / 2, SIZE / 2))])
+    in_cam = viewing_directions(directions_for(cpu), lens, camera, torch.ones(1, 2))
+    _, direction = cast_rays(PoseParameters(torch.eye(4)[None], 1.0, cpu).matrices(), camera, in_cam)
     direction.sum().backward()
 
 

@@ -39,10 +39,12 @@ class Adam:
             if parameter.grad is not None:
                 parameters.append(parameter)
                 gradients.append(parameter.grad)
-                histories.append(self._of_parameter.setdefault(i, self._fresh(parameter)))
-        first, second, steps = ([history[name] for history in histories] for name in (*MOMENTS, "step"))
+                if i not in self._of_parameter:
+                    self._of_parameter[i] = self._fresh(parameter)
+                histories.append(self._of_parameter[i])
         if not parameters:
             return
+        first, second, steps = ([history[name] for history in histories] for name in (*MOMENTS, "step"))
         torch._foreach_add_(steps, 1)
         torch._fused_adam_(
             parameters, gradients, first, second, [], steps, lr=rate, beta1=self.betas[0], beta2=self.betas[1],

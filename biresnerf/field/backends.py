@@ -94,12 +94,14 @@ def gpu_faults(device: torch.device) -> tuple[str, ...]:
 
 
 def directions_for(device: torch.device) -> Directions:
-    """`directions_in_cam`; on a GPU whose kernels are right, the form that never waits for the device."""
-    if device.type == "cuda" and not gpu_faults(device):
-        from biresnerf.field.cuda.lens import directions_in_cam as on_device
-
-        return on_device
-    return directions_in_cam
+    """The kernel that computes `directions_in_cam` on the device; the definition on a GPU whose kernels are wrong."""
+    if device.type == "cpu":
+        from biresnerf.field.cpu.lens import directions_in_cam as by_kernel
+    elif device.type == "cuda" and not gpu_faults(device):
+        from biresnerf.field.cuda.lens import directions_in_cam as by_kernel
+    else:
+        return directions_in_cam
+    return by_kernel
 
 
 def make_field(shape: FieldShape, seed: int, device: torch.device, threads: int) -> RadianceField:

@@ -73,11 +73,11 @@ class CpuField(GridField):
             first[:, low : low + high] = self.reconstruction_columns.detach().numpy()
         return first
 
-    def _weights(self) -> list[np.ndarray]:
+    def _weights(self) -> tuple[np.ndarray, ...]:
         """The five layers as contiguous arrays; input columns padded to whole tiles, colour rows to 4."""
         last = np.zeros((4, HIDDEN), f4)
         last[:3] = self.networks[4].detach().numpy()
-        return [self._first_layer(self.modules), *(w.detach().numpy() for w in self.networks[1:4]), last]
+        return (self._first_layer(self.modules), *(w.detach().numpy() for w in self.networks[1:4]), last)
 
     def _encode(
         self, x: np.ndarray, gradient: PositionGradient | None, role: str, modules: tuple[str, ...]
@@ -182,11 +182,12 @@ class CpuField(GridField):
                 take("kept begin", count, dtype=np.int64), take("kept end", count, dtype=np.int64),
                 take("colour", 3 * n),
             ),
+            self._weights(),
         )  # fmt: skip
         colour, opacity, depth = np.empty((count, 3), f4), np.empty(count, f4), np.empty(count, f4)
         render_segments(
             segment, offset, t, dt, ray, features.reshape(-1), len(features), view.reshape(-1),
-            rays.background.numpy(), tuple(w.reshape(-1) for w in self._weights()), samples.composited,
+            rays.background.numpy(), tuple(w.reshape(-1) for w in samples.weights), samples.composited,
             colour, opacity, depth, tasks(), self.workers,
         )  # fmt: skip
         return samples, colour, opacity, depth
@@ -196,8 +197,7 @@ class CpuField(GridField):
                         ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
         """Gradients to grid positions [3, n] and view harmonics [rays, 16]; keeps those to the field for `step`."""
         take, n, width = self._buffers.take, len(s.t), len(s.features)
-        weights = self._weights()
-        sums = [take(f"sums {k}", max(1, s.learning), w.size) for k, w in enumerate(weights)]
+        sums = [take(f"sums {k}", max(1, s.learning), w.size) for k, w in enumerate(s.weights)]
         for layer in sums:
             layer.fill(0)
         g_features, dx = take("g features", width, n), take("dx", 3, n)
@@ -206,13 +206,13 @@ class CpuField(GridField):
         second = s.jacobians[1] if len(s.jacobians) > 1 else np.empty((0, 6, n), f4)
         render_segments_backward(
             s.segment, s.learning, longest, s.offset, s.dt, s.ray, s.features.reshape(-1), width, view.reshape(-1),
-            tuple(w.reshape(-1) for w in weights), s.composited, colour, opacity, g_colour, g_opacity,
+            tuple(w.reshape(-1) for w in s.weights), s.composited, colour, opacity, g_colour, g_opacity,
             s.jacobians[0], second, f4(gradient.reconstruction_share if gradient else 0), s.x, take("g density", n),
             take("g colour", 3 * n), g_features.reshape(-1), dx, g_view, tuple(sums), tasks(), self.workers,
         )  # fmt: skip
         if s.learning:
             self._keep_network_gradients(
-                [from_tiles(d.sum(0), *w.shape) for d, w in zip(sums, weights, strict=True)]
+                [from_tiles(d.sum(0), *w.shape) for d, w in zip(sums, s.weights, strict=True)]
             )
             self._pending = (s, g_features)
         return dx, g_view

@@ -28,7 +28,7 @@ class Samples:
 
     Rays segment[s]:segment[s + 1] form segment s; `learning` segments give gradients to the field. Of the samples of
     ray r, offset[r]:offset[r + 1], light reaches those with indices kept[kept_begin[r]:kept_end[r]]. There were
-    `marched` samples before any were merged.
+    `marched` samples before any were merged. `weights` are those of the networks' layers.
     """
 
     segment: np.ndarray
@@ -42,6 +42,7 @@ class Samples:
     features: np.ndarray
     jacobians: list[np.ndarray]
     composited: Composited
+    weights: tuple[np.ndarray, ...]
 
 
 def segments(offset: np.ndarray, trained: int) -> tuple[np.ndarray, int]:

@@ -20,7 +20,7 @@ from biresnerf.geometry.camera.camera_models import FullParameters
 # Newton doubles the digits at each step; lenses that do not fold inside the image need five or six.
 NEWTON_STEPS = 20
 # In units of the focal length: under 1e-9 px for any real camera.
-_NEWTON_DONE = 1e-13
+NEWTON_DONE = 1e-13
 
 # NumPy arrays or torch tensors; torch is not needed to load this.
 Array = TypeVar("Array", bound=Any)
@@ -94,7 +94,7 @@ def undistort(to_x: Array, to_y: Array, c: Coefficients) -> tuple[Array, Array]:
     for _ in range(NEWTON_STEPS):
         step_x, step_y = newton_step(x, y, to_x, to_y, c)
         x, y = x - step_x, y - step_y
-        if len(x) == 0 or float((abs(step_x) + abs(step_y)).max()) < _NEWTON_DONE:
+        if len(x) == 0 or float((abs(step_x) + abs(step_y)).max()) < NEWTON_DONE:
             break
     return x, y
 

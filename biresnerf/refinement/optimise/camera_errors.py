@@ -111,7 +111,7 @@ class CameraErrors:
         self.weights: Tensor | None = None
         self.doubted = torch.zeros(count, dtype=torch.bool, device=device)
         self._stood_out = torch.zeros(count, dtype=torch.int64, device=device)
-        self._sums = torch.zeros(3, count, device=device)  # rays, squared errors, opacities
+        self._sums = torch.zeros(count, 3, device=device)  # rays, squared errors, opacities
 
     @property
     def lost(self) -> Tensor:
@@ -150,12 +150,11 @@ class CameraErrors:
     def add(self, image: Tensor, colour: Tensor, target: Tensor, opacity: Tensor) -> None:
         """One batch: image [rays], rendered and target colours [rays, 3], opacity [rays]."""
         squared = ((colour - target) ** 2).mean(1)
-        for total, values in zip(self._sums, (torch.ones_like(squared), squared, opacity), strict=True):
-            total.index_add_(0, image, values)
+        self._sums.index_add_(0, image, torch.stack([torch.ones_like(squared), squared, opacity], 1))
 
     def close_block(self) -> None:
         """Add the block's errors to the moving average and find the cameras that stand out."""
-        rays, squared, opacity = self._sums
+        rays, squared, opacity = self._sums.unbind(1)
         measured = rays > 0
         block = squared / rays.clamp(min=1) / self.shares
         smoothed = torch.where(self.errors.isfinite(), self.errors + SMOOTHING * (block - self.errors), block)
@@ -180,14 +179,14 @@ class CameraErrors:
         self.errors[camera] = torch.inf
         self._stood_out[camera] = 0
         self.doubted[camera] = False
-        self._sums[:, camera] = 0
+        self._sums[camera] = 0
         self._weigh()
 
     def state(self) -> dict[str, Tensor]:
         return {
             "errors": self.errors,
             "stood_out": self._stood_out,
-            "sums": self._sums,
+            "sums": self._sums.T,
             "doubted": self.doubted,
         }
 

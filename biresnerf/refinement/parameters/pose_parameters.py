@@ -150,7 +150,7 @@ class PoseParameters:
 
     def zero_if_finite(self) -> Tensor:
         """Zero; not a number where some increment is not finite. Does not wait for the device."""
-        return 0 * (self.rotation.detach().sum() + self.translation.detach().sum())
+        return 0 * (self.rotation.detach() + self.translation.detach()).sum()
 
     def forget_gradients(self) -> None:
         self._adam.zero_grad()
