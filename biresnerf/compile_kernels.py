@@ -21,6 +21,7 @@ from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, Patc
 from biresnerf.refinement.adjustment.patch_points import Surfaces, find_patches
 from biresnerf.refinement.kernels.draw_pixels import draw_pixels
 from biresnerf.refinement.optimise.cast_rays import cast_rays, viewing_directions
+from biresnerf.refinement.optimise.pixel_chances import PixelChances
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
 logger = logging.getLogger(__name__)
@@ -43,12 +44,14 @@ def compile_kernels(*, field: bool = True) -> float:
 
 def _cast_one_ray() -> None:
     """One pixel of one photo, on the way a step takes."""
-    one, nowhere = np.zeros(1, np.int64), np.zeros((1, 2), np.float32)
-    photo, colour = np.zeros((1, 3), np.uint8), np.zeros((1, 3), np.float32)
+    cpu = torch.device("cpu")
+    photo, one, nowhere = np.zeros((1, 3), np.uint8), np.zeros(1, np.int64), np.zeros((1, 2), np.float32)
+    colour, weight = np.zeros((1, 3), np.float32), np.zeros(1, np.float32)
+    chances = PixelChances.of([photo[None]], [(1, 1)], [None], 0.0, cpu).arrays()
     draw_pixels(
-        np.zeros(1, np.float32), nowhere, one, 1, np.ones((1, 2), np.int64), one, photo, one, nowhere, colour
+        weight, nowhere, one, 1, chances, np.ones((1, 2), np.int64), one, photo, one, nowhere, colour, weight
     )
-    cpu, camera = torch.device("cpu"), torch.zeros(1, dtype=torch.int64)
+    camera = torch.zeros(1, dtype=torch.int64)
     lens = Intrinsics.from_cameras([Camera("PINHOLE", SIZE, SIZE, (SIZE, SIZE, SIZE / 2, SIZE / 2))])
     in_cam = viewing_directions(directions_for(cpu), lens, camera, torch.ones(1, 2))
     _, direction = cast_rays(PoseParameters(torch.eye(4)[None], 1.0, cpu).matrices(), camera, in_cam)

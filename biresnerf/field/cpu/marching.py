@@ -1,4 +1,4 @@
-"""Ray marching through the occupancy grid, in Numba.
+"""Ray marching through the occupancy grid, and merging of intervals that give little light, in Numba.
 
 The definitions are in `field.reference.operations`. Rays live in the unit frame; the encoding sees positions in
 [0, 1]: (x + 1) / 2 when the scene is bounded, (contract(x) + 2) / 4 when it is not.
@@ -9,14 +9,16 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from biresnerf.field.cpu.matrix_blocks import exponential
 from biresnerf.field.cpu.vector_access import PARALLEL_KERNEL
 from biresnerf.field.reference import operations
 
 f4, i4 = np.float32, np.int32
-ONE, TWO = f4(1), f4(2)
+ONE, TWO, HALF = f4(1), f4(2), f4(0.5)
 BLOCK = 4  # cells a side that are passed at once where all are empty
 FARTHEST = 8  # blocks
 SAFETY = f4(1e-2)  # intervals: a midpoint that rounding puts beyond a face is looked at
+GAP, LEAST_TRANSMITTANCE = f4(operations.GAP), f4(operations.LEAST_TRANSMITTANCE)
 EDGE = f4(operations.EDGE)  # keeps grid positions strictly inside [0, 1)
 _LARGEST_BITS = np.array(ONE - EDGE, f4).view(np.uint32)
 
@@ -166,3 +168,36 @@ def bring_inside(x):
     """
     bits = x.view(np.uint32)
     np.minimum(bits, _LARGEST_BITS, out=bits)
+
+
+@njit(**PARALLEL_KERNEL)
+def merge(density, offset, jitter, light_most, run_most, t_buffer, dt_buffer, count):
+    """Put the merged intervals of each ray in the place of its intervals in t_buffer, dt_buffer and count.
+
+    density [n] is of the intervals one after another, those of ray r from offset[r] on.
+    """
+    for r in prange(count.shape[0]):
+        kept, members = 0, 0
+        transmittance, light, begin, end = ONE, f4(0), f4(0), f4(0)
+        for k in range(count[r]):
+            if transmittance < LEAST_TRANSMITTANCE:
+                break
+            t, dt = t_buffer[r, k], dt_buffer[r, k]
+            left = transmittance * exponential(-density[offset[r] + k] * dt)
+            given, transmittance = transmittance - left, left
+            apart = t - HALF * dt - end > GAP * dt
+            if members > 0 and (apart or light + given > light_most or members == run_most):
+                t_buffer[r, kept] = begin + (HALF if members == 1 else jitter[r]) * (end - begin)
+                dt_buffer[r, kept] = end - begin
+                kept += 1
+                members, light = 0, f4(0)
+            if members == 0:
+                begin = t - HALF * dt
+            end = t + HALF * dt
+            light += given
+            members += 1
+        if members > 0:
+            t_buffer[r, kept] = begin + (HALF if members == 1 else jitter[r]) * (end - begin)
+            dt_buffer[r, kept] = end - begin
+            kept += 1
+        count[r] = kept

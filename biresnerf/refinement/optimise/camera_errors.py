@@ -147,10 +147,11 @@ class CameraErrors:
         self.doubted[camera] = False
         self._weigh()
 
-    def add(self, image: Tensor, colour: Tensor, target: Tensor, opacity: Tensor) -> None:
-        """One batch: image [rays], rendered and target colours [rays, 3], opacity [rays]."""
+    def add(self, image: Tensor, colour: Tensor, target: Tensor, opacity: Tensor, weight: Tensor) -> None:
+        """One batch: image, opacity and weight [rays], rendered and target colours [rays, 3]."""
         squared = ((colour - target) ** 2).mean(1)
-        self._sums.index_add_(0, image, torch.stack([torch.ones_like(squared), squared, opacity], 1))
+        values = torch.stack([torch.ones_like(squared), squared, opacity], 1)
+        self._sums.index_add_(0, image, values * weight[:, None])
 
     def close_block(self) -> None:
         """Add the block's errors to the moving average and find the cameras that stand out."""

@@ -71,7 +71,7 @@ class JointOptimiser:
         self.poses = self._pose_parameters(torch.from_numpy(unit_from_cam))
         self.schedule = self.method.schedule(options, frame.pixel, frame.unbounded, frame.distance)
         self._images = images
-        self.sampler = sampler or PhotoSampler(images, held_out, device)
+        self.sampler = sampler or PhotoSampler(images, held_out, device, self.method.by_detail)
         self.camera_errors = CameraErrors(images, held_out, device)
         self.directions, self.metrics = directions_for(device), AsyncMetrics(device)
         self.occupancy = make_occupancy(self.method.occupancy_side(options), device)
@@ -199,17 +199,17 @@ class JointOptimiser:
         self.step_index += 1
         self._adapt_rays(rendering.samples, schedule.samples(t, self.switch))
         shown = colour.detach().clamp(max=1)
-        self.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach())
-        error = ((shown - batch.sharp) ** 2)[: batch.trained].mean()
+        self.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach(), batch.weight)
+        error = ((shown - batch.sharp) ** 2 * batch.weight[:, None])[: batch.trained].mean()
         # A pose that is not finite sees nothing, so the loss stays finite.
         loss_value, error_value = self.metrics.read(loss.detach() + self.poses.zero_if_finite(), error)
         return StepResult(loss_value, error_value, len(origin), rendering.samples)
 
     def _loss(self, colour: Tensor, batch: PixelBatch) -> Tensor:
-        loss, weights = self.method.loss(colour, batch.target), self.camera_errors.weights
-        if weights is not None and self.method.robust_extensions:
-            loss = loss * weights[batch.image][:, None]
-        return loss.mean()
+        weight, of_camera = batch.weight, self.camera_errors.weights
+        if of_camera is not None and self.method.robust_extensions:
+            weight = weight * of_camera[batch.image]
+        return (self.method.loss(colour, batch.target) * weight[:, None]).mean()
 
     def pose_rate(self) -> float:
         """Learning rate of the poses at this step."""

@@ -46,6 +46,7 @@ class Method:
         pruned: whether the occupancy grid is updated; otherwise every cell counts as occupied.
         merging: how intervals that give little light are merged, if they are.
         rays_least: fewest rays a step.
+        by_detail: share of the rays that are drawn in proportion to the photos' detail, see `PixelChances`.
     """
 
     build_field: BuildField
@@ -60,6 +61,7 @@ class Method:
     pruned: bool = True
     merging: Merging | None = None
     rays_least: int = 256
+    by_detail: float = 0.0
 
 
 def half_squared_error(colour: Tensor, target: Tensor) -> Tensor:
@@ -108,6 +110,7 @@ BIRESNERF = Method(
     robust_extensions=True,
     robust_frame=True,
     merging=Merging(light=0.03, most=8),
+    by_detail=0.5,
 )
 
 # The baselines belong to the studies, which this package must not import. `find_method` loads theirs by name when a run

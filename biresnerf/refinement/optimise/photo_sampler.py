@@ -17,39 +17,53 @@ from torch import Tensor
 from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.refinement.kernels.draw_pixels import draw_pixels
+from biresnerf.refinement.optimise.pixel_chances import PixelChances
 
 PYRAMID_LEVELS = 5
 LEVEL_SIGMA = 0.5  # blur of level k, in px: 0.5 * 2**k (a box of 2**k px and the bilinear taps)
+
+
+# Of rays: image, pixel centre, colour and weight; how many are of training views.
+Drawn = tuple[Tensor, Tensor, Tensor, Tensor, int]
 
 
 @dataclass(frozen=True)
 class PixelBatch:
     """`image` [rays] indices, pixel centres `xy` [rays, 2] px, colours [rays, 3] in 0..1: blurred and sharp.
 
-    The first `trained` rays belong to training views, the rest to held-out ones.
+    `weight` [rays] makes sums over rays what they were if all pixels had the same chance. The first `trained` rays
+    belong to training views, the rest to held-out ones.
     """
 
     image: Tensor
     xy: Tensor
     target: Tensor
     sharp: Tensor
+    weight: Tensor
     trained: int
 
 
 class PhotoSampler:
     """Draws the same number of pixels from every image; keeps an image pyramid for coarse-to-fine targets.
 
+    Args:
+        by_detail: share of an image's rays that are drawn in proportion to its detail, see `PixelChances`.
+
     Attributes:
         shares: how much of each of the pyramid's pixels counts, uint8 of 255; None where there are no masks.
     """
 
-    def __init__(self, images: ImageSet, held_out: list[int], device: torch.device) -> None:
+    def __init__(
+        self, images: ImageSet, held_out: list[int], device: torch.device, by_detail: float = 0.0
+    ) -> None:
         count = len(images)
         unseen = set(held_out)
         training = [i for i in range(count) if i not in unseen]
         self.order = torch.tensor(training + sorted(held_out), device=device)
         self.training, self.device = len(training), device
-        offsets, sizes, base = [], [], 0
+        offsets: list[list[int]] = []
+        sizes: list[list[tuple[int, int]]] = []
+        base = 0
         pixels = np.empty((_pyramid_pixels(images), 3), dtype=np.uint8)
         current = [images.image(i) for i in range(count)]
         masks, shares = _masks(images), []
@@ -57,6 +71,9 @@ class PhotoSampler:
             if level:
                 halves = [_half(image, mask) for image, mask in zip(current, masks, strict=True)]
                 current, masks = [image for image, _ in halves], [mask for _, mask in halves]
+            if level == 1:
+                counts = [images.counts_image(i) for i in range(count)]
+                self.chances = PixelChances.of(current, sizes[0], counts, by_detail, device)
             shares += [mask.reshape(-1) for mask in masks if mask is not None]
             begin = base + np.cumsum([0, *(im.shape[0] * im.shape[1] for im in current)])
             offsets.append(begin[:-1].tolist())
@@ -66,68 +83,52 @@ class PhotoSampler:
             base = int(begin[-1])
         self.pixels = torch.from_numpy(pixels).to(device)
         self.shares = torch.from_numpy(np.concatenate(shares)).to(device) if shares else None
-        self._counted = self._counted_pixels(images) if shares else None
         self.offsets = torch.tensor(offsets, device=device)
         self.sizes = torch.tensor(sizes, device=device)
         self.long_side = float(self.sizes[0].max())
         self._corners = torch.tensor([[[0, 0]], [[0, 1]], [[1, 0]], [[1, 1]]], device=device)
         self._host: torch.Generator | None = None
 
-    def _counted_pixels(self, images: ImageSet) -> tuple[Tensor, Tensor]:
-        """Indices (int32) of the pixels that count, image after image, and where each image's begin [n + 1]."""
-        masks = (images.counts_image(i) for i in range(len(images)))
-        parts = [np.flatnonzero(mask).astype(np.int32) for mask in masks if mask is not None]
-        begin = torch.from_numpy(np.cumsum([0, *map(len, parts)]))
-        return torch.from_numpy(np.concatenate(parts)).to(self.device), begin.to(self.device)
-
     def draw(
         self, rays: int, blur_px: float, generator: torch.Generator, *, held_out_only: bool = False
     ) -> PixelBatch:
         """`rays` pixels, spread evenly over all images or the held-out ones, blurred by a random share of `blur_px`."""
-        if self.device.type == "cpu" and self._counted is None and not held_out_only:
-            image, xy, sharp, trained = self._drawn_at_once(rays, generator)
-        else:
-            image, xy, sharp, trained = self._drawn(rays, generator, held_out_only=held_out_only)
+        drawn = self._drawn_at_once if self.device.type == "cpu" else self.defined_draw
+        image, xy, sharp, weight, trained = drawn(rays, generator, held_out_only)
         sigma = blur_px * self._share(generator)
         target = sharp if sigma <= LEVEL_SIGMA else self._blurred(image, xy, sigma)
-        return PixelBatch(image, xy, target, sharp, trained)
+        return PixelBatch(image, xy, target, sharp, weight, trained)
 
-    def _drawn(
-        self, rays: int, generator: torch.Generator, *, held_out_only: bool = False
-    ) -> tuple[Tensor, Tensor, Tensor, int]:
-        """Image, pixel centre and colour of each ray, and how many are of training views."""
+    def defined_draw(self, rays: int, generator: torch.Generator, held_out_only: bool) -> Drawn:
+        """Image, pixel centre, colour and weight of each ray, and how many are of training views."""
         position, trained = self._positions(rays, generator, held_out_only)
         image = self.order[position]
-        size = self.sizes[0][image]
-        xy = self.random_pixels(image, generator)
-        index = self.offsets[0][image] + (xy[:, 1].floor() * size[:, 0] + xy[:, 0].floor()).long()
-        return image, xy, self.pixels[index].float() / 255, trained
+        share = torch.rand(rays, 2, generator=generator, device=generator.device).to(self.device)
+        pixel, weight = self.chances.draw(image, share)
+        sharp = self.pixels[self.offsets[0][image] + pixel].float() / 255
+        return image, self._centre(image, pixel), sharp, weight, trained
 
-    def _drawn_at_once(self, rays: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, int]:
-        """The same from the same random numbers in one kernel, on a CPU and where all pixels count."""
+    def _drawn_at_once(self, rays: int, generator: torch.Generator, held_out_only: bool) -> Drawn:
+        """The same from the same random numbers in one kernel, on a CPU."""
         where, share = torch.rand(rays, generator=generator), torch.rand(rays, 2, generator=generator)
-        image, xy, sharp = (
-            np.empty(rays, np.int64),
-            np.empty((rays, 2), np.float32),
-            np.empty((rays, 3), np.float32),
-        )
+        image, weight = np.empty(rays, np.int64), np.empty(rays, np.float32)
+        xy, sharp = np.empty((rays, 2), np.float32), np.empty((rays, 3), np.float32)
+        order, training = (self.order[self.training :], 0) if held_out_only else (self.order, self.training)
         trained = draw_pixels(
-            where.numpy(), share.numpy(), self.order.numpy(), self.training, self.sizes[0].numpy(),
-            self.offsets[0].numpy(), self.pixels.numpy(), image, xy, sharp,
+            where.numpy(), share.numpy(), order.numpy(), training, self.chances.arrays(), self.sizes[0].numpy(),
+            self.offsets[0].numpy(), self.pixels.numpy(), image, xy, sharp, weight,
         )  # fmt: skip
-        return torch.from_numpy(image), torch.from_numpy(xy), torch.from_numpy(sharp), trained
+        tensors = [torch.from_numpy(each) for each in (image, xy, sharp, weight)]
+        return tensors[0], tensors[1], tensors[2], tensors[3], trained
 
     def random_pixels(self, image: Tensor, generator: torch.Generator) -> Tensor:
-        """The centre [rays, 2] (px) of a random pixel that counts, of each of the images `image` [rays]."""
-        size = self.sizes[0][image]
-        if self._counted is None:
-            share = torch.rand(len(image), 2, generator=generator, device=generator.device).to(self.device)
-            return (share * size).floor() + 0.5
-        pixels, begin = self._counted
-        first, count = begin[image], begin[image + 1] - begin[image]
-        drawn = torch.rand(len(image), generator=generator, device=generator.device, dtype=torch.float64)
-        pixel = pixels[first + (drawn.to(self.device) * count).long()].long()
-        return torch.stack([pixel % size[:, 0], pixel // size[:, 0]], 1) + 0.5
+        """The centre [rays, 2] (px) of any pixel that counts, of each of the images `image` [rays]."""
+        share = torch.rand(len(image), generator=generator, device=generator.device, dtype=torch.float64)
+        return self._centre(image, self.chances.draw_evenly(image, share.to(self.device)))
+
+    def _centre(self, image: Tensor, pixel: Tensor) -> Tensor:
+        width = self.sizes[0][image][:, 0]
+        return torch.stack([pixel % width, pixel // width], 1) + 0.5
 
     def counting(self, image: Tensor, xy: Tensor) -> Tensor | None:
         """Whether pixels with centres `xy` [rays, 2] count, 0 or 1 [rays]; None where there are no masks."""

@@ -27,6 +27,7 @@ from biresnerf.geometry.level_ring import order_on_ring
 from biresnerf.geometry.turntable import Ring
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import find_method
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.parameters.ring_parameters import RingParameters
 from biresnerf.refinement.scene.scene_frame import scene_frame
@@ -70,7 +71,7 @@ class RingTrials:
         self._run = torch.from_numpy(order.run)
         self.images, self.unseen = images, trial_views(len(images))
         self._options, self._device, self._threads, self._should_stop = options, device, threads, should_stop
-        self._sampler = PhotoSampler(images, self.unseen, device)
+        self._sampler = PhotoSampler(images, self.unseen, device, find_method(options.method).by_detail)
         pixels = int(sum(images.widths[v] * images.heights[v] for v in self.unseen))
         self._stride = max(1, math.ceil(math.sqrt(pixels / UNSEEN_RAYS)))
         even = torch.arange(len(images)) * (2 * torch.pi / len(images))

@@ -65,7 +65,7 @@ def gains(optimiser: JointOptimiser) -> Array:
         rendering = optimiser.render(
             origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=False
         )
-        seen = (rendering.opacity > 0.5).float()  # the background shines as it likes
+        seen = (rendering.opacity > 0.5).float() * batch.weight[part]  # the background shines as it likes
         for total, colour in ((shown, batch.sharp[part]), (rendered, rendering.colour)):
             values = (colour.mean(1) * seen).double().cpu().numpy()
             np.add.at(total, image.cpu().numpy(), values)

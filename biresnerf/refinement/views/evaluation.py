@@ -68,7 +68,7 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
         origin, direction = optimiser.cast(matrices, batch.image, batch.xy)
         rendering = optimiser.render(origin, direction, 0, schedule.fine_interval, gradient, jitter=True)
         colour = exposure.forgiven(exposure.shown(rendering, batch.image), batch.sharp)
-        optimiser.method.loss(colour, batch.sharp).mean().backward()
+        (optimiser.method.loss(colour, batch.sharp) * batch.weight[:, None]).mean().backward()
         poses.step(FIT_RATE * 0.1 ** (step / FIT_STEPS), mobility)
         exposure.step(FIT_EXPOSURE_RATE * 0.1 ** (step / FIT_STEPS))
 

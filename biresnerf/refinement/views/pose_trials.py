@@ -22,6 +22,7 @@ from biresnerf.errors import Interrupted
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import find_method
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.views.evaluation import render_view
@@ -88,7 +89,9 @@ class PoseTrials:
             }
         )
         self._device, self._threads, self._should_stop = device, threads, should_stop
-        self._sampler = sampler or PhotoSampler(images, self.unseen, device)
+        self._sampler = sampler or PhotoSampler(
+            images, self.unseen, device, find_method(options.method).by_detail
+        )
 
     def score(
         self,

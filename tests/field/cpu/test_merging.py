@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.field.cpu.merging import merge
+from biresnerf.field.cpu.marching import merge
 from biresnerf.field.radiance_field import Merging
 from biresnerf.field.reference import operations as reference
 

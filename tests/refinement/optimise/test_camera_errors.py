@@ -80,7 +80,7 @@ def block(watch: CameraErrors, squared: list[float], opacity: float = 1.0) -> No
     """One block in which camera i is off by the root of `squared`[i] at each of its five rays; NaN: it has none."""
     image = torch.tensor([i for i, value in enumerate(squared) for _ in range(5) if value == value])
     off = torch.tensor(squared)[image].sqrt()[:, None].expand(-1, 3)
-    watch.add(image, off, torch.zeros_like(off), torch.full((len(image),), opacity))
+    watch.add(image, off, torch.zeros_like(off), torch.full((len(image),), opacity), torch.ones(len(image)))
     watch.close_block()
 
 
@@ -119,7 +119,7 @@ def test_a_camera_that_renders_next_to_nothing_is_lost_whatever_its_error(tmp_pa
     colour = torch.zeros(35, 3)
     opacity = watch.shares[image] * torch.where(image == 3, 0.05, 0.5)
     for _ in range(2):
-        watch.add(image, colour, colour, opacity)
+        watch.add(image, colour, colour, opacity, torch.ones(35))
         watch.close_block()
     assert torch.nonzero(watch.lost)[:, 0].tolist() == [3]
 
@@ -131,6 +131,16 @@ def test_a_camera_without_rays_keeps_what_was_known_of_it():
     block(watch, errors)
     block(watch, [0.01] * 4 + [float("nan")] + [0.01] * 7)
     assert watch.relative[4] == pytest.approx(10)
+
+
+def test_errors_are_means_by_the_rays_weights():
+    watch = CameraErrors(striped_set(2), [], CPU)
+    colour = torch.tensor([[0.0] * 3, [1.0] * 3])
+    watch.add(
+        torch.zeros(2, dtype=torch.int64), colour, torch.zeros(2, 3), torch.ones(2), torch.tensor([3.0, 1.0])
+    )
+    watch.close_block()
+    assert float(watch.errors[0]) == pytest.approx(0.25)
 
 
 def test_a_repaired_camera_starts_over():
@@ -150,7 +160,7 @@ def test_all_state_travels():
     errors = [0.01] * 12
     errors[4] = 0.1
     block(watch, errors)
-    watch.add(torch.tensor([4]), torch.ones(1, 3), torch.zeros(1, 3), torch.ones(1))
+    watch.add(torch.tensor([4]), torch.ones(1, 3), torch.zeros(1, 3), torch.ones(1), torch.ones(1))
     other.load_state({name: tensor.clone() for name, tensor in watch.state().items()})
     for each in (watch, other):
         block(each, errors)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler, turned
+from tests.refinement.optimise.test_masked_photos import two_coloured
 from tests.refinement.tiny_scene import CPU, photos_set
 
 
@@ -67,14 +68,45 @@ def test_the_same_generator_draws_the_same_pixels():
     assert torch.equal(one.target, other.target)
 
 
+@pytest.mark.parametrize("by_detail", [0.0, 0.5])
+@pytest.mark.parametrize("held_out_only", [False, True])
 @pytest.mark.parametrize("rays", [1, 8, 4097])
-def test_the_kernel_draws_what_torch_draws(rays):
-    sampler = PhotoSampler(photos_set(noise_photos()), [1], CPU)
-    *ours, trained = sampler._drawn_at_once(rays, generator(6))
-    *theirs, of_training_views = sampler._drawn(rays, generator(6))
-    assert trained == of_training_views
-    for one, other in zip(ours, theirs, strict=True):
-        assert torch.equal(one, other)
+def test_the_kernel_draws_what_torch_draws(rays, held_out_only, by_detail):
+    for images in (photos_set(noise_photos()), two_coloured()):
+        sampler = PhotoSampler(images, [1], CPU, by_detail)
+        *ours, trained = sampler._drawn_at_once(rays, generator(6), held_out_only)
+        *theirs, of_training_views = sampler.defined_draw(rays, generator(6), held_out_only)
+        assert trained == of_training_views
+        for one, other in zip(ours, theirs, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-6, atol=0)
+
+
+def edge(height: int = 40, width: int = 48) -> np.ndarray:
+    """Dark on the left, bright on the right."""
+    photo = np.full((height, width, 3), 40, np.uint8)
+    photo[:, width // 2 :] = 200
+    return photo
+
+
+def test_pixels_at_an_edge_are_drawn_more_often_and_weigh_less():
+    batch = PhotoSampler(photos_set([edge()]), [], CPU, by_detail=0.5).draw(50_000, 0.0, generator())
+    at_edge = (batch.xy[:, 0] - 24).abs() < 8  # a third of the pixels, and all detail
+    assert float(at_edge.float().mean()) == pytest.approx(0.5 + 0.5 / 3, rel=0.02)
+    assert float(batch.weight[at_edge].max()) == pytest.approx(0.5, rel=0.02)
+    assert float(batch.weight.max()) == pytest.approx(2, rel=1e-3), (
+        "no more than an even draw of half the rays"
+    )
+
+
+@pytest.mark.parametrize("by_detail", [0.0, 0.5, 0.9])
+def test_weighted_sums_over_rays_are_those_over_all_pixels(by_detail):
+    photos = [edge(), *noise_photos()]
+    batch = PhotoSampler(photos_set(photos), [], CPU, by_detail).draw(400_000, 0.0, generator(2))
+    for i, photo in enumerate(photos):
+        of_photo = batch.image == i
+        colour = (batch.sharp[of_photo] * batch.weight[of_photo, None]).mean(0) * 255
+        np.testing.assert_allclose(colour, photo.reshape(-1, 3).mean(0), rtol=0.02)
+        assert float(batch.weight[of_photo].mean()) == pytest.approx(1, rel=0.02)
 
 
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 2.0, 5.0, 50.0])
