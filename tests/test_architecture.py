@@ -190,7 +190,7 @@ def imported(package: str) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("package", "extras"),
     [
-        ("biresnerf", ["client", "colmap", "studies"]),
+        ("biresnerf", ["client", "colmap", "photos", "studies", "view"]),
         ("workers", ["service", "otel"]),
         ("service", ["service"]),
     ],
