@@ -15,13 +15,14 @@ from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.part_of_set import without_photos
 from biresnerf.data.photos.images import load_images
+from biresnerf.data.photos.video.video_frames import VideoReading
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.errors import Interrupted
 from biresnerf.field.backends import resolve_here, use_threads
 from biresnerf.forecast import Forecast, remember_rates, remembered_rates
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
-from biresnerf.progress import Monitor, OnProgress, Progress
+from biresnerf.progress import Monitor, OnProgress, Progress, told_before_the_run
 from biresnerf.refinement.finish.rounds import run_stage_2
 from biresnerf.refinement.finish.time_budget import keep_to_budget
 from biresnerf.refinement.finish.work_ahead import expect_rest, expect_run
@@ -81,8 +82,7 @@ def refine_poses(
         Path(output), options, on_progress, should_stop, keep_reusable=keep_reusable, overwrite=overwrite
     )
 
-    strict = setup.options.bad_frames == "refuse"
-    dataset = input if isinstance(input, Dataset) else read_dataset(Path(input), strict=strict)
+    dataset = input if isinstance(input, Dataset) else _read(Path(input), setup)
     dataset = without_photos(dataset, setup.options.leave_out)
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
@@ -153,6 +153,12 @@ def _set_up(
     compile_kernels(field=device.type == "cpu")
     forecast.begins()
     return _Setup(folder, asked, options, device, threads, earlier, monitor)
+
+
+def _read(path: Path, setup: _Setup) -> Dataset:
+    watch = told_before_the_run(setup.monitor.report, setup.monitor.should_stop)
+    videos = VideoReading(setup.options.video_frames, watch)
+    return read_dataset(path, strict=setup.options.bad_frames == "refuse", videos=videos)
 
 
 def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:

@@ -43,6 +43,24 @@ class Progress(FrozenModel):
 OnProgress = Callable[[Progress], None]
 
 
+def told_before_the_run(on_progress: OnProgress, should_stop: Callable[[], bool]) -> Callable[[str], None]:
+    """A function to call with what is being done while the input is read: tells what is new, and ends it on request.
+
+    It raises `Interrupted` where ``should_stop`` says so.
+    """
+    last = ""
+
+    def watch(what: str) -> None:
+        nonlocal last
+        if should_stop():
+            raise Interrupted(f"stopped while {what}; run again to go on")
+        if what != last:
+            on_progress(Progress(stage="preparing", message=what))
+            last = what
+
+    return watch
+
+
 @dataclass(frozen=True)
 class Monitor:
     """Whoever follows a run.

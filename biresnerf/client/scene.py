@@ -20,15 +20,18 @@ class Scene:
     total_bytes: int
 
 
-def look_at(path: Path) -> Scene:
+def look_at(path: Path, video_frames: int = 0) -> Scene:
     """The files that make up the input at ``path``: poses with the images and masks they name, or images alone.
+
+    Of videos it is the frames, as many as the option ``video_frames`` says, which are written beside them.
 
     Raises:
         InputError: the input cannot be used, or an image is outside its folder.
     """
     from biresnerf.data.formats.read_dataset import read_dataset
+    from biresnerf.data.photos.video.video_frames import VideoReading
 
-    dataset = read_dataset(path)
+    dataset = read_dataset(path, videos=VideoReading(video_frames))
     root = dataset.root
     images = list({frame.path.resolve(): frame.path for frame in dataset.frames}.values())
     masks = list(

@@ -64,7 +64,7 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
         """
         wanted = as_options(options)
         await tell(on_progress, Sending("reading"))
-        files = await _local_files(path)
+        files = await _local_files(path, wanted.video_frames)
         if resume is None:
             folder = path.resolve()
             title = (name or (folder.parent if folder.is_file() else folder).name or "scene")[:200]
@@ -114,9 +114,9 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
             cause.add_note(f"The dataset {target.id} remains on the service: {error}")
 
 
-async def _local_files(path: Path) -> list[LocalFile]:
+async def _local_files(path: Path, video_frames: int) -> list[LocalFile]:
     """The files of the input at ``path``, with their digests; raises `InputError`."""
-    scene = await to_thread.run_sync(look_at, path, abandon_on_cancel=True)
+    scene = await to_thread.run_sync(look_at, path, video_frames, abandon_on_cancel=True)
     return [
         await to_thread.run_sync(LocalFile.at, name, file, abandon_on_cancel=True)
         for name, file in scene.files

@@ -39,6 +39,13 @@ class Option:
         return {**handler(schema), **metadata, **({"title": self.title} if self.title else {})}
 
 
+def all_required(schema: Schema) -> None:
+    """Resolved options have no defaults."""
+    schema["required"] = list(schema["properties"])
+    for field in schema["properties"].values():
+        field.pop("default", None)
+
+
 def divided(by: int, least: int) -> Callable[[int], int]:
     """``value // by``, but not below `least`."""
     return lambda value: min(value, max(least, value // by))

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Generic, Literal, Never, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from biresnerf.options.formats import ExportName
-from biresnerf.options.option import ONCE, Option, divided, lowered
+from biresnerf.options.option import ONCE, Option, all_required, divided, lowered
 from biresnerf.options.presets import ComputeDevice, MethodName, PresetName, in_proportion, preset_values
 from biresnerf.options.validated_options import validated, with_near_names
 from biresnerf.stages import STAGES
@@ -93,6 +93,9 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     )
     leave_out: Annotated[Names, Option("seeding", "Photos to leave out", level="usual")] = Field(
         (), max_length=10_000, description="Names of photos to treat as if they were not in the set."
+    )
+    video_frames: Annotated[int, Option("seeding", "Frames of videos", level="main")] = Field(
+        0, ge=0, le=2000, description="Sharp frames to take of videos; 0: 120, or as many as before."
     )
     fixed: Annotated[Names, Option("coarse", "Photos to keep fixed", level="main")] = Field(
         (),
@@ -249,19 +252,10 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         return self
 
 
-def _all_required(schema: dict[str, Any]) -> None:
-    """Resolved options have no defaults."""
-    schema["required"] = list(schema["properties"])
-    for field in schema["properties"].values():
-        field.pop("default", None)
-
-
 class ResolvedOptions(_Options[Never, ComputeDevice]):
     """Options of one refinement with every value filled in for the device that runs it."""
 
-    model_config = ConfigDict(
-        title="Resolved options", validate_default=True, json_schema_extra=_all_required
-    )
+    model_config = ConfigDict(title="Resolved options", validate_default=True, json_schema_extra=all_required)
 
     def with_steps(self, steps: int) -> ResolvedOptions:
         """The same with so many steps; what keeps its proportion to them does."""

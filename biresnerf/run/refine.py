@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.photos.video.video_frames import VideoReading
 from biresnerf.openmp import let_waiting_threads_sleep
 from biresnerf.options.refine_options import parse_options
-from biresnerf.progress import OnProgress
+from biresnerf.progress import OnProgress, told_before_the_run
 from biresnerf.result import Result, load
 from biresnerf.run.show_progress import ShownProgress
 from biresnerf.run.stop_request import StopRequest
@@ -33,7 +34,7 @@ def refine(
     options of stage 2 differ.
 
     Args:
-        input: a folder of images, with or without poses, or a file with poses (docs/input.md).
+        input: a folder of images, with or without poses, a file with poses, or a video (docs/input.md).
         output: a folder that is empty, new, or holds an unfinished run of the same input and options.
         progress: True draws one bar over the whole run, with the time left: in notebooks, too; lines where there is
             neither a notebook nor a terminal. A function is called with a `Progress` a few times a second.
@@ -57,7 +58,9 @@ def refine(
     with ExitStack() as during:
         on_progress = during.enter_context(ShownProgress()) if progress is True else progress or None
         stop = should_stop or during.enter_context(StopRequest(signal.SIGINT))
-        dataset = read_dataset(Path(input), strict=asked.bad_frames == "refuse")
+        watch = told_before_the_run(on_progress or (lambda _progress: None), stop)
+        videos = VideoReading(asked.video_frames, watch)
+        dataset = read_dataset(Path(input), strict=asked.bad_frames == "refuse", videos=videos)
         from biresnerf.pipeline import refine_poses  # loads torch, which takes seconds
 
         refine_poses(dataset, output, asked, on_progress, stop, overwrite=overwrite)

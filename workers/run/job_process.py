@@ -129,14 +129,26 @@ def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop)
         protocol.write(progress.model_dump_json() + "\n")
         protocol.flush()
 
-    refine_poses(
-        order.input,
-        order.output,
-        options,
-        on_progress=tell,
-        should_stop=stop.asked.is_set,
-        keep_reusable=True,
-    )
+    try:
+        refine_poses(
+            order.input,
+            order.output,
+            options,
+            on_progress=tell,
+            should_stop=stop.asked.is_set,
+            keep_reusable=True,
+        )
+    finally:
+        _give_video_frames(order)
+
+
+def _give_video_frames(order: Order) -> None:
+    """The result names frames of a video that was sent: nobody else has them."""
+    from biresnerf.data.photos.video.video_frames import CHOSEN, VIDEO_FRAMES
+
+    frames = order.input / VIDEO_FRAMES
+    if any(frames.glob(f"*/{CHOSEN}")):
+        shutil.copytree(frames, order.output / VIDEO_FRAMES, copy_function=os.link, dirs_exist_ok=True)
 
 
 def _export(order: Order, stop: _Stop) -> None:

@@ -14,6 +14,7 @@ from workers.jobs.claim import Claim, published_files
 from workers.store.files import FileStore
 
 EXPORTED_FROM = ("poses.json", "colmap/sparse/0/")  # of a result; all other formats can be made from these
+VIDEO_FRAMES = "video_frames/"  # of a result: photos that its dataset holds as a video
 
 
 async def stage_job(database: Database, files: FileStore, claim: Claim, folder: Path) -> None:
@@ -34,6 +35,9 @@ async def stage_job(database: Database, files: FileStore, claim: Claim, folder: 
             "SELECT key, path FROM dataset_files WHERE dataset_id = %s", claim.dataset_id
         )
         await files.stage(((row["key"], row["path"]) for row in rows), folder / "input")
+    if claim.kind == "export" and _needs_photos(claim.options["formats"]):
+        found = await _parents_files(database, claim)
+        await files.stage((pair for pair in found if pair[1].startswith(VIDEO_FRAMES)), folder / "input")
     await files.stage(_resumed_files(claim), folder / "output")
     (folder / "job.json").write_text(json.dumps(order, indent=1))
 
@@ -60,6 +64,10 @@ def _resumed_files(claim: Claim) -> Iterator[tuple[str, str]]:
 
 async def _stage_result(database: Database, files: FileStore, claim: Claim, folder: Path) -> None:
     folder.mkdir()
-    assert claim.parent is not None, "an export has one"
-    found = await published_files(database, claim.parent)
+    found = await _parents_files(database, claim)
     await files.stage((pair for pair in found if pair[1].startswith(EXPORTED_FROM)), folder)
+
+
+async def _parents_files(database: Database, claim: Claim) -> list[tuple[str, str]]:
+    assert claim.parent is not None, "an export has one"
+    return await published_files(database, claim.parent)

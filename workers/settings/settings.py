@@ -121,7 +121,7 @@ class Settings(BaseSettings):
     )
 
     max_files: int = Field(1000, ge=1, description="Files in a dataset.")
-    max_file_bytes: int = Field(64 * MIB, ge=1, description="Size of one file of a dataset.")
+    max_file_bytes: int = Field(2 * GIB, ge=1, description="Size of one file of a dataset.")
     max_dataset_bytes: int = Field(8 * GIB, ge=1, description="Size of all files of a dataset.")
     max_archive_bytes: int = Field(8 * GIB, ge=1, description="Size of an uploaded archive.")
     max_unpacked_bytes: int = Field(20 * GIB, ge=1, description="Size of all that comes out of an archive.")

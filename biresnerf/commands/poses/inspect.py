@@ -40,10 +40,11 @@ def inspect_command(
     from biresnerf.data.model.part_of_set import without_photos
     from biresnerf.data.photos.images import load_images
     from biresnerf.data.photos.turning_object import turning_notes
+    from biresnerf.data.photos.video.video_frames import VideoReading
     from biresnerf.field.backends import resolve_here
 
     options, _ = resolve_here(asked)
-    dataset = read_dataset(input_path)
+    dataset = read_dataset(input_path, videos=VideoReading(options.video_frames))
     missing_names = sorted(set(options.fixed) - {*dataset.names, *dataset.file_names})
     dataset = without_photos(dataset, options.leave_out)
     if pixels:

@@ -50,7 +50,7 @@ def refine_command(
     verbose: bool,
     as_json: bool,
 ) -> int:
-    """Refine the camera poses of INPUT, a folder of images with or without poses.
+    """Refine the camera poses of INPUT, a folder of images with or without poses, or a video.
 
     Results go to OUT: transforms.json and colmap/sparse/0 in the input's own frame and scale, report.json,
     renders/ and config.json. --json prints report.json. Run the same command again to resume.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
@@ -18,7 +18,11 @@ from biresnerf.data.photos.photo_folders import (
     photos_beside,
     visible,
 )
+from biresnerf.data.photos.video.video_frames import VIDEO_FRAMES, is_video_name
 from biresnerf.errors import InputError
+
+# Folders that are part of the names of photos, also where there is nothing beside them.
+_NAMED_IN_SETS = (IMAGE_FOLDER, VIDEO_FRAMES)
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,7 @@ class FolderContents:
         root: the folder that images lie in or below.
         format: the name of the poses' format; None where there are none.
         notes: what was found and is not read.
+        videos: whose frames are photos, too; only where there are no poses.
     """
 
     root: Path
@@ -36,6 +41,7 @@ class FolderContents:
     poses: Path | None
     images: tuple[Path, ...]
     notes: tuple[str, ...]
+    videos: tuple[Path, ...] = ()
 
 
 def look_into(folder: Path) -> FolderContents:
@@ -50,7 +56,7 @@ def look_into(folder: Path) -> FolderContents:
     root = folder
     for _ in range(3):
         entries = [entry for entry in visible(root) if entry.name != "__MACOSX"]
-        if len(entries) != 1 or not entries[0].is_dir() or entries[0].name == IMAGE_FOLDER:
+        if len(entries) != 1 or not entries[0].is_dir() or entries[0].name in _NAMED_IN_SETS:
             break
         root = entries[0]
     found = list(_pose_places(root))
@@ -59,30 +65,48 @@ def look_into(folder: Path) -> FolderContents:
         image_root = ALL_CODECS[name].image_root(place) if place == root else root
         return FolderContents(image_root, name, place, (), _notes(root, found))
     refuse_unread(root)
-    images, notes = _photos_alone(root)
-    if not images:
+    images, videos, notes = _photos_alone(root)
+    if not images and not videos:
         raise no_images(root, "holds no photo")
-    return FolderContents(root, None, None, tuple(images), notes)
+    return FolderContents(root, None, None, tuple(images), notes, tuple(videos))
 
 
-def _photos_alone(root: Path) -> tuple[list[Path], tuple[str, ...]]:
-    """The photos of a folder without poses, and a note on folders that they are not taken from."""
+def _photos_alone(root: Path) -> tuple[list[Path], list[Path], tuple[str, ...]]:
+    """The photos of a folder without poses, videos that belong to them, and a note on folders that are passed over."""
     photos = list(photos_beside(root).values())
     folders = folders_of_photos(root)
     if not photos:
-        return [path for paths in folders.values() for path in paths], ()
+        photos = [path for paths in folders.values() for path in paths]
+    videos = [path for path in visible(root) if is_video_name(path) and path.is_file()]
+    if videos:  # whose frames are written there
+        photos = [path for path in photos if path.relative_to(root).parts[0] != VIDEO_FRAMES]
+        folders.pop(VIDEO_FRAMES, None)
     taken = {path.relative_to(root).parts[0] for path in photos}
     others = [f"{name}/ ({len(paths)})" for name, paths in folders.items() if name not in taken]
     notes = (f"photos in other folders are left out: {few_names(others)}",) if others else ()
-    return photos, notes
+    return photos, _videos_beside(root, videos, photos), notes
+
+
+def _videos_beside(root: Path, videos: Sequence[Path], photos: Sequence[Path]) -> list[Path]:
+    """The videos whose frames count as photos: where there are no others, or these lie in the same folder.
+
+    Photos in a folder of their own may well be frames of the video. One that is called as a photo beside it was taken
+    with that photo by a phone, and is no more than it.
+    """
+    if any(path.parent != root for path in photos):
+        return []
+    names = {path.stem.casefold() for path in photos}
+    return [path for path in videos if path.stem.casefold() not in names]
 
 
 def look_at(file: Path) -> FolderContents:
-    """What the user means by naming one file with poses: the format by its name, images beside it.
+    """What the user means by naming one file: poses, in the format of its name, with images beside it; or a video.
 
     Raises:
         InputError: ``input_unsupported``.
     """
+    if is_video_name(file):
+        return FolderContents(file.parent, None, None, (), (), (file,))
     readable = [(name, codec) for name, codec in ALL_CODECS.items() if codec.parse is not None]
 
     def doubt(item: tuple[str, Codec]) -> int:
@@ -103,7 +127,7 @@ def look_at(file: Path) -> FolderContents:
         "input_unsupported",
         "is neither a folder nor a file with poses that is read.",
         where=file.name,
-        hint="Give a transforms.json, or a folder that holds poses or images.",
+        hint="Give a transforms.json, a video, or a folder that holds poses or images.",
     )
 
 

@@ -16,35 +16,63 @@ from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry, without_
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.photos.masks import refuse_unfit_mask
-from biresnerf.data.photos.photo_folders import left_out_notes, photos_beside
+from biresnerf.data.photos.named_images import refuse_outside
+from biresnerf.data.photos.photo_folders import few_names, left_out_notes, photos_beside
+from biresnerf.data.photos.video.video_frames import (
+    EACH_VIDEO,
+    VIDEO_FRAMES,
+    VideoReading,
+    frames_of_videos,
+)
 from biresnerf.errors import InputError
 
 
-def read_dataset(path: Path, within: Path | None = None, *, strict: bool = False) -> Dataset:
-    """Reads poses in any format of docs/formats.md with their images, or a folder of images alone.
+def read_dataset(
+    path: Path, within: Path | None = None, *, strict: bool = False, videos: VideoReading = EACH_VIDEO
+) -> Dataset:
+    """Reads poses in any format of docs/formats.md with their images, or a folder of images alone, or of videos.
 
     Everything is validated but the pixels, which `photos.images.load_images` decodes. Frames may lack poses:
     `seeding.seed_poses` finds them.
 
     Args:
-        path: a folder, or the file in it that has the poses.
+        path: a folder, or the file in it that has the poses, or a video.
         within: refuse files outside of this folder; for uploaded sets.
         strict: refuse the set for one bad frame, else leave bad frames out where most are good.
+        videos: how many frames of videos are wanted. They are written beside these, into video_frames/, where they are
+            not there already.
 
     Raises:
         InputError: the input cannot be used; says the file, the field and a hint.
     """
     contents = find_input(Path(path))
     if contents.format is None or contents.poses is None:
-        dataset = _read_images(contents.root, contents.images, within, strict=strict)
+        images, notes = _with_video_frames(contents, within, videos)
+        dataset = _read_images(contents.root, images, within, strict=strict)
+        contents = replace(contents, notes=(*contents.notes, *notes))
     else:
         codec = ALL_CODECS[contents.format]
         parsed = _parse(contents.format, contents.root, contents.poses)
         dataset = codec.bind(without_problems(parsed, strict=strict), contents.root, within)
     for index, frame in enumerate(dataset.frames):
         refuse_unfit_mask(frame, dataset.camera_of(index))
-    left_out = left_out_notes(contents.root, [frame.path for frame in dataset.frames])
+    used = [*contents.videos, *(frame.path for frame in dataset.frames)]
+    left_out = () if path in contents.videos else left_out_notes(contents.root, used)
     return replace(dataset, warnings=(*contents.notes, *left_out, *dataset.warnings))
+
+
+def _with_video_frames(
+    contents: FolderContents, within: Path | None, videos: VideoReading
+) -> tuple[list[Path], list[str]]:
+    """The images and the frames of the videos beside them, and a note on these."""
+    if not contents.videos:
+        return list(contents.images), []
+    names = [video.name for video in contents.videos]
+    if within is not None:
+        refuse_outside(contents.videos, names, within, contents.root.name)
+    frames = frames_of_videos(contents.videos, contents.root, videos)
+    note = f"{len(frames)} frames of {few_names(names)} were chosen by sharpness and motion: {VIDEO_FRAMES}/"
+    return [*contents.images, *frames], [note]
 
 
 def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:

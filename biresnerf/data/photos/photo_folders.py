@@ -11,6 +11,7 @@ from pathlib import Path
 
 from biresnerf.data.photos.image_files import is_image_name
 from biresnerf.data.photos.kinds.photo_kinds import INSTALL, KIND_OF, PHOTO_KINDS, is_readable
+from biresnerf.data.photos.video.ffmpeg_frames import DEMUXERS
 from biresnerf.errors import InputError
 
 IMAGE_FOLDER = "images"
@@ -25,8 +26,8 @@ _NO_PHOTOS = frozenset(
 _NO_PHOTO = re.compile(
     r"^(dynamic_mask_.*|.*[._-](depth|normal|mask|sensor_depth|confidence)\.(png|tiff?))$", re.I
 )
-# Pictures that no extra reads, by their extension.
-_NEVER_READ = {".gif": "GIF"} | dict.fromkeys((".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"), "video")
+# Pictures that are no photos, by their extension.
+_NO_PICTURES = {".gif": "GIF"} | dict.fromkeys(DEMUXERS, "video")
 _MOST_ENTRIES = 100_000  # looked at for a message
 
 
@@ -159,18 +160,23 @@ def _unread_kind(path: Path) -> str | None:
     kind = KIND_OF.get(path.suffix.lower())
     if kind is not None:
         return None if is_readable(kind) else kind.name
-    return _NEVER_READ.get(path.suffix.lower())
+    return _NO_PICTURES.get(path.suffix.lower())
 
 
 def left_out_notes(folder: Path, used: Iterable[Path] = ()) -> tuple[str, ...]:
     """A note for each kind of picture in or below ``folder`` that is not read; those ``used`` are never meant."""
+    taken = {path.absolute() for path in used}
+    unread = {
+        kind: left
+        for kind, names in pictures_left_out(folder).items()
+        if (left := [name for name in names if (folder / name).absolute() not in taken])
+    }
     notes = [
         f"{len(names)} {kind} {'file is' if len(names) == 1 else 'files are'} not read and left out: "
         f"{few_names(names, 3)}{_how_to_read(kind)}"
-        for kind, names in pictures_left_out(folder).items()
+        for kind, names in unread.items()
     ]
     photos = [path for path in islice(_files_below(folder), _MOST_ENTRIES) if is_photo_name(path.name)]
-    taken = {path.absolute() for path in used}
     doubles = [
         f"{one.relative_to(folder).as_posix()} ({other.name} is used)"
         for one, other in sorted(doubled(photos).items())

@@ -86,7 +86,7 @@ def test_the_first_form_in_the_order_is_read_and_the_others_are_said(tmp_path):
     assert look_into(tmp_path).format is None
 
 
-@pytest.mark.parametrize("name", ["poses.bin", "video.mp4", "scene.ply"])
+@pytest.mark.parametrize("name", ["poses.bin", "audio.mp3", "scene.ply"])
 def test_a_file_in_no_form_that_is_read_is_refused(tmp_path, name):
     (tmp_path / name).touch()
     with pytest.raises(InputError) as caught:
@@ -110,13 +110,12 @@ def test_photos_alone_are_found_where_people_keep_them_and_other_folders_are_sai
 
 
 def test_what_is_no_photo_that_is_read_is_counted_by_its_kind(tmp_path):
-    for name in ("a.gif", "b.gif", "e.MOV"):
+    for name in ("a.gif", "b.gif"):
         (tmp_path / name).touch()
     with pytest.raises(InputError) as caught:
         read_dataset(tmp_path)
     assert_complete(caught.value, "no_images", tmp_path.name)
-    for part in ("2 GIF (a.gif, b.gif)", "1 video (e.MOV)"):
-        assert part in caught.value.detail
+    assert "2 GIF (a.gif, b.gif)" in caught.value.detail
     for index in range(3):
         write_image(tmp_path / f"{index}.jpg", index)
     assert any("2 GIF files are not read" in text for text in read_dataset(tmp_path).warnings)

@@ -55,7 +55,6 @@ REFUSED = {
     "05_poses_silently_ignored/3dgs_cameras": ("image_missing", "14 of 14 images not found"),
     "05_poses_silently_ignored/opensfm": ("image_missing", "19 of 19 images not found"),
     "07_heic_beside_jpg": ("not_an_image", "not an image"),  # of HEIC they have the head only
-    "17_mp4": ("no_images", "1 video (v.mp4)"),
     "19_model_without_points": ("no_images", "there are poses, but no photo"),
     "20_blender_dialect_to_nerfstudio": ("image_missing", "./train/r_0"),
 }
@@ -84,6 +83,7 @@ def test_no_case_is_without_an_expectation():
     apart = {
         "README.md",
         "01_symlink_false_warning",
+        "17_mp4",
         "13_fox_17_missing",
         "14_last_row_scaled",
         "15_lens_folds",
@@ -114,6 +114,13 @@ def test_a_bundlers_list_of_undistorted_photos_gives_each_camera_its_photo():
         centre = -block[:3].T @ block[3]
         np.testing.assert_allclose(frame.world_from_cam[:3, 3], centre, atol=1e-6)
         assert dataset.camera_of(index).full().fx == float(numbers[1 + 5 * index][0])
+
+
+def test_a_video_is_read_by_its_frames(tmp_path):
+    shutil.copyfile(CASES / "17_mp4/v.mp4", tmp_path / "v.mp4")
+    dataset = read_dataset(tmp_path)
+    assert len(dataset) == 20
+    assert dataset.names[:2] == ("video_frames/v_mp4/00m00s000.jpg", "video_frames/v_mp4/00m00s100.jpg")
 
 
 def test_the_fox_is_read_without_the_photos_that_its_file_names_and_its_folder_lacks(tmp_path):

@@ -1,0 +1,1 @@
+"""Photos out of videos: which frames are worth having, and where they are written."""
