@@ -40,6 +40,7 @@ from biresnerf.refinement.verdict.run_report import run_report
 from biresnerf.refinement.views.held_out_views import held_out_views
 from biresnerf.report import Report
 from biresnerf.resume import earlier_work, refuse_other_run, reusable_seeding, run_origin
+from biresnerf.stages import Stage
 from biresnerf.write.output_folder import OutputFolder
 from biresnerf.write.preview import SeedingPreview, write_preview
 from biresnerf.write.result import ResultPictures, write_result
@@ -177,7 +178,9 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
             on_progress=preview,
         )
         preview.show_candidate(seeding)
-    images = load_images(seeding.dataset, options.max_image_size, options.background)
+    images = load_images(
+        seeding.dataset, options.max_image_size, options.background, _photo_counter(len(dataset), setup)
+    )
     origin = run_origin(folder.path, dataset, images, options)
     if earlier is not None:
         refuse_other_run(folder.path, earlier, origin)
@@ -188,6 +191,13 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
         tracks = Tracks.load(folder.path / TRACKS, dataset.names)
     held_out = held_out_views(len(dataset), options.holdout, start.reliable)
     return Scene(seeding.dataset, images, start, held_out, tracks), origin
+
+
+def _photo_counter(count: int, setup: _Setup) -> Callable[[int], None]:
+    """Tells every tenth of the photos that is decoded, and stops between two of them."""
+    stage: Stage = "seeding" if (setup.folder.path / SEEDING).is_file() else "preparing"
+    watch = told_before_the_run(setup.monitor.report, setup.monitor.should_stop, stage)
+    return lambda done: watch(f"reading {count} photos: {10 * (10 * done // count)} %")
 
 
 def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observer | None) -> TwoStages:

@@ -43,7 +43,9 @@ class Progress(FrozenModel):
 OnProgress = Callable[[Progress], None]
 
 
-def told_before_the_run(on_progress: OnProgress, should_stop: Callable[[], bool]) -> Callable[[str], None]:
+def told_before_the_run(
+    on_progress: OnProgress, should_stop: Callable[[], bool], stage: Stage = "preparing"
+) -> Callable[[str], None]:
     """A function to call with what is being done while the input is read: tells what is new, and ends it on request.
 
     It raises `Interrupted` where ``should_stop`` says so.
@@ -55,7 +57,7 @@ def told_before_the_run(on_progress: OnProgress, should_stop: Callable[[], bool]
         if should_stop():
             raise Interrupted(f"stopped while {what}; run again to go on")
         if what != last:
-            on_progress(Progress(stage="preparing", message=what))
+            on_progress(Progress(stage=stage, message=what))
             last = what
 
     return watch

@@ -35,6 +35,8 @@ def inspect_command(
 
     Checks all that `refine` checks before it starts. Pixels are only checked with --pixels.
     """
+    from tqdm import tqdm
+
     asked = parse_options({**settings, **({"preset": preset} if preset else {})})
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.model.part_of_set import without_photos
@@ -48,7 +50,8 @@ def inspect_command(
     missing_names = sorted(set(options.fixed) - {*dataset.names, *dataset.file_names})
     dataset = without_photos(dataset, options.leave_out)
     if pixels:
-        load_images(dataset, options.max_image_size, options.background)
+        with tqdm(total=len(dataset), desc="decoding", unit="photo", leave=False, disable=None) as bar:
+            load_images(dataset, options.max_image_size, options.background, lambda _done: bar.update())
     wanted = {**plan(dataset, options), "seconds": expected_seconds(dataset, asked)}
     found = {**contents(dataset), "pixels_checked": pixels, "plan": wanted}
     found["warnings"] += turning_notes(dataset)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -102,13 +102,18 @@ def working_size(width: int, height: int, max_size: int | None) -> tuple[int, in
     return max(1, round(width * max_size / longest)), max(1, round(height * max_size / longest))
 
 
-def load_images(dataset: Dataset, max_size: int | None = None, background: Background = "auto") -> ImageSet:
+def load_images(
+    dataset: Dataset,
+    max_size: int | None = None,
+    background: Background = "auto",
+    on_photo: Callable[[int], object] = lambda _done: None,
+) -> ImageSet:
     """Decodes all images, shrunk by exact area averaging so that the long side is ``max_size`` px at most.
 
     ``background``: ``white`` and ``black`` say what lies behind the scene, and what transparency is
     composited on; ``none`` says that photos show surroundings (opacity is then dropped and colours are taken
     as stored); ``auto`` is white where images have transparency, else black or white where all borders show
-    it, else none.
+    it, else none. ``on_photo`` is called with the number of photos decoded so far, after each; it may raise.
 
     Raises:
         InputError: ``not_an_image``, ``image_truncated``, ``image_too_large``, ``image_changed``,
@@ -136,8 +141,9 @@ def load_images(dataset: Dataset, max_size: int | None = None, background: Backg
     with quiet_pillow(), ThreadPoolExecutor(decoding_threads(dataset), thread_name_prefix="decode") as pool:
         pending = [pool.submit(fill, index) for index in range(len(dataset))]
         try:
-            for job in pending:
+            for done, job in enumerate(pending, 1):
                 job.result()
+                on_photo(done)
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise

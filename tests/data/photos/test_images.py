@@ -12,7 +12,7 @@ from PIL import Image
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.images import load_images, uniform_background, working_size
-from biresnerf.errors import InputError
+from biresnerf.errors import InputError, Interrupted
 from tests.data.scenes import (
     HEIGHT,
     WIDTH,
@@ -240,3 +240,17 @@ def test_no_more_large_pictures_are_decoded_at_once_than_fit_into_memory(tmp_pat
     monkeypatch.setattr("biresnerf.data.photos.images._DECODING_BYTES", 3 * 16 * HEIGHT * WIDTH)
     load_images(dataset)
     assert most[0] == 3
+
+
+def test_each_photo_that_is_decoded_is_counted_and_the_caller_may_end_it(tmp_path):
+    dataset = read_dataset(save(tmp_path, nerfstudio_scene(tmp_path, 6)))
+    counts: list[int] = []
+    load_images(dataset, on_photo=counts.append)
+    assert counts == [1, 2, 3, 4, 5, 6]
+
+    def stop(done: int) -> None:
+        if done == 2:
+            raise Interrupted("enough")
+
+    with pytest.raises(Interrupted, match="enough"):
+        load_images(dataset, on_photo=stop)
