@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from biresnerf.compile_kernels import compile_kernels
+from biresnerf.data.formats.positions.known_distance import KnownDistance
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.part_of_set import without_photos
@@ -166,6 +167,7 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
     """The set with initial poses for all its images: those of earlier work, else those that predict photos best."""
     options, folder, earlier, monitor = setup.options, setup.folder, setup.earlier, setup.monitor
     rigid_bodies(dataset, options)  # refuses unknown names before anything takes time
+    KnownDistance.of(options.known_distance, dataset)  # so does this
     expect_run(monitor.forecast, dataset, options)
     with SeedingPreview(dataset, folder, monitor) as preview:
         seeding = seed_poses(

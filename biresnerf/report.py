@@ -8,7 +8,7 @@ from pydantic import Field
 
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.uncertainty import GeoReference, InputAccuracy, PoseUncertainty
+from biresnerf.uncertainty import GeoReference, InputAccuracy, KnownScale, PoseUncertainty
 
 SwitchReason = Literal["stable", "cap"]
 IntrinsicsSource = Literal["given", "exif", "colmap", "guessed", "refined"]
@@ -280,7 +280,8 @@ class Report(FrozenModel):
     input_accuracy: InputAccuracy | None = Field(
         None, description="None where fewer than six poses were given, or nothing tells of them."
     )
-    geo_reference: GeoReference | None = Field(None, description="None unless GPS gave frame and scale.")
+    geo_reference: GeoReference | None = Field(None, description="None without measured positions.")
+    known_scale: KnownScale | None = Field(None, description="None without the option known_distance.")
     steps_done: int = Field(examples=[2000])
     switch_step: int | None = Field(None, examples=[700], description="The step at which stage 2 began.")
     switch_reason: SwitchReason | None = Field(None, examples=["stable"])

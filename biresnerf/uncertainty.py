@@ -35,16 +35,47 @@ class PoseUncertainty(FrozenModel, allow_inf_nan=False):
     )
 
 
-class GeoReference(FrozenModel, allow_inf_nan=False):
-    """Where on Earth the poses are: x points east, y north and z up, in metres, from a place given in WGS84."""
+_Row4 = tuple[float, float, float, float]
 
-    latitude: float = Field(examples=[50.0874], description="Degrees, north above zero.")
-    longitude: float = Field(examples=[14.4213], description="Degrees, east above zero.")
-    altitude: float = Field(examples=[195.0], description="Metres, as the photos have it.")
-    images: int = Field(examples=[48], description="How many photos with a GPS position this rests on.")
-    residual_m: float = Field(
-        examples=[2.1], description="Median distance of a camera from its GPS position."
+
+class GeoReference(FrozenModel, allow_inf_nan=False):
+    """Where the returned cameras lie among measured positions: GPS, or a table beside the photos.
+
+    The poses are not changed by it: it is one more transform.
+    """
+
+    source: str = Field(examples=["EXIF"], description="EXIF, or the file that has the positions.")
+    images: int = Field(examples=[48], description="How many photos have a position.")
+    used: int = Field(0, examples=[47], description="How many of them are not far beyond the others.")
+    metres_from_world: tuple[_Row4, _Row4, _Row4, _Row4] | None = Field(
+        None,
+        description="4 x 4 similarity from the input's world to metres: along east, north and up from the place below, "
+        "or in the frame of the positions. None where the positions do not tell it.",
     )
+    why_not: str | None = Field(None, examples=["3 photos have a position, and 6 are needed"])
+    epsg: int | None = Field(
+        None, examples=[4979], description="Of the place below, or of the frame of the positions, if known."
+    )
+    latitude: float | None = Field(None, examples=[50.0874], description="Degrees, north above zero.")
+    longitude: float | None = Field(None, examples=[14.4213], description="Degrees, east above zero.")
+    altitude: float | None = Field(None, examples=[195.0], description="Metres, as the positions have it.")
+    accuracy_m: float | None = Field(
+        None, examples=[5.0], description="Stated standard deviation along an axis, median; None: not stated."
+    )
+    residual_m: float | None = Field(
+        None, examples=[2.1], description="Median distance of a camera from its position."
+    )
+    residuals_m: dict[str, float] = Field(
+        default_factory=dict, description="That distance by the photo's name."
+    )
+
+
+class KnownScale(FrozenModel, allow_inf_nan=False):
+    """The scale that a known distance gives, at the returned poses. They are not changed by it."""
+
+    between: tuple[str, str] = Field(examples=[["a.jpg", "b.jpg"]], description="Photos, or points.")
+    metres: float = Field(examples=[1.25], description="The distance, as stated.")
+    metres_per_unit: float = Field(examples=[0.31], description="Of the input's world.")
 
 
 class InputAccuracy(FrozenModel):

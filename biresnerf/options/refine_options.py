@@ -120,6 +120,12 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         description="How exact the given positions are: standard deviation along each axis, in the input's unit; 0: "
         "measured.",
     )
+    known_distance: Annotated[str, Option("fine", "Known distance", changes_result=False)] = Field(
+        "",
+        max_length=1000,
+        description="Two photos, or two points of the input's world, and the metres between them; gives the scale: "
+        "`a.jpg, b.jpg, 1.25` or `0 0 1, 2 0 1, 3.5`.",
+    )
     steps: Annotated[int | Open, Option("coarse", "Steps", level="usual")] = Field(
         OPEN, ge=20, le=1_000_000, description="Optimisation steps of both stages together."
     )

@@ -14,7 +14,7 @@ from biresnerf.options.formats import formats
 from biresnerf.refinement.stages.checkpoint import CHECKPOINT, OTHER_FOLDER
 from biresnerf.viewer.report_html import REPORT_HTML
 
-REPORT, CONFIG = "report.json", "config.json"
+REPORT, CONFIG, GEOREFERENCE = "report.json", "config.json", "georeference.json"
 RENDERS, ORBIT = "renders", "renders/orbit.mp4"
 
 
@@ -53,7 +53,7 @@ class OutputFolder:
             return
         written = {one.in_result for one in formats().values()}
         written |= {REPORT, REPORT_HTML, CONFIG, HISTORY, RENDERS, REFINED, THUMBNAIL, VIEW, CONTACT_SHEET}
-        written.add(CHECKPOINT.parent.name)
+        written |= {GEOREFERENCE, CHECKPOINT.parent.name}
         for name in {Path(file).parts[0] for file in written if file}:
             path = self.path / name
             if path.is_dir():

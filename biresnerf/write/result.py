@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.codec import WriteContext
+from biresnerf.data.formats.positions.known_distance import KnownDistance
 from biresnerf.data.formats.result_formats import write_result_formats
 from biresnerf.data.formats.simple.poses_json import POSES
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes
@@ -31,6 +32,7 @@ from biresnerf.refinement.views.evaluation import RenderedView, ViewScore
 from biresnerf.refinement.views.shown_views import Points
 from biresnerf.report import PointsReport, Report
 from biresnerf.viewer.report_html import write_report_html
+from biresnerf.write.georeference import write_georeference
 from biresnerf.write.output_folder import CONFIG, ORBIT, RENDERS, REPORT, OutputFolder
 
 logger = logging.getLogger(__name__)
@@ -69,6 +71,10 @@ def write_result(folder: OutputFolder, stages: TwoStages, evaluation: Evaluation
             poses = f"{REFINED}/{POSES}"
     # A run that is stopped must end soon: it leaves large exports out.
     exports, monitor = (optimiser.options.exports, stages.monitor) if complete else ((), Monitor())
+    reference = write_georeference(returned_dataset, returned, path) if np.isfinite(returned).all() else None
+    distance = KnownDistance.of(optimiser.options.known_distance, scene.dataset)
+    scale = distance.scale(returned) if distance is not None else None
+    report = report.model_copy(update={"geo_reference": reference, "known_scale": scale})
     report, result = _write_poses(path, scene, returned_dataset, returned, report, field, exports, monitor)
     _write_view_file(path, scene, evaluation, moved or result, surface, poses)
     notes = write_report_html(path, report)

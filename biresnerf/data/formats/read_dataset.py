@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from biresnerf.data.formats.bind_images import dataset_of
 from biresnerf.data.formats.folder import FolderContents, look_at, look_into
 from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry, without_problems
+from biresnerf.data.formats.positions.position_priors import position_notes
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.photos.masks import refuse_unfit_mask
@@ -57,6 +58,7 @@ def read_dataset(
     for index, frame in enumerate(dataset.frames):
         refuse_unfit_mask(frame, dataset.camera_of(index))
     used = [*contents.videos, *(frame.path for frame in dataset.frames)]
+    contents = replace(contents, notes=(*contents.notes, *position_notes(dataset)))
     left_out = () if path in contents.videos else left_out_notes(contents.root, used)
     return replace(dataset, warnings=(*contents.notes, *left_out, *dataset.warnings))
 

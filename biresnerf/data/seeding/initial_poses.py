@@ -11,7 +11,6 @@ from pydantic import PlainSerializer, PlainValidator
 
 from biresnerf.data.model.dataset import GUESSES
 from biresnerf.report import PoseSource, TrialReport
-from biresnerf.uncertainty import GeoReference
 
 MATCHED_SOURCES: frozenset[PoseSource] = frozenset({"colmap", "matches-incremental", "matches-global"})
 MOSTLY_MATCHED = 0.8  # share of the cameras from which on feature matches placed most
@@ -43,7 +42,6 @@ class InitialPoses:
         trials: how every candidate did in the choice between several; empty if there was only one.
         matched_poses: float64 [n, 4, 4], the best set that feature matches support, whichever set is started from; None
             where there is none.
-        geo_reference: where GPS gave the frame, which then is in metres.
     """
 
     world_from_cam: PoseArray
@@ -51,7 +49,6 @@ class InitialPoses:
     sources: tuple[PoseSource, ...]
     trials: tuple[TrialReport, ...] = ()
     matched_poses: MaybePoseArray = None
-    geo_reference: GeoReference | None = None
 
     @property
     def matched(self) -> NDArray[np.bool_]:

@@ -19,7 +19,7 @@ from biresnerf.data.seeding.cached_mapping import remembered_mapping
 from biresnerf.data.seeding.compare_models import adds_to, model_lens_problem, with_found_lenses
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.seeding.map_images import MappedModel, Mapping
-from biresnerf.data.seeding.match_poses import MatchedPoses, can_match, carry_model, in_earth_frame
+from biresnerf.data.seeding.match_poses import MatchedPoses, can_match, carry_model, in_measured_frame
 from biresnerf.data.seeding.missing_poses import guess_missing
 from biresnerf.data.seeding.on_turntable import even_ring
 from biresnerf.data.seeding.seeding_progress import OnSeeding
@@ -77,8 +77,7 @@ class _Given:
         for i, guess in enumerate(guessed):
             if guess is not None or placed[i]:
                 sources[i] = guess or source
-        geo_reference = matched.geo_reference if matched is not None else None
-        return InitialPoses(poses, name, tuple(sources), geo_reference=geo_reference)
+        return InitialPoses(poses, name, tuple(sources))
 
     def without_matches(self) -> InitialPoses:
         """The given poses, and guesses for the missing ones."""
@@ -231,13 +230,13 @@ def _from_scratch(given: _Given, mapping: Mapping, start: StartPoses) -> Seeding
 
 
 def _tied(model: MappedModel, given: _Given) -> MatchedPoses:
-    """The model in the frame of given poses, however much it contradicts them; else in that of GPS, or in its own."""
+    """The model in the frame of given poses, whatever it contradicts; else of measured positions, or in its own."""
     carried = carry_model(model, given.poses, given.posed, judged=False)
     if carried is not None:
         return carried
     poses, placed = given.poses.copy(), np.zeros(len(given.poses), dtype=np.bool_)
     poses[model.rows], placed[model.rows] = model.world_from_cam, True
-    return in_earth_frame(MatchedPoses(model.mapper, poses, placed), given.dataset)
+    return in_measured_frame(MatchedPoses(model.mapper, poses, placed), given.dataset)
 
 
 def _facing_forward(given: _Given, what: str) -> Seeding:

@@ -61,7 +61,6 @@ def run_report(
         start_trials=scene.start.trials,
         candidates=finish.candidates,
         input_accuracy=finish.given and accuracy_report(finish.given),
-        geo_reference=scene.start.geo_reference,
         steps_done=optimiser.step_index,
         switch_step=optimiser.switch if optimiser.method.two_stages else None,
         switch_reason=record.switch_reason,

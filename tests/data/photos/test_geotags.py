@@ -15,7 +15,7 @@ from tests.data.photos.geotagged import write_geotagged
 )
 def test_signs_minutes_and_seconds_are_read(tmp_path, place):
     write_geotagged(tmp_path / "photo.jpg", place)
-    np.testing.assert_allclose(read_geotag(tmp_path / "photo.jpg", "photo.jpg"), place, atol=1e-6)
+    np.testing.assert_allclose(read_geotag(tmp_path / "photo.jpg", "photo.jpg").place, place, atol=1e-6)
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (91.0, 14.0, 100.0)])

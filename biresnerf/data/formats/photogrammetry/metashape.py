@@ -54,9 +54,9 @@ def parse_metashape(_root: Path, file: Path) -> ParsedPoses:
     Raises:
         InputError: codes as in docs/input.md.
     """
-    chunk = _chunk(file)
+    chunk = the_chunk(file)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
-    cameras = _labelled(chunk, file)
+    cameras = cameras_by_label(chunk, file)
     components = Counter(
         camera.get("component_id") for camera in cameras.values() if camera.find("transform") is not None
     )
@@ -81,7 +81,7 @@ def parse_metashape(_root: Path, file: Path) -> ParsedPoses:
     return ParsedPoses(source, tuple(entries), notes=tuple(notes), take_file_names=True)
 
 
-def _chunk(file: Path) -> ElementTree.Element:
+def the_chunk(file: Path) -> ElementTree.Element:
     """The one chunk of the file."""
     tree = read_xml(file, _HINT)
     chunks = [tree] if tree.tag == "chunk" else list(tree.iter("chunk"))
@@ -90,7 +90,7 @@ def _chunk(file: Path) -> ElementTree.Element:
     return chunks[0]
 
 
-def _labelled(chunk: ElementTree.Element, file: Path) -> dict[str, ElementTree.Element]:
+def cameras_by_label(chunk: ElementTree.Element, file: Path) -> dict[str, ElementTree.Element]:
     """The cameras by label, but those switched off."""
     entries: dict[str, ElementTree.Element] = {}
     for entry in chunk.iter("camera"):

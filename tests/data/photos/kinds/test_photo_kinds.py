@@ -91,7 +91,7 @@ def test_focal_length_and_gps_position_are_read(tmp_path, suffix):
     film_diagonal = np.hypot(36, 24)
     expected = FOCAL_35MM * np.hypot(WIDTH, HEIGHT) / film_diagonal
     assert exif_focal_px(read_header(path, "x")) == pytest.approx(expected)
-    np.testing.assert_allclose(read_geotag(path, "x"), PLACE, atol=1e-6)
+    np.testing.assert_allclose(read_geotag(path, "x").place, PLACE, atol=1e-6)
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])

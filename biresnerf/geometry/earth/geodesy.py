@@ -23,13 +23,36 @@ def earth_centred(place: Array) -> Array:
 
 def east_north_up(place: Array, origin: Array) -> Array:
     """Coordinates [..., 3], m, along east, north and up at `origin` [3]; both as in `earth_centred`."""
+    return np.asarray((earth_centred(place) - earth_centred(origin)) @ _axes(origin).T)
+
+
+def place_of(enu_m: Array, origin: Array) -> Array:
+    """Latitude, longitude (degrees) and height (m) [..., 3] of `east_north_up` coordinates: its inverse.
+
+    By Bowring's formula (1985), exact to a millimetre below 100 km of height.
+    """
+    x, y, z = np.moveaxis(enu_m @ _axes(origin) + earth_centred(origin), -1, 0)
+    squared = FLATTENING * (2 - FLATTENING)
+    polar_axis = SEMI_MAJOR_AXIS * (1 - FLATTENING)
+    across = np.hypot(x, y)
+    angle = np.arctan2(z * SEMI_MAJOR_AXIS, across * polar_axis)
+    latitude = np.arctan2(
+        z + squared / (1 - squared) * polar_axis * np.sin(angle) ** 3,
+        across - squared * SEMI_MAJOR_AXIS * np.cos(angle) ** 3,
+    )
+    normal = SEMI_MAJOR_AXIS / np.sqrt(1 - squared * np.sin(latitude) ** 2)
+    height = across * np.cos(latitude) + z * np.sin(latitude) - SEMI_MAJOR_AXIS**2 / normal
+    return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), height], -1)
+
+
+def _axes(origin: Array) -> Array:
+    """East, north and up at a place, as rows in earth-centred coordinates."""
     latitude, longitude = np.radians(origin[:2])
     sines, cosines = np.sin([latitude, longitude]), np.cos([latitude, longitude])
-    axes = np.array(
+    return np.array(
         [
             [-sines[1], cosines[1], 0],
             [-sines[0] * cosines[1], -sines[0] * sines[1], cosines[0]],
             [cosines[0] * cosines[1], cosines[0] * sines[1], sines[0]],
         ]
     )
-    return np.asarray((earth_centred(place) - earth_centred(origin)) @ axes.T)

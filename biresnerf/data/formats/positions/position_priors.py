@@ -1,0 +1,105 @@
+"""The measured positions of a set's photos in metres: of a table beside them, Metashape's references, or EXIF."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.formats.match_names import match_files
+from biresnerf.data.formats.positions.metashape_references import read_references
+from biresnerf.data.formats.positions.position_table import (
+    WGS84,
+    PositionTable,
+    position_file,
+    read_position_table,
+)
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.photos.geotags import MeasuredPlace, read_geotag
+from biresnerf.geometry.earth.geodesy import east_north_up
+
+
+@dataclass(frozen=True, eq=False)
+class PositionPriors:
+    """Where photos were taken, as measured.
+
+    Attributes:
+        source: what says so, for messages.
+        rows: int64 [m], the frames that have a position.
+        positions_m: float64 [m, 3]: along east, north and up from the origin, or in the source's own frame.
+        accuracy_m: float64 [m], standard deviation along each axis; NaN where it is not said.
+        origin: latitude, longitude (degrees) and height (m), the median of all; None for a frame of the source's own.
+        epsg: EPSG's number of the origin's coordinates, or of the source's frame; None where it is not known.
+    """
+
+    source: str
+    rows: NDArray[np.int64]
+    positions_m: NDArray[np.float64]
+    accuracy_m: NDArray[np.float64]
+    origin: tuple[float, float, float] | None
+    epsg: int | None
+
+    def of(self, frames: NDArray[np.bool_]) -> PositionPriors:
+        """Those of these frames [n] alone, with the same origin."""
+        kept = frames[self.rows]
+        return replace(
+            self, rows=self.rows[kept], positions_m=self.positions_m[kept], accuracy_m=self.accuracy_m[kept]
+        )
+
+
+def position_priors(dataset: Dataset) -> PositionPriors | None:
+    """The positions of the first source that has some: a table beside the photos, Metashape's references, EXIF.
+
+    Raises:
+        InputError: ``positions_invalid``, or a code of `open_image`.
+    """
+    for table in (_of_table(dataset), _of_metashape(dataset)):
+        if table is not None:
+            found = _by_frame(dataset, table)
+            if found:
+                return _priors(table.source, found, table.epsg, in_degrees=table.in_degrees)
+    tags = {i: tag for i, f in enumerate(dataset.frames) if (tag := read_geotag(f.path, f.name)) is not None}
+    return _priors("EXIF", tags, WGS84, in_degrees=True) if tags else None
+
+
+def position_notes(dataset: Dataset) -> tuple[str, ...]:
+    """A note on how many photos a table beside them has positions for. Raises InputError ``positions_invalid``."""
+    table = _of_table(dataset)
+    if table is None:
+        return ()
+    count = len(_by_frame(dataset, table))
+    return (f"{table.source}: measured positions of {count} of {len(dataset)} photos",)
+
+
+def _of_table(dataset: Dataset) -> PositionTable | None:
+    file = position_file(dataset.root)
+    return None if file is None else read_position_table(file)
+
+
+def _of_metashape(dataset: Dataset) -> PositionTable | None:
+    if dataset.source.dialect != "metashape" or not dataset.source.files:
+        return None
+    return read_references(dataset.source.files[0])
+
+
+def _by_frame(dataset: Dataset, table: PositionTable) -> dict[int, MeasuredPlace]:
+    """Places by frame, with names compared as those of pose files are."""
+    found, _ = match_files(list(table.places), dataset.file_names)
+    index_of = {name: index for index, name in enumerate(dataset.file_names)}
+    return {index_of[file]: table.places[name] for name, file in found.items()}
+
+
+def _priors(
+    source: str, found: dict[int, MeasuredPlace], epsg: int | None, *, in_degrees: bool
+) -> PositionPriors:
+    places = np.array([place.place for place in found.values()], dtype=np.float64)
+    accuracy = np.array([np.nan if p.accuracy_m is None else p.accuracy_m for p in found.values()])
+    rows = np.array(list(found), dtype=np.int64)
+    if not in_degrees:
+        return PositionPriors(source, rows, places, accuracy, None, epsg)
+    origin = np.median(places, axis=0)
+    latitude, longitude, height = origin.tolist()
+    return PositionPriors(
+        source, rows, east_north_up(places, origin), accuracy, (latitude, longitude, height), epsg
+    )

@@ -1,0 +1,75 @@
+"""Cameras are carried to measured positions where these tell the frame, and nothing is claimed where they do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from biresnerf.geometry.earth.georeference import NoGeoreference, fit_positions
+from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.geometry.similarity import Similarity
+
+COUNT = 30
+WORLD_FROM_METRES = Similarity(
+    0.04, Rotation.from_rotvec([0.3, 1.2, -0.5]).as_matrix(), np.array([4.0, 1.0, -9.0])
+)
+
+
+def cameras_m(flat: float = 1.0) -> np.ndarray:
+    """Poses [n, 4, 4] in metres, within 50 m; on a line where ``flat`` is 0."""
+    rng = np.random.default_rng(1)
+    poses = np.tile(np.eye(4), (COUNT, 1, 1))
+    poses[:, :3, :3] = Rotation.random(COUNT, random_state=2).as_matrix()
+    poses[:, :3, 3] = rng.uniform(-50, 50, (COUNT, 3)) * [1, flat, flat]
+    return poses
+
+
+def measured(poses: np.ndarray, noise_m: float) -> np.ndarray:
+    return poses[:, :3, 3] + np.random.default_rng(3).normal(0, noise_m, (COUNT, 3))
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.02, 2.0])
+def test_the_similarity_is_the_true_one_as_far_as_the_positions_tell(noise_m):
+    poses = cameras_m()
+    stated = np.full(COUNT, max(noise_m, 1e-3))
+    fit = fit_positions(WORLD_FROM_METRES.apply_to_poses(poses), measured(poses, noise_m), stated)
+    back = fit.metres_from_world.apply_to_poses(WORLD_FROM_METRES.apply_to_poses(poses))
+    assert np.abs(back[:, :3, 3] - poses[:, :3, 3]).max() < 1e-6 + 2 * noise_m
+    assert rotation_between_deg(back, poses).max() < 1e-4 + np.degrees(2 * noise_m / 50)
+    assert fit.metres_from_world.scale * WORLD_FROM_METRES.scale == pytest.approx(1, abs=1e-6 + noise_m / 50)
+    assert fit.used.all()
+
+
+def test_the_residuals_are_the_distances_and_one_wrong_position_moves_nothing():
+    poses = cameras_m()
+    positions = measured(poses, 0.1)
+    positions[4] += [3000.0, 0, 0]
+    positions[9] += [0, 20.0, 0]
+    fit = fit_positions(WORLD_FROM_METRES.apply_to_poses(poses), positions)
+    assert not fit.used[4]
+    assert fit.residual_m[4] == pytest.approx(3000, rel=0.01)
+    assert fit.residual_m[9] == pytest.approx(20, abs=0.6)
+    assert np.delete(fit.residual_m, [4, 9]).max() < 0.6
+
+
+def refusal(poses: np.ndarray, positions: np.ndarray, accuracy_m: float = np.nan) -> str:
+    with pytest.raises(NoGeoreference) as caught:
+        fit_positions(WORLD_FROM_METRES.apply_to_poses(poses), positions, np.full(len(poses), accuracy_m))
+    return str(caught.value)
+
+
+def test_a_frame_that_positions_leave_open_is_refused_with_the_reason():
+    poses, line = cameras_m(), cameras_m(flat=0.0)
+    assert "6 are needed" in refusal(poses[:5], poses[:5, :3, 3])
+    assert "one place" in refusal(poses, np.tile([1.0, 2.0, 3.0], (COUNT, 1)))
+    assert "leave the turn open" in refusal(line, line[:, :3, 3])
+    assert "leave the turn open" in refusal(line, measured(line, 1.0))
+    assert "scatter" in refusal(poses, np.random.default_rng(8).normal(0, 50, (COUNT, 3)))
+
+
+def test_positions_farther_away_than_their_accuracy_allows_are_refused():
+    poses = cameras_m()
+    positions = measured(poses, 2.0)
+    assert "accuracy is 0.05 m" in refusal(poses, positions, 0.05)
+    fit_positions(WORLD_FROM_METRES.apply_to_poses(poses), positions, np.full(COUNT, 1.5))
