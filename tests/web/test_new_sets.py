@@ -40,14 +40,14 @@ def test_a_sample_set_is_one_click_away(page: Page, service: Running) -> None:
     times = page.locator(".preset-time")
     expect(times).to_have_count(4)
     expect(times.first).to_have_text(re.compile(r"about \d+(\.\d)? (s|min|h) here"))
+    expect(page.get_by_role("button", name="Refine the poses")).to_be_visible()
     # It waits in the list, with its first photo, until its job is started.
     page.goto(service.url)
-    waiting = page.get_by_role("region", name="Not started yet")
+    waiting = page.get_by_role("region", name="Not started yet").locator(".set-card", has_text="sample")
     expect(waiting).to_contain_text("24 photos · ready to start")
     page.wait_for_function("() => document.querySelector('.set-card img')?.naturalWidth > 0")
     waiting.get_by_role("button", name="Delete sample").click()
-    expect(waiting).to_be_hidden()
-    expect(page.get_by_role("button", name="Refine the poses")).to_be_visible()
+    expect(waiting).to_have_count(0)
 
 
 def test_a_checked_set_shows_its_photos_and_cameras_and_leaves_photos_out(
