@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +46,7 @@ RATES: dict[Unit, float] = {
     "evaluation": 2.4,
 }
 MEMORY = 0.98  # of the running mean of a step's time
+TELLING_S = 2.0  # in less time a small set mostly measures what does not grow with the work
 LEARNING = 0.5  # weight of a run's rates against those remembered
 LATE = 0.2  # a phase that takes longer than expected is expected to take this share of its time more
 RATES_FILE = "rates.json"
@@ -71,7 +72,7 @@ class Forecast:
         self._phase: Phase | None = None
         self._phase_began = self._done = 0.0
         self._steps: dict[Unit, int] = {}
-        self._measured: set[Unit] = set()
+        self._measured: dict[Unit, float] = {}  # seconds that each rate was measured over
         self._fraction = 0.0
 
     def begins(self) -> None:
@@ -113,8 +114,9 @@ class Forecast:
             return
         amount = self.left.pop(self._phase, 0.0)
         if amount > 0:
-            self.rates[UNITS[self._phase]] = (time.monotonic() - self._phase_began) / amount
-            self._measured.add(UNITS[self._phase])
+            unit, seconds = UNITS[self._phase], time.monotonic() - self._phase_began
+            self.rates[unit] = seconds / amount
+            self._measured[unit] = seconds
         self._phase = None
 
     def advance(self, share: float) -> None:
@@ -130,7 +132,7 @@ class Forecast:
         self._steps[unit] = count = self._steps.get(unit, 0) + 1
         share = max(1 / max(1, count - 1), 1 - MEMORY)
         self.rates[unit] += share * (seconds / self.step_weights[stage] - self.rates[unit])
-        self._measured.add(unit)
+        self._measured[unit] = self._measured.get(unit, 0.0) + seconds
         self._slower = self.rates[unit] / self._expected[unit]
 
     def plan_steps(self, coarse: int, fine: int) -> None:
@@ -166,9 +168,9 @@ class Forecast:
         self._fraction = max(self._fraction, min(0.99, spent_s / max(spent_s + left_s, 1e-9)))
         return self._fraction, left_s
 
-    def measured(self) -> dict[Unit, float]:
-        """The rates that this run has measured."""
-        return {unit: self.rates[unit] for unit in get_args(Unit) if unit in self._measured}
+    def measured(self, least_s: float = 0.0) -> dict[Unit, float]:
+        """The rates that this run has measured, over at least so many seconds."""
+        return {unit: self.rates[unit] for unit, seconds in self._measured.items() if seconds >= least_s}
 
     def _rate(self, unit: Unit) -> float:
         return self.rates[unit] * (1.0 if unit in self._measured else self._slower)

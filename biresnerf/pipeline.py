@@ -21,7 +21,7 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.errors import Interrupted
 from biresnerf.field.backends import resolve_here, use_threads
-from biresnerf.forecast import Forecast, remember_rates, remembered_rates
+from biresnerf.forecast import TELLING_S, Forecast, remember_rates, remembered_rates
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import Monitor, OnProgress, Progress, told_before_the_run
 from biresnerf.refinement.finish.rounds import run_stage_2
@@ -108,7 +108,7 @@ def refine_poses(
         report = run_report(stages, evaluation.scores, judgement, "partial")
         write_result(setup.folder, stages, evaluation, report)
         raise
-    remember_rates(setup.device.type, setup.threads, setup.monitor.forecast.measured())
+    remember_rates(setup.device.type, setup.threads, setup.monitor.forecast.measured(TELLING_S))
     return report
 
 

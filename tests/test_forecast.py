@@ -108,6 +108,16 @@ def test_the_phases_of_matching_follow_each_other():
     assert found.measured()["megapixel"] == pytest.approx(0.2, abs=0.1)
 
 
+def test_what_took_too_short_a_time_is_not_told_to_the_next_run():
+    found = forecast(judging=400.0)
+    with found.within("trying", 10.0):
+        time.sleep(0.1)
+    for _ in range(2):
+        found.stepped("coarse", 3.0)
+    assert set(found.measured()) == {"trial step", "coarse step"}
+    assert set(found.measured(least_s=2.0)) == {"coarse step"}
+
+
 def test_a_phase_that_ends_with_an_error_teaches_nothing():
     found = forecast(judging=400.0)
     with pytest.raises(RuntimeError), found.within("judging"):
