@@ -81,6 +81,8 @@ class ShareView(Record):
 class NewLink(Record):
     """A link to the page of a job."""
 
+    model_config = ConfigDict(json_schema_extra={"examples": [{"valid_s": 86_400}]})
+
     valid_s: int = Field(7 * 86_400, ge=60, le=90 * 86_400, description="How long it is valid.")
 
 

@@ -212,7 +212,7 @@ def test_what_is_seen_needs_no_torch():
 @pytest.mark.slow
 def test_the_cameras_of_a_refinement_can_be_watched(tmp_path):
     write_synthetic_scene(tmp_path / "scene", 6, 24, seed=1)
-    settings = {"start": "none", "verdict": False, "shown_views": 0, "steps": 100}
+    settings = {"start": "none", "verdict": False, "shown_views": 0, "steps": 600}
     words = [*command(tmp_path / "scene", tmp_path / "out", **settings), "--view", "--json"]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:

@@ -113,7 +113,8 @@ def test_a_result_whose_time_is_over_is_410_while_its_record_stays(
     until(http, job["id"], lambda found: found["expires_at"] is not None)
     with psycopg.connect(EmbeddedPostgres(service.data_dir / "postgres").url) as connection:
         connection.execute(
-            "UPDATE jobs SET finished_at = now() - interval '8 days' WHERE id = %s", (job["id"],)
+            "UPDATE jobs SET finished_at = now() - interval '8 days', expires_at = NULL WHERE id = %s",
+            (job["id"],),
         )
     until(http, job["id"], lambda found: found["state"] == "expired")
     for path in ("/artifacts", "/artifacts/report.json", "/report"):

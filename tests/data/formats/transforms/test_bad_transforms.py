@@ -223,10 +223,10 @@ def test_names_that_lead_out_of_a_strangers_folder_are_refused_whether_or_not_th
 
 
 def test_a_file_that_is_no_json_is_refused_by_its_name(tmp_path):
-    (tmp_path / "video.mp4").touch()
+    (tmp_path / "notes.pdf").touch()
     with pytest.raises(InputError) as caught:
-        read_dataset(tmp_path / "video.mp4")
-    assert_complete(caught.value, "input_unsupported", "video.mp4")
+        read_dataset(tmp_path / "notes.pdf")
+    assert_complete(caught.value, "input_unsupported", "notes.pdf")
 
 
 def test_a_path_that_does_not_exist_is_refused(tmp_path):

@@ -88,15 +88,15 @@ def submitted(name: str) -> Change:
 
 
 def cancelled_by_client(name: str) -> Change:
-    """A waiting job ends at once; a running one is asked to."""
+    """A waiting job ends at once, also if who lost it has woken up and runs it; another that runs is asked to."""
 
     def change(world: World) -> Outcome:
         job = world.jobs[name]
         if not job.final and not job.cancel_requested:
             place = "doing" if job.place == "doing" else "over"
             asked = replace(job, cancel_requested=True, place=place, abort=job.abort or place == "doing")
-            if job.state == "queued":
-                job = asked.ended("cancelled")
+            if job.state == "queued" or place == "over":
+                job = replace(asked, token=None).ended("cancelled")
             else:
                 job = asked.with_event("cancel_requested")
             world = world.with_job(name, job)
