@@ -62,4 +62,6 @@ def test_a_job_leaves_nothing_on_local_disk_and_its_files_come_from_the_bucket(
         assert left <= {"postgres", "scratch", "slots", "staging"}
         assert [path for path in (folder / "data/scratch").rglob("*") if path.is_file()] == []
         keys = [item["Key"] for item in by_boto(bucket).list_objects_v2(Bucket=bucket.name)["Contents"]]
-        assert sum("/datasets/" in key for key in keys) == len(scene_files(scene))
+        of_sets = [key for key in keys if "/datasets/" in key and "/shown/" not in key]
+        assert len(of_sets) == len(scene_files(scene))
+        assert any("/shown/" in key for key in keys), "small photos for pages"

@@ -8,6 +8,7 @@ from biresnerf.options.refine_options import RefineOptions
 from biresnerf.progress import Progress
 from biresnerf.wire.problems import JobError
 from tests.workers.conftest import ready_dataset
+from workers.database import job_queue
 from workers.database.database import Database
 from workers.engine import Stores
 from workers.jobs import ledger as ledgers
@@ -32,6 +33,8 @@ def database(stores: Stores) -> Database:
 async def ledger(stores: Stores, database: Database) -> Ledger:
     dataset_id = await ready_dataset(stores, {"plan.json": b"{}"})
     job, _ = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"))
+    async with database.transaction() as connection:
+        await job_queue.take(connection, await job_queue.register_worker(connection))
     claim = await claim_job(database, job.id, max_attempts=3, stall_s=60.0)
     assert claim is not None
     return Ledger(database, claim, STALL_S)

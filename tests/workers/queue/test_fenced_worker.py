@@ -96,11 +96,22 @@ async def test_an_entry_that_is_put_back_for_later_is_not_offered_before(stores:
 
 async def test_a_job_whose_cancellation_was_answered_is_not_claimed_again(stores: Stores, database: Database):
     job_id = await queued(stores)
+    await taken(database, await registered(database))
     assert await claim_job(database, job_id, max_attempts=3, stall_s=60.0) is not None
     assert (await stores.jobs.cancel(job_id)).state == "running"
     assert await claim_job(database, job_id, max_attempts=3, stall_s=60.0) is None
     job = await stores.jobs.get(job_id)
     assert (job.state, job.attempt) == ("cancelled", 1)
+
+
+async def test_a_cancelled_job_ends_at_once_where_who_runs_it_has_lost_it(stores: Stores, database: Database):
+    """Taken for dead, and awake again: it may die before it is told, and nobody would end the job then."""
+    job_id = await queued(stores)
+    claim = await claim_job(database, job_id, max_attempts=3, stall_s=60.0)
+    assert claim is not None
+    assert (await stores.jobs.cancel(job_id)).state == "cancelled"
+    with pytest.raises(claims.Fenced):
+        await Ledger(database, claim, 60.0).publish([], None)
 
 
 async def test_a_claim_whose_acknowledgement_was_lost_counts_once(
