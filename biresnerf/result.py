@@ -112,7 +112,7 @@ class Result:
         for name in names:
             if name not in known:
                 near = get_close_matches(name, known, 1)
-                said = f"unknown format; did you mean `{near[0]}`?" if near else "unknown format."
+                said = f"unknown format (did you mean `{near[0]}`?)." if near else "unknown format."
                 raise InputError("invalid_options", said, where=name, hint=f"There are {', '.join(known)}.")
         refined = read_result(self.folder, None if photos is None else Path(photos))
         written, notes = write_exports(refined, Path(folder), names, WriteContext())

@@ -35,7 +35,7 @@ def _error(name: str, known: list[str]) -> PydanticCustomError:
     near = get_close_matches(name, known, n=1)
     if not near:
         return PydanticCustomError("unknown_option", "unknown option")
-    return PydanticCustomError("unknown_option", "unknown option; did you mean `{near}`?", {"near": near[0]})
+    return PydanticCustomError("unknown_option", "unknown option (did you mean `{near}`?)", {"near": near[0]})
 
 
 def validated(model: type[Parsed], values: Mapping[str, Any]) -> Parsed:

@@ -43,7 +43,7 @@ def test_the_result_is_what_lies_in_the_folder(scene, tmp_path):
 @pytest.mark.parametrize(
     ("input", "options", "code", "said"),
     [
-        ("scene", {"step": 30}, "invalid_options", "step: unknown option; did you mean `steps`?"),
+        ("scene", {"step": 30}, "invalid_options", "step: unknown option (did you mean `steps`?)."),
         ("scene", {"steps": 3}, "invalid_options", "greater than or equal to 20"),
         ("nowhere", {}, "input_missing", "does not exist"),
     ],

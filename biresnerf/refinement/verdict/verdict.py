@@ -176,17 +176,18 @@ def _named(evidence: list[str]) -> str:
 def _sentences(f: Findings) -> list[str]:
     """The figures, in words."""
     sentences = []
+    before = "the poses found" if f.compared_with == "seeded" else "the input's poses"
     if f.heldout is not None:
         p = f.heldout.psnr
         sentences.append(
-            f"{p.count} unseen views: {p.before:.2f} dB with the input's poses, {p.after:.2f} dB with the refined ones"
+            f"{p.count} unseen views: {p.before:.2f} dB with {before}, {p.after:.2f} dB with the refined ones"
             f" ({_gain_db(p)})."
         )
     if f.epipolar is not None:
         e = f.epipolar.error_px
         source = "" if f.epipolar.independent else ", which the initial poses came from"
         sentences.append(
-            f"{f.epipolar.matches} feature matches{source}: epipolar error {e.before:.2f} px with the input's poses, "
+            f"{f.epipolar.matches} feature matches{source}: epipolar error {e.before:.2f} px with {before}, "
             f"{e.after:.2f} px with the refined ones ({_times(e)})."
         )
     return sentences
@@ -200,9 +201,10 @@ def _gain_db(item: PairedDifference) -> str:
 
 def _times(item: PairedDifference) -> str:
     """A ratio of errors given as its logarithm to base 2."""
-    words = (
-        f"typically {2 ** abs(item.difference):.2g} times {'larger' if item.difference < 0 else 'smaller'}"
-    )
+    ratio = f"{2 ** abs(item.difference):.2g}"
+    words = f"typically {ratio} times {'larger' if item.difference < 0 else 'smaller'}"
+    if ratio == "1":
+        words = "typically the same"
     if item.low is None or item.high is None:
         return words
     return f"{words}, 95 % interval of before / after {2**item.low:.2g} to {2**item.high:.2g}"

@@ -157,3 +157,17 @@ def test_poses_far_from_the_input_doubt_its_frame_and_the_verdict_says_so():
         doubt = frame_doubt(turned, shifted, 1.0)
         assert "only roughly" in doubt
         assert doubt in decide(findings(held_out(4.0), matched(1.0), out_of_frame=doubt)).why[0]
+
+
+@pytest.mark.parametrize(
+    ("octaves", "words"),
+    [(0.0, "typically the same"), (1.0, "typically 2 times smaller"), (-1.0, "typically 2 times larger")],
+)
+def test_a_ratio_of_errors_is_told_in_words(octaves, words):
+    assert words in decide(findings(epipolar=matched(octaves))).why[-1]
+
+
+@pytest.mark.parametrize(("source", "poses"), [("given", "the input's poses"), ("seeded", "the poses found")])
+def test_poses_are_the_inputs_only_where_it_held_them(source, poses):
+    for sentence in decide(findings(held_out(4.0), matched(1.0), compared_with=source)).why[-2:]:
+        assert f"with {poses}" in sentence
