@@ -8,3 +8,4 @@ Stage = Literal["preparing", "seeding", "coarse", "fine", "evaluating", "exporti
 STAGES: tuple[Stage, ...] = ("preparing", "seeding", "coarse", "fine", "evaluating", "exporting")
 # Stages whose work another run of the same set can take over.
 ReusableStage = Literal["seeding", "coarse"]
+REUSABLE_STAGES: tuple[ReusableStage, ...] = ("seeding", "coarse")

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from biresnerf.options.refine_options import OPTIONS, STAGE_1_OPTIONS, RefineOptions, parse_options
-from biresnerf.stages import ReusableStage
+from biresnerf.stages import REUSABLE_STAGES, ReusableStage
 from biresnerf.wire.jobs import WantedStage
 from workers.settings.errors import Conflict
 
-LATEST_FIRST: tuple[ReusableStage, ...] = ("coarse", "seeding")
+LATEST_FIRST = REUSABLE_STAGES[::-1]
 
 
 def plan_fork(

@@ -14,6 +14,7 @@ from typing import Any, Literal
 from psycopg import sql
 from psycopg.types.json import Jsonb
 
+from biresnerf.stages import REUSABLE_STAGES
 from biresnerf.wire.jobs import EventType
 from biresnerf.wire.problems import JobError
 from workers.database import job_queue
@@ -268,7 +269,15 @@ async def trash_attempts(
     *,
     preview: str | None = None,
 ) -> None:
-    """Give to the trash what attempts left, except the results of ``keep`` and the preview named ``preview``."""
+    """Give to the trash what attempts left.
+
+    The results of ``keep``, the preview named ``preview`` and the stages' work that the job records stay.
+    """
+    row = await connection.only_row("SELECT reusable FROM jobs WHERE id = %s", job_id)
+    kept = {"checkpoints": None, "results": keep, "previews": preview}
+    for stage in REUSABLE_STAGES:
+        recorded = row["reusable"].get(stage)
+        kept[f"stages/{stage}"] = recorded and recorded["prefix"].rpartition("/")[2]
     # Twice the stall time: a frozen owner that wakes up later finds itself fenced at its first write.
-    for folder, kept in (("checkpoints", None), ("results", keep), ("previews", preview)):
-        await discard(connection, f"jobs/{job_id}/{folder}", after_s=2 * stall_s, keep=kept)
+    for folder, name in kept.items():
+        await discard(connection, f"jobs/{job_id}/{folder}", after_s=2 * stall_s, keep=name)

@@ -12,7 +12,7 @@ from pathlib import Path
 from obstore.exceptions import BaseError as StoreError
 
 from biresnerf.progress import Progress
-from biresnerf.stages import ReusableStage
+from biresnerf.stages import REUSABLE_STAGES, ReusableStage
 from workers.jobs.claim import Fenced
 from workers.jobs.ledger import Ledger
 from workers.run.results import files_inside, store_artifact
@@ -40,7 +40,7 @@ class Courier:
         self._latest: Progress | None = None
         self._log = _LogLines(log_file)
         self._checkpoints, self._previews = _Box(), _Box()
-        self._reusable: dict[ReusableStage, _Box] = {"seeding": _Box(), "coarse": _Box()}
+        self._reusable: dict[ReusableStage, _Box] = {stage: _Box() for stage in REUSABLE_STAGES}
         self._stored = 0
         self._spans = StageSpans()
         self._progress_due = asyncio.Event()
@@ -156,12 +156,13 @@ class Courier:
 
     async def _store_reusable(self, stage: ReusableStage, progress: Progress) -> None:
         """The same for the work of a stage."""
-        prefix = self._new_prefix("stages")
+        prefix = self._new_prefix(f"stages/{stage}")
         found = files_inside(self._output, progress.reusable[stage])
+        if len(found) < len(progress.reusable[stage]):
+            return
         for name, path in found.items():
             await self._files.put_path(f"{prefix}/{name}", path)
-        if len(found) == len(progress.reusable[stage]):
-            await self._point(prefix, self._ledger.reusable(stage, prefix, list(found)))
+        await self._point(prefix, self._ledger.reusable(stage, prefix, list(found)))
 
     async def _point(self, prefix: str, writing: Awaitable[None]) -> None:
         try:

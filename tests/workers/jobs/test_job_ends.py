@@ -75,13 +75,17 @@ async def test_whoever_ends_a_job_has_its_attempts_deleted_after_twice_the_stall
     assert entry is not None
     claim = await claim_job(database, entry.job_id, 3, STALL_S)
     assert claim is not None
-    await Ledger(database, claim, STALL_S).checkpoint(f"jobs/{claim.job_id}/checkpoints/1", ["a"], 10)
+    root = f"jobs/{claim.job_id}"
+    await Ledger(database, claim, STALL_S).checkpoint(f"{root}/checkpoints/1", ["a"], 10)
+    await Ledger(database, claim, STALL_S).reusable("seeding", f"{root}/stages/seeding/{claim.name}-2", ["b"])
     await end(database, claim)
     (job,) = await database.fetch("SELECT state, checkpoint FROM jobs")
     assert job == {"state": state, "checkpoint": None}
     rows = await database.fetch(
-        "SELECT prefix, extract(epoch FROM not_before - clock_timestamp())::float8 AS left_s FROM trash"
+        "SELECT prefix, keep, extract(epoch FROM not_before - clock_timestamp())::float8 AS left_s FROM trash"
     )
-    folders = {f"jobs/{claim.job_id}/{name}" for name in ("checkpoints", "results", "previews")}
-    assert {row["prefix"] for row in rows} == folders
+    folders = ("checkpoints", "results", "previews", "stages/seeding", "stages/coarse")
+    assert {row["prefix"] for row in rows} == {f"{root}/{name}" for name in folders}
+    kept = {row["prefix"].removeprefix(f"{root}/stages/"): row["keep"] for row in rows}
+    assert (kept["seeding"], kept["coarse"]) == (f"{claim.name}-2", None), "other jobs may start from it"
     assert all(STALL_S < row["left_s"] <= 2 * STALL_S for row in rows)

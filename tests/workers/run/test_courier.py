@@ -135,7 +135,10 @@ async def test_work_of_a_stage_that_lacks_a_file_is_not_offered(run: Run):
     run.wrote("poses")
     run.courier.offer(Progress(stage="coarse", reusable={"seeding": ("poses", "lost"), "coarse": ("poses",)}))
     await run.end()
-    assert [(kind, files) for kind, _, files in run.notes.pointers] == [("coarse", ["poses"])]
+    ((kind, prefix, files),) = run.notes.pointers
+    assert (kind, files) == ("coarse", ["poses"])
+    assert await run.stored() == {f"{prefix}/poses"}
+    assert "/stages/coarse/" in prefix, "where the end of the job looks for what is not recorded"
 
 
 async def test_a_store_that_refuses_a_checkpoint_does_not_end_the_job(

@@ -155,41 +155,53 @@ class Actors:
         assert claim is not None
         ledger = Ledger(self._database, claim, self._settings.stall_s)
         root = f"jobs/{claim.job_id}"
-
-        def write(what: str, run: Callable[[], Awaitable[Any]], change: Change, ends: Any = None) -> Act:
-            def learn(answer: object) -> None:
-                if answer == FENCED:
-                    self.exit(worker)  # and leaves the entry to the new owner
-                elif ends is not None:
-                    worker.again = ends(answer)
-
-            return Act(f"worker {worker.id}: {what} {name}", run, lambda _: change, worker, learn)
-
         stage = "coarse" if world.jobs[name].stage != "coarse" else "fine"
         now = Progress(stage=stage, step=1, steps_total=9, fraction=0.1)
-        yield write("progress", lambda: ledger.progress(now), model.progressed(name, claim.token, stage))
+        yield self._write(
+            worker, "progress", lambda: ledger.progress(now), model.progressed(name, claim.token, stage)
+        )
         worker.stored += 1
-        prefix = f"checkpoints/{claim.name}-{worker.stored}"
-        yield write(
+        stored = f"{claim.name}-{worker.stored}"
+        prefix, work = f"checkpoints/{stored}", f"stages/coarse/{stored}"
+        yield self._write(
+            worker,
             "checkpoint",
             lambda: ledger.checkpoint(f"{root}/{prefix}", ["latest"], 1),
             model.checkpointed(name, claim.token, prefix),
         )
+        yield self._write(
+            worker,
+            "stage",
+            lambda: ledger.reusable("coarse", f"{root}/{work}", ["poses"]),
+            model.stage_kept(name, claim.token, work),
+        )
+        yield from self._ends(worker, world, claim, ledger)
+
+    def _ends(self, worker: Worker, world: World, claim: Claim, ledger: Ledger) -> Iterator[Act]:
+        name, root = worker.name, f"jobs/{claim.job_id}"
         result = tuple(f"results/{claim.name}/{file}" for file in ("poses.json", "report.json"))
         files = [
             Artifact(name=key.rpartition("/")[2], key=f"{root}/{key}", size=1, sha256="", media_type="")
             for key in result
         ]
-        yield write(
+        yield self._write(
+            worker,
             "publish",
             lambda: ledger.publish(files, None),
             model.published(name, claim.token, result),
             lambda done: "over" if done else None,
         )
         error = JobError(code="engine_error", detail="It failed.")
-        yield write("fail", lambda: ledger.fail(error, []), model.failed(name, claim.token), lambda _: "over")
+        yield self._write(
+            worker,
+            "fail",
+            lambda: ledger.fail(error, []),
+            model.failed(name, claim.token),
+            lambda _: "over",
+        )
         if world.jobs[name].cancel_requested:
-            yield write(
+            yield self._write(
+                worker,
                 "cancelled",
                 lambda: ledger.cancelled([]),
                 model.ended_cancelled(name, claim.token),
@@ -201,12 +213,31 @@ class Actors:
             ("requeued", "disk_full", "later"),
         ):
             how = Requeue(event, {}, setback)  # type: ignore[arg-type]
-            yield write(
+            yield self._write(
+                worker,
                 f"give back ({setback})",
                 lambda how=how: ledger.give_back(how),
                 model.given_back(name, claim.token, event, setback),
                 lambda back, again=again: again if back else "over",
             )
+
+    def _write(
+        self,
+        worker: Worker,
+        what: str,
+        run: Callable[[], Awaitable[Any]],
+        change: Change,
+        ends: Callable[[Any], Again | None] | None = None,
+    ) -> Act:
+        """``ends``: what the worker does with the entry after this answer."""
+
+        def learn(answer: object) -> None:
+            if answer == FENCED:
+                self.exit(worker)  # and leaves the entry to the new owner
+            elif ends is not None:
+                worker.again = ends(answer)
+
+        return Act(f"worker {worker.id}: {what} {worker.name}", run, lambda _: change, worker, learn)
 
     def _acknowledge(self, worker: Worker) -> Act:
         entry, again = worker.entry, worker.again

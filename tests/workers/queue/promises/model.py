@@ -29,6 +29,7 @@ class Job:
     cancel_requested: bool = False
     stage: str | None = None
     checkpoint: str | None = None
+    stage_work: str | None = None
     result: tuple[str, ...] = ()
     held: bool = False
     place: Place = "todo"
@@ -45,7 +46,7 @@ class Job:
         return replace(self, events=(*self.events, event), **changes)  # type: ignore[arg-type]
 
     def ended(self, state: str, result: tuple[str, ...] = ()) -> Job:
-        swept = self.trash | {"checkpoints", "previews", "results"}
+        swept = self.trash | {"checkpoints", "previews", "results", "stages/seeding", "stages/coarse"}
         return self.with_event(state, state=state, result=result, checkpoint=None, trash=swept)
 
 
@@ -166,6 +167,16 @@ def checkpointed(name: str, token: uuid.UUID, prefix: str) -> Change:
     def effect(job: Job) -> tuple[object, Job]:
         replaced = job.trash | ({job.checkpoint} if job.checkpoint not in (None, prefix) else set())
         return None, job.with_event("checkpoint", checkpoint=prefix, crashes=0, trash=replaced)
+
+    return _owned(name, token, None, effect)
+
+
+def stage_kept(name: str, token: uuid.UUID, prefix: str) -> Change:
+    """The work of a stage is there for other jobs, also after the end; of the one before nothing is left."""
+
+    def effect(job: Job) -> tuple[object, Job]:
+        replaced = job.trash | ({job.stage_work} if job.stage_work not in (None, prefix) else set())
+        return None, replace(job, stage_work=prefix, trash=replaced)
 
     return _owned(name, token, None, effect)
 

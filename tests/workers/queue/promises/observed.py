@@ -18,6 +18,7 @@ _JOBS = """
         ARRAY(SELECT seq FROM job_events WHERE job_id = jobs.id ORDER BY seq) AS numbers,
         ARRAY(SELECT prefix FROM trash WHERE starts_with(prefix, 'jobs/' || jobs.id || '/')) AS trash,
         ARRAY(SELECT keep FROM trash WHERE prefix = 'jobs/' || jobs.id || '/results') AS kept,
+        ARRAY(SELECT keep FROM trash WHERE prefix = 'jobs/' || jobs.id || '/stages/coarse') AS kept_work,
         (SELECT count(*) FROM queue_entries AS live WHERE live.job_id = jobs.id
             AND live.state IN ('todo', 'doing')) AS live_entries
     FROM jobs JOIN procrastinate_jobs AS entry ON entry.id = jobs.queue_id ORDER BY jobs.queue_id"""
@@ -46,6 +47,7 @@ def _job(row: Mapping[str, Any]) -> Job:
         **{name: row[name] for name in same},
         token=row["run_token"],
         checkpoint=None if row["checkpoint"] is None else row["checkpoint"]["prefix"].removeprefix(root),
+        stage_work=_stage_work(row),
         result=tuple(item["key"].removeprefix(root) for item in row["artifacts"]),
         place=place,
         worker=row["worker_id"] if place == "doing" else None,
@@ -53,6 +55,12 @@ def _job(row: Mapping[str, Any]) -> Job:
         events=tuple(row["events"]),
         trash=frozenset(prefix.removeprefix(root) for prefix in row["trash"]),
     )
+
+
+def _stage_work(row: Mapping[str, Any]) -> str | None:
+    """The folder of the work of stage 1 that other jobs may start from."""
+    recorded = row["reusable"].get("coarse")
+    return None if recorded is None else recorded["prefix"].removeprefix(f"jobs/{row['id']}/")
 
 
 def broken_promises(
@@ -73,7 +81,7 @@ def broken_promises(
         name, events = row["idempotency_key"], row["events"]
         after = events[confirmed.get(name, len(events)) :]
         ends = [event for event in events if event in ENDS]
-        final = row["state"] in ENDS
+        final, work = row["state"] in ENDS, _stage_work(row)
         holds = {
             "has a gap in its history": row["numbers"] == list(range(1, row["seq"] + 1)),
             "has more or less than one end": len(ends) == final,
@@ -85,6 +93,8 @@ def broken_promises(
             "has a result that is to be deleted": not row["artifacts"]
             or row["kept"] == [row["artifacts"][0]["key"].split("/")[3]],
             "counts more attempts than it started": row["attempt"] <= events.count("started"),
+            "has lost the work of a stage, or keeps another's": not final
+            or row["kept_work"] == [work and work.rpartition("/")[2]],
             "has a checkpoint that is to be deleted": final
             or row["checkpoint"] is None
             or row["checkpoint"]["prefix"] not in row["trash"],

@@ -10,7 +10,7 @@ from tests.workers.queue.promises.faulty_connections import AFTER_COMMIT
 from tests.workers.queue.promises.machine import Promises, promises_on
 
 ENDS = ("publish", "fail", "give back (None)", "give back (error)", "give back (disk_full)")
-WRITES = ("progress", "checkpoint", *ENDS)
+WRITES = ("progress", "checkpoint", "stage", *ENDS)
 CANCELLED = "cancelled"
 
 
