@@ -115,6 +115,19 @@ def test_a_camera_given_another_pose_starts_over_as_free_as_any(scene):
     assert bool((optimiser.mobility == 1).all())
 
 
+def test_rays_count_in_the_loss_and_the_error_by_their_weight(scene):
+    results = []
+    for factor in (1.0, 2.0):
+        optimiser = tiny_optimiser(*scene, tiny_options())
+        batch = optimiser.sampler.draw(200, 0.0, torch.Generator().manual_seed(3))
+        weighed = replace(batch, weight=factor * batch.weight)
+        optimiser.sampler.draw = lambda *_, drawn=weighed: drawn
+        results.append(optimiser.step())
+    one, two = results
+    assert two.loss == pytest.approx(2 * one.loss)
+    assert two.mean_squared_error == pytest.approx(2 * one.mean_squared_error)
+
+
 def test_lost_cameras_weigh_less_in_our_loss_and_in_no_other_methods(scene):
     for method, weighed in (("biresnerf", True), ("biresnerf-paper", False)):
         losses = []
