@@ -7,12 +7,12 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from docs.generate.badges import badges
 from docs.generate.commands_page import commands_page
-from docs.generate.conventions_picture import conventions_svg
 from docs.generate.format_tables import format_page, page_formats
 from docs.generate.notebooks import notebook
 from docs.generate.options_page import options_page
+from docs.generate.pictures.badges import badges
+from docs.generate.pictures.conventions import conventions_svg
 from docs.generate.result_schema import result_schema
 from docs.generate.settings_page import settings_page
 from service.app import create_app

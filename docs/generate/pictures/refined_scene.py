@@ -1,4 +1,4 @@
-"""The pictures of the README: `python -m docs.generate.pictures` refines a made scene and draws what came of it.
+"""The pictures of the README: `python -m docs.generate.pictures.refined_scene` refines a made scene and draws what came of it.
 
 Takes some minutes. Writes docs/pictures/cameras.webp and docs/pictures/before_after.webp.
 """
@@ -21,7 +21,7 @@ from biresnerf.commands.poses.make_scene import make_scene
 from biresnerf.data.show.view_file import read_view_file
 from biresnerf.result import Array, Result
 
-FOLDER = Path(__file__).resolve().parents[1] / "pictures"
+FOLDER = Path(__file__).resolve().parents[2] / "pictures"
 VIEWS, SIZE, NOISE, SEED = 48, 200, 0.15, 3
 MOVING, STILL, FRAME_MS = 24, 12, 60  # frames, and how long each is seen
 SIDE, GAP, CAPTION = 220, 8, 22  # px
