@@ -7,19 +7,18 @@ import json
 import re
 from pathlib import Path
 
-from biresnerf.options.formats import Format, Loss, Need, formats
+from biresnerf.options.formats import Loss, Need, formats
 from docs.generate.markdown import DASH, table
 
 _TESTS = Path(__file__).resolve().parents[2] / "tests"
 _NAMES = {"bpy": "Blender", "gaussian-splatting": "3D Gaussian Splatting", "open3d": "Open3D"}
 _END = "<!-- end -->"
-_LOSSES: dict[Loss, str] = {
+_LOSSES: dict[Loss, str] = {  # except rigs, which the sentence below the table names
     "poses": "poses",
-    "names": "names: rows are in the order of the files' names",
+    "names": "names: rows follow the order of the files' names",
     "lenses": "lenses",
     "some lenses": "two focal lengths, a principal point off the centre, lenses other than [these](#camera-models)",
     "distortion": "any distortion",
-    "rigs": "rigs and features",
     "points": "points",
     "mask paths": "paths of masks",
     "masks": "masks",
@@ -38,7 +37,6 @@ def format_page(path: Path) -> str:
     text = path.read_text("utf-8")
     tables = {
         "formats read": _read_table(),
-        "formats proven": _proof_table(),
         "formats written": _write_table(),
     }
     for name, content in tables.items():
@@ -54,43 +52,13 @@ def _read_table() -> str:
             one.title,
             ", ".join("the folder itself" if name == "." else f"`{name}`" for name in one.found_as),
             one.gives,
-            f"`{_folder_of(one)}`",
             one.checked_against,
         )
         for one in formats().values()
         if one.found_as
     ]
-    rows.append(("images alone", "the folder itself, `images/`", "sizes, EXIF", "`data/photos`", ""))
-    return table(("format", "found as", "what it gives", "code", "checked against"), rows)
-
-
-def _proof_table() -> str:
-    """What tests prove of each format: whether it comes back, and which programs read it."""
-    back, readers = _come_back(), _readers()
-    rows = [
-        (
-            f"`{one.name}`",
-            "yes" if one.found_as or one.name in back else DASH,
-            "yes" if one.in_result else DASH,
-            "yes" if one.name in back else DASH,
-            ", ".join(readers.get(one.name, [])) or DASH,
-        )
-        for one in formats().values()
-    ]
-    return table(("format", "read", "written", "comes back", "read by the program itself"), rows)
-
-
-def _come_back() -> set[str]:
-    """The formats that the test of `convert` there and back goes through."""
-    tree = ast.parse((_TESTS / "commands/poses/test_convert.py").read_text("utf-8"))
-    [places] = [
-        node.value
-        for node in tree.body
-        if isinstance(node, ast.Assign)
-        and isinstance(node.targets[0], ast.Name)
-        and node.targets[0].id == "PLACES"
-    ]
-    return set(ast.literal_eval(places))
+    rows.append(("images alone", "the folder itself, `images/`", "sizes, EXIF", ""))
+    return table(("format", "found as", "what it gives", "checked against"), rows)
 
 
 def _readers() -> dict[str, list[str]]:
@@ -111,18 +79,13 @@ def _readers() -> dict[str, list[str]]:
     return found
 
 
-def _folder_of(one: Format) -> str:
-    path = one.module.removeprefix("biresnerf.").replace(".", "/")
-    return path.removesuffix("/format") if path.endswith("/format") else f"{path}.py"
-
-
 def _write_table() -> str:
-    rows = []
+    rows, readers = [], _readers()
     for one in formats().values():
         if not (one.in_set or one.in_result):
             continue
         when = "always" if one.always else "on request" if one.on_request else "where the input has it"
-        lost = [_LOSSES[loss] for loss in one.loses] + ([one.lacks] if one.lacks else [])
+        lost = [_LOSSES[loss] for loss in one.loses if loss != "rigs"] + ([one.lacks] if one.lacks else [])
         rows.append(
             (
                 f"`{one.name}`",
@@ -132,10 +95,14 @@ def _write_table() -> str:
                 one.heading.removeprefix("For "),
                 ", ".join(_NEEDS[need] for need in one.needs) or DASH,
                 "; ".join(lost) or DASH,
+                ", ".join(readers.get(one.name, [])) or DASH,
             )
         )
-    head = ("format", "in a result", "written", "by `convert`", "for", "needs", "cannot hold")
-    return table(head, rows)
+    head = ("format", "in a result", "written", "by `convert`", "for", "needs", "cannot hold", "opened by")
+    hold_rigs = ", ".join(
+        f"`{one.name}`" for one in formats().values() if one.in_set and "rigs" not in one.loses
+    )
+    return f"{table(head, rows)}\nOnly {hold_rigs} hold rigs and features.\n"
 
 
 def page_formats() -> str:
