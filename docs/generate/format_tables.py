@@ -99,10 +99,8 @@ def _write_table() -> str:
             )
         )
     head = ("format", "in a result", "written", "by `convert`", "for", "needs", "cannot hold", "opened by")
-    hold_rigs = ", ".join(
-        f"`{one.name}`" for one in formats().values() if one.in_set and "rigs" not in one.loses
-    )
-    return f"{table(head, rows)}\nOnly {hold_rigs} hold rigs and features.\n"
+    hold_rigs = [f"`{one.name}`" for one in formats().values() if one.in_set and "rigs" not in one.loses]
+    return f"{table(head, rows)}\nOnly {' and '.join(hold_rigs)} hold rigs.\n"
 
 
 def page_formats() -> str:
