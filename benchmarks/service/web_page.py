@@ -10,24 +10,19 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import os
 import shutil
-import signal
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 import zipfile
 from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
 from playwright.sync_api import Browser, sync_playwright
 
 from biresnerf.data.synthetic.scene import write_synthetic_scene
+from service.commands.temporary_service import temporary_service
 
 CONTROLS = {"list": ".drop-buttons .act", "job": ".scene-slider input"}
 QUIET_MS = 1500
@@ -61,28 +56,6 @@ WATCH = """selector => {
   };
   look();
 }"""
-
-
-@contextmanager
-def _service() -> Iterator[str]:
-    folder = Path(tempfile.mkdtemp(prefix="biresnerf-page-"))
-    folder.chmod(0o711)  # the database runs as another user where root starts it
-    command = [sys.executable, "-m", "biresnerf.command_line", "up", "--port", "0", "--slots", "1"]
-    with (folder / "log").open("wb") as log:
-        environment = {**os.environ, "BIRESNERF_DATA_DIR": str(folder / "data")}
-        process = subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=log, start_new_session=True
-        )
-    try:
-        assert process.stdout is not None
-        said = process.stdout.readline().decode().split()
-        if said[:2] != ["ready", "at"]:
-            raise SystemExit((folder / "log").read_text())
-        yield said[2]
-    finally:
-        process.send_signal(signal.SIGINT)
-        process.wait(60)
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _finished_job(url: str) -> str:
@@ -141,7 +114,7 @@ def main() -> None:
     if chromium is None:
         raise SystemExit("There is no Chromium; on Debian: apt install chromium")
     arguments = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with _service() as url, sync_playwright() as playwright:
+    with temporary_service() as url, sync_playwright() as playwright:
         pages = {"list": f"{url}/", "job": f"{url}/#/jobs/{_finished_job(url)}"}
         browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
         began = time.strftime("%Y-%m-%d %H:%M")

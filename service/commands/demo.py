@@ -8,15 +8,10 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
-import signal
 import statistics
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +24,10 @@ from biresnerf.commands.jobs.service_options import service_at
 from biresnerf.errors import BiresnerfError, InputError
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.report import Report
-from workers.process.die_with_parent import dying_with_parent
+from service.commands.temporary_service import temporary_service
 
 # Marks a folder that a later run may clear.
 _MARK = ".made-by-biresnerf-demo"
-_STOP_S = 40.0
-_READY = re.compile(r"ready at (\S+)")
 
 
 def run_demo(scene: Path | None, output: Path, options: RefineOptions, views: int, size: int) -> None:
@@ -45,7 +38,7 @@ def run_demo(scene: Path | None, output: Path, options: RefineOptions, views: in
     _clear(output)
     given = scene or _make_scene(output / "scene", views, size)
     result = output / "result"
-    with _service() as url:
+    with temporary_service() as url:
         click.echo(f"service, while this runs: {url}  (its page; API docs: {url}/docs)")
         _send_and_fetch(url, given, result, options)
     _print_outcome(result, given, None if scene else output / "scene.truth.json")
@@ -77,45 +70,6 @@ def _biresnerf(*arguments: object) -> str:
     if done.returncode != 0:
         raise BiresnerfError(f"`biresnerf {arguments[0]}` failed: {done.stderr.strip()}")
     return done.stdout
-
-
-@contextmanager
-def _service() -> Iterator[str]:
-    """Runs a service on a free port, with a private database; deletes both at the end."""
-    home = Path(tempfile.mkdtemp(prefix="biresnerf-demo-"))
-    home.chmod(0o711)  # if root starts the database, it runs as another user
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("BIRESNERF_")}
-    environment["BIRESNERF_DATA_DIR"] = str(home / "data")
-    log = home / "service.log"
-    command = [sys.executable, "-m", "biresnerf.command_line", "up", "--port", "0", "--slots", "1"]
-    with log.open("wb") as errors:
-        # In its own session it does not receive Ctrl-C; `dying_with_parent` ends it if this process is killed.
-        process = subprocess.Popen(
-            dying_with_parent(command, signal_number=signal.SIGINT),
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            start_new_session=True,
-        )
-    try:
-        found = _READY.match(process.stdout.readline().decode()) if process.stdout else None
-        if found is None:
-            raise BiresnerfError(f"The service did not start:\n{log.read_text(errors='replace')[-3000:]}")
-        yield found[1]
-    finally:
-        _stop(process)
-        shutil.rmtree(home, ignore_errors=True)
-
-
-def _stop(process: subprocess.Popen[bytes]) -> None:
-    process.send_signal(signal.SIGINT)
-    try:
-        process.wait(_STOP_S)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-    if process.stdout:
-        process.stdout.close()
 
 
 def _send_and_fetch(url: str, scene: Path, target: Path, options: RefineOptions) -> None:

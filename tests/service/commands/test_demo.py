@@ -112,7 +112,7 @@ def test_a_killed_demo_takes_its_service_with_it(tmp_path: Path, scene: Path) ->
 
 
 def test_ctrl_c_leaves_no_process_and_no_folder(tmp_path: Path, scene: Path) -> None:
-    homes = set(Path(tempfile.gettempdir()).glob("biresnerf-demo-*"))
+    homes = set(Path(tempfile.gettempdir()).glob("biresnerf-temporary-*"))
     process = subprocess.Popen(
         [*COMMAND, "--output", str(tmp_path / "out"), "--scene", str(scene), "--set", "steps=100000"],
         stdout=subprocess.PIPE,
@@ -134,4 +134,4 @@ def test_ctrl_c_leaves_no_process_and_no_folder(tmp_path: Path, scene: Path) -> 
     assert process.returncode == 130, said
     _, alive = psutil.wait_procs(below, timeout=5)
     assert alive == []
-    assert set(Path(tempfile.gettempdir()).glob("biresnerf-demo-*")) == homes
+    assert set(Path(tempfile.gettempdir()).glob("biresnerf-temporary-*")) == homes
