@@ -192,7 +192,7 @@ class Operations:
         self._worker = self._worker or await self._database.run(job_queue.register_worker)
         entry = await self._database.run(job_queue.take, self._worker)
         assert entry is not None, "jobs wait"
-        claim = await claim_job(self._database, entry.job_id, 3, 60.0)
+        claim = await claim_job(self._database, entry.job_id, self._worker, 3, 60.0)
         assert claim is not None, "it waited"
         await Ledger(self._database, claim, 60.0).publish([], None)
         async with self._database.transaction() as connection:

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from pathlib import Path
 
 import psutil
@@ -23,10 +23,14 @@ from psycopg import sql
 from psycopg.conninfo import make_conninfo
 
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.wire.jobs import JobView
+from biresnerf.wire.jobs import JobKind, JobView
+from workers.database import job_queue
+from workers.database.database import Database
 from workers.database.embedded_postgres import EmbeddedPostgres
+from workers.database.job_queue import Entry
 from workers.database.migrate import migrate
 from workers.engine import Stores, open_stores
+from workers.jobs.claim import Claim, claim_job
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 
@@ -192,6 +196,21 @@ async def ready_dataset(stores: Stores, files: dict[str, bytes]) -> str:
     checked = await stores.datasets.check(dataset.id)
     assert checked.state == "ready", checked.error
     return dataset.id
+
+
+async def taken_by_somebody(database: Database, kinds: Sequence[JobKind] = job_queue.KINDS) -> Entry:
+    """The next entry of the queue, which a new worker has now."""
+    async with database.transaction() as connection:
+        entry = await job_queue.take(connection, await job_queue.register_worker(connection), kinds)
+    assert entry is not None
+    return entry
+
+
+async def claimed(database: Database, job_id: str, stall_s: float = 60.0) -> Claim | None:
+    """A claim by the worker that has the job's entry."""
+    having = "SELECT worker_id FROM queue_entries WHERE job_id = %s AND state = 'doing'"
+    (row,) = await database.fetch(having, job_id)
+    return await claim_job(database, job_id, row["worker_id"], 3, stall_s)
 
 
 @pytest.fixture

@@ -134,8 +134,7 @@ async def acknowledge(
 
     False, and nothing is changed, where the entry is another worker's by now.
     """
-    own = "SELECT 1 FROM procrastinate_jobs WHERE id = %s AND worker_id = %s AND status = 'doing' FOR UPDATE"
-    if not await connection.rows(own, entry_id, worker_id):
+    if not await lock_taken(connection, entry_id, worker_id):
         return False
     if again_in_s is None:
         await _manager(connection).finish_job_by_id_async(entry_id, Status.SUCCEEDED, delete_job=False)
@@ -144,10 +143,13 @@ async def acknowledge(
     return True
 
 
-async def lock_taken(connection: Connection, entry_id: int) -> bool:
-    """Whether some worker has the entry; it stays so until the end of the transaction."""
-    taken = "SELECT 1 FROM procrastinate_jobs WHERE id = %s AND status = 'doing' FOR UPDATE"
-    return bool(await connection.rows(taken, entry_id))
+async def lock_taken(connection: Connection, entry_id: int, worker_id: int | None) -> bool:
+    """Whether the worker, or any worker, has the entry; it stays so until the end of the transaction."""
+    taken = (
+        "SELECT 1 FROM procrastinate_jobs WHERE id = %s AND status = 'doing'"
+        " AND (%s::bigint IS NULL OR worker_id = %s) FOR UPDATE"
+    )
+    return bool(await connection.rows(taken, entry_id, worker_id, worker_id))
 
 
 async def put_back(connection: Connection, entry_id: int, in_s: float = 0) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import JobKind
+from workers.database import job_queue
 from workers.database.database import Database
 from workers.jobs.job_states import finish, finish_cancelled, start_attempt, trash_attempts
 from workers.jobs.setbacks import crashed_too_often, used_up
@@ -45,17 +46,22 @@ class Claim:
         return f"{self.attempt}-{self.token.hex[:8]}"
 
 
-async def claim_job(database: Database, job_id: str, max_attempts: int, stall_s: float) -> Claim | None:
-    """Claim a job with a fresh token; none where there is nothing to run.
+async def claim_job(
+    database: Database, job_id: str, worker_id: int, max_attempts: int, stall_s: float
+) -> Claim | None:
+    """Claim a job with a fresh token, for the worker that has its queue entry; none where there is nothing to run.
 
+    A worker that was taken for dead and woke up finds the entry in the queue again, or with another worker.
     A job whose cancellation was asked for ends ``cancelled``, one that has used up its attempts ends ``failed``.
     """
     token = uuid.uuid4()
-    return await retry_while_unavailable(lambda: _claim(database, job_id, max_attempts, stall_s, token))
+    return await retry_while_unavailable(
+        lambda: _claim(database, job_id, worker_id, max_attempts, stall_s, token)
+    )
 
 
 async def _claim(
-    database: Database, job_id: str, max_attempts: int, stall_s: float, token: uuid.UUID
+    database: Database, job_id: str, worker_id: int, max_attempts: int, stall_s: float, token: uuid.UUID
 ) -> Claim | None:
     async with database.transaction() as connection:
         row = await connection.row("SELECT * FROM jobs WHERE id = %s FOR UPDATE", job_id)
@@ -63,6 +69,8 @@ async def _claim(
             # An earlier try got through, though its acknowledgement was lost: the attempt counts once.
             return _claimed(row, token)
         if row is None or row["state"] not in ("queued", "running"):
+            return None
+        if not await job_queue.lock_taken(connection, row["queue_id"], worker_id):
             return None
         if row["cancel_requested"]:
             await finish_cancelled(connection, job_id, stall_s)

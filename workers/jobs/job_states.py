@@ -131,7 +131,7 @@ async def take_back(connection: Connection, entry_id: int, stall_s: float) -> No
         " WHERE queue_id = %s AND state IN ('queued', 'running') FOR UPDATE",
         entry_id,
     )
-    if not await job_queue.lock_taken(connection, entry_id):
+    if not await job_queue.lock_taken(connection, entry_id, None):
         return  # it came to an end in the meantime
     if job is None:  # or final
         await job_queue.abort(connection, entry_id)
@@ -185,11 +185,8 @@ async def request_cancel(
     )
     if job is None:
         return
-    # Who was taken for dead and woke up runs a job that is in the queue again, and may die before it is told.
-    taken = await job_queue.lock_taken(connection, job["queue_id"])
     await job_queue.cancel(connection, job["queue_id"])
-    if job["state"] == "queued" or not taken:  # perhaps after an attempt that has shown something
-        await connection.execute("UPDATE jobs SET run_token = NULL WHERE id = %s", (job_id,))
+    if job["state"] == "queued":  # perhaps after an attempt that has shown something
         await finish_cancelled(connection, job_id, stall_s)
     else:
         await add_event(connection, job_id, "cancel_requested")

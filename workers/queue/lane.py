@@ -114,7 +114,11 @@ class Lane:
             await retry_while_unavailable(lambda: self._database.run(say))
             return Ending("setback", self._settings.stall_s / 4)
         claim = await claim_job(
-            self._database, entry.job_id, self._settings.max_attempts, self._settings.stall_s
+            self._database,
+            entry.job_id,
+            self._place.worker_id,
+            self._settings.max_attempts,
+            self._settings.stall_s,
         )
         if claim is None:
             return None

@@ -58,7 +58,7 @@ class Line:
             entry = await job_queue.take(connection, worker_id)
         if entry is None:
             return ""
-        assert await claim_job(self.database, entry.job_id, 3, 60.0) is not None
+        assert await claim_job(self.database, entry.job_id, worker_id, 3, 60.0) is not None
         return self.ids[entry.job_id]
 
     async def end(self, name: str) -> None:

@@ -8,11 +8,10 @@ import pytest
 
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.problems import JobError
-from tests.workers.conftest import ready_dataset
-from workers.database import job_queue
+from tests.workers.conftest import claimed, ready_dataset, taken_by_somebody
 from workers.database.database import Database
 from workers.engine import Stores
-from workers.jobs.claim import Claim, claim_job
+from workers.jobs.claim import Claim
 from workers.jobs.job_states import Requeue
 from workers.jobs.ledger import Ledger
 from workers.queue.janitor import release_worker
@@ -33,12 +32,12 @@ async def _given_back_after_its_cancel(database: Database, claim: Claim) -> None
 
 async def _claimed_after_its_cancel(database: Database, claim: Claim) -> None:
     await _ask(database, claim)
-    assert await claim_job(database, claim.job_id, 3, STALL_S) is None
+    assert await claimed(database, claim.job_id, STALL_S) is None
 
 
 async def _claimed_once_too_often(database: Database, claim: Claim) -> None:
     await database.fetch("UPDATE jobs SET crashes = 3 RETURNING id")
-    assert await claim_job(database, claim.job_id, 3, STALL_S) is None
+    assert await claimed(database, claim.job_id, STALL_S) is None
 
 
 async def _failed(database: Database, claim: Claim) -> None:
@@ -70,10 +69,8 @@ async def test_whoever_ends_a_job_has_its_attempts_deleted_after_twice_the_stall
     database = stores.jobs._database
     dataset_id = await ready_dataset(stores, {"plan.json": b"{}"})
     await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"))
-    async with database.transaction() as connection:
-        entry = await job_queue.take(connection, await job_queue.register_worker(connection))
-    assert entry is not None
-    claim = await claim_job(database, entry.job_id, 3, STALL_S)
+    entry = await taken_by_somebody(database)
+    claim = await claimed(database, entry.job_id)
     assert claim is not None
     root = f"jobs/{claim.job_id}"
     await Ledger(database, claim, STALL_S).checkpoint(f"{root}/checkpoints/1", ["a"], 10)

@@ -7,12 +7,11 @@ import pytest
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.progress import Progress
 from biresnerf.wire.problems import JobError
-from tests.workers.conftest import ready_dataset
-from workers.database import job_queue
+from tests.workers.conftest import claimed, ready_dataset, taken_by_somebody
 from workers.database.database import Database
 from workers.engine import Stores
 from workers.jobs import ledger as ledgers
-from workers.jobs.claim import Fenced, claim_job
+from workers.jobs.claim import Fenced
 from workers.jobs.job_states import Requeue
 from workers.jobs.ledger import Ledger
 from workers.records import Artifact
@@ -33,9 +32,8 @@ def database(stores: Stores) -> Database:
 async def ledger(stores: Stores, database: Database) -> Ledger:
     dataset_id = await ready_dataset(stores, {"plan.json": b"{}"})
     job, _ = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"))
-    async with database.transaction() as connection:
-        await job_queue.take(connection, await job_queue.register_worker(connection))
-    claim = await claim_job(database, job.id, max_attempts=3, stall_s=60.0)
+    await taken_by_somebody(database)
+    claim = await claimed(database, job.id)
     assert claim is not None
     return Ledger(database, claim, STALL_S)
 
@@ -158,7 +156,7 @@ class _Losing:
 
 
 async def test_nothing_is_written_once_another_attempt_owns_the_job(database: Database, ledger: Ledger):
-    assert await claim_job(database, ledger.claim.job_id, max_attempts=3, stall_s=60.0) is not None
+    assert await claimed(database, ledger.claim.job_id) is not None
     before = await database.fetch("SELECT * FROM jobs")
     for write in (
         ledger.progress(Progress(stage="coarse")),
@@ -193,13 +191,13 @@ async def test_a_job_given_back_starts_from_its_checkpoint_unless_that_is_forgot
 ):
     await ledger.checkpoint("jobs/x/1", ["a"], 10)
     assert await ledger.give_back(Requeue("requeued", {"why": "shutdown"}))
-    again = await claim_job(database, ledger.claim.job_id, max_attempts=3, stall_s=60.0)
+    again = await claimed(database, ledger.claim.job_id)
     assert again is not None
     assert (again.attempt, again.checkpoint) == (1, {"prefix": "jobs/x/1", "files": ["a"]})
     smaller = {"max_image_size": 100}
     await Ledger(database, again, STALL_S).give_back(
         Requeue("retried_smaller", {}, "killed", forget_checkpoint=True, smaller=smaller)
     )
-    last = await claim_job(database, ledger.claim.job_id, max_attempts=3, stall_s=60.0)
+    last = await claimed(database, ledger.claim.job_id)
     assert last is not None
     assert (last.attempt, last.checkpoint, last.smaller) == (2, None, smaller)

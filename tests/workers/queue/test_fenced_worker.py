@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from biresnerf.options.refine_options import RefineOptions
-from tests.workers.conftest import ready_dataset
+from tests.workers.conftest import claimed, ready_dataset, taken_by_somebody
 from workers.database import job_queue
 from workers.database.database import Database, open_database
 from workers.database.job_queue import Entry
@@ -17,7 +17,7 @@ from workers.engine import Stores
 from workers.jobs import claim as claims
 from workers.jobs.claim import Fenced, claim_job
 from workers.jobs.ledger import Ledger
-from workers.queue.janitor import Janitor
+from workers.queue.janitor import Janitor, release_worker
 from workers.run.attempt import Attempt
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
@@ -96,22 +96,26 @@ async def test_an_entry_that_is_put_back_for_later_is_not_offered_before(stores:
 
 async def test_a_job_whose_cancellation_was_answered_is_not_claimed_again(stores: Stores, database: Database):
     job_id = await queued(stores)
-    await taken(database, await registered(database))
-    assert await claim_job(database, job_id, max_attempts=3, stall_s=60.0) is not None
+    await taken_by_somebody(database)
+    assert await claimed(database, job_id) is not None
     assert (await stores.jobs.cancel(job_id)).state == "running"
-    assert await claim_job(database, job_id, max_attempts=3, stall_s=60.0) is None
+    assert await claimed(database, job_id) is None
     job = await stores.jobs.get(job_id)
     assert (job.state, job.attempt) == ("cancelled", 1)
 
 
-async def test_a_cancelled_job_ends_at_once_where_who_runs_it_has_lost_it(stores: Stores, database: Database):
-    """Taken for dead, and awake again: it may die before it is told, and nobody would end the job then."""
+async def test_a_job_that_was_taken_back_is_not_claimed_by_who_had_it(stores: Stores, database: Database):
+    """Taken for dead between taking and claiming, and awake again: the attempt would be lost, or run beside another."""
     job_id = await queued(stores)
-    claim = await claim_job(database, job_id, max_attempts=3, stall_s=60.0)
-    assert claim is not None
-    assert (await stores.jobs.cancel(job_id)).state == "cancelled"
-    with pytest.raises(claims.Fenced):
-        await Ledger(database, claim, 60.0).publish([], None)
+    frozen, other = await registered(database), await registered(database)
+    await taken(database, frozen)
+    await release_worker(database, frozen, 60.0)
+    assert await claim_job(database, job_id, frozen, max_attempts=3, stall_s=60.0) is None
+    await taken(database, other)
+    assert await claim_job(database, job_id, frozen, max_attempts=3, stall_s=60.0) is None
+    job = await stores.jobs.get(job_id)
+    assert (job.state, job.attempt) == ("queued", 0)
+    assert await claim_job(database, job_id, other, max_attempts=3, stall_s=60.0) is not None
 
 
 async def test_a_claim_whose_acknowledgement_was_lost_counts_once(
@@ -128,7 +132,8 @@ async def test_a_claim_whose_acknowledgement_was_lost_counts_once(
         return answer
 
     monkeypatch.setattr(claims, "_claim", loses_the_first_answer)
-    assert await claim_job(database, job_id, 3, 60.0) == lost[0]
+    await taken_by_somebody(database)
+    assert await claimed(database, job_id) == lost[0]
     assert (await stores.jobs.get(job_id)).attempt == 1
     assert [event.type for event in await stores.jobs.events(job_id)] == ["queued", "started"]
 
@@ -158,7 +163,9 @@ async def test_a_result_that_was_stored_in_vain_is_taken_away_again(
     stores: Stores, database: Database, settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """By who was frozen while storing it: the job has ended since, and its trash was taken out."""
-    claim = await claim_job(database, await queued(stores), 3, 60.0)
+    job_id = await queued(stores)
+    await taken_by_somebody(database)
+    claim = await claimed(database, job_id)
     assert claim is not None
     files, folder = stores.files, tmp_path / "job"
     attempt = Attempt(database, files, settings, claim, folder, {})
@@ -167,7 +174,7 @@ async def test_a_result_that_was_stored_in_vain_is_taken_away_again(
     async def another_worker_takes_the_job(_: Attempt) -> int:
         (folder / "output").mkdir(parents=True)
         (folder / "output" / "report.json").write_text("{}")
-        assert await claim_job(database, claim.job_id, 3, 60.0) is not None
+        assert await claimed(database, claim.job_id) is not None
         return 0
 
     async def published(ledger: Ledger, artifacts, *rest) -> bool:

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from biresnerf.options.refine_options import RefineOptions
-from tests.workers.conftest import ready_dataset
+from tests.workers.conftest import claimed, ready_dataset, taken_by_somebody
 from workers.engine import Stores
-from workers.jobs.claim import claim_job
 from workers.run.staging import stage_job
 from workers.settings.settings import Settings
 
@@ -24,7 +23,8 @@ async def test_the_process_gets_the_options_that_were_sent_so_that_it_can_fill_i
     dataset_id = await ready_dataset(stores, {"a.txt": b"photo"})
     job, _ = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast", steps=500))
     assert (job.options, job.resolved_options) == ({"preset": "fast", "steps": 500}, None)
-    claim = await claim_job(stores.jobs._database, job.id, max_attempts=3, stall_s=60.0)
+    await taken_by_somebody(stores.jobs._database)
+    claim = await claimed(stores.jobs._database, job.id)
     assert claim is not None
     await stage_job(stores.jobs._database, stores.files, claim, tmp_path / "job")
     order = json.loads((tmp_path / "job" / "job.json").read_text())

@@ -143,8 +143,8 @@ class Actors:
 
         return Act(
             f"worker {worker.id}: claim {worker.name}",
-            lambda: claim_job(self._database, job_id, model.MAX_CRASHES, self._settings.stall_s),
-            lambda claim: model.claimed(worker.name, None if claim is None else claim.token),
+            lambda: claim_job(self._database, job_id, worker.id, model.MAX_CRASHES, self._settings.stall_s),
+            lambda claim: model.claimed(worker.name, worker.id, None if claim is None else claim.token),
             worker,
             learn,
             lambda claim: claim is not None,

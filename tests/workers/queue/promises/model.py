@@ -89,15 +89,15 @@ def submitted(name: str) -> Change:
 
 
 def cancelled_by_client(name: str) -> Change:
-    """A waiting job ends at once, also if who lost it has woken up and runs it; another that runs is asked to."""
+    """A waiting job ends at once; a running one is asked to."""
 
     def change(world: World) -> Outcome:
         job = world.jobs[name]
         if not job.final and not job.cancel_requested:
             place = "doing" if job.place == "doing" else "over"
             asked = replace(job, cancel_requested=True, place=place, abort=job.abort or place == "doing")
-            if job.state == "queued" or place == "over":
-                job = replace(asked, token=None).ended("cancelled")
+            if job.state == "queued":
+                job = asked.ended("cancelled")
             else:
                 job = asked.with_event("cancel_requested")
             world = world.with_job(name, job)
@@ -122,12 +122,14 @@ def taken(worker: int) -> Change:
     return change
 
 
-def claimed(name: str, token: uuid.UUID | None) -> Change:
-    """A new attempt, unless the job is over, should be cancelled, or crashed too often. ``token``: its own."""
+def claimed(name: str, worker: int, token: uuid.UUID | None) -> Change:
+    """A new attempt, unless the worker has lost the entry, or the job is over, should be cancelled, or crashed too
+    often. ``token``: its own.
+    """
 
     def change(world: World) -> Outcome:
         job = world.jobs[name]
-        if job.final:
+        if job.final or job.place != "doing" or job.worker != worker:
             return False, world
         if job.cancel_requested:
             return False, world.with_job(name, job.ended("cancelled"))

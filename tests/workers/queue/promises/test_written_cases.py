@@ -32,10 +32,14 @@ class Play:
             if step == "claim" and self._cancelling:
                 self._perform(self.machine.actors.possible(self.machine.world), "client: cancel job0", set())
 
-    def is_replaced(self, number: int) -> None:
-        """It falls silent, and its job goes to the next worker."""
+    def is_taken_for_dead(self, number: int) -> None:
+        """It falls silent, and its job goes back to the queue."""
         self.machine.silence(self.workers[number])
         self.machine.notice(self.workers[number])
+
+    def is_replaced(self, number: int) -> None:
+        """It falls silent, and its job goes to the next worker."""
+        self.is_taken_for_dead(number)
         self.does(number + 1, "take", "claim")
 
     def end(self) -> None:
@@ -63,6 +67,17 @@ def test_nothing_is_changed_by_a_worker_that_was_replaced(database_url: str, tmp
                     play.does(1, "publish")
                 play.does(0, write)
                 play.end()
+
+
+def test_a_worker_that_was_replaced_before_it_claimed_does_not_claim(database_url: str, tmp_path: Path):
+    with promises_on(database_url, tmp_path) as promises:
+        for steps in ((), ("take",), ("take", "claim"), ("take", "claim", "publish", "acknowledge over")):
+            play = Play(promises)
+            play.does(0, "take")
+            play.is_taken_for_dead(0)
+            play.does(1, *steps)
+            play.does(0, "claim", "acknowledge over")
+            play.end()
 
 
 def test_a_write_whose_answer_was_lost_is_done_once(database_url: str, tmp_path: Path):
