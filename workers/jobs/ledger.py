@@ -39,11 +39,11 @@ _Write: TypeAlias = Callable[Concatenate["Ledger", Connection, DictRow, P], Awai
 _Fenced: TypeAlias = Callable[Concatenate["Ledger", P], Coroutine[Any, Any, T]]
 
 
-def _fenced(done: T) -> Callable[[_Write[P, T]], _Fenced[P, T]]:
+def _fenced(done: Callable[[DictRow], T]) -> Callable[[_Write[P, T]], _Fenced[P, T]]:
     """Runs a method of `Ledger` under the job's row lock, with the row, if the token still holds.
 
     While the database is away it waits. ``done`` is the answer where an earlier try ended the attempt, though its
-    acknowledgement was lost.
+    acknowledgement was lost; it is given the row.
     """
 
     def decorate(write: _Write[P, T]) -> _Fenced[P, T]:
@@ -55,7 +55,7 @@ def _fenced(done: T) -> Callable[[_Write[P, T]], _Fenced[P, T]]:
                     if job is None or job["run_token"] != self.claim.token:
                         raise Fenced(f"job {self.claim.job_id} has a new owner")
                     if job["state"] != "running":
-                        return done
+                        return done(job)
                     return await write(self, connection, job, *given, **named)
 
             return await retry_while_unavailable(once)
@@ -63,6 +63,14 @@ def _fenced(done: T) -> Callable[[_Write[P, T]], _Fenced[P, T]]:
         return fenced
 
     return decorate
+
+
+def _nothing(_: DictRow) -> None:
+    return None
+
+
+def _not_cancelled(job: DictRow) -> bool:
+    return bool(job["state"] != "cancelled")
 
 
 class Ledger:
@@ -75,7 +83,7 @@ class Ledger:
         self.claim = claim
         self._database, self._stall_s = database, stall_s
 
-    @_fenced(None)
+    @_fenced(_nothing)
     async def progress(self, connection: Connection, job: DictRow, now: Progress) -> None:
         """Write the progress columns, and the options where they are reported; a new stage is also an event."""
         resolved = None if now.options is None else Jsonb(now.options.model_dump(mode="json"))
@@ -94,7 +102,7 @@ class Ledger:
         else:
             await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job["id"],))
 
-    @_fenced(None)
+    @_fenced(_nothing)
     async def checkpoint(
         self, connection: Connection, job: DictRow, prefix: str, files: Sequence[str], step: int
     ) -> None:
@@ -106,7 +114,7 @@ class Ledger:
         await connection.execute("UPDATE jobs SET crashes = 0 WHERE id = %s", (job["id"],))
         await _add_event(connection, job, "checkpoint", {"step": step})
 
-    @_fenced(None)
+    @_fenced(_nothing)
     async def reusable(
         self, connection: Connection, job: DictRow, stage: ReusableStage, prefix: str, files: Sequence[str]
     ) -> None:
@@ -115,7 +123,7 @@ class Ledger:
         stages = {**job["reusable"], stage: {"prefix": prefix, "files": list(files)}}
         await _set(connection, job, "reusable", stages)
 
-    @_fenced(None)
+    @_fenced(_nothing)
     async def preview(
         self, connection: Connection, job: DictRow, prefix: str, artifacts: Sequence[Artifact], now: Progress
     ) -> None:
@@ -132,7 +140,7 @@ class Ledger:
         """Append lines to the job's log; what is more than `LOG_LINES_MAX` is in its log file alone."""
         await self._append(lines, [])
 
-    @_fenced(None)
+    @_fenced(_nothing)
     async def _append(
         self, connection: Connection, job: DictRow, lines: Sequence[str], lengths: list[int]
     ) -> None:
@@ -154,17 +162,17 @@ class Ledger:
             "UPDATE jobs SET log_lines = log_lines + %s WHERE id = %s", (len(kept), job["id"])
         )
 
-    @_fenced(0)
+    @_fenced(lambda _: 0)
     async def crashes(self, _: Connection, job: DictRow) -> int:
         """How often attempts crashed since the job's last checkpoint, this one not counted."""
         return int(job["crashes"])
 
-    @_fenced(False)
+    @_fenced(lambda _: False)
     async def wants_partial(self, _: Connection, job: DictRow) -> bool:
         """Whether who cancelled the job wants what there is of its result."""
         return bool(job["keep_partial"])
 
-    @_fenced(True)
+    @_fenced(_not_cancelled)
     async def publish(
         self,
         connection: Connection,
@@ -180,7 +188,7 @@ class Ledger:
         await trash_attempts(connection, job["id"], self._stall_s, self.claim.name)
         return True
 
-    @_fenced(True)
+    @_fenced(_not_cancelled)
     async def fail(
         self, connection: Connection, job: DictRow, error: JobError, artifacts: Sequence[Artifact]
     ) -> bool:
@@ -192,12 +200,12 @@ class Ledger:
         await trash_attempts(connection, job["id"], self._stall_s, self.claim.name)
         return True
 
-    @_fenced(None)
+    @_fenced(_nothing)
     async def cancelled(self, connection: Connection, job: DictRow, artifacts: Sequence[Artifact]) -> None:
         """End the job as cancelled, with what is wanted of the files."""
         await finish_cancelled(connection, job["id"], self._stall_s, artifacts, self.claim.name)
 
-    @_fenced(True)
+    @_fenced(_not_cancelled)
     async def give_back(self, connection: Connection, job: DictRow, how: Requeue) -> bool:
         """Back to the queue; False if the job was cancelled instead."""
         if job["cancel_requested"]:

@@ -141,15 +141,20 @@ def claimed(name: str, worker: int, token: uuid.UUID | None) -> Change:
     return change
 
 
-def _owned(name: str, token: uuid.UUID, done: object, effect: Callable[[Job], tuple[object, Job]]) -> Change:
-    """A write of an attempt: only who claimed last can write, and only until the job is no longer running."""
+def _owned(
+    name: str, token: uuid.UUID, effect: Callable[[Job], tuple[object, Job]], *, ends: bool = False
+) -> Change:
+    """A write of an attempt: only who claimed last can write, and only until the job is no longer running.
+
+    ``ends``: it is one that would end the attempt, and its answer is false where a cancellation came first.
+    """
 
     def change(world: World) -> Outcome:
         job = world.jobs[name]
         if job.token != token:
             return FENCED, world
         if job.state != "running":
-            return done, world
+            return job.state != "cancelled" if ends else None, world
         answer, job = effect(job)
         return answer, world.with_job(name, job)
 
@@ -160,7 +165,6 @@ def progressed(name: str, token: uuid.UUID, stage: str) -> Change:
     return _owned(
         name,
         token,
-        None,
         lambda job: (None, job if job.stage == stage else job.with_event("stage", stage=stage)),
     )
 
@@ -170,7 +174,7 @@ def checkpointed(name: str, token: uuid.UUID, prefix: str) -> Change:
         replaced = job.trash | ({job.checkpoint} if job.checkpoint not in (None, prefix) else set())
         return None, job.with_event("checkpoint", checkpoint=prefix, crashes=0, trash=replaced)
 
-    return _owned(name, token, None, effect)
+    return _owned(name, token, effect)
 
 
 def stage_kept(name: str, token: uuid.UUID, prefix: str) -> Change:
@@ -180,15 +184,15 @@ def stage_kept(name: str, token: uuid.UUID, prefix: str) -> Change:
         replaced = job.trash | ({job.stage_work} if job.stage_work not in (None, prefix) else set())
         return None, replace(job, stage_work=prefix, trash=replaced)
 
-    return _owned(name, token, None, effect)
+    return _owned(name, token, effect)
 
 
 def published(name: str, token: uuid.UUID, result: tuple[str, ...]) -> Change:
     return _owned(
         name,
         token,
-        True,
         lambda job: (False, job) if job.cancel_requested else (True, job.ended("succeeded", result)),
+        ends=True,
     )
 
 
@@ -196,16 +200,16 @@ def failed(name: str, token: uuid.UUID) -> Change:
     return _owned(
         name,
         token,
-        True,
         lambda job: (
             not job.cancel_requested,
             job.ended("cancelled" if job.cancel_requested else "failed"),
         ),
+        ends=True,
     )
 
 
 def ended_cancelled(name: str, token: uuid.UUID) -> Change:
-    return _owned(name, token, None, lambda job: (None, job.ended("cancelled")))
+    return _owned(name, token, lambda job: (None, job.ended("cancelled")))
 
 
 def given_back(name: str, token: uuid.UUID, event: str, setback: str | None) -> Change:
@@ -216,7 +220,7 @@ def given_back(name: str, token: uuid.UUID, event: str, setback: str | None) -> 
         crashes = job.crashes + (setback in COUNTED)
         return True, job.with_event(event, state="queued", attempt=attempt, crashes=crashes, setback=setback)
 
-    return _owned(name, token, True, effect)
+    return _owned(name, token, effect, ends=True)
 
 
 def acknowledged(name: str, worker: int, again: Literal["over", "now", "later"]) -> Change:

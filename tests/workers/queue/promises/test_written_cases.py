@@ -82,8 +82,11 @@ def test_a_worker_that_was_replaced_before_it_claimed_does_not_claim(database_ur
 
 def test_a_write_whose_answer_was_lost_is_done_once(database_url: str, tmp_path: Path):
     with promises_on(database_url, tmp_path) as promises:
-        for write in (*WRITES, CANCELLED):
-            play = Play(promises, cancelling=write == CANCELLED)
+        for write, cancelling in (
+            *((write, False) for write in WRITES),
+            *((end, True) for end in (*ENDS, CANCELLED)),
+        ):
+            play = Play(promises, cancelling=cancelling)
             play.does(0, "take", "claim")
             play.does(0, write, lost=True)
             play.end()
