@@ -127,7 +127,10 @@ class Promises(RuleBasedStateMachine):
         ]
         job = first.name.rpartition("job")[2]
         others += 4 * [act for act in others if act.name.rpartition("job")[2] == job]
-        second = data.draw(strategies.sampled_from(others), "second")
+        self.meet(first, data.draw(strategies.sampled_from(others), "second"), at)
+
+    def meet(self, first: Act, second: Act, at: int) -> None:
+        """The second within the first, which waits at this place of its transaction."""
         answers = self.runner.run(_side_by_side(first, second, at))
         self.count("pairs of calls, one within the other")
         worlds = []

@@ -1,7 +1,8 @@
-"""What chance seldom meets in few runs: writes of a worker that was replaced, repeated writes, and lost answers."""
+"""What chance seldom meets in few runs: late, repeated and simultaneous writes, and lost answers."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,9 +18,9 @@ CANCELLED = "cancelled"
 class Play:
     """One job, and three workers whose steps are told; each is compared with the model."""
 
-    def __init__(self, promises: type[Promises], *, cancelling: bool = False) -> None:
+    def __init__(self, promises: type[Promises], *, cancelling: bool = False, limit: int = 0) -> None:
         self.machine, self._cancelling = promises(), cancelling
-        self.machine.begin(limit=0)
+        self.machine.begin(limit=limit)
         self.workers = list(self.machine.actors.workers)
         self._perform(self.machine.actors.possible(self.machine.world), "client: submit job0", set())
 
@@ -41,6 +42,11 @@ class Play:
         """It falls silent, and its job goes to the next worker."""
         self.is_taken_for_dead(number)
         self.does(number + 1, "take", "claim")
+
+    def meet(self, first: str, second: str, at: int) -> None:
+        """Two calls at once, the second within the first."""
+        acts = {act.name: act for act in self.machine.actors.possible(self.machine.world)}
+        self.machine.meet(acts[first], acts[second], at)
 
     def end(self) -> None:
         """A good worker brings the job to its end."""
@@ -98,4 +104,16 @@ def test_an_attempt_ends_once_however_often_it_says_so(database_url: str, tmp_pa
             for second in WRITES:
                 play = Play(promises)
                 play.does(0, "take", "claim", first, second)
+                play.end()
+
+
+def test_of_a_submission_and_an_end_at_once_the_new_job_is_held_only_while_there_is_no_room(
+    database_url: str, tmp_path: Path
+):
+    with promises_on(database_url, tmp_path) as promises:
+        for at in range(12):
+            for first, second in itertools.permutations(("client: submit job1", "client: cancel job0")):
+                play = Play(promises, limit=1)
+                play.meet(first, second, at)
+                assert not play.machine.world.jobs["job1"].held
                 play.end()
