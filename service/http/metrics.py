@@ -42,10 +42,10 @@ _COUNTERS = {
 }
 # The columns of the view queue_depth, by kind of slot.
 _QUEUE = (
-    ("biresnerf_queue_waiting", "Jobs that a free slot would be given.", "waiting"),
+    ("biresnerf_queue_waiting", "Jobs that need a slot.", "waiting"),
     ("biresnerf_queue_held", "Jobs that wait for their tenant's limit.", "held"),
-    ("biresnerf_queue_running", "Jobs that run on slots of this kind.", "running"),
-    ("biresnerf_queue_oldest_seconds", "Age of the oldest job that a free slot would be given.", "oldest_s"),
+    ("biresnerf_queue_running", "Jobs that need the slot of this kind on which they run.", "running"),
+    ("biresnerf_queue_oldest_seconds", "Age of the oldest job that waits for a slot.", "oldest_s"),
 )
 # Reported as 0 before they first happen: a rate needs the zero before the one.
 _FROM_ZERO: dict[str, tuple[str, ...]] = {

@@ -5,7 +5,10 @@ from __future__ import annotations
 import psycopg
 import pytest
 
-from tests.workers.conftest import Counting, Slots
+from tests.workers.conftest import Counting, Slots, claimed, taken_by_somebody
+from tests.workers.queue.test_exports_beside import submit_export
+from workers.database.job_queue import EXPORTS, REFINEMENTS
+from workers.jobs.ledger import Ledger
 from workers.settings.settings import Settings
 
 pytestmark = pytest.mark.anyio
@@ -42,6 +45,28 @@ async def test_it_tells_what_waits_what_is_held_and_what_runs_where(
     assert 0 < oldest_s < 60
     for job in (first, counting.id):
         await counting.stores.jobs.cancel(job)
+
+
+async def test_an_export_needs_a_slot_only_where_no_refinement_waits_or_runs(
+    counting: Counting, scaler: psycopg.Connection
+):
+    database = counting.stores.jobs._database
+    refinement = await counting.submit(5, 0.01)
+    export = await submit_export(counting)
+    assert depth(scaler, "cpu")[:3] == (1, 0, 0)
+    await taken_by_somebody(database, [REFINEMENTS])
+    claim = await claimed(database, refinement)
+    assert claim is not None
+    waiting, held, running, oldest_s = depth(scaler, "cpu")
+    assert (waiting, held, running) == (0, 0, 1)
+    assert oldest_s > 0, "the export waits"
+    await taken_by_somebody(database, [EXPORTS])
+    assert await claimed(database, export.id) is not None
+    assert depth(scaler, "cpu") == (0, 0, 1, 0.0)
+    await Ledger(database, claim, 60.0).publish([], None)
+    await submit_export(counting, 1)
+    assert depth(scaler, "cpu")[:3] == (1, 0, 1)
+    assert depth(scaler, "gpu")[:3] == (1, 0, 0)
 
 
 async def test_a_reader_of_the_view_reads_nothing_else(scaler: psycopg.Connection):
