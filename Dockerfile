@@ -104,6 +104,7 @@ ENTRYPOINT ["/opt/venv/bin/python", "-I", "/opt/biresnerf/entrypoint.py"]
 CMD ["biresnerf", "--help"]
 
 # Last, so that another revision builds no layer again.
+ARG PYTHON_IMAGE
 ARG VERSION=0.1.0
 ARG REVISION=unknown
 ARG CREATED=unknown
@@ -113,4 +114,4 @@ LABEL org.opencontainers.image.title="BiResNeRF" \
       org.opencontainers.image.version="${VERSION}" \
       org.opencontainers.image.revision="${REVISION}" \
       org.opencontainers.image.created="${CREATED}" \
-      org.opencontainers.image.base.name="docker.io/library/python:3.11-slim-bookworm"
+      org.opencontainers.image.base.name="${PYTHON_IMAGE}"

@@ -60,6 +60,14 @@ def test_secrets_come_as_files_that_prepare_makes(name):
         )
 
 
+def test_workers_alone_have_less_than_the_usual_weight():
+    assert {name for name, service in SERVICES.items() if service.get("cpu_shares", 1024) < 1024} == {
+        "worker",
+        "worker-gpu",
+    }
+    assert all(service.get("cpu_shares", 0) <= 1024 for service in SERVICES.values())
+
+
 @pytest.mark.parametrize("name", ["worker", "worker-gpu"])
 def test_a_worker_may_take_the_time_that_its_job_takes_to_stop(name):
     grace_s = float(SERVICES[name]["stop_grace_period"].removesuffix("s"))
