@@ -114,7 +114,7 @@ base_images() {
   fi
   stand_in NGINX_IMAGE docker.io/library/nginx:1.28-bookworm nginx
   stand_in POSTGRES_IMAGE docker.io/library/postgres:17-bookworm postgres
-  stand_in STORE_IMAGE ghcr.io/versity/versitygw:v1.8.0 store
+  stand_in STORE_IMAGE ghcr.io/versity/versitygw:v1.7.0 store
 }
 
 stand_in() { # variable of compose.yaml, image it names, name of the stand-in
