@@ -55,7 +55,9 @@ class FrameStream:
                 "-fps_mode",
                 "passthrough",
             ),
-            *("-f", "image2pipe", "-c:v", "pgm" if grey else "ppm", "pipe:1"),
+            # Phones film in 10 bits, which FFmpeg would write as numbers of 16.
+            *("-pix_fmt", "gray" if grey else "rgb24", "-f", "image2pipe", "-c:v", "pgm" if grey else "ppm"),
+            "pipe:1",
         ]
 
     def __iter__(self) -> Iterator[NDArray[np.uint8]]:
@@ -76,6 +78,7 @@ class FrameStream:
                     if count > MOST_FRAMES:
                         raise self._too_long()
                     yield frame
+                process.stdout.close()  # so that FFmpeg ends, should it have more to say
                 process.wait(_TO_END_S)
                 ended = True
             finally:

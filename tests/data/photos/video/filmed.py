@@ -27,11 +27,16 @@ def wall(width: int, seed: int = 3) -> Image.Image:
     return Image.fromarray(np.stack([grey, np.roll(grey, 7, 1), 255 - grey], axis=2).astype(np.uint8))
 
 
-def film(path: Path, at_px: Sequence[float], blurred: Sequence[bool], *options: str) -> None:
-    """A video whose frame i shows the wall from ``at_px[i]`` on, blurred where that is said; by FFmpeg, H.264."""
+def film(
+    path: Path, at_px: Sequence[float], blurred: Sequence[bool], *options: str, pixels: str = "yuv420p"
+) -> None:
+    """A video whose frame i shows the wall from ``at_px[i]`` on, blurred where that is said; by FFmpeg, H.264.
+
+    ``pixels`` is FFmpeg's name of what is coded.
+    """
     scene = wall(int(max(at_px)) + WIDTH + 1)
     form = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", str(RATE), "-i", "-")
-    coded = ("-c:v", "libx264", "-crf", "14", "-pix_fmt", "yuv420p", *options, str(path))
+    coded = ("-c:v", "libx264", "-crf", "14", "-pix_fmt", pixels, *options, str(path))
     command = [get_ffmpeg_exe(), "-y", "-v", "error", *form, *coded]
     with subprocess.Popen(command, stdin=subprocess.PIPE) as coder:
         assert coder.stdin is not None

@@ -58,8 +58,10 @@ def test_the_chosen_frames_are_the_sharp_ones_and_cover_the_motion(clip):
     assert "12 frames" in note
 
 
-def test_a_frame_is_the_picture_of_its_time(clip):
-    dataset = read_dataset(clip, videos=VideoReading(12))
+@pytest.mark.parametrize("pixels", ["yuv420p", "yuv420p10le"])  # phones film in 10 bits, too
+def test_a_frame_is_the_picture_of_its_time(tmp_path, pixels):
+    film(tmp_path / "walk.mp4", AT_PX, SOFT, pixels=pixels)
+    dataset = read_dataset(tmp_path / "walk.mp4", videos=VideoReading(12))
     images, scene = load_images(dataset), np.asarray(wall(int(AT_PX.max()) + WIDTH + 1), dtype=float)
     assert (images.widths == WIDTH).all()
     for index, number in enumerate(numbers(dataset.names)):
