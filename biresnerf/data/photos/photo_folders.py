@@ -211,7 +211,7 @@ def unused_image_notes(paths: Sequence[Path], others: Iterable[Path] = ()) -> li
 def refuse_no_images(files: dict[str, Path], root: Path) -> None:
     """Raises InputError ``no_images`` where there are none, which says what there is instead."""
     if not files:
-        raise no_images(root, "there are poses, but no photos")
+        raise no_images(root, "there are poses, but no photo")
 
 
 def no_images(root: Path, what: str) -> InputError:

@@ -33,8 +33,8 @@ MATRIX_FILES = Format(
     found_as=("pose", "poses", "."),
     gives="poses; one lens, or one an image, from the intrinsics beside them",
     checked_against=(
-        "files written from the programs' sources; real ones of andyzeng/tsdf-fusion-python (7-Scenes) and of "
-        "borglab/gtsfm (MobileBrick), against their own numbers"
+        "files written from the programs' sources; real ones of andyzeng/tsdf-fusion-python (7-Scenes), of "
+        "andyzeng/3dmatch-toolbox (3DMatch) and of borglab/gtsfm (MobileBrick), against their own numbers"
     ),
 )
 _HINT = "Give a file of 4 rows of 4 numbers for each image, camera to world."

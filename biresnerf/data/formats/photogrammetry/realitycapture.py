@@ -1,9 +1,10 @@
-"""RealityCapture's csv of internal and external camera parameters.
+"""RealityCapture's csv of internal and external camera parameters, or of positions with omega, phi and kappa.
 
 The program's source is closed: columns and conventions are those by which nerfstudio reads the file
 (process_data/realitycapture_utils.py, 1.1.5). Heading (clockwise), pitch and roll are degrees: world_from_cam with
 OpenGL axes is Rz(-heading) Rx(pitch) Ry(roll). The focal length is that of a film 36 mm wide; px and py are shares of
-the longer side, from the centre; t1 and t2 are OpenCV's p1 and p2.
+the longer side, from the centre; t1 and t2 are OpenCV's p1 and p2. Of omega, phi and kappa it is
+Ry(kappa) Rx(phi) Rz(-omega): so the program's XMP files of the same photos have it, to 1e-13.
 """
 
 from __future__ import annotations
@@ -37,8 +38,9 @@ REALITYCAPTURE = Format(
     rank=65,
     found_as=("realitycapture.csv", "*.csv"),
     suffixes=(".csv",),
-    gives="poses and lenses, from a csv of internal and external camera parameters",
-    checked_against="files that `convert` wrote; no export of the program itself was at hand",
+    gives="poses and lenses, from a csv of internal and external camera parameters; poses, of omega, phi, kappa",
+    checked_against="files that `convert` wrote; omega, phi, kappa: a real one of KU-Leuven-Geomatics/geomapi, against "
+    "the program's own XMP",
     in_set="realitycapture.csv",
     loses=("rigs", "points", "mask paths"),
     instead="pinhole",
@@ -55,10 +57,11 @@ _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 
 _HINT = "Export Internal/External camera parameters, with the columns name, x, y, alt, heading, pitch, roll and f."
 _NEEDED = COLUMNS[:8]
+_WITHOUT_LENS = ("#name", "x", "y", "z", "omega", "phi", "kappa")
 
 
 def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
-    """The rows of ``file``. Columns other than pose and focal length may be missing.
+    """The rows of ``file``. Columns other than pose and focal length may be missing; with omega they are all there are.
 
     Raises:
         InputError: codes as in docs/input.md.
@@ -69,7 +72,8 @@ def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
         raise invalid_file(file.name, f"has no line that begins with {COLUMNS[0]}.", _HINT)
     head, *table = csv.reader(lines[start:])
     columns = [name.strip() for name in head]
-    missing = [name for name in _NEEDED if name not in columns]
+    with_lens = "omega" not in columns
+    missing = [name for name in (_NEEDED if with_lens else _WITHOUT_LENS) if name not in columns]
     if missing:
         raise invalid_file(f"{file.name} line {start + 1}", f"has no column {missing[0]}.", _HINT)
 
@@ -77,13 +81,21 @@ def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
         if len(words) != len(columns):
             raise invalid_file(where, f"has {len(words)} values for {len(columns)} columns.", _HINT)
         given = {
-            name: word for name, word in zip(columns, words, strict=True) if name in COLUMNS[1:] and word
+            name: word
+            for name, word in zip(columns, words, strict=True)
+            if name in (*COLUMNS[1:], *_WITHOUT_LENS[1:]) and word
         }
         numbers = finite_numbers(list(given.values()), where, _HINT).tolist()
         value = dict.fromkeys(COLUMNS[1:], 0.0) | dict(zip(given, numbers, strict=True))
-        rotation = _rotation(value["heading"], value["pitch"], value["roll"]) @ _OPENGL_FROM_OPENCV
-        centre = [value["x"], value["y"], value["alt"]]
-        pose = rigid_matrix(np.column_stack([rotation, centre]).tolist(), where)[0]
+        if with_lens:
+            rotation = _about(2, -value["heading"]) @ _about(0, value["pitch"]) @ _about(1, value["roll"])
+        else:
+            rotation = _about(1, value["kappa"]) @ _about(0, value["phi"]) @ _about(2, -value["omega"])
+        centre = [value["x"], value["y"], value["alt" if with_lens else "z"]]
+        matrix = np.column_stack([rotation @ _OPENGL_FROM_OPENCV, centre])
+        pose = rigid_matrix(matrix.tolist(), where)[0]
+        if not with_lens:
+            return pose, None
         distortion = FilmLens(
             value["f"], value["px"], value["py"],
             (value["k1"], value["k2"], value["k3"], value["k4"]), (value["t1"], value["t2"]),
@@ -139,13 +151,14 @@ def lens_on_film(lens: FilmLens, where: str) -> LensOf:
     return at_size_of(at)
 
 
-def _rotation(heading_deg: float, pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
-    """Rz(-heading) Rx(pitch) Ry(roll) [3, 3]."""
-    (c, a, b), (cz, cx, cy) = (f(np.radians([-heading_deg, pitch_deg, roll_deg])) for f in (np.sin, np.cos))
-    about_z = np.array([[cz, -c, 0.0], [c, cz, 0.0], [0.0, 0.0, 1.0]])
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -a], [0.0, a, cx]])
-    about_y = np.array([[cy, 0.0, b], [0.0, 1.0, 0.0], [-b, 0.0, cy]])
-    return np.asarray(about_z @ about_x @ about_y)
+def _about(axis: int, angle_deg: float) -> NDArray[np.float64]:
+    """The rotation [3, 3] about a coordinate axis, counter-clockwise."""
+    turn = np.eye(3)
+    after, last = (axis + 1) % 3, (axis + 2) % 3
+    sine, cosine = math.sin(math.radians(angle_deg)), math.cos(math.radians(angle_deg))
+    turn[after, after] = turn[last, last] = cosine
+    turn[last, after], turn[after, last] = sine, -sine
+    return turn
 
 
 def write_realitycapture(refined: RefinedSet, path: Path) -> None:
@@ -195,7 +208,10 @@ CODECS = (
     Codec(
         REALITYCAPTURE,
         parse=parse_realitycapture,
-        recognises=lambda file: head_holds(b"#name,")(file) and head_holds(b"heading")(file),
+        recognises=lambda file: (
+            head_holds(b"#name,")(file)
+            and (head_holds(b"heading")(file) or head_holds(b"omega,phi,kappa")(file))
+        ),
         write=lambda refined, path, _: write_realitycapture(refined, path),
         given_back=lambda dataset: dataset.source.dialect == "realitycapture",
     ),

@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import io
 from dataclasses import replace
+from pathlib import PurePosixPath
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from biresnerf.data.formats.photogrammetry.realitycapture import COLUMNS, write_realitycapture
 from biresnerf.data.formats.read_dataset import read_dataset
@@ -75,6 +77,25 @@ def test_one_bad_row_costs_one_image_its_pose(tmp_path, row, column, value, code
     with pytest.raises(InputError) as caught:
         read_dataset(tmp_path, strict=True)
     assert_complete(caught.value, code, "out.csv line 3")
+
+
+def test_a_table_of_omega_phi_and_kappa_has_poses_and_no_lens(tmp_path):
+    refined = made("SIMPLE_PINHOLE")
+    write_photos(tmp_path, refined)
+    table = ["#cameras 5", "#name,x,y,z,omega,phi,kappa"]
+    for image, pose in zip(refined.images, refined.world_from_cam, strict=True):
+        turn = Rotation.from_matrix(pose[:3, :3] @ np.diag([1, -1, -1]))
+        kappa, phi, against_omega = turn.as_euler("YXZ", degrees=True)
+        row = [PurePosixPath(image.file_name).name, *pose[:3, 3], -against_omega, phi, kappa]
+        table.append(",".join(map(str, row)))
+    (tmp_path / "survey.csv").write_text("\n".join(table))
+    dataset = read_dataset(tmp_path)
+    assert dataset.source.dialect == "realitycapture"
+    names = [PurePosixPath(name).name for name in dataset.file_names]
+    for image, pose in zip(refined.images, refined.world_from_cam, strict=True):
+        index = names.index(PurePosixPath(image.file_name).name)
+        np.testing.assert_allclose(dataset.world_from_cam[index], pose, atol=1e-9)
+        assert dataset.source_of_intrinsics(dataset.frames[index].camera) != "given"
 
 
 def test_a_table_without_focal_lengths_is_refused(tmp_path):
