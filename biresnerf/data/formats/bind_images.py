@@ -17,6 +17,7 @@ from biresnerf.data.photos.guessed_lens import guess_note
 from biresnerf.data.photos.masks import mask_beside
 from biresnerf.data.photos.named_images import refuse_outside, refuse_too_few
 from biresnerf.data.photos.photo_folders import all_photos, few_names, photos_beside, refuse_no_images
+from biresnerf.data.photos.shear import shear_notes
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 
@@ -120,6 +121,7 @@ def dataset_of(
     masked = sum(frame.mask is not None for frame in frames)
     masks = [f"masks were found for {masked} of {len(frames)} images"] if masked else []
     lens_notes = [note for lens in photos.lenses for note in lens.notes]
+    lens_notes += shear_notes([lens.camera for lens in photos.lenses])
     return Dataset(
         root,
         tuple(camera for camera, _, _ in cameras),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -20,7 +21,8 @@ from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters, smallest_model
 
 MAX_ROWS = 100_000
-MAX_SKEW = 1e-3  # of the focal length: a third of a pixel at the corner of a photo of 640 px
+LEAST_SKEW_PX = 0.5  # at the upper and lower edge; less is left out
+MOST_SHEAR = 0.1  # of a scanned film; cameras have a thousandth
 Lens: TypeAlias = Camera | LensOf | None
 # ``world_from_cam`` [4, 4] (OpenCV axes) or None, and the lens.
 Placed: TypeAlias = tuple[NDArray[np.float64] | None, Lens]
@@ -82,19 +84,44 @@ def pinhole_of(matrix: NDArray[np.float64], where: str, first_pixel: float) -> C
         first_pixel: where the matrix has the middle of the first pixel: at 0, or at 0.5 as here.
 
     Raises:
-        InputError: ``camera_model_unsupported`` for skew; ``intrinsics_invalid``.
+        InputError: ``intrinsics_invalid``.
     """
     fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    if abs(float(matrix[0, 1])) > MAX_SKEW * abs(fx):
-        raise InputError(
-            "camera_model_unsupported",
-            f"the skew ({float(matrix[0, 1]):.3g} px) is not zero, and no supported camera model has it.",
-            where=where,
-            hint="Give undistorted images with square pixels.",
-        )
     shift = 0.5 - first_pixel
     full = FullParameters(fx, fy, cx + shift, cy + shift)
-    return lambda width, height: lens_of(full, where, (width, height))
+    shear = shear_of(float(matrix[0, 1]), fy, where)
+    return lambda width, height: without_skew(lens_of(full, where, (width, height)), shear, where)
+
+
+def shear_of(skew_px: float, focal_y: float, where: str) -> float:
+    """How far skew moves x for each pixel of y. Raises InputError ``intrinsics_invalid`` where no camera has as much.
+
+    Args:
+        skew_px: by which x grows with the distorted y / z.
+    """
+    shear = skew_px / focal_y if focal_y else 0.0
+    if not abs(shear) <= MOST_SHEAR:
+        raise InputError(
+            "intrinsics_invalid",
+            f"a skew of {skew_px:.3g} px is none that a camera has.",
+            where=where,
+            hint="Give the intrinsics that the images were taken with.",
+        )
+    return shear
+
+
+def without_skew(camera: Camera, shear: float, where: str) -> Camera:
+    """A camera given with all but its skew, as one of photos that are straightened: see `Camera.shear`.
+
+    Raises:
+        InputError: ``intrinsics_invalid``.
+    """
+    if abs(shear) * camera.height / 2 <= LEAST_SKEW_PX:
+        return camera
+    full = camera.full()
+    straight = full._replace(cx=full.cx + shear * (camera.height / 2 - full.cy))
+    model, params = smallest_model(straight, camera.model)
+    return replace(camera_of_numbers(model, camera.width, camera.height, params, where), shear=shear)
 
 
 def at_size_of(make: Callable[[int, int], Camera]) -> LensOf:

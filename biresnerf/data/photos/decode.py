@@ -1,4 +1,4 @@
-"""Decoding one image file into the pixels that its frame means: 8-bit colours, turned only where the frame says so."""
+"""Decoding an image file into the pixels its frame means: 8-bit colours, turned and straightened where it says so."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from biresnerf.data.model.dataset import Frame
 from biresnerf.data.photos.image_files import DAMAGED, header_of, open_image
 from biresnerf.data.photos.kinds.linear_light import eight_bit
 from biresnerf.data.photos.orientation import INVERSE, turned, turned_size
+from biresnerf.data.photos.shear import straightened
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 
@@ -43,7 +44,7 @@ def decode(frame: Frame, camera: Camera) -> NDArray[np.uint8]:
         try:
             image.load()
             stored = as_stored(_eight_bit(image, frame.name), image, header.orientation)
-            return turned(stored, frame.orientation)
+            return straightened(turned(stored, frame.orientation), camera.shear)
         except DAMAGED:
             raise InputError(
                 "image_truncated",

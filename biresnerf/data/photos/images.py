@@ -16,7 +16,7 @@ from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_files import quiet_pillow
 from biresnerf.data.photos.kinds.photo_kinds import PLAIN_SUFFIXES
-from biresnerf.data.photos.masks import load_mask, shrink_mask
+from biresnerf.data.photos.masks import is_masked, load_mask, shrink_mask
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import Background
 
@@ -125,7 +125,7 @@ def load_images(
     offsets = np.concatenate(([0], np.cumsum(widths.astype(np.int64) * heights)))
     pixels = np.empty((int(offsets[-1]), 3), dtype=np.uint8)
     alpha = np.empty(int(offsets[-1]), dtype=np.uint8)
-    masked = any(frame.mask is not None for frame in dataset.frames)
+    masked = is_masked(dataset)
     counts = np.ones(int(offsets[-1]) if masked else 0, dtype=np.bool_)
     behind = _BLACK if background == "black" else _WHITE
 

@@ -22,6 +22,7 @@ from biresnerf.data.photos.image_files import (
 )
 from biresnerf.data.photos.named_images import lies_in, refuse_outside
 from biresnerf.data.photos.orientation import same_shape, turned, turned_size
+from biresnerf.data.photos.shear import straightened_mask
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 
@@ -88,7 +89,7 @@ def refuse_unfit_mask(frame: Frame, camera: Camera) -> None:
 
 
 def load_mask(frame: Frame, camera: Camera) -> NDArray[np.bool_] | None:
-    """Which pixels count, bool [h, w] at the mask's own size, turned as the photo; None where there is no mask.
+    """Which pixels count, bool [h, w] at the mask's own size, turned and straightened as the photo; None where all do.
 
     Any kind of picture will do. A pixel counts unless it is black; in formats with losses, unless it is darker than
     the middle; a transparent one does not. An inverted mask (``Frame.mask_inverted``) means the opposite.
@@ -98,7 +99,8 @@ def load_mask(frame: Frame, camera: Camera) -> NDArray[np.bool_] | None:
             next to nothing counts, ``not_an_image``, ``image_truncated`` or ``image_too_large``.
     """
     if frame.mask is None:
-        return None
+        every = np.ones((camera.height, camera.width), dtype=np.bool_)
+        return straightened_mask(every, camera.shear) if camera.shear else None
     with open_image(frame.mask, _where(frame)) as image:
         header = header_of(image)
         turn = _turn_to_fit(frame, camera, header.width, header.height, header.orientation)
@@ -116,7 +118,12 @@ def load_mask(frame: Frame, camera: Camera) -> NDArray[np.bool_] | None:
             where=_where(frame),
             hint="Invert the mask if it means the opposite; else remove the frame, or its mask.",
         )
-    return turned(counts, turn)
+    return straightened_mask(turned(counts, turn), camera.shear)
+
+
+def is_masked(dataset: Dataset) -> bool:
+    """Whether some pixels of a photo may not count."""
+    return any(frame.mask is not None for frame in dataset.frames) or any(c.shear for c in dataset.cameras)
 
 
 def shrink_mask(counts: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
@@ -135,7 +142,7 @@ def write_masks(dataset: Dataset, names: Sequence[str], folder: Path) -> bool:
     Photos without a mask get a white one: COLMAP leaves out photos whose mask it does not find. ``names`` are those
     that COLMAP is given for the frames, in their order.
     """
-    if all(frame.mask is None for frame in dataset.frames):
+    if not is_masked(dataset):
         return False
     for index, (frame, name) in enumerate(zip(dataset.frames, names, strict=True)):
         camera = dataset.camera_of(index)

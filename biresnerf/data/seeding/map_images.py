@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from biresnerf.data.model.dataset import Dataset, Frame
+from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.image_order import natural_order, pose_distances
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_files import is_plain, quiet_pillow
@@ -155,18 +155,20 @@ def lay_out(dataset: Dataset, work: Path) -> dict[str, Any]:
 
 def _numbered(dataset: Dataset) -> list[str]:
     """COLMAP's list of pairs knows no spaces, so photos go by numbers there."""
-    suffixes = (frame.path.suffix if _as_it_is(frame) else ".png" for frame in dataset.frames)
+    suffixes = (f.path.suffix if _as_it_is(dataset, i) else ".png" for i, f in enumerate(dataset.frames))
     return [f"{i:06}{suffix}" for i, suffix in enumerate(suffixes)]
 
 
-def _as_it_is(frame: Frame) -> bool:
+def _as_it_is(dataset: Dataset, index: int) -> bool:
     """Whether COLMAP takes the file itself: it reads plain photos, and takes their pixels as they are stored."""
-    return frame.orientation == 1 and is_plain(frame.path, frame.name)
+    frame = dataset.frames[index]
+    stored = frame.orientation == 1 and not dataset.camera_of(index).shear
+    return stored and is_plain(frame.path, frame.name)
 
 
 def _link_photos(dataset: Dataset, names: list[str], folder: Path) -> None:
     folder.mkdir()
-    plain = [_as_it_is(frame) for frame in dataset.frames]
+    plain = [_as_it_is(dataset, index) for index in range(len(dataset))]
 
     def lay(index: int) -> None:
         name, frame = names[index], dataset.frames[index]

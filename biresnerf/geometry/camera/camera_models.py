@@ -111,12 +111,17 @@ class Camera:
     """Intrinsics: COLMAP model name, image size (px) and parameters in COLMAP's order.
 
     Pixels; the centre of the first pixel lies at (0.5, 0.5).
+
+    Attributes:
+        shear: of a camera with skew. Its model has none and describes the photo once that is straightened: what is at
+            (x, y) then is at (x + shear (y - height / 2), y) in the file.
     """
 
     model: str
     width: int
     height: int
     params: tuple[float, ...]
+    shear: float = 0.0
 
     def full(self) -> FullParameters:
         """These intrinsics with all coefficients written out, and whether they are a fisheye's."""
@@ -131,4 +136,4 @@ class Camera:
         p = self.full()
         scaled = p._replace(fx=p.fx * a, fy=p.fy * b, cx=p.cx * a, cy=p.cy * b)
         model, params = smallest_model(scaled, self.model)
-        return Camera(model, width, height, params)
+        return Camera(model, width, height, params, self.shear * a / b)

@@ -92,7 +92,7 @@ export function turnDeg(first: Matrix, second: Matrix): number {
 }
 
 /** Borders of the image at distance 1 in front of the lens: left, top, right, bottom; without distortion. */
-export function bordersOf(camera: Camera): [number, number, number, number] {
+export function bordersOf(camera: Omit<Camera, "shear">): [number, number, number, number] {
   const { width, height, params } = camera;
   // COLMAP's models with one focal length have f, cx, cy; the others fx, fy, cx, cy.
   const single = /^(SIMPLE_|RADIAL)/.test(camera.model);

@@ -194,7 +194,7 @@ XML = {
     "NaN": (lambda text: text.replace("<transform>", "<transform>nan ", 1), "pose_not_finite"),
     "a number too many": (lambda text: text.replace("<transform>", "<transform>1 ", 1), "pose_file_invalid"),
     "fisheye": (lambda text: text.replace('ion type="frame"', 'ion type="fisheye"'), "camera_model_unsupported"),
-    "skewed pixels": (lambda text: text.replace("<f>", "<b2>1.5</b2><f>"), "camera_model_unsupported"),
+    "skewed pixels": (lambda text: text.replace("<f>", "<b2>2.5</b2><f>"), "intrinsics_invalid"),
     "no focal length": (lambda text: text.replace("<f>18.5</f>", ""), "intrinsics_invalid"),
     "no size": (lambda text: text.replace('width="20"', 'width="wide"'), "pose_file_invalid"),
 }  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.errors import InputError
+from tests.data.formats.posed_sets import write_plain_photos
 from tests.data.test_real_sets import ROOT
 
 CASES = ROOT / "interop"
@@ -43,7 +45,6 @@ READ = {
     "23_tum_header_without_hash": ("tum", 40, 39, "by time"),
 }
 REFUSED = {
-    "12_metashape_b2": ("camera_model_unsupported", "b2 moves pixels by up to 4.7 px"),
     "05_poses_silently_ignored/mvsnet": ("poses_coincide", "one point"),
     "06_says_no_images_where_there_are/evo": ("pose_file_invalid", "how the camera sits on the body"),
     "06_says_no_images_where_there_are/nerfies": ("poses_coincide", "one point"),
@@ -83,6 +84,7 @@ def test_no_case_is_without_an_expectation():
     apart = {
         "README.md",
         "01_symlink_false_warning",
+        "12_metashape_b2",
         "17_mp4",
         "13_fox_17_missing",
         "14_last_row_scaled",
@@ -92,6 +94,27 @@ def test_no_case_is_without_an_expectation():
     for group in ("05_poses_silently_ignored", "06_says_no_images_where_there_are"):
         cases = cases - {group} | {f"{group}/{path.name}" for path in (CASES / group).iterdir()}
     assert cases == READ.keys() | REFUSED.keys() | apart
+
+
+def test_a_metashape_export_with_skew_is_read_and_its_photos_are_straightened(tmp_path):
+    case = CASES / "12_metashape_b2"
+    shutil.copy(case / "cameras.xml", tmp_path)
+    tree = ElementTree.parse(case / "cameras.xml")
+    cameras = {one.get("label"): one for one in tree.iter("camera")}
+    sensors = {one.get("id"): one.find("calibration[@class='adjusted']") for one in tree.iter("sensor")}
+    write_plain_photos(tmp_path / "images", [f"{label}.jpg" for label in cameras], (648, 432))
+    dataset = read_dataset(tmp_path)
+    posed = [frame for frame in dataset.frames if frame.world_from_cam is not None]
+    assert len(posed) == sum(one.find("transform") is not None for one in cameras.values()) > 3
+    for frame in posed:
+        camera = cameras[frame.name.removesuffix(".jpg")]
+        given = np.array(camera.findtext("transform").split(), dtype=float)
+        np.testing.assert_allclose(frame.world_from_cam, given.reshape(4, 4), atol=1e-12)
+        f, b2 = (float(sensors[camera.get("sensor_id")].findtext(name, "0")) for name in ("f", "b2"))
+        shear = b2 / f if abs(b2 / f) * 3456 / 2 > 0.5 else 0.0
+        assert dataset.cameras[frame.camera].shear == pytest.approx(shear)
+    skewed = sum(dataset.camera_of(index).shear != 0 for index in range(len(dataset)))
+    assert any(f"{skewed} photos were taken with skew" in text for text in dataset.warnings)
 
 
 def test_photos_that_are_links_are_not_said_to_be_unused(tmp_path):

@@ -15,10 +15,9 @@ from pydantic import BaseModel, Field
 
 from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.parsed_poses import ParsedPoses
-from biresnerf.data.formats.pose_rows import MAX_SKEW, Placed, Row, lens_of, parsed_rows
+from biresnerf.data.formats.pose_rows import Placed, Row, lens_of, parsed_rows, shear_of, without_skew
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.untrusted_file import checked, read_json_object
-from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import FullParameters
 from biresnerf.options.formats import Format
 
@@ -63,19 +62,13 @@ def parse_nerfies(_root: Path, place: Path) -> ParsedPoses:
 
 def _read(file: Path) -> Placed:
     camera = checked(_Camera, read_json_object(file), file.name, _HINT)
-    if abs(camera.skew) > MAX_SKEW * abs(camera.focal_length):
-        raise InputError(
-            "camera_model_unsupported",
-            "the skew is not zero, and no supported camera model has it.",
-            where=f"{file.name} skew",
-            hint="Give undistorted images.",
-        )
     rotation = np.array(camera.orientation).T
     pose = rigid_matrix(np.column_stack([rotation, camera.position]).tolist(), f"{file.name} orientation")[0]
     (k1, k2, k3), (p1, p2, *_) = camera.radial_distortion, camera.tangential or camera.tangential_distortion
     focal, (cx, cy) = camera.focal_length, camera.principal_point
     full = FullParameters(focal, focal * camera.pixel_aspect_ratio, cx, cy, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
-    return pose, lens_of(full, file.name, camera.image_size)
+    shear = shear_of(camera.skew, full.fy, f"{file.name} skew")
+    return pose, without_skew(lens_of(full, file.name, camera.image_size), shear, file.name)
 
 
 def _recognises(place: Path) -> bool:

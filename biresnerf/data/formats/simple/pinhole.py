@@ -27,7 +27,7 @@ from biresnerf.data.model.atomic_file import whole_file, write_json
 from biresnerf.data.model.colmap_scene import ColmapImage
 from biresnerf.data.model.dataset import Frame
 from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
-from biresnerf.data.photos.bilinear import bilinear
+from biresnerf.data.photos.bilinear import resampled
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_files import quiet_pillow
 from biresnerf.data.show.renders import picture_stems
@@ -51,7 +51,6 @@ PINHOLE = Format(
 
 WIDEST_TANGENT = 1.75  # 60 degrees from the axis: beyond it a flat picture is all stretch
 _JPEG = {"quality": 95, "subsampling": 0}
-_ROWS_AT_ONCE = 256
 _THREADS = 4
 
 
@@ -65,11 +64,11 @@ def pinhole_camera(camera: Camera) -> Camera:
     """
     lens = camera.full()
     centred = lens.cx == camera.width / 2 and lens.cy == camera.height / 2
-    if lens.fx == lens.fy and centred and not lens.distorted and not lens.fisheye:
+    if lens.fx == lens.fy and centred and not (lens.distorted or lens.fisheye or camera.shear):
         return Camera("PINHOLE", camera.width, camera.height, (lens.fx, lens.fy, lens.cx, lens.cy))
     width, height = camera.width, camera.height
     down, across = np.linspace(0, height, height + 1), np.linspace(0, width, width + 1)
-    sides = [np.stack([np.full_like(down, x), down], 1) for x in (0, width)]
+    sides = [np.stack([x - camera.shear * (down - height / 2), down], 1) for x in (0, width)]
     caps = [np.stack([across, np.full_like(across, y)], 1) for y in (0, height)]
     focal = (lens.fx * lens.fy) ** 0.5
     seen = (
@@ -175,7 +174,7 @@ def _write_photo(image: RefinedImage, old: Camera, new: Camera, path: Path) -> N
             hint="Name the folder of the photos (--photos).",
         )
     same = (new.width, new.height, new.full()) == (old.width, old.height, old.full())
-    if same and image.orientation == 1 and image.path.suffix == path.suffix:
+    if same and image.orientation == 1 and not old.shear and image.path.suffix == path.suffix:
         with whole_file(path) as temporary:
             shutil.copyfile(image.path, temporary)
         return
@@ -191,26 +190,14 @@ def _write_photo(image: RefinedImage, old: Camera, new: Camera, path: Path) -> N
 
 
 def undistorted(picture: NDArray[np.uint8], old: Camera, new: Camera) -> NDArray[np.uint8]:
-    """The picture [h, w, channels] that ``old`` took, as the pinhole camera ``new`` at its place would; bilinear.
-
-    Colours of a picture with opacity are weighed by it.
-    """
+    """The picture [h, w, channels] that ``old`` took, as the pinhole camera ``new`` at its place would; bilinear."""
     lens, focal, cx, cy = old.full(), new.params[0], new.params[2], new.params[3]
-    values = picture.astype(np.float32)
-    opacity = values.shape[2] == 4
-    if opacity:
-        values[..., :3] *= values[..., 3:] / 255.0
-    flat = np.empty((new.height, new.width, values.shape[2]), dtype=np.uint8)
-    for first in range(0, new.height, _ROWS_AT_ONCE):
-        last = min(first + _ROWS_AT_ONCE, new.height)
-        y, x = np.mgrid[first:last, 0 : new.width] + 0.5
-        rays = np.stack([((x - cx) / focal).ravel(), ((y - cy) / focal).ravel(), np.ones(x.size)], axis=1)
-        rows = bilinear(values, pixels_of_points(lens, rays) - 0.5)
-        if opacity:
-            rows[:, :3] *= 255.0 / np.maximum(rows[:, 3:], 1e-3)
-        shape = (last - first, new.width, values.shape[2])
-        flat[first:last] = np.clip(np.rint(rows), 0, 255).astype(np.uint8).reshape(shape)
-    return flat
+
+    def source_of(at: NDArray[np.float64]) -> NDArray[np.float64]:
+        rays = np.column_stack([(at - [cx, cy]) / focal, np.ones(len(at))])
+        return pixels_of_points(lens, rays)
+
+    return resampled(picture, new.width, new.height, source_of)
 
 
 CODECS = (

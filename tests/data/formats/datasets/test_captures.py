@@ -129,7 +129,7 @@ BAD = [
         lambda f: edit(f / "meta_data.json", lambda d: d["frames"][1].update(intrinsics=[[1]])),
         "[1]",
     ),
-    ("nerfies", lambda f: edit(f / "camera/000001.json", lambda d: d.update(skew=3)), "000001.json skew"),
+    ("nerfies", lambda f: edit(f / "camera/000001.json", lambda d: d.update(skew=30)), "000001.json skew"),
     ("nerfies", lambda f: edit(f / "camera/000001.json", lambda d: d.pop("position")), "000001.json"),
 ]
 

@@ -116,7 +116,7 @@ def test_a_lost_pose_is_left_out_and_named(tmp_path):
         ("pose/0.txt", "a " * 16, "pose_file_invalid"),
         ("pose/0.txt", "2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", "pose_not_rotation"),
         ("intrinsic/intrinsic_color.txt", "1 2\n3 4", "pose_file_invalid"),
-        ("intrinsic/intrinsic_color.txt", "18 5 9\n0 18 8\n0 0 1", "camera_model_unsupported"),
+        ("intrinsic/intrinsic_color.txt", "18 5 9\n0 18 8\n0 0 1", "intrinsics_invalid"),
     ],
 )
 def test_a_bad_file_is_named(tmp_path, file, text, code):
