@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pkgutil
 from collections import Counter
 from collections.abc import Container, Iterable
@@ -18,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 Row = tuple[str, str]
 
 SHARED_BY = 5  # commands; an option of so many is described once
+ALIKE = 6  # options that a command describes as an earlier one does; so many are described there alone
 
 _HEAD = """# Commands: all options
 
@@ -49,7 +51,10 @@ def commands_page() -> str:
     links = ", ".join(f"[`{name}`](#{name.replace(' ', '-')})" for name in commands)
     rows = {name: _options(command) for name, command in commands.items()}
     shared = shared_options(rows.values())
-    sections = [_section(name, command, shared) for name, command in commands.items()]
+    sections = [
+        _section(name, command, shared, like_earlier(name, rows, shared))
+        for name, command in commands.items()
+    ]
     return "\n".join((_HEAD + links + "\n" + _SHARED + table(("option", ""), shared), *sections))
 
 
@@ -57,6 +62,16 @@ def shared_options(options: Iterable[list[Row]]) -> list[Row]:
     """Options that `SHARED_BY` commands or more describe in the same words."""
     counts = Counter(row for rows in options for row in rows)
     return [row for row, count in counts.items() if count >= SHARED_BY]
+
+
+def like_earlier(name: str, rows: dict[str, list[Row]], shared: Container[Row]) -> tuple[str, list[Row]]:
+    """The first earlier command that describes `ALIKE` or more of this one's own options in the same words, and these."""
+    own = [row for row in rows[name] if row not in shared]
+    for earlier in itertools.takewhile(lambda other: other != name, rows):
+        alike = [row for row in own if row in rows[earlier]]
+        if len(alike) >= ALIKE:
+            return earlier, alike
+    return "", []
 
 
 def _options(command: click.Command) -> list[Row]:
@@ -69,14 +84,18 @@ def _options(command: click.Command) -> list[Row]:
     return rows
 
 
-def _section(name: str, command: click.Command, shared: Container[Row]) -> str:
+def _section(name: str, command: click.Command, shared: Container[Row], like: tuple[str, list[Row]]) -> str:
     context = click.Context(command, info_name=f"biresnerf {name}")
     usage = " ".join(command.collect_usage_pieces(context))
     text = "\n\n".join(" ".join(part.split()) for part in cleandoc(command.help or "").split("\n\n"))
     parts = [f"## {name}\n", f"`biresnerf {name} {usage}`\n", text + "\n"]
     options = _options(command)
-    if own := [row for row in options if row not in shared]:
+    earlier, alike = like
+    if own := [row for row in options if row not in shared and row not in alike]:
         parts.append(table(("option", ""), own))
+    if alike:
+        listed = ", ".join(row[0] for row in alike)
+        parts.append(f"[As of `{earlier}`](#{earlier.replace(' ', '-')}): {listed}.\n")
     if common := [row[0] for row in options if row in shared]:
         parts.append("[Also](#options-of-several-commands): " + ", ".join(common) + ".\n")
     return "\n".join(parts)

@@ -37,20 +37,31 @@ def sections_of_commands() -> dict[str, str]:
     return dict(zip(parts[::2], parts[1::2], strict=True))
 
 
+def described_in(section: str) -> set[str]:
+    """Options that have a row there."""
+    return set(re.findall(r"^\| `(?:-\w, )?(--[\w-]+)", section, flags=re.M))
+
+
 def test_a_command_names_all_its_options_and_each_is_described_there_or_with_those_of_several():
     sections = sections_of_commands()
-    shared = set(re.findall(r"^\| `(--[\w-]+)", sections["Options of several commands"], flags=re.M))
+    shared = described_in(sections["Options of several commands"])
     assert {"--json", "--url", "--api-key"} <= shared
     for name, command in all_commands().items():
         named = set(re.findall(r"`(?:-\w, )?(--[\w-]+)", sections[name]))
-        described = set(re.findall(r"^\| `(?:-\w, )?(--[\w-]+)", sections[name], flags=re.M))
         options = {
             next(text for text in parameter.opts if text.startswith("--"))
             for parameter in command.params
             if isinstance(parameter, click.Option) and not parameter.hidden and "--help" not in parameter.opts
         }
+        elsewhere = {
+            option
+            for other, listed in re.findall(
+                r"^\[As of `([\w -]+)`\]\(#[\w-]+\): (.+)\.$", sections[name], flags=re.M
+            )
+            for option in set(re.findall(r"--[\w-]+", listed)) & described_in(sections[other])
+        }
         assert options <= named, name
-        assert options <= described | shared, name
+        assert options <= described_in(sections[name]) | elsewhere | shared, name
 
 
 def test_a_notebook_holds_the_code_of_its_script():

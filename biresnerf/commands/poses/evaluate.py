@@ -38,13 +38,10 @@ def evaluate_command(
     """Measure the poses of RESULT against those of TRUTH, beside the poses before.
 
     RESULT and TRUTH are files with poses, or folders that hold one, in any form that `refine` reads. Images are matched
-    by name, with or without extension, else by file name alone where just one has it; they need not be there. "robust"
-    is after a similarity that single lost cameras do not drag along; "aligned" after BARF's similarity of the camera
-    centres, as published tables have it: the least-squares rotation, and the ratio of the rigs' sizes for scale; "own
-    frame" without any alignment: it includes where the whole rig lies, which photos alone cannot tell. --paper-compat
-    adds the alignment of the published code with its flaw on flat rigs. ATE and RPE (from each image to the next, in
-    RESULT's order) are after the least-squares similarity (Umeyama's); AUC is of the relative poses of all pairs, and
-    needs none. docs/conventions.md defines them all.
+    by name, with or without extension, or else by file name alone; they need not be there. Errors are "aligned" by
+    BARF's similarity of the camera centres, as in published tables; "robust", by one that single lost cameras do not
+    affect; and in the "own frame" without any, which includes where the whole rig lies. docs/conventions.md defines
+    them, ATE, RPE and AUC.
     """
     from biresnerf.commands.poses.error_table import error_table
     from biresnerf.commands.poses.plot_errors import refuse_other_files
