@@ -36,7 +36,14 @@ PHOTO_KINDS = (
     PhotoKind("AVIF", (".avif",), None),
     PhotoKind("EXR", (".exr",), "OpenEXR"),
     PhotoKind("HDR", (".hdr",), "imageio_ffmpeg"),
-    PhotoKind("RAW", (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "rawpy"),
+    PhotoKind(
+        "RAW",
+        (
+            *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2", ".rwl"),
+            *(".pef", ".srw", ".x3f", ".3fr", ".iiq", ".mrw", ".kdc", ".dcr", ".erf"),
+        ),
+        "rawpy",
+    ),
 )
 KIND_OF = {suffix: kind for kind in PHOTO_KINDS for suffix in kind.suffixes}
 RAW_SUFFIXES = frozenset(next(kind.suffixes for kind in PHOTO_KINDS if kind.name == "RAW"))

@@ -94,6 +94,14 @@ def test_focal_length_and_gps_position_are_read(tmp_path, suffix):
     np.testing.assert_allclose(read_geotag(path, "x").place, PLACE, atol=1e-6)
 
 
+@pytest.mark.parametrize("suffix", [".nrw", ".PEF", ".kdc"])
+def test_a_raw_photo_is_developed_whatever_its_maker_calls_it(tmp_path, suffix):
+    for index in range(3):
+        write_dng(tmp_path / f"x{index}{suffix}", linear(picture() / 255))
+    images = load_images(read_dataset(tmp_path))
+    np.testing.assert_allclose(images.image(0)[9:12, 9:12].astype(float), picture()[9:12, 9:12], atol=3)
+
+
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
 def test_a_raw_photo_keeps_its_stored_pixels_and_says_how_it_was_held(tmp_path, orientation):
     write_dng(tmp_path / "x.dng", linear(picture() / 255), orientation=orientation)
