@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 from xml.etree import ElementTree
 
@@ -70,6 +71,21 @@ def test_3dmatchs_frames_have_the_matrices_of_their_files(tmp_path):
         )  # its rotations are rounded
         x, y, z = matrix((tmp_path / "camera-intrinsics.txt").read_text().splitlines()[:3]) @ [0.3, -0.2, 4.0]
         assert_projects(dataset, index, np.array([0.3, -0.2, 4.0]), np.array([x / z, y / z]) + 0.5)
+
+
+def test_bops_scene_projects_as_its_matrices_do(tmp_path):
+    """patricksko/PoseEstimator: ten rendered views; pixels are counted from the first one's middle."""
+    shutil.copy(FILES / "bop/scene_camera.json", tmp_path)
+    cameras = json.loads((tmp_path / "scene_camera.json").read_text())
+    write_plain_photos(tmp_path / "rgb", [f"{int(number):06}.png" for number in cameras])
+    dataset = read_dataset(tmp_path)
+    assert len(dataset) == int(dataset.posed.sum()) == 10
+    for index, camera in enumerate(cameras.values()):
+        point = (dataset.world_from_cam[index] @ [20.0, -30.0, 700.0, 1.0])[:3]
+        in_cam = np.reshape(camera["cam_R_w2c"], (3, 3)) @ point + camera["cam_t_w2c"]
+        np.testing.assert_allclose(in_cam, [20.0, -30.0, 700.0], atol=1e-3)  # its rotations are rounded
+        x, y, z = np.reshape(camera["cam_K"], (3, 3)) @ [20.0, -30.0, 700.0]
+        assert_projects(dataset, index, np.array([20.0, -30.0, 700.0]), np.array([x / z, y / z]) + 0.5)
 
 
 def csv_rows() -> dict[str, list[str]]:
