@@ -7,7 +7,7 @@ import { SceneView } from "./scene/scene_view";
 import { Curves } from "./widgets/curves";
 import { ImageCompare } from "./widgets/image_compare";
 import { ImageTable } from "./widgets/image_table";
-import { count, duration, fixed } from "./widgets/numbers";
+import { count, duration, fixed, optionText } from "./widgets/numbers";
 import { ResultSummary } from "./widgets/result_summary";
 
 /** What report_html.py embeds. */
@@ -59,7 +59,7 @@ function ReportPage({ data, licences }: { data: Embedded; licences: string }) {
             {Object.entries(report.options).map(([key, value]) => (
               <div key={key}>
                 <dt>{key}</dt>
-                <dd>{typeof value === "string" ? value : JSON.stringify(value)}</dd>
+                <dd>{optionText(value)}</dd>
               </div>
             ))}
           </dl>

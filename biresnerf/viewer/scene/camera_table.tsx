@@ -1,6 +1,7 @@
 // Stands in for the three-dimensional view if the browser has no WebGL.
 import { centreOf, type Triple } from "../result/poses";
 import type { SceneCamera } from "../result/widget_data";
+import { ScrolledTable } from "../widgets/controls";
 import { short } from "../widgets/numbers";
 
 const words = (centre: Triple): string => centre.map((value) => short(value, 4)).join(", ");
@@ -13,38 +14,36 @@ export function CameraTable(props: {
   return (
     <section class="scene" aria-label="Cameras">
       <p class="notice">This browser has no WebGL, so the cameras are listed in a table.</p>
-      <div class="table-scroll" tabIndex={0} role="region" aria-label="Positions of the cameras">
-        <table class="table">
-          <thead>
-            <tr>
-              <th scope="col">image</th>
-              <th scope="col">centre before</th>
-              <th scope="col">centre after</th>
-              <th scope="col" class="number">
-                turned °
+      <ScrolledTable label="Positions of the cameras">
+        <thead>
+          <tr>
+            <th scope="col">image</th>
+            <th scope="col">centre before</th>
+            <th scope="col">centre after</th>
+            <th scope="col" class="number">
+              turned °
+            </th>
+            <th scope="col" class="number">
+              moved
+            </th>
+          </tr>
+        </thead>
+        <tbody>
+          {props.cameras.map((camera, index) => (
+            <tr key={index} aria-current={index === props.selected ? "true" : undefined}>
+              <th scope="row">
+                <button type="button" class="link" onClick={() => props.onSelect(index)}>
+                  <bdi>{camera.name}</bdi>
+                </button>
               </th>
-              <th scope="col" class="number">
-                moved
-              </th>
+              <td>{camera.before ? words(centreOf(camera.before)) : "–"}</td>
+              <td>{words(centreOf(camera.after))}</td>
+              <td class="number">{short(camera.moved_deg)}</td>
+              <td class="number">{short(camera.moved_units)}</td>
             </tr>
-          </thead>
-          <tbody>
-            {props.cameras.map((camera, index) => (
-              <tr key={index} aria-current={index === props.selected ? "true" : undefined}>
-                <th scope="row">
-                  <button type="button" class="link" onClick={() => props.onSelect(index)}>
-                    <bdi>{camera.name}</bdi>
-                  </button>
-                </th>
-                <td>{camera.before ? words(centreOf(camera.before)) : "–"}</td>
-                <td>{words(centreOf(camera.after))}</td>
-                <td class="number">{short(camera.moved_deg)}</td>
-                <td class="number">{short(camera.moved_units)}</td>
-              </tr>
-            ))}
-          </tbody>
-        </table>
-      </div>
+          ))}
+        </tbody>
+      </ScrolledTable>
     </section>
   );
 }

@@ -133,6 +133,16 @@ export function ImageStepper(props: {
   );
 }
 
+/** A table in a box of its own, which scrolls by keyboard, too; a note may stand below its rows. */
+export function ScrolledTable({ label, note, children }: { label: string; note?: ComponentChildren; children: ComponentChildren }) {
+  return (
+    <div class="table-scroll" tabIndex={0} role="region" aria-label={label}>
+      <table class="table">{children}</table>
+      {note}
+    </div>
+  );
+}
+
 /** The verdict as a small label. */
 export function VerdictChip({ verdict }: { verdict: Verdict["verdict"] }) {
   const { word, tone } = VERDICTS[verdict];

@@ -1,7 +1,8 @@
 // Curves of the run: fit to the photos, motion of the cameras, and the signal of the stability detector.
 import { useEffect, useMemo, useRef } from "preact/hooks";
-import uPlot from "uplot";
+import type uPlot from "uplot";
 import type { CurvePoint } from "../result/widget_data";
+import { chartAxis, chartIn } from "./chart";
 import { fixed, short } from "./numbers";
 import { themeColour, useDark } from "./theme";
 
@@ -139,13 +140,10 @@ function Plot(props: { chart: Chart; lines: readonly CurvePoint[]; switchStep: n
   useEffect(() => {
     const element = host.current;
     if (!element) return;
-    const made = new uPlot(optionsOf(chart, element.clientWidth, latest), latest.current.data, element);
+    const { plot: made, close } = chartIn(element, optionsOf(chart, latest), latest.current.data);
     plot.current = made;
-    const observer = new ResizeObserver(() => made.setSize({ width: element.clientWidth, height: HEIGHT_PX }));
-    observer.observe(element);
     return () => {
-      observer.disconnect();
-      made.destroy();
+      close();
       plot.current = null;
     };
   }, [chart, dark]);
@@ -172,22 +170,9 @@ function Plot(props: { chart: Chart; lines: readonly CurvePoint[]; switchStep: n
 
 function optionsOf(
   chart: Chart,
-  width: number,
   latest: { readonly current: { switchStep: number | null; steps: number | null } },
-): uPlot.Options {
-  const [text, line] = [themeColour("--text-soft"), themeColour("--line")];
-  const font = "11px system-ui, sans-serif";
-  const axis = (more: uPlot.Axis): uPlot.Axis => ({
-    stroke: text,
-    font,
-    labelFont: font,
-    labelSize: 16,
-    ticks: { stroke: line, width: 1, size: 4 },
-    grid: { stroke: line, width: 1 },
-    ...more,
-  });
+): Omit<uPlot.Options, "width"> {
   return {
-    width,
     height: HEIGHT_PX,
     legend: { show: false },
     cursor: { sync: { key: "biresnerf-curves" }, drag: { x: false, y: false }, points: { size: 6 } },
@@ -197,9 +182,9 @@ function optionsOf(
       second: { distr: 3 },
     },
     axes: [
-      axis({ size: 26 }),
-      axis({ label: chart.axis, size: 46 }),
-      ...(chart.second ? [axis({ scale: "second", side: 1, label: chart.second, size: 52, grid: { show: false } })] : []),
+      chartAxis({ size: 26 }),
+      chartAxis({ label: chart.axis, size: 46 }),
+      ...(chart.second ? [chartAxis({ scale: "second", side: 1, label: chart.second, size: 52, grid: { show: false } })] : []),
     ],
     series: [
       {},

@@ -1,7 +1,7 @@
 // The table of images: one row each, sorted by a click on a heading, filtered by name and flag.
 import { useMemo, useState } from "preact/hooks";
 import type { ImageRow, SheetCell } from "../result/widget_data";
-import { Pick } from "./controls";
+import { Pick, ScrolledTable } from "./controls";
 import { count, fixed, short, signed } from "./numbers";
 import { Thumb } from "./thumb";
 import { ALARMING, FLAGS, sourceWords } from "./words";
@@ -116,69 +116,66 @@ export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }:
           {found.length === rows.length ? count(rows.length, "image") : `${found.length} of ${count(rows.length, "image")}`}
         </span>
       </div>
-      <div class="table-scroll" tabIndex={0} role="region" aria-label="Table of images">
-        <table class="table">
-          <thead>
-            <tr>
+      <ScrolledTable label="Table of images" note={found.length === 0 && <p class="notice">No image matches.</p>}>
+        <thead>
+          <tr>
+            {onTick && (
+              <th scope="col">
+                <span class="unseen">selected</span>
+              </th>
+            )}
+            {heading(NAME, "up", "")}
+            {columns.map((column) => heading(column, "down", "number"))}
+            {heading(SOURCE, "up", "")}
+            <th scope="col">flags</th>
+          </tr>
+        </thead>
+        <tbody>
+          {shown.map((row) => (
+            <tr
+              key={row.image}
+              aria-current={row.image === selected ? "true" : undefined}
+              data-image={row.image}
+              onClick={() => onSelect(row.image)}
+            >
               {onTick && (
-                <th scope="col">
-                  <span class="unseen">selected</span>
-                </th>
-              )}
-              {heading(NAME, "up", "")}
-              {columns.map((column) => heading(column, "down", "number"))}
-              {heading(SOURCE, "up", "")}
-              <th scope="col">flags</th>
-            </tr>
-          </thead>
-          <tbody>
-            {shown.map((row) => (
-              <tr
-                key={row.image}
-                aria-current={row.image === selected ? "true" : undefined}
-                data-image={row.image}
-                onClick={() => onSelect(row.image)}
-              >
-                {onTick && (
-                  <td class="tick" onClick={(event) => event.stopPropagation()}>
-                    <input
-                      type="checkbox"
-                      aria-label={`Select ${row.name}`}
-                      checked={ticked?.has(row.image) ?? false}
-                      onChange={(event) => onTick(row.image, event.currentTarget.checked)}
-                    />
-                  </td>
-                )}
-                <th scope="row">
-                  <span class="images-name">
-                    {cellOf && <Thumb cell={cellOf(row.image)} size={THUMB_PX} />}
-                    <button type="button" class="link" onClick={() => onSelect(row.image)}>
-                      <bdi>{row.name}</bdi>
-                    </button>
-                  </span>
-                </th>
-                {columns.map((column) => (
-                  <td key={column.key} class="number" title={column.key.endsWith("_90") ? row.why_unknown ?? undefined : undefined}>
-                    {column.key === "moved_deg" && (
-                      <span class="bar" style={{ width: `${(100 * row.moved_deg) / most}%` }} aria-hidden="true" />
-                    )}
-                    {column.text(row)}
-                  </td>
-                ))}
-                <td>{sourceWords(row.source)}</td>
-                <td>
-                  {row.flags.map((flag) => (
-                    <span key={flag} class={ALARMING.has(flag) ? "flag flag-bad" : "flag"}>
-                      {FLAGS[flag]}
-                    </span>
-                  ))}
+                <td class="tick" onClick={(event) => event.stopPropagation()}>
+                  <input
+                    type="checkbox"
+                    aria-label={`Select ${row.name}`}
+                    checked={ticked?.has(row.image) ?? false}
+                    onChange={(event) => onTick(row.image, event.currentTarget.checked)}
+                  />
                 </td>
-              </tr>
-            ))}
-          </tbody>
-        </table>
-        {found.length === 0 && <p class="notice">No image matches.</p>}
-      </div>
+              )}
+              <th scope="row">
+                <span class="images-name">
+                  {cellOf && <Thumb cell={cellOf(row.image)} size={THUMB_PX} />}
+                  <button type="button" class="link" onClick={() => onSelect(row.image)}>
+                    <bdi>{row.name}</bdi>
+                  </button>
+                </span>
+              </th>
+              {columns.map((column) => (
+                <td key={column.key} class="number" title={column.key.endsWith("_90") ? row.why_unknown ?? undefined : undefined}>
+                  {column.key === "moved_deg" && (
+                    <span class="bar" style={{ width: `${(100 * row.moved_deg) / most}%` }} aria-hidden="true" />
+                  )}
+                  {column.text(row)}
+                </td>
+              ))}
+              <td>{sourceWords(row.source)}</td>
+              <td>
+                {row.flags.map((flag) => (
+                  <span key={flag} class={ALARMING.has(flag) ? "flag flag-bad" : "flag"}>
+                    {FLAGS[flag]}
+                  </span>
+                ))}
+              </td>
+            </tr>
+          ))}
+        </tbody>
+      </ScrolledTable>
       {found.length > shown.length && (
         <button type="button" class="button" onClick={() => setAll(true)}>
           Show all {found.length}

@@ -20,6 +20,13 @@ export const fixed = (value: Maybe, decimals: number): string => (known(value) ?
 export const signed = (value: Maybe, decimals: number): string =>
   known(value) ? `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(decimals)}` : "–";
 
+/** Null of no values. */
+export function median(values: readonly number[]): number | null {
+  const sorted = [...values].sort((a, b) => a - b);
+  const [below, above] = [sorted[(sorted.length - 1) >> 1], sorted[sorted.length >> 1]];
+  return below === undefined || above === undefined ? null : (below + above) / 2;
+}
+
 export const count = (value: number, one: string, many = `${one}s`): string =>
   `${value.toLocaleString("en-GB")} ${value === 1 ? one : many}`;
 
@@ -31,6 +38,9 @@ export function duration(seconds: number): string {
     ? `${minutes} min ${String(whole % 60).padStart(2, "0")} s`
     : `${Math.floor(minutes / 60)} h ${String(minutes % 60).padStart(2, "0")} min`;
 }
+
+/** The value of an option as it is set. */
+export const optionText = (value: unknown): string => (typeof value === "string" ? value : (JSON.stringify(value) ?? "–"));
 
 /** A predicted time, no more exact than it is. */
 export function roughly(seconds: number): string {

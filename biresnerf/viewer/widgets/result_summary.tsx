@@ -2,7 +2,7 @@
 import type { ComponentChildren } from "preact";
 import type { Report } from "schemas";
 import type { ImageRow, SheetCell } from "../result/widget_data";
-import { count, fixed, short } from "./numbers";
+import { count, fixed, median, short } from "./numbers";
 import { Thumb } from "./thumb";
 import { Evidence, VerdictSentence } from "./verdict";
 import { ADVICE, ALARMING, type Flag } from "./words";
@@ -123,9 +123,4 @@ function figuresOf(report: Report, rows: readonly ImageRow[]): Figure[] {
       ? [{ name: "Final render", value: `${fixed(report.heldout.psnr, 1)} dB`, note: `PSNR of ${count(report.heldout.count, "unseen view")}` }]
       : []),
   ];
-}
-
-function median(values: readonly number[]): number | null {
-  const sorted = [...values].sort((a, b) => a - b);
-  return sorted[Math.floor(sorted.length / 2)] ?? null;
 }

@@ -1,6 +1,7 @@
 // The curves of two runs in one chart.
 import { useEffect, useRef } from "preact/hooks";
 import uPlot from "uplot";
+import { chartAxis, chartIn } from "../../../biresnerf/viewer/widgets/chart";
 import { fixed } from "../../../biresnerf/viewer/widgets/numbers";
 import { themeColour, useDark } from "../../../biresnerf/viewer/widgets/theme";
 import { titleOf } from "../jobs/state";
@@ -16,13 +17,13 @@ export function OverlaidCurves({ sides }: { sides: readonly [Side, Side] }) {
     const element = host.current;
     if (!element) return;
     const tables = sides.map(({ history }): uPlot.AlignedData => [history.map(({ step }) => step), history.map(({ psnr }) => psnr)]);
-    const [text, line] = [themeColour("--text-soft"), themeColour("--line")];
-    const axis = { stroke: text, font: "11px system-ui, sans-serif", ticks: { stroke: line, width: 1, size: 4 }, grid: { stroke: line, width: 1 } };
-    const made = new uPlot(
+    return chartIn(
+      element,
       {
-        ...{ width: element.clientWidth, height: HEIGHT_PX, legend: { show: false } },
+        height: HEIGHT_PX,
+        legend: { show: false },
         scales: { x: { time: false } },
-        axes: [axis, { ...axis, label: "PSNR (dB)", labelSize: 16, size: 46 }],
+        axes: [chartAxis({}), chartAxis({ label: "PSNR (dB)", size: 46 })],
         series: [
           {},
           ...sides.map(({ job }, index): uPlot.Series => ({
@@ -32,14 +33,7 @@ export function OverlaidCurves({ sides }: { sides: readonly [Side, Side] }) {
         ],
       },
       uPlot.join(tables),
-      element,
-    );
-    const observer = new ResizeObserver(() => made.setSize({ width: element.clientWidth, height: HEIGHT_PX }));
-    observer.observe(element);
-    return () => {
-      observer.disconnect();
-      made.destroy();
-    };
+    ).close;
   }, [sides, dark]);
   const ends = sides.map(({ job, history }) => `${titleOf(job)}: ${fixed(history.at(-1)?.psnr ?? null, 1)} dB at step ${history.at(-1)?.step ?? 0}`);
   return <div ref={host} class="overlaid" role="img" aria-label={`PSNR of the training views. ${ends.join(". ")}.`} />;

@@ -3,7 +3,8 @@ import { useMemo } from "preact/hooks";
 import type { ArtifactList, JobView, PosesDocument, Report } from "schemas";
 import { differencesOf } from "../../../biresnerf/viewer/result/align";
 import { type CurvePoint, historyOf } from "../../../biresnerf/viewer/result/widget_data";
-import { count, duration, fixed, short } from "../../../biresnerf/viewer/widgets/numbers";
+import { ScrolledTable } from "../../../biresnerf/viewer/widgets/controls";
+import { count, duration, fixed, median, optionText, short } from "../../../biresnerf/viewer/widgets/numbers";
 import { once, useLoaded } from "../api/hooks";
 import { Problem, request, requestJson } from "../api/http";
 import { Chip, titleOf } from "../jobs/state";
@@ -69,7 +70,7 @@ const FIGURES: readonly { name: string; of: (side: Side) => string }[] = [
   { name: "Unseen views in the before/after test", of: ({ report }) => psnr(report.verdict?.heldout?.psnr.after) },
   { name: "Matching error", of: ({ report }) => unit(short(report.verdict?.epipolar?.error_px.after ?? null, 2), "px") },
   { name: "Final render, held-out views", of: ({ report }) => psnr(report.heldout?.psnr) },
-  { name: "Cameras turned by (median)", of: ({ report }) => unit(short(middle(report.images.map((image) => image.moved_deg)), 2), "°") },
+  { name: "Cameras turned by (median)", of: ({ report }) => unit(short(median(report.images.map((image) => image.moved_deg)), 2), "°") },
   { name: "Photos", of: ({ report }) => String(report.images.length) },
   { name: "Steps", of: ({ report }) => String(report.steps_done) },
   { name: "Time", of: ({ report }) => duration(Object.values(report.seconds).reduce((a, b) => a + b, 0)) },
@@ -77,41 +78,32 @@ const FIGURES: readonly { name: string; of: (side: Side) => string }[] = [
 const psnr = (value: number | null | undefined) => unit(fixed(value ?? null, 2), "dB");
 const unit = (text: string, name: string) => (text === "–" ? text : `${text} ${name}`);
 
-function middle(values: readonly number[]): number | null {
-  const sorted = [...values].sort((a, b) => a - b);
-  return sorted[Math.floor(sorted.length / 2)] ?? null;
-}
-
 function Figures({ sides }: { sides: Sides }) {
   const options = sides.map(({ report }) => report.options as Readonly<Record<string, unknown>>);
-  const differing = Object.keys(options[0] ?? {}).filter((name) => text(options[0]?.[name]) !== text(options[1]?.[name]));
+  const differing = Object.keys(options[0] ?? {}).filter((name) => optionText(options[0]?.[name]) !== optionText(options[1]?.[name]));
   return (
-    <div class="table-scroll" tabIndex={0} role="region" aria-label="Figures of both jobs">
-      <table class="table">
-        <thead>
-          <tr>
-            <td />
-            {sides.map(({ job }, index) => (
-              <th scope="col" key={index}>
-                <i class={`dash compare-${index}`} /> <a href={`#/jobs/${job.id}`}>{titleOf(job)}</a> <Chip job={job} />
-              </th>
-            ))}
-          </tr>
-        </thead>
-        <tbody>
-          {FIGURES.map(({ name, of }) => (
-            <Row key={name} name={name} texts={sides.map(of)} />
+    <ScrolledTable label="Figures of both jobs">
+      <thead>
+        <tr>
+          <td />
+          {sides.map(({ job }, index) => (
+            <th scope="col" key={index}>
+              <i class={`dash compare-${index}`} /> <a href={`#/jobs/${job.id}`}>{titleOf(job)}</a> <Chip job={job} />
+            </th>
           ))}
-          {differing.map((name) => (
-            <Row key={name} name={`Option ${name}`} texts={options.map((values) => text(values[name]))} />
-          ))}
-        </tbody>
-      </table>
-    </div>
+        </tr>
+      </thead>
+      <tbody>
+        {FIGURES.map(({ name, of }) => (
+          <Row key={name} name={name} texts={sides.map(of)} />
+        ))}
+        {differing.map((name) => (
+          <Row key={name} name={`Option ${name}`} texts={options.map((values) => optionText(values[name]))} />
+        ))}
+      </tbody>
+    </ScrolledTable>
   );
 }
-
-const text = (value: unknown) => (typeof value === "string" ? value : (JSON.stringify(value) ?? "–"));
 
 function Row({ name, texts }: { name: string; texts: readonly string[] }) {
   return (
@@ -127,39 +119,37 @@ function Row({ name, texts }: { name: string; texts: readonly string[] }) {
 function PoseTable({ first, second }: { first: Side; second: Side }) {
   const { images, aligned } = useMemo(() => differencesOf(first.poses, second.poses), [first, second]);
   const largest = useMemo(() => [...images].sort((a, b) => b.turned_deg - a.turned_deg), [images]);
-  const turned = middle(images.map(({ turned_deg }) => turned_deg));
+  const turned = median(images.map(({ turned_deg }) => turned_deg));
   return (
     <>
       <p>
         {count(images.length, "photo")} in both: poses differ by {short(turned, 2)}° (median), {short(largest[0]?.turned_deg ?? null, 2)}° at most.
         {aligned && " Neither frame was given, so the second was moved onto the first."}
       </p>
-      <div class="table-scroll" tabIndex={0} role="region" aria-label="Differences of poses">
-        <table class="table">
-          <thead>
-            <tr>
-              <th scope="col">image</th>
-              <th scope="col" class="number">
-                rotation °
+      <ScrolledTable label="Differences of poses">
+        <thead>
+          <tr>
+            <th scope="col">image</th>
+            <th scope="col" class="number">
+              rotation °
+            </th>
+            <th scope="col" class="number">
+              distance
+            </th>
+          </tr>
+        </thead>
+        <tbody>
+          {largest.map(({ name, turned_deg, moved }) => (
+            <tr key={name}>
+              <th scope="row">
+                <bdi>{name}</bdi>
               </th>
-              <th scope="col" class="number">
-                distance
-              </th>
+              <td class="number">{short(turned_deg)}</td>
+              <td class="number">{short(moved)}</td>
             </tr>
-          </thead>
-          <tbody>
-            {largest.map(({ name, turned_deg, moved }) => (
-              <tr key={name}>
-                <th scope="row">
-                  <bdi>{name}</bdi>
-                </th>
-                <td class="number">{short(turned_deg)}</td>
-                <td class="number">{short(moved)}</td>
-              </tr>
-            ))}
-          </tbody>
-        </table>
-      </div>
+          ))}
+        </tbody>
+      </ScrolledTable>
     </>
   );
 }

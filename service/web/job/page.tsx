@@ -1,7 +1,7 @@
 // One job: its progress, its result and what can be done with it.
 import { useEffect, useMemo, useState } from "preact/hooks";
 import type { JobView } from "schemas";
-import { duration } from "../../../biresnerf/viewer/widgets/numbers";
+import { duration, optionText } from "../../../biresnerf/viewer/widgets/numbers";
 import { shared } from "../api/http";
 import { pictureUrl } from "../api/picture_urls";
 import { useStore } from "../api/store";
@@ -134,7 +134,7 @@ function Facts({ job, seen }: { job: JobView; seen: LiveState }) {
           <Fact key={stage} name={`Time: ${STAGE_WORDS[stage as Stage] ?? stage}`} value={duration(s)} />
         ))}
         {options.map(([name, value]) => (
-          <Fact key={name} name={name} value={typeof value === "string" ? value : JSON.stringify(value)} />
+          <Fact key={name} name={name} value={optionText(value)} />
         ))}
       </dl>
     </details>
