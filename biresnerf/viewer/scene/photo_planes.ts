@@ -29,17 +29,16 @@ class PhotoPlanes {
     geometry.setAttribute("position", this.positions);
     geometry.setAttribute("uv", this.parts);
     geometry.setIndex(Array.from({ length: count }, (_, i) => [0, 1, 2, 0, 2, 3].map((corner) => corner + 4 * i)).flat());
-    this.material = new MeshBasicMaterial({ side: DoubleSide, transparent: true, opacity, depthWrite: false });
+    this.material = new MeshBasicMaterial({ side: DoubleSide, transparent: true, opacity, depthWrite: false, visible: false });
     this.mesh = new Mesh(geometry, this.material);
     this.mesh.frustumCulled = false;
-    this.mesh.visible = false;
   }
 
   /** Shows this picture, once it has arrived; null shows none. */
   show(url: string | null): void {
     if (url === this.url) return;
     this.url = url;
-    this.mesh.visible = false;
+    this.material.visible = false;
     this.material.map?.dispose();
     this.material.map = null;
     if (url) new TextureLoader().load(url, (texture) => this.paint(url, texture));
@@ -50,13 +49,8 @@ class PhotoPlanes {
     texture.colorSpace = SRGBColorSpace;
     this.material.map = texture;
     this.material.needsUpdate = true;
-    this.mesh.visible = true;
+    this.material.visible = true;
     this.onLoaded();
-  }
-
-  /** Whether there is a picture to show. */
-  get ready(): boolean {
-    return this.url !== null && this.material.map !== null;
   }
 
   /** Draws it over everything else. */
@@ -137,7 +131,7 @@ export class Photos {
       });
     }
     this.all.show(look.photos ? (look.cellOf(0)?.url ?? null) : null);
-    this.all.mesh.visible = this.all.ready && through === null;
+    this.all.mesh.visible = through === null;
     const camera = through === null ? undefined : this.cameras[through];
     if (through === null || !camera) return this.one.show(null);
     const [photo, cell] = [look.photoOf(through), look.cellOf(through)];
