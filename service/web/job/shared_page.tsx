@@ -1,16 +1,16 @@
 // The page of one job for somebody with a link: it can be looked at, and its files taken, until the link expires.
-import { useEffect, useState } from "preact/hooks";
+import { useEffect } from "preact/hooks";
 import type { LinkView } from "schemas";
 import { once, useLoaded } from "../api/hooks";
-import { requestJson, setLink } from "../api/http";
+import { apiKey, requestJson, setLink } from "../api/http";
+import { useStore } from "../api/store";
 import { moment } from "../parts/format";
 import { JobPage } from "./page";
 
 export function SharedPage({ id, token }: { id: string; token: string }) {
-  const [ready, setReady] = useState(false);
+  const ready = useStore(apiKey) === token; // before that, requests would carry the key
   useEffect(() => {
     setLink(token);
-    setReady(true);
     return () => setLink(null);
   }, [token]);
   return ready ? <Shown id={id} /> : null;

@@ -23,7 +23,7 @@ export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
   const first = view?.views[0]?.image ?? (poses?.images.length ? 0 : null);
   const choice = { selected: chosen === undefined ? first : chosen, onSelect: setChosen };
   const { names, cameras, centres, rows, cellOf: ownCellOf, photoOf } = useWidgetData(poses, report, view, urlOf);
-  const setCellOf = useSetPhotos(guest ? null : job.dataset_id, names);
+  const setCellOf = useSetPhotos(guest || !poses || view?.contact_sheet ? null : job.dataset_id, names);
   const cellOf = view?.contact_sheet ? ownCellOf : setCellOf;
   if (problem) return <ProblemBox problem={problem} />;
   if (over && !poses && !history.length) return null;
