@@ -31,20 +31,23 @@ export interface Jobs {
   readonly cut: boolean;
 }
 
+const runs = ({ state }: JobView) => state === "running";
+
 /** Whether the wish needs jobs beyond those that are shown. */
 const looksFurther = ({ order, search }: Wish) => order !== "newest" || search.trim() !== "";
 
 export async function loadJobs(wish: Wish, signal: AbortSignal): Promise<Jobs> {
-  const running = wish.state === "" || wish.state === "running" ? (await newest("running", SEARCHED_MAX, signal)).jobs : [];
-  const known = new Set(running.map(({ id }) => id));
-  const most = looksFurther(wish) ? SEARCHED_MAX : wish.wanted + running.length;
-  const others = wish.state === "running" ? { jobs: [], more: false } : await newest(wish.state, most, signal);
+  const { jobs, more } = await newest(wish.state, looksFurther(wish) ? SEARCHED_MAX : wish.wanted, signal);
+  // A running job may be older than many that wait.
+  const older = more && wish.state === "" ? (await newest("running", SEARCHED_MAX, signal)).jobs : [];
+  const known = new Set(jobs.map(({ id }) => id));
+  const all = sorted([...jobs, ...older.filter(({ id }) => !known.has(id))], wish.order);
   const words = wish.search.trim().toLocaleLowerCase();
-  const found = [...running, ...sorted(others.jobs.filter(({ id }) => !known.has(id)), wish.order)].filter(
+  const found = [...all.filter(runs), ...all.filter((job) => !runs(job))].filter(
     (job) => !words || titleOf(job).toLocaleLowerCase().includes(words) || job.id.toLocaleLowerCase().includes(words),
   );
-  const cut = looksFurther(wish) && others.more;
-  return { wish, jobs: found.slice(0, wish.wanted), more: found.length > wish.wanted || (others.more && !cut), cut };
+  const cut = looksFurther(wish) && more;
+  return { wish, jobs: found.slice(0, wish.wanted), more: found.length > wish.wanted || (more && !cut), cut };
 }
 
 /** How long the list is shown before it is loaded again: the longer it is, the longer. */
