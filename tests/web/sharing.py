@@ -15,7 +15,8 @@ def expect_a_link_to_show_the_page_until_it_is_revoked(browser: Browser, page: P
     page.get_by_role("button", name="Share", exact=True).click()
     page.get_by_role("button", name="Create a link").click()
     link = page.get_by_label("Link to this page").input_value()
-    assert re.fullmatch(re.escape(origin) + r"/#/shared/job_\w+/brl_[\w-]+", link)
+    job = page.url.rpartition("/")[2]
+    assert re.fullmatch(re.escape(f"{origin}/#/shared/{job}/") + r"brl_[\w-]+", link)
     links = page.get_by_role("list", name="Links to this page").get_by_role("listitem")
     expect(links).to_have_count(1)
     context = browser.new_context(viewport=DESKTOP, accept_downloads=True)

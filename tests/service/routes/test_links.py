@@ -44,7 +44,14 @@ def test_a_link_opens_its_job_to_read_and_no_other_route(
                     continue
                 answer = guest.request(method, address(path, owner), json={})
                 assert answer.status_code == 404, (method, path, answer.text)
-        for path in (f"{base}/artifacts/log.txt", f"{base}0", f"{base}/", f"/v1/jobs/{bert.job}"):
+        other = submit(anna.http, anna.dataset)["id"]
+        for path in (
+            f"{base}/artifacts/log.txt",
+            f"{base}0",
+            f"{base}/",
+            f"/v1/jobs/{other}",
+            f"/v1/jobs/{bert.job}",
+        ):
             problem(guest.get(path), 404, "not_found")
         assert guest.get("/metrics").status_code == 401
     assert anna.http.get(f"{base}/artifacts/report.json").status_code == 200, "nothing was deleted"
