@@ -75,9 +75,9 @@ class LiveView:
         """Draw what is new in the folder; whether anything was."""
         try:
             poses = newest_poses(self._folder)
-            if poses is None or self._drawn == (poses, poses.stat().st_mtime_ns):
+            now = None if poses is None else (poses, poses.stat().st_mtime_ns)
+            if poses is None or now == self._drawn:
                 return False
-            now = (poses, poses.stat().st_mtime_ns)
             seen = read_state(self._folder, poses)
         except (InputError, OSError) as error:  # the run is just replacing its files: the next look will do
             logger.debug("not drawn: %s", error)
