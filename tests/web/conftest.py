@@ -38,6 +38,7 @@ ARGUMENTS = [
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 ]
 DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 360, "height": 740}
+NARROW = {"width": 390, "height": 844}
 # On a machine that others use as well.
 PATIENCE_MS = 480_000
 expect.set_options(timeout=PATIENCE_MS)
@@ -50,6 +51,8 @@ LOOKS_ELSEWHERE = """
         constructor(title, more) { super(title, more); window.told.push(title); }
     };
 """
+# Targets of 24 px are the one rule that axe leaves off.
+AXE_OPTIONS = "{resultTypes: ['violations'], rules: {'target-size': {enabled: true}}}"
 # What of a page's accessibility may not be wrong.
 SERIOUS = {"serious", "critical"}
 
@@ -103,13 +106,24 @@ class Watched:
         """What axe finds wrong here, by rule and place."""
         # A script tag would be against the page's own policy.
         self.page.evaluate(AXE.read_text())
-        found: dict[str, Any] = self.page.evaluate("axe.run(document, {resultTypes: ['violations']})")
+        found: dict[str, Any] = self.page.evaluate(f"axe.run(document, {AXE_OPTIONS})")
         return [
             f"{one['id']}: {node['target']} {node['failureSummary']}"
             for one in found["violations"]
             if one["impact"] in SERIOUS
             for node in one["nodes"]
         ]
+
+    def findings_in_each_look(self) -> list[str]:
+        """The same in light and dark, wide and 390 px; and where one has to scroll sideways or has a small target."""
+        found = []
+        for scheme in ("dark", "light"):
+            for size in (NARROW, DESKTOP):
+                self.page.emulate_media(color_scheme=scheme)
+                self.page.set_viewport_size(size)
+                here = self.serious_findings() + (["it overflows"] if self.overflows() else [])
+                found += [f"{scheme}, {size['width']} px: {one}" for one in here]
+        return found
 
     def overflows(self) -> bool:
         """Whether one would have to scroll sideways."""

@@ -32,7 +32,7 @@ def expect_a_link_to_show_the_page_until_it_is_revoked(browser: Browser, page: P
     seen.wait_for_function("() => document.querySelector('.compare-frame img')?.naturalWidth > 0")
     for name in ("Delete", "Share", "Run again …", "curl, Python For nerfstudio"):
         expect(seen.get_by_role("button", name=name, exact=True)).to_have_count(0)
-    assert guest.serious_findings() == []
+    assert guest.findings_in_each_look() == []
     assert (guest.complaints, guest.outside) == ([], [])
     links.get_by_role("button", name="Revoke").click()
     expect(links).to_have_count(0)

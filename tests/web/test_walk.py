@@ -266,7 +266,7 @@ def test_a_fork_goes_on_after_stage_1_and_its_end_on_request_leaves_a_partial_re
     page.goto(job_url.partition("#")[0])
     expect_compared(page, api, done["id"], fork)
     tab.screenshot("compared")
-    assert tab.serious_findings() == []
+    assert tab.findings_in_each_look() == []
     assert tab.complaints == []
 
 
