@@ -120,7 +120,7 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         description="How exact the given positions are: standard deviation along each axis, in the input's unit; 0: "
         "measured.",
     )
-    known_distance: Annotated[str, Option("fine", "Known distance", changes_result=False)] = Field(
+    known_distance: Annotated[str, Option("fine", "Scale", level="usual", changes_result=False)] = Field(
         "",
         max_length=1000,
         description="Two photos, or two points of the input's world, and the metres between them; gives the scale: "

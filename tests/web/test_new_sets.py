@@ -74,11 +74,15 @@ def test_a_checked_set_shows_its_photos_and_cameras_and_leaves_photos_out(
     expect(plan).to_contain_text("1 photo of 10 is left out.")
     expect(photos.nth(3)).to_have_attribute("aria-pressed", "true")
     tab.screenshot("checked-set")
-    assert tab.serious_findings() == []
+    assert tab.findings_in_each_look() == []
+    page.get_by_text("More options").click()
+    distance = "./train/r_1, ./train/r_2, 0.5"
+    page.get_by_label("Scale", exact=True).fill(distance)
     with page.expect_response(lambda sent: sent.url.endswith("/v1/jobs")) as sent:
         page.get_by_role("button", name="Refine the poses").click()
     job = sent.value.json()
-    assert job["options"] == {"preset": "balanced", "leave_out": ["./train/r_3"]}
+    chosen = {"leave_out": ["./train/r_3"], "known_distance": distance}
+    assert job["options"] == {"preset": "balanced", **chosen}
     api.post(f"/jobs/{job['id']}/cancel")
     assert tab.complaints == []
 

@@ -24,7 +24,8 @@ export interface Field {
   name: string;
   title: string;
   help: string;
-  kind: "choice" | "yes-no" | "number" | "several" | "words";
+  /** "words": several, with commas between them; "text" may have commas. */
+  kind: "choice" | "yes-no" | "number" | "several" | "words" | "text";
   choices: string[];
   whole: boolean;
   least: number | null;
@@ -52,6 +53,7 @@ function fieldOf(name: string, property: Schema): Field {
   if (type.enum) return { ...field, kind: "choice", choices: type.enum.map(String) };
   if (type.type === "boolean") return { ...field, kind: "yes-no", choices: ["true", "false"] };
   if (type.type === "integer" || type.type === "number") return { ...field, kind: "number" };
+  if (type.type === "string") return { ...field, kind: "text" };
   if (type.type === "array" && items) return { ...field, kind: "several", choices: items };
   return field;
 }
