@@ -37,6 +37,7 @@ from service.routes import (
     health,
     jobs,
     meta,
+    photos,
     sample,
     shares,
     signed_uploads,
@@ -52,7 +53,18 @@ from workers.settings.traces import flush_traces
 logger = logging.getLogger(__name__)
 
 _UNFINISHED_EVERY_S = 15.0
-_RESOURCES = (datasets, uploads, signed_uploads, jobs, derived_jobs, events, artifacts, shares, webhooks)
+_RESOURCES = (
+    datasets,
+    photos,
+    uploads,
+    signed_uploads,
+    jobs,
+    derived_jobs,
+    events,
+    artifacts,
+    shares,
+    webhooks,
+)
 _ROUTERS = [module.router for module in (*_RESOURCES, meta, sample, health, docs_page, web_page)]
 _DESCRIPTION = """
 Refines the camera poses of an image set.

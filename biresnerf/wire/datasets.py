@@ -100,6 +100,15 @@ class NewDataset(Record):
     )
 
 
+class MaskPlace(Record):
+    """Where the readers find a photo's mask: a file of the dataset, or one that may be added to a copy of it."""
+
+    path: str = Field(examples=["images/dynamic_mask_0001.png"])
+    inverted: bool = Field(
+        examples=[True], description="Only its black pixels count; else all others do, and black ones do not."
+    )
+
+
 class CheckedPhoto(Record):
     """A photo of a checked set."""
 
@@ -110,6 +119,19 @@ class CheckedPhoto(Record):
         description="The given pose: the upper three rows, OpenCV axes, in the input's world. Null: to be found.",
     )
     masked: bool = Field(examples=[False])
+    path: str | None = Field(
+        None,
+        examples=["images/0001.jpg"],
+        description="Its file in the dataset; null for a frame of a video.",
+    )
+    orientation: int = Field(
+        1,
+        ge=1,
+        le=8,
+        examples=[1],
+        description="As in EXIF: how stored pixels are turned into those that pose, lens and mask are for.",
+    )
+    mask: MaskPlace | None = Field(None, description="Null for a frame of a video.")
 
 
 class CheckedCamera(Record):

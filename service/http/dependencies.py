@@ -25,6 +25,8 @@ from workers.settings.settings import Settings
 
 # Archives that one process unpacks at a time; each takes a core and memory.
 UNPACKED_AT_ONCE = 4
+# Photos that one process decodes at a time, likewise.
+DECODED_AT_ONCE = 2
 Listing = TypeVar("Listing", bound=BaseModel)
 _ID = re.compile(r"^[a-z]{2,3}_[0-9A-Za-z]{1,40}$", re.ASCII)
 
@@ -72,6 +74,7 @@ class Service:
     closing: asyncio.Event = field(default_factory=asyncio.Event)
     background: set[asyncio.Task[Any]] = field(default_factory=set)
     unpacking: Turns = field(default_factory=lambda: Turns(UNPACKED_AT_ONCE))
+    decoding: Turns = field(default_factory=lambda: Turns(DECODED_AT_ONCE))
     sending: UploadLimit = field(init=False)
 
     def __post_init__(self) -> None:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import base64
 import binascii
-import hashlib
 import re
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import Response
@@ -18,19 +17,16 @@ from biresnerf.wire.datasets import (
     FileList,
     FileView,
     NewDataset,
-    PhotoList,
     dataset_url,
 )
 from biresnerf.wire.safe_paths import checked_path
-from service.http.access import Caller, DatasetWriter, ReadCaller
-from service.http.dependencies import DatasetId, IfNoneMatch, Paged, next_link, service_of
-from service.http.http_conditionals import none_match
+from service.http.access import DatasetWriter, ReadCaller
+from service.http.dependencies import DatasetId, Paged, next_link, service_of
 from service.http.problems import ProblemError, declared
 from service.intake.archive_import import import_archive
 from service.intake.dataset_finalize import begin_check, finish_check
 from service.intake.json_body import JSON_BYTES_MAX, JsonRoute
 from service.intake.uploads import limited_body, raw_request, staging_folder, write_stream
-from workers.records import FIRST_PHOTO, PHOTO_LIST, PHOTO_SHEET
 
 ENTRY_BYTES = 2048  # allowed in a manifest for each file that a dataset may have
 _DIGEST = re.compile(r"sha-256=:([A-Za-z0-9+/=]+):")
@@ -198,49 +194,3 @@ async def finalize_dataset(
     response.headers.update({"Location": dataset_url(dataset_id), "Retry-After": "2"})
     response.headers["Preference-Applied"] = "respond-async"
     return view
-
-
-_SHOWN: dict[int | str, dict[str, Any]] = {
-    304: {"description": "Not modified."},
-    **declared("expired", "storage_unavailable"),
-}
-_PICTURE: dict[int | str, dict[str, Any]] = {
-    200: {"description": "A JPEG.", "content": {"image/jpeg": {"schema": {"type": "string"}}}},
-    **_SHOWN,
-}
-
-
-@router.get("/{dataset_id}/photos", response_model=PhotoList, responses=_SHOWN)
-async def list_photos(
-    dataset_id: DatasetId, caller: ReadCaller, if_none_match: IfNoneMatch = None
-) -> Response:
-    """The photos of a checked dataset, with their given poses and lenses."""
-    return await _shown(caller, dataset_id, PHOTO_LIST, "application/json", if_none_match)
-
-
-@router.get("/{dataset_id}/photos.jpg", response_class=Response, responses=_PICTURE)
-async def get_photos_picture(
-    dataset_id: DatasetId, caller: ReadCaller, if_none_match: IfNoneMatch = None
-) -> Response:
-    """All photos of a checked dataset in one picture; `sheet` of the list of photos says where each lies."""
-    return await _shown(caller, dataset_id, PHOTO_SHEET, "image/jpeg", if_none_match)
-
-
-@router.get("/{dataset_id}/thumbnail.jpg", response_class=Response, responses=_PICTURE)
-async def get_dataset_thumbnail(
-    dataset_id: DatasetId, caller: ReadCaller, if_none_match: IfNoneMatch = None
-) -> Response:
-    """The first photo of a checked dataset, at most 320 px long."""
-    return await _shown(caller, dataset_id, FIRST_PHOTO, "image/jpeg", if_none_match)
-
-
-async def _shown(
-    caller: Caller, dataset_id: str, name: str, kind: str, if_none_match: str | None
-) -> Response:
-    content = await caller.datasets.shown(dataset_id, name)
-    etag = f'"{hashlib.sha256(content).hexdigest()[:32]}"'
-    # A checked dataset never changes.
-    headers = {"ETag": etag, "Cache-Control": "private, max-age=86400", "X-Content-Type-Options": "nosniff"}
-    if not none_match(if_none_match, etag):
-        return Response(status_code=304, headers=headers)
-    return Response(content, media_type=kind, headers=headers)

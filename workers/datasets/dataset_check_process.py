@@ -52,9 +52,10 @@ def check(folder: Path, shown: Path) -> dict[str, Any]:
     from biresnerf.data.photos.turning_object import turning_notes
     from workers.datasets.shown_set import expected_seconds, small_side, write_shown
 
+    sent = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     dataset = read_dataset(folder, within=folder)
     images = load_images(dataset, small_side(len(dataset)))
-    write_shown(dataset, images, shown)
+    write_shown(dataset, images, folder, sent, shown)
     posed = int(dataset.posed.sum())
     return {
         "images": len(dataset),

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
 from biresnerf.cores import usable_cores
-from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.photos.images import ImageSet, load_images
+from biresnerf.data.photos.masks import mask_place
 from biresnerf.data.show.view_pictures import CELL_PX, THUMBNAIL_PX, write_contact_sheet, write_thumbnail
 from biresnerf.data.workload import can_be_adjusted, workload
 from biresnerf.forecast import latest_machine, remembered_rates
 from biresnerf.options.presets import PRESETS, ComputeDevice, PresetName
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.wire.datasets import CheckedCamera, CheckedPhoto, PhotoList, PhotoSheet
+from biresnerf.wire.datasets import CheckedCamera, CheckedPhoto, MaskPlace, PhotoList, PhotoSheet
 from workers.records import FIRST_PHOTO, PHOTO_LIST
 
 SMALLEST_PX = 16  # of sets with too many photos to show
@@ -24,22 +27,19 @@ def small_side(count: int) -> int:
     return next((side for most, side in CELL_PX if count <= most), SMALLEST_PX)
 
 
-def write_shown(dataset: Dataset, images: ImageSet, folder: Path) -> None:
-    """The list of photos with their poses, all photos in one picture, and the first one, into ``folder``."""
+def write_shown(
+    dataset: Dataset, images: ImageSet, checked: Path, sent: Collection[str], folder: Path
+) -> None:
+    """The list of photos with their poses, all photos in one picture, and the first one, into ``folder``.
+
+    ``sent``: the paths of the set's own files in the folder ``checked``, which by now has frames of videos as well.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     sheet = write_contact_sheet(images, folder)
     first = load_images(replace(dataset, frames=dataset.frames[:1]), THUMBNAIL_PX)
     write_thumbnail(first.image(0), folder / FIRST_PHOTO)
     photos = PhotoList(
-        photos=tuple(
-            CheckedPhoto(
-                name=frame.name,
-                camera=frame.camera,
-                world_from_cam=None if frame.world_from_cam is None else frame.world_from_cam[:3].tolist(),
-                masked=frame.mask is not None,
-            )
-            for frame in dataset.frames
-        ),
+        photos=tuple(_listed(frame, checked, sent) for frame in dataset.frames),
         cameras=tuple(
             CheckedCamera(model=one.model, width=one.width, height=one.height, params=tuple(one.params))
             for one in dataset.cameras
@@ -47,6 +47,24 @@ def write_shown(dataset: Dataset, images: ImageSet, folder: Path) -> None:
         sheet=sheet and PhotoSheet(**sheet.model_dump(exclude={"file"})),
     )
     (folder / PHOTO_LIST).write_text(photos.model_dump_json(), "utf-8")
+
+
+def _listed(frame: Frame, checked: Path, sent: Collection[str]) -> CheckedPhoto:
+    path, (mask, inverted) = _inside(frame.path, checked), mask_place(frame)
+    own = path in sent
+    return CheckedPhoto(
+        name=frame.name,
+        camera=frame.camera,
+        world_from_cam=None if frame.world_from_cam is None else frame.world_from_cam[:3].tolist(),
+        masked=frame.mask is not None,
+        path=path if own else None,
+        orientation=frame.orientation,
+        mask=MaskPlace(path=_inside(mask, checked), inverted=inverted) if own else None,
+    )
+
+
+def _inside(path: Path, folder: Path) -> str:
+    return Path(os.path.relpath(path, folder)).as_posix()
 
 
 def expected_seconds(dataset: Dataset, *, unbounded: bool) -> dict[PresetName, float]:

@@ -45,11 +45,23 @@ def mask_beside(root: Path, image: Path, name: str, within: Path | None = None) 
     return dynamic_mask(image, within)
 
 
+def mask_place(frame: Frame) -> tuple[Path, bool]:
+    """The file in which a mask for the frame is looked for in all formats, and whether it is black where pixels count.
+
+    That is the mask that it has, else instant-ngp's, which may not be there yet.
+    """
+    return (frame.mask, frame.mask_inverted) if frame.mask else (_dynamic(frame.path), True)
+
+
 def dynamic_mask(image: Path, within: Path | None = None) -> tuple[Path | None, bool]:
     """instant-ngp's dynamic_mask_STEM.png beside ``image``, in which all but black does not count."""
-    candidate = image.with_name(f"dynamic_mask_{image.stem}.png")
+    candidate = _dynamic(image)
     ready = _is_ready(candidate, within)
     return (candidate, True) if ready else (None, False)
+
+
+def _dynamic(image: Path) -> Path:
+    return image.with_name(f"dynamic_mask_{image.stem}.png")
 
 
 def named_mask(file: Path, name: Any, where: str, within: Path | None = None) -> Path:

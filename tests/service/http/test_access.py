@@ -92,7 +92,7 @@ def address(path: str, owner: Tenant) -> str:
     """The path of something that is the owner's. A new kind of id needs a line here."""
     values = {
         **{"dataset_id": owner.dataset, "job_id": owner.job, "upload_id": owner.upload},
-        **{"path": "transforms.json", "name": "report.json"},
+        **{"path": "transforms.json", "name": "report.json", "photo": "0"},
         **{"webhook_id": owner.webhook, "delivery_id": owner.delivery, "link_id": owner.link},
     }
     return re.sub(r"\{(\w+)(:\w+)?\}", lambda match: values[match[1]], path)

@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
+from biresnerf.data.photos.image_files import EXIF_ORIENTATION
 from tests.service.conftest import (
     Tenant,
     dataset_ids,
@@ -46,6 +49,57 @@ def test_the_photos_of_a_checked_set_are_shown_to_its_tenant_alone(
     problem(other.get(f"{place}/photos"), 404, "not_found")
     assert mine.delete(place).status_code == 204
     problem(mine.get(f"{place}/photos.jpg"), 404, "not_found")
+
+
+def test_a_photo_and_its_mask_are_shown_as_its_pose_means_them(tenants: tuple[Tenant, Tenant]) -> None:
+    mine, other = (tenant.http for tenant in tenants)
+    stored, counts = stripes(1600, 1200), np.zeros((1600, 1200), dtype=bool)
+    counts[:400, 300:] = True
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = range(3)
+    frames: list[dict[str, Any]] = [
+        {"file_path": f"{i}.jpg", "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)
+    ]
+    frames[1]["mask_path"] = "away.png"
+    # As a phone stores an upright photo: on its side, with a tag.
+    upright: Any = {"camera_model": "OPENCV", "w": 1200, "h": 1600, "fl_x": 1000.0, "frames": frames}
+    tag = Image.Exif()
+    tag[EXIF_ORIENTATION] = 6
+    photo = encoded(stored, "JPEG", exif=tag, quality=95)
+    files = {f"{i}.jpg": photo for i in range(3)}
+    files |= {"away.png": encoded(counts, "PNG"), "transforms.json": json.dumps(upright).encode()}
+    dataset = new_dataset(mine)
+    upload(mine, dataset, zip_of(files))
+    assert mine.post(f"/v1/datasets/{dataset}/finalize").json()["state"] == "ready"
+    place = f"/v1/datasets/{dataset}/photos"
+    listed = mine.get(place).json()["photos"]
+    assert [photo["path"] for photo in listed] == ["0.jpg", "1.jpg", "2.jpg"]
+    assert listed[0]["mask"] == {"path": "dynamic_mask_0.png", "inverted": True}
+    assert listed[1]["mask"] == {"path": "away.png", "inverted": False}
+    shown = np.asarray(Image.open(io.BytesIO(mine.get(f"{place}/1/picture.jpg").content)), float)
+    meant = Image.fromarray(stored).transpose(Image.Transpose.ROTATE_270).resize((960, 1280))
+    assert shown.shape == (1280, 960, 3)
+    assert np.abs(shown - np.asarray(meant, float)).mean() < 4
+    mask = np.asarray(Image.open(io.BytesIO(mine.get(f"{place}/1/mask.png").content)))
+    assert mask.shape == (1280, 960)
+    assert mask[:320, 240:].all()
+    assert mask.sum() == 320 * 720
+    problem(mine.get(f"{place}/0/mask.png"), 404, "not_found")
+    problem(mine.get(f"{place}/3/picture.jpg"), 404, "not_found")
+    problem(other.get(f"{place}/1/picture.jpg"), 404, "not_found")
+    problem(mine.get(f"{place}/-1/picture.jpg"), 422, "invalid_request")
+
+
+def stripes(width: int, height: int) -> NDArray[np.uint8]:
+    """A picture that looks like none of its turned copies."""
+    across, down = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
+    return np.stack([across, down, np.zeros_like(down)], axis=-1).astype(np.uint8)
+
+
+def encoded(picture: NDArray[Any], kind: str, **how: Any) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, kind, **how)
+    return file.getvalue()
 
 
 def transforms_of(scene: Path) -> dict[str, Any]:

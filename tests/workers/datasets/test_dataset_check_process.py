@@ -12,10 +12,11 @@ from PIL import Image
 
 from biresnerf.cores import usable_cores
 from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.photos.masks import load_mask
 from biresnerf.errors import InputError
 from biresnerf.forecast import RATES, remember_rates
 from biresnerf.options.presets import PRESETS
-from biresnerf.wire.datasets import PhotoList
+from biresnerf.wire.datasets import CheckedPhoto, PhotoList
 from tests.data.formats.simple import trajectories
 from tests.data.scenes import nerfstudio_scene, save, write_image
 from workers.datasets import dataset_check_process
@@ -95,13 +96,15 @@ def test_images_alone_are_decoded_and_have_no_pose(tmp_path: Path) -> None:
     assert caught.value.code == "image_truncated"
 
 
-@pytest.mark.parametrize("form", ["transforms", "colmap", "llff", "tum", "bundler", "metashape", "images"])
-def test_a_link_out_of_the_folder_is_refused_in_every_form(tmp_path: Path, form: str) -> None:
-    folder = tmp_path / "set"
+FORMS = ["transforms", "colmap", "llff", "tum", "bundler", "metashape", "images"]
+
+
+def write_set(folder: Path, form: str) -> None:
+    """A set whose first photo is images/a.png."""
     folder.mkdir()
-    write_image(tmp_path / "secret.png")
     if form == "transforms":
         document = nerfstudio_scene(folder)
+        write_image(folder / "images/a.png")
         document["frames"][0]["file_path"] = "images/a.png"
         save(folder, document)
     elif form == "colmap":
@@ -116,8 +119,41 @@ def test_a_link_out_of_the_folder_is_refused_in_every_form(tmp_path: Path, form:
         trajectories.write_images(folder)
     if form == "metashape":
         (folder / "cameras.xml").write_text(trajectories.metashape_xml())
-    (folder / "images/a.png").unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_link_out_of_the_folder_is_refused_in_every_form(tmp_path: Path, form: str) -> None:
+    folder = tmp_path / "set"
+    write_image(tmp_path / "secret.png")
+    write_set(folder, form)
+    (folder / "images/a.png").unlink()
     (folder / "images/a.png").symlink_to(tmp_path / "secret.png")
     with pytest.raises(InputError) as caught:
         check(folder)
     assert caught.value.code == "unsafe_path"
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_mask_at_the_place_that_is_named_is_read_in_every_form(tmp_path: Path, form: str) -> None:
+    folder = tmp_path / "set"
+    write_set(folder, form)
+    before = photo_a(folder)
+    assert (before.path, before.masked) == ("images/a.png", False)
+    assert before.mask is not None
+    with Image.open(folder / "images/a.png") as photo:
+        away = np.zeros((photo.height, photo.width), dtype=np.uint8)
+    away[:, :7] = 255
+    Image.fromarray(away if before.mask.inverted else 255 - away).save(folder / before.mask.path)
+    assert check(folder)["masks"] == 1
+    after = photo_a(folder)
+    assert (after.masked, after.mask) == (True, before.mask)
+    dataset = read_dataset(folder)
+    index = next(i for i, frame in enumerate(dataset.frames) if frame.path.name == "a.png")
+    counts = load_mask(dataset.frames[index], dataset.camera_of(index))
+    np.testing.assert_array_equal(counts, away == 0)
+
+
+def photo_a(folder: Path) -> CheckedPhoto:
+    check(folder)
+    listed = PhotoList.model_validate_json((shown_folder(folder) / PHOTO_LIST).read_bytes())
+    return next(photo for photo in listed.photos if photo.path and photo.path.endswith("a.png"))

@@ -1,0 +1,89 @@
+"""One photo of a checked dataset, or its mask, as a picture for pages.
+
+It is made when it is asked for, in a child program: `python -m service.intake.photo_pictures`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from biresnerf.frozen_model import FrozenModel
+from biresnerf.wire.datasets import CheckedCamera, CheckedPhoto, PhotoList
+from service.http.access import Caller
+from service.intake.sandboxed_child import Limits, run_child, run_confined
+from service.intake.uploads import staging_folder
+from workers.records import PHOTO_LIST
+from workers.settings.errors import NotFound
+
+PictureName = Literal["picture.jpg", "mask.png"]
+LONG_SIDE_PX = 1280
+_FILES = "files"
+_QUALITY = 92  # of JPEG, with colours as fine as brightness: areas are chosen by them
+# One decoder with a picture of up to 150 million pixels.
+_LIMITS = Limits(seconds=60, memory_bytes=6 * 2**30, file_bytes=16 * 2**20)
+
+
+class DrawRequest(FrozenModel):
+    """What to draw, and the folder for it, which has the photo's files at their paths below ``files``."""
+
+    folder: Path
+    photo: CheckedPhoto
+    camera: CheckedCamera
+    name: PictureName
+
+
+async def photo_picture(caller: Caller, dataset_id: str, number: int, name: PictureName) -> bytes:
+    """The photo of that number, turned as its pose means it, or its mask: white where pixels count, of the same size.
+
+    Raises:
+        NotFound: there is no such photo, or no mask, or it is a frame of a video.
+        ProblemError: ``validation_timeout``, ``validation_resources``.
+    """
+    listed = PhotoList.model_validate_json(await caller.datasets.shown(dataset_id, PHOTO_LIST))
+    photo = listed.photos[number] if number < len(listed.photos) else None
+    if photo is None or photo.path is None or photo.mask is None:
+        raise NotFound(f"Dataset {dataset_id} has no file of photo {number}.")
+    if name == "mask.png" and not photo.masked:
+        raise NotFound(f"Photo {number} of dataset {dataset_id} has no mask.")
+    wanted = (photo.path, photo.mask.path) if photo.masked else (photo.path,)
+    files = [await caller.datasets.file(dataset_id, path) for path in wanted]
+    service = caller.service
+    async with service.decoding.turn(caller.tenant), staging_folder(service.staging_dir) as folder:
+        await service.stores.files.stage([(file.key, file.path) for file in files], folder / _FILES)
+        request = DrawRequest(folder=folder, photo=photo, camera=listed.cameras[photo.camera], name=name)
+        await run_confined("service.intake.photo_pictures", request, _LIMITS)
+        return (folder / name).read_bytes()
+
+
+def draw(request: DrawRequest) -> dict[str, Any]:
+    """Writes the picture into the folder."""
+    from PIL import Image
+
+    from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
+    from biresnerf.data.photos.images import load_images
+    from biresnerf.geometry.camera.camera_models import Camera
+
+    files, photo, lens = request.folder / _FILES, request.photo, request.camera
+    masked = photo.mask if photo.masked else None
+    frame = Frame(
+        photo.name,
+        files / str(photo.path),
+        camera=0,
+        world_from_cam=None,
+        pose_source=None,
+        mask=files / masked.path if masked else None,
+        orientation=photo.orientation,
+        mask_inverted=masked is not None and masked.inverted,
+    )
+    # Without skew: a mask is for pixels that are not straightened yet.
+    camera = Camera(lens.model, lens.width, lens.height, lens.params)
+    images = load_images(Dataset(files, (camera,), (frame,), SourceFormat("images")), LONG_SIDE_PX)
+    shown = images.counts_image(0) if request.name == "mask.png" else images.image(0)
+    assert shown is not None, "only masks of masked photos are asked for"
+    Image.fromarray(shown).save(request.folder / request.name, quality=_QUALITY, subsampling=0)
+    return {}
+
+
+if __name__ == "__main__":
+    run_child(lambda request: draw(DrawRequest.model_validate(request)))
