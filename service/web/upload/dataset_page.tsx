@@ -40,7 +40,7 @@ export function DatasetPage({ id }: { id: string }) {
         <ProblemBox problem={dataset.error} heading="The image set was rejected" />
       )}
       {dataset.state === "rejected" && <DropZone compact />}
-      {dataset.state === "ready" && <NewJob dataset={dataset} />}
+      {dataset.state === "ready" && <NewJob key={dataset.id} dataset={dataset} />}
     </div>
   );
 }

@@ -6,6 +6,7 @@ import type { SceneCamera } from "../../../biresnerf/viewer/result/widget_data";
 import { once, useAttempt, useLoaded } from "../api/hooks";
 import { requestJson } from "../api/http";
 import { nameLabel } from "../jobs/state";
+import { useMasks } from "../masks/use_masks";
 import { OptionsForm } from "../options/form";
 import type { Values } from "../options/schema";
 import { ProblemBox } from "../parts/problem_box";
@@ -13,8 +14,11 @@ import { Photos } from "./photos";
 import { Plan } from "./plan";
 import { type SetPhotos, useSet } from "./set_photos";
 
+/** Options chosen before a set was masked, by the id of the masked one. */
+const carried = new Map<string, Values>();
+
 export function NewJob({ dataset }: { dataset: DatasetView }) {
-  const [values, setValues] = useState<Values>({ preset: "balanced" });
+  const [values, setValues] = useState<Values>(carried.get(dataset.id) ?? { preset: "balanced" });
   const { attempt, busy, problem } = useAttempt();
   const photos = useSet(dataset.id);
   const report = dataset.report!;
@@ -23,6 +27,10 @@ export function NewJob({ dataset }: { dataset: DatasetView }) {
   const leaveOut = (names: ReadonlySet<string>) => {
     setValues(({ leave_out: _, ...others }) => (names.size ? { ...others, leave_out: [...names] } : others));
   };
+  const masks = useMasks(dataset, photos?.list ?? null, (id) => {
+    carried.set(id, values);
+    location.hash = `#/datasets/${id}`;
+  });
   const submit = async () => {
     const json = { dataset_id: dataset.id, options: values, labels: nameLabel(dataset.name) };
     location.hash = `#/jobs/${(await requestJson<JobView>("POST", "v1/jobs", { json })).id}`;
@@ -31,7 +39,7 @@ export function NewJob({ dataset }: { dataset: DatasetView }) {
     <>
       {photos && (
         <div class="set-views">
-          <Photos photos={photos} leftOut={leftOut} onChange={leaveOut} />
+          <Photos {...{ photos, leftOut, masks }} onChange={leaveOut} />
           {report.with_pose > 0 && <Cameras photos={photos} />}
         </div>
       )}
@@ -48,9 +56,10 @@ export function NewJob({ dataset }: { dataset: DatasetView }) {
         <OptionsForm values={values} onChange={setValues} expected={report.expected_s} problems={problem?.errors ?? []} />
         {problem && <ProblemBox problem={problem} />}
         <p class="submit">
-          <button class="act primary" disabled={busy}>
+          <button class="act primary" disabled={busy || masks.painted.size > 0}>
             {busy ? "Submitting …" : "Refine the poses"}
           </button>
+          {masks.painted.size > 0 && <span class="soft">Save the masks first, above.</span>}
         </p>
       </form>
     </>

@@ -1,5 +1,5 @@
 // Sends files to the service: only those that it lacks, several at a time, with retries.
-import type { DatasetView, Info, SizeLimits } from "schemas";
+import type { DatasetView, FileList, FileView, Info, SizeLimits } from "schemas";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
 import { asProblem, Problem, requestJson } from "../api/http";
 import type { Store } from "../api/store";
@@ -56,7 +56,26 @@ export async function begin(gathered: Gathered, onHashing: (share: number) => vo
     return track(await sendArchive(file, name, state), state);
   }
   const entries = await hashed(chosen, bytes, onHashing);
-  const manifest = entries.map(({ path, file, sha256 }) => ({ path, size: file.size, ...(sha256 && { sha256 }) }));
+  return create(name, entries, [], state);
+}
+
+/** Creates a copy of a checked dataset with files added or replaced; the service copies the others. Throws `Problem`. */
+export async function beginCopy(of: DatasetView, name: string, changed: Chosen[]): Promise<string> {
+  const bytes = changed.reduce((sum, { file }) => sum + file.size, 0);
+  const entries = await hashed(changed, bytes, () => {});
+  const replaced = new Set(changed.map(({ path }) => path));
+  const kept: FileView[] = [];
+  for (let cursor: string | null = ""; cursor !== null; ) {
+    const page: FileList = await requestJson("GET", `v1/datasets/${of.id}/files?cursor=${encodeURIComponent(cursor)}`);
+    kept.push(...page.items.filter(({ path }) => !replaced.has(path)));
+    cursor = page.next_cursor;
+  }
+  return create(name, entries, kept, newTransfer(changed.length, bytes));
+}
+
+async function create(name: string, entries: Entry[], kept: readonly FileView[], state: Store<Transfer>): Promise<string> {
+  const sent = entries.map(({ path, file, sha256 }) => ({ path, size: file.size, ...(sha256 && { sha256 }) }));
+  const manifest = [...kept.map(({ path, size, sha256 }) => ({ path, size, sha256 })), ...sent];
   const dataset = await requestJson<DatasetView>("POST", "v1/datasets", { json: { name, manifest } });
   return track({ dataset: dataset.id, sent: sendMissing(dataset, entries, state) }, state);
 }
