@@ -93,10 +93,15 @@ class Requeue:
 
 
 async def requeue(connection: Connection, job_id: str, how: Requeue) -> None:
-    """Set the job back to queued. The caller puts its queue entry back."""
+    """Set the job back to queued. The caller puts its queue entry back.
+
+    A setback counts only where an attempt was running: not before one began, nor after it gave the job back itself.
+    """
     setback = None if how.setback is None else SETBACKS[how.setback]
     await connection.execute(
-        "UPDATE jobs SET state = 'queued', attempt = attempt - %s, crashes = crashes + %s, setback = %s,"
+        "UPDATE jobs SET state = 'queued', attempt = attempt - %s,"
+        " crashes = crashes + CASE WHEN state = 'running' THEN %s ELSE 0 END,"
+        " setback = CASE WHEN state = 'running' THEN %s ELSE setback END,"
         " message = %s, eta_s = NULL, run_token = CASE WHEN %s THEN NULL ELSE run_token END,"
         " checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END, smaller = smaller || %s WHERE id = %s",
         (

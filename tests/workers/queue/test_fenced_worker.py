@@ -16,6 +16,7 @@ from workers.database.job_queue import Entry
 from workers.engine import Stores
 from workers.jobs import claim as claims
 from workers.jobs.claim import Fenced, claim_job
+from workers.jobs.job_states import Requeue
 from workers.jobs.ledger import Ledger
 from workers.queue.janitor import Janitor, release_worker
 from workers.run.attempt import Attempt
@@ -116,6 +117,24 @@ async def test_a_job_that_was_taken_back_is_not_claimed_by_who_had_it(stores: St
     job = await stores.jobs.get(job_id)
     assert (job.state, job.attempt) == ("queued", 0)
     assert await claim_job(database, job_id, other, max_attempts=3, stall_s=60.0) is not None
+
+
+async def test_a_worker_that_is_lost_costs_a_job_nothing_before_it_starts_and_after_it_was_given_back(
+    stores: Stores, database: Database
+):
+    job_id = await queued(stores)
+    for _ in range(4):
+        worker = await registered(database)
+        await taken(database, worker)
+        await release_worker(database, worker, 60.0)
+    worker = await registered(database)
+    await taken(database, worker)
+    claim = await claim_job(database, job_id, worker, max_attempts=3, stall_s=60.0)
+    assert claim is not None
+    assert await Ledger(database, claim, 60.0).give_back(Requeue("requeued", {"why": "shutdown"}))
+    await release_worker(database, worker, 60.0)
+    (row,) = await database.fetch("SELECT state, attempt, crashes, setback FROM jobs")
+    assert row == {"state": "queued", "attempt": 0, "crashes": 0, "setback": None}
 
 
 async def test_a_claim_whose_acknowledgement_was_lost_counts_once(

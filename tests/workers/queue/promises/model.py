@@ -238,7 +238,7 @@ def acknowledged(name: str, worker: int, again: Literal["over", "now", "later"])
 
 
 def released(world: World) -> Outcome:
-    """A janitor takes back all that silent workers have."""
+    """A janitor takes back all that silent workers have. A crash is counted where an attempt was running."""
     for name, job in world.jobs.items():
         if job.place != "doing" or job.worker not in world.silent:
             continue
@@ -247,8 +247,9 @@ def released(world: World) -> Outcome:
         elif job.cancel_requested:
             job = replace(job, place="over", worker=None, abort=False, token=None).ended("cancelled")
         else:
-            lost = replace(job, place="todo", worker=None, token=None, state="queued", setback="worker_lost")
-            job = lost.with_event("requeued", crashes=job.crashes + 1)
+            if job.state == "running":
+                job = replace(job, state="queued", setback="worker_lost", crashes=job.crashes + 1)
+            job = job.with_event("requeued", place="todo", worker=None, token=None)
         world = world.with_job(name, job)
     return None, replace(world, silent=frozenset())
 
