@@ -204,6 +204,15 @@ def api(service: Running) -> Iterator[httpx.Client]:
         yield client
 
 
+def asked_after_reload(page: Page, ending: str) -> int:
+    """How often the page asks for addresses with this end, in its first second and until it is idle."""
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.reload(wait_until="networkidle")
+    page.wait_for_timeout(1000)
+    return sum(url.endswith(ending) for url in asked)
+
+
 def curve_steps(page: Page) -> list[int]:
     """The first and the last step that the curves show."""
     chart = page.get_by_role("img", name="PSNR of the training views")

@@ -16,7 +16,7 @@ from playwright.sync_api import Browser, expect
 
 from tests.service.conftest import Running, operator
 from tests.web.comparison import expect_compared
-from tests.web.conftest import LOOKS_ELSEWHERE, Watched, again, another_job, curve_steps
+from tests.web.conftest import LOOKS_ELSEWHERE, Watched, again, another_job, asked_after_reload, curve_steps
 from tests.web.download_lines import expect_lines_to_bring_the_same
 from tests.web.photo_over_view import expect_photo_over_the_view
 from tests.web.sharing import expect_a_link_to_show_the_page_until_it_is_revoked
@@ -263,6 +263,7 @@ def test_a_fork_goes_on_after_stage_1_and_its_end_on_request_leaves_a_partial_re
     page.get_by_text("Options and times").click()
     expect(page.get_by_role("link", name=done["id"])).to_be_visible()
     tab.screenshot("job-partial")
+    assert asked_after_reload(page, "/artifacts") == 1
     page.goto(job_url.partition("#")[0])
     expect_compared(page, api, done["id"], fork)
     tab.screenshot("compared")

@@ -38,6 +38,8 @@ export class LiveJob extends Store<LiveState> {
   private live: CurvePoint[] = [];
   private loading: Promise<void> | null = null;
   private loadAgain = false;
+  /** Whether the job was over before its files were loaded: there will be no others. */
+  private complete = false;
 
   constructor(readonly id: string) {
     super(NOTHING);
@@ -67,7 +69,9 @@ export class LiveJob extends Store<LiveState> {
   async run(): Promise<void> {
     try {
       await this.waitForJob();
+      const over = this.value.job !== null && isOver(this.value.job);
       await this.refresh();
+      this.complete = over && this.value.artifacts.length > 0;
       if (shared.value) return; // links open what a job has, not what happens to it
       const handlers = { onProgress: this.progress, onEvent: this.event, onConnection: this.connection };
       await followJob(this.id, handlers, this.stop.signal);
@@ -109,7 +113,7 @@ export class LiveJob extends Store<LiveState> {
   private readonly event = (event: JobEvent) => {
     this.change({ events: [...this.value.events, event] });
     // Old events are replayed on connecting; the files were loaded once already.
-    const fresh = Date.now() - Date.parse(event.at) < 60_000;
+    const fresh = !this.complete && Date.now() - Date.parse(event.at) < 60_000;
     if (fresh && ["preview", "succeeded", "cancelled", "failed"].includes(event.type)) void this.refresh();
   };
 
