@@ -19,7 +19,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Each process of the tests would compile all modules, and pytest rewrite all assertions, again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs docs-site notebooks fuzz promises audit sbom compose-check slurm-check consumers-check
+.PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -74,6 +74,9 @@ docs-site: setup  ## the documentation as a site in build/site, which needs no n
 
 notebooks: setup  ## run the notebooks of examples/ and keep their outputs; NOTEBOOKS="names" chooses
 	$(BIN)/python -m docs.generate.run_notebooks $(NOTEBOOKS)
+
+screenshots: web  ## the pictures of the page that the docs show, and its finished example (minutes; Chromium)
+	$(BIN)/python -m docs.generate.pictures.screenshots
 
 fuzz: setup  ## a hundred thousand made-up requests against a real service; FUZZ="arguments"
 	$(BIN)/python -m tests.service.fuzzing $(FUZZ)

@@ -1,4 +1,4 @@
-"""The web page: the files that `hatch_build.py` builds from service/web.
+"""The web page: the files that `hatch_build.py` builds from service/web, and those of a finished example.
 
 File names contain a digest of the content, so browsers may cache them for a year; index.html, which refers to them, is
 revalidated on each visit.
@@ -15,6 +15,8 @@ from fastapi.responses import FileResponse, Response
 from service.http.problems import ProblemError
 
 FOLDER = Path(__file__).parent / "web" / "dist"
+# Files of a result, kept by `make screenshots`.
+EXAMPLE = Path(__file__).parent / "example"
 CSP = (
     "default-src 'self'; img-src 'self' blob: data:; media-src 'self' blob:; worker-src 'self' blob:; "
     "object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -26,10 +28,17 @@ _MEDIA_TYPES = {
     ".css": "text/css",
     ".svg": "image/svg+xml",
     ".txt": "text/plain",
+    ".json": "application/json",
+    ".jsonl": "application/jsonl",
+    ".jpg": "image/jpeg",
+    ".png": "image/png",
+    ".bin": "application/octet-stream",
 }
 # Best first; the build writes a compressed copy of a file where that is smaller.
 _ENCODINGS = {"br": ".br", "gzip": ".gz"}
 _SAFE = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
+
+_IN_EXAMPLE = {path.relative_to(EXAMPLE).as_posix() for path in EXAMPLE.rglob("*") if path.is_file()}
 
 router = APIRouter(include_in_schema=False)
 
@@ -56,6 +65,16 @@ async def part(name: str, request: Request) -> Response:
         raise ProblemError("not_found", "The page has no such part; load it again.")
     caching = "no-cache" if name == "licences.txt" else "public, max-age=31536000, immutable"
     return _file(name, request, {"Cache-Control": caching})
+
+
+@router.get("/example/{name:path}")
+@router.head("/example/{name:path}")
+async def example(name: str) -> Response:
+    """A file of the finished example; anybody may see it, as it comes with every installation."""
+    if name not in _IN_EXAMPLE:
+        raise ProblemError("not_found", "The example has no such file.")
+    headers = {**_SAFE, "Cache-Control": "public, max-age=3600"}
+    return FileResponse(EXAMPLE / name, media_type=_MEDIA_TYPES[Path(name).suffix], headers=headers)
 
 
 def _file(name: str, request: Request, headers: dict[str, str]) -> Response:

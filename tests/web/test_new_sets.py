@@ -11,6 +11,8 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Page, expect
 
+from biresnerf.viewer.report_html import read_report
+from service.web_page import EXAMPLE
 from tests.service.conftest import LIMITS, Running
 from tests.web.conftest import Watched, check_row, drop, zip_of
 
@@ -48,6 +50,31 @@ def test_a_sample_set_is_one_click_away(page: Page, service: Running) -> None:
     page.wait_for_function("() => document.querySelector('.set-card img')?.naturalWidth > 0")
     waiting.get_by_role("button", name="Delete sample").click()
     expect(waiting).to_have_count(0)
+
+
+def test_a_finished_example_is_one_click_away_and_needs_no_job(
+    tab: Watched, service: Running, api: httpx.Client
+) -> None:
+    page = tab.page
+    before = api.get("/jobs").json()["items"]
+    page.goto(service.url)
+    page.get_by_role("link", name="See a finished example").click()
+    expect(page.get_by_role("region", name="Verdict")).to_contain_text("The refined poses are better")
+    report = read_report(EXAMPLE)
+    expect(page.get_by_text(f"{len(report.images)} photos of a made scene")).to_be_visible()
+    expect(page.get_by_role("region", name="Table of images").get_by_role("row")).to_have_count(
+        len(report.images) + 1
+    )
+    expect(page.get_by_role("application")).to_be_visible()
+    page.wait_for_function(
+        "() => [...document.querySelectorAll('.compare-frame img')].filter(e => e.naturalWidth > 0).length >= 2"
+    )
+    page.get_by_role("slider", name="Swipe between before and after").press("Home")
+    expect(page.locator(".curves canvas").first).to_be_visible()
+    tab.screenshot("example")
+    assert tab.serious_findings() == []
+    assert (tab.outside, tab.complaints) == ([], [])
+    assert api.get("/jobs").json()["items"] == before
 
 
 def test_a_checked_set_shows_its_photos_and_cameras_and_leaves_photos_out(

@@ -1,6 +1,6 @@
 """The pictures of the README: `python -m docs.generate.pictures.refined_scene` refines a made scene and draws what came of it.
 
-Takes some minutes. Writes docs/pictures/cameras.webp and docs/pictures/before_after.webp.
+Takes some minutes. Writes the pictures of the README, docs/pictures/cameras.webp and before_after.webp.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from biresnerf.data.show.view_file import read_view_file
 from biresnerf.result import Array, Result
 
 FOLDER = Path(__file__).resolve().parents[2] / "pictures"
+CAMERAS, BEFORE_AFTER = PICTURES = (FOLDER / "cameras.webp", FOLDER / "before_after.webp")
 VIEWS, SIZE, NOISE, SEED = 48, 200, 0.15, 3
 MOVING, STILL, FRAME_MS = 24, 12, 60  # frames, and how long each is seen
 SIDE, GAP, CAPTION = 220, 8, 22  # px
@@ -30,15 +31,14 @@ SIDE, GAP, CAPTION = 220, 8, 22  # px
 def main() -> None:
     """Make a scene, refine it, draw both pictures."""
     matplotlib.use("Agg")
-    FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
         scene, out = Path(temporary, "scene"), Path(temporary, "out")
         make_scene(scene, "dome", own=None, views=VIEWS, size=SIZE, noise=NOISE, seed=SEED)
         result = biresnerf.refine(
             scene, out, progress=True, preset="fast", max_image_size=SIZE, orbit_frames=0
         )
-        draw_cameras(result, FOLDER / "cameras.webp")
-        draw_before_after(result, FOLDER / "before_after.webp")
+        draw_cameras(result, CAMERAS)
+        draw_before_after(result, BEFORE_AFTER)
 
 
 def draw_cameras(result: Result, path: Path) -> None:

@@ -4,3 +4,4 @@ export { ImageCompare } from "../../../biresnerf/viewer/widgets/image_compare";
 export { ImageTable } from "../../../biresnerf/viewer/widgets/image_table";
 export { ResultSummary } from "../../../biresnerf/viewer/widgets/result_summary";
 export { SceneView } from "../../../biresnerf/viewer/scene/scene_view";
+export { ResultView } from "../../../biresnerf/viewer/result_view";

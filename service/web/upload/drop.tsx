@@ -43,9 +43,14 @@ export function DropZone({ onChosen, compact = false }: Props) {
         <FileButton label="Choose files" onFiles={(files) => void take(fromInput(files))} />
         <FileButton label="Photo library" photos onFiles={(files) => void take(fromInput(files))} />
         {!compact && !onChosen && (
-          <button type="button" class="act" onClick={() => void take(sample())}>
-            Try a sample set
-          </button>
+          <>
+            <button type="button" class="act" onClick={() => void take(sample())}>
+              Try a sample set
+            </button>
+            <a class="act" href="#/example">
+              See a finished example
+            </a>
+          </>
         )}
       </div>
       <p class="drop-status" role="status">

@@ -83,7 +83,7 @@ def test_only_health_docs_and_schema_are_open():
     open_paths = {path for _, path, _ in all_routes() if OPEN.fullmatch(path)}
     assert open_paths <= {
         *("/", "/livez", "/readyz", "/startupz", "/metrics", "/openapi.json"),
-        *("/docs", "/docs/start.js", "/docs/{name}", "/web/{name}"),
+        *("/docs", "/docs/start.js", "/docs/{name}", "/web/{name}", "/example/{name:path}"),
         "/v1/shared/{job_id}/{name:path}",  # by a signature: tests/service/routes/test_shares.py
     }
 

@@ -1,0 +1,36 @@
+"""service/example: the finished example of the page, a result of which only what the page shows is kept."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from PIL import Image
+
+from biresnerf.data.show.history import HISTORY
+from biresnerf.data.show.view_file import ShownView, read_view_file, write_view_file
+
+SHOWN, QUALITY = 4, 85  # views, and JPEG quality of their pictures
+
+
+def keep_example(result: Path, example: Path) -> None:
+    """The files of a result that the page shows, with small pictures, in place of what is in ``example``."""
+    shutil.rmtree(example, ignore_errors=True)
+    view = read_view_file(result)
+    sheet = [view.contact_sheet.file] if view.contact_sheet else []
+    for name in (view.poses, "report.json", HISTORY, *sheet, *(points.file for points in view.points)):
+        (example / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(result / name, example / name)
+    views = tuple(_with_small_pictures(one, result, example) for one in view.views[:SHOWN])
+    write_view_file(view.model_copy(update={"views": views, "orbit": None}), example)
+
+
+def _with_small_pictures(view: ShownView, result: Path, example: Path) -> ShownView:
+    names = {}
+    for kind, file in view.pictures.files().items():
+        target = (example / file).with_suffix(".jpg")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with Image.open(result / file) as picture:
+            picture.convert("RGB").save(target, quality=QUALITY, optimize=True)
+        names[kind] = target.relative_to(example).as_posix()
+    return view.model_copy(update={"pictures": view.pictures.model_copy(update=names)})

@@ -1,0 +1,132 @@
+"""`make screenshots`: pictures of the web page for the docs, of a real service that refines a made scene, in Chromium.
+
+Takes some minutes. Writes the files of `SCREENSHOTS`, and keeps the job's result as the finished example of the page.
+"""
+
+from __future__ import annotations
+
+import io
+import shutil
+import tempfile
+from pathlib import Path
+
+from PIL import Image
+from playwright.sync_api import Page, sync_playwright
+
+from biresnerf.client import Client
+from biresnerf.commands.poses.make_scene import make_scene
+from docs.generate.pages import ROOT
+from docs.generate.pictures.example import keep_example
+from service.commands.temporary_service import temporary_service
+from service.web_page import EXAMPLE
+
+FOLDER = ROOT / "docs/pictures"
+SCREENSHOTS = {
+    name: FOLDER / f"page_{name}.webp" for name in ("check", "running", "list", "result", "compare")
+}
+NAME, VIEWS, SIZE, NOISE, SEED = "shapes", 32, 160, 0.12, 3
+OTHER = {"preset": "fast", "steps": 500}  # of the job that the first is compared with
+PERCENT = "Number(document.querySelector('[role=progressbar]')?.getAttribute('aria-valuenow'))"
+RUNNING_PERCENT = 50  # of the run, where its picture is taken
+WIDTH, HEIGHT, QUALITY = 1200, 900, 82
+SHOWN_HEIGHTS = {"list": 560}  # px; below is nothing
+PATIENCE_MS, SETTLING_MS = 1_800_000, 5_000
+# WebGL without a GPU.
+ARGUMENTS = ("--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader")
+
+
+def main() -> None:
+    """Make a scene, and take it through the page from the upload to the comparison of two jobs."""
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        raise SystemExit("There is no Chromium; on Debian: apt install chromium")
+    with (
+        tempfile.TemporaryDirectory() as temporary,
+        temporary_service() as url,
+        sync_playwright() as playwright,
+    ):
+        scene = Path(temporary, NAME)
+        make_scene(scene, "dome", views=VIEWS, size=SIZE, noise=NOISE, seed=SEED)
+        browser = playwright.chromium.launch(executable_path=chromium, args=ARGUMENTS)
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
+        page.set_default_timeout(PATIENCE_MS)
+        page.goto(url)
+        page.locator("input[type=file]").first.set_input_files(scene)
+        _show_check(page)
+        first, dataset = _job_of(page, url)
+        _show_running(page)
+        _show_result(page)
+        with Client(url) as client:
+            client.download_all(first, Path(temporary, "result"))
+            keep_example(Path(temporary, "result"), EXAMPLE)
+            second = client.create_job(dataset, OTHER, labels={"name": f"{NAME}, {OTHER['steps']} steps"})
+            _show_list(page, url)
+            client.wait(second.id)
+        _show_comparison(page, f"{url}/#/compare/{first}/{second.id}")
+        browser.close()
+
+
+def _show_check(page: Page) -> None:
+    page.get_by_role("button", name="Refine the poses").wait_for()
+    page.get_by_text("A first result within minutes").click()
+    _wait_for_drawing(page)
+    _take(page, "check")
+
+
+def _job_of(page: Page, url: str) -> tuple[str, str]:
+    """Starts the job; the ids of the job and of its set."""
+    with page.expect_response(f"{url}/v1/jobs") as sent:
+        page.get_by_role("button", name="Refine the poses").click()
+    job = sent.value.json()
+    return job["id"], job["dataset_id"]
+
+
+def _show_running(page: Page) -> None:
+    page.get_by_role("img", name="render of one view").wait_for()
+    page.wait_for_function(f"() => {PERCENT} > {RUNNING_PERCENT}")
+    _wait_for_drawing(page)
+    _take(page, "running")
+
+
+def _show_result(page: Page) -> None:
+    page.get_by_role("heading", name="Downloads").wait_for()
+    page.get_by_role("slider", name="Swipe between before and after").wait_for()
+    page.wait_for_function("() => document.querySelector('.compare-frame img')?.naturalWidth > 0")
+    _wait_for_drawing(page)
+    _take(page, "result")
+
+
+def _show_list(page: Page, url: str) -> None:
+    page.goto(url)
+    page.locator(".job-card").nth(1).wait_for()
+    page.wait_for_function(
+        "() => [...document.querySelectorAll('.job-card img')].every(e => e.naturalWidth > 0)"
+    )
+    page.wait_for_function(f"() => {PERCENT} > 0")
+    _take(page, "list")
+
+
+def _show_comparison(page: Page, address: str) -> None:
+    page.goto(address)
+    page.get_by_role("img", name="PSNR of the training views").wait_for()
+    _wait_for_drawing(page)
+    _take(page, "compare")
+
+
+def _wait_for_drawing(page: Page) -> None:
+    """Until what comes after the markup is there: the 3-D view, its photos and the curves."""
+    page.wait_for_timeout(SETTLING_MS)
+
+
+def _take(page: Page, name: str) -> None:
+    page.mouse.move(0, 0)
+    page.evaluate("scrollTo(0, 0)")
+    with Image.open(io.BytesIO(page.screenshot())) as picture:
+        picture.convert("RGB").crop((0, 0, WIDTH, SHOWN_HEIGHTS.get(name, HEIGHT))).save(
+            SCREENSHOTS[name], quality=QUALITY, method=6
+        )
+    print(f"written: {SCREENSHOTS[name]}")
+
+
+if __name__ == "__main__":
+    main()
