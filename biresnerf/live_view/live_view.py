@@ -64,6 +64,8 @@ class LiveView:
         self._names: tuple[str, ...] = ()
         self._cameras: dict[str, Any] = {}
         self._first_look = (np.full(3, 3.0), np.zeros(3))
+        # A browser that connects, in a thread of its own, while cameras are drawn must not keep the look before.
+        self._looking = threading.Lock()
         self.server = _listening(host, port)
         self.url = f"http://{host}:{self.server.get_port()}"
         self._said = self.server.gui.add_markdown("nothing to see yet")
@@ -123,7 +125,8 @@ class LiveView:
                 "/points", seen.points.astype(np.float32), seen.colours, point_size=0.01 * _spread(seen)
             )
         self._said.content = f"{len(seen.names)} photos: {seen.said}"
-        self._first_look = _first_look(seen)
+        with self._looking:
+            self._first_look = _first_look(seen)
         self.server.scene.set_up_direction(tuple(_up(seen).tolist()))
         for client in self.server.get_clients().values() if new else ():
             self._look_at_all(client)
@@ -170,7 +173,8 @@ class LiveView:
         return self._photos
 
     def _look_at_all(self, client: Any) -> None:
-        client.camera.position, client.camera.look_at = self._first_look
+        with self._looking:
+            client.camera.position, client.camera.look_at = self._first_look
 
 
 def _listening(host: str, port: int) -> Any:
