@@ -29,6 +29,7 @@ OTHERS = (
     "cp ",
     "cd ",
     "git clone ",
+    "python3.11 -m venv ",
     ". .venv/bin/activate",
     "mkdir ",
 )
