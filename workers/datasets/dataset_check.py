@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import fcntl
 import json
 import logging
@@ -19,6 +20,7 @@ from psycopg.types.json import Jsonb
 from biresnerf.wire.datasets import CheckReport
 from biresnerf.wire.problems import JobError
 from workers.database.database import Connection, Database
+from workers.process.disk_space import EXIT_DISK
 from workers.process.turns import Turns
 from workers.process.waiting import retry_while_unavailable
 from workers.records import shown_folder, shown_key
@@ -137,6 +139,10 @@ async def check_files(
     What pages show of a good set is stored below the key ``shown``.
 
     Where it is killed (perhaps by the kernel, because another process took too much memory) it is tried once more.
+
+    Raises:
+        OSError: the disk is full, which says nothing about the files.
+        Unavailable: the store is away.
     """
     parent = settings.scratch_dir / CHECKS
     parent.mkdir(parents=True, exist_ok=True)
@@ -173,7 +179,7 @@ def _sweep(parent: Path) -> None:
 
 
 async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[CheckReport | JobError, bool]:
-    """The outcome, and whether a signal ended the program."""
+    """The outcome, and whether a signal ended the program. Raises `OSError` where it found no room to write."""
     child = await Child.start(settings.check_command, dataset, errors, {"OMP_NUM_THREADS": "1"}, CHECK_NICE)
     try:
         async with asyncio.timeout(settings.check_timeout_s):
@@ -186,6 +192,8 @@ async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[CheckRe
     finally:
         child.kill()
         await child.wait()
+    if status == EXIT_DISK:
+        raise OSError(errno.ENOSPC, "no room for the check of a dataset")
     try:
         answer = json.loads(output)
         if status == 0:

@@ -1,9 +1,9 @@
 """The program that validates a dataset: `python -m workers.datasets.dataset_check_process FOLDER`.
 
 Writes one line of JSON to standard output: ``{"report": {...}}`` (exit status 0), or ``{"error": a fault}``
-(exit status 2), and leaves in a folder beside it what pages show of the set. It reads what strangers sent, so it
-confines itself first: memory, CPU time, size of files. Loads neither torch nor pycolmap; poses that are missing are
-found by the job, not here.
+(exit status 2), and leaves in a folder beside it what pages show of the set. Exits with `EXIT_DISK` where it finds no
+room to write. It reads what strangers sent, so it confines itself first: memory, CPU time, size of files. Loads neither
+torch nor pycolmap; poses that are missing are found by the job, not here.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from biresnerf.errors import InputError
+from workers.process.disk_space import EXIT_DISK, failed_for_room
 from workers.records import shown_folder
 
 EXIT_INPUT_ERROR = 2
@@ -32,7 +33,11 @@ def main(folder: Path) -> int:
     try:
         answer: dict[str, Any] = {"report": check(folder, shown_folder(folder))}
         status = 0
-    except InputError as error:
+    except Exception as error:
+        if failed_for_room(error, folder):
+            return EXIT_DISK
+        if not isinstance(error, InputError):
+            raise
         where = error.where.replace(f"{folder}/", "").replace(str(folder), "the dataset")
         answer = {"error": error.fault.model_copy(update={"where": where}).model_dump()}
         status = EXIT_INPUT_ERROR

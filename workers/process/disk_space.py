@@ -10,6 +10,9 @@ from pathlib import Path
 from workers.settings.errors import LimitReached
 from workers.settings.settings import Settings
 
+EXIT_DISK = 5  # of a child process that found no room to write
+_ROOM_BYTES = 2**20  # a disk with less is full: libraries do not always say why they could not write
+
 
 class DiskBudget:
     """The disks under some folders (which need not exist yet), of which ``reserve_bytes`` each stay free."""
@@ -43,6 +46,11 @@ def job_disk_budget(settings: Settings) -> DiskBudget:
 def is_disk_full(error: BaseException) -> bool:
     """Whether the operating system refused to write for want of room."""
     return isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}
+
+
+def failed_for_room(error: BaseException, folder: Path) -> bool:
+    """Whether what failed in ``folder`` may have failed because its disk is full."""
+    return is_disk_full(error) or shutil.disk_usage(folder).free < _ROOM_BYTES
 
 
 def _existing(folder: Path) -> Path:

@@ -24,7 +24,7 @@ from workers.jobs.claim import Claim, Fenced
 from workers.jobs.job_states import Requeue
 from workers.jobs.ledger import Ledger
 from workers.jobs.setbacks import Cause, crashed_too_often, used_up
-from workers.process.disk_space import is_disk_full
+from workers.process.disk_space import EXIT_DISK, is_disk_full
 from workers.process.waiting import first_done, retry_while_unavailable
 from workers.records import CRASH_NAME, LOG_NAME, Artifact
 from workers.run.child import Child, log_tail
@@ -41,7 +41,6 @@ log = logging.getLogger(__name__)
 StopReason = Literal["cancel", "shutdown"]
 EXIT_ERRORS = {2: "InputError", 3: "RefinementError"}  # deterministic: another attempt would end the same
 EXIT_MEMORY = 4
-EXIT_DISK = 5
 # Of a process that the kernel may have killed for want of memory; the second where it was a process of its own.
 KILLED, CHILD_KILLED = -signal.SIGKILL, "seeding_crashed"
 # Ours to fix, not the user's: a checkpoint of an older version, for example. The job starts over.

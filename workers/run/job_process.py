@@ -29,15 +29,13 @@ from biresnerf.options.formats import ExportName
 from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.progress import Progress
 from biresnerf.stages import Stage
-from workers.process.disk_space import is_disk_full
+from workers.process.disk_space import EXIT_DISK, failed_for_room
 from workers.records import CRASH_NAME
 
 EXIT_BUG = 1
 EXIT_INPUT = 2
 EXIT_REFINEMENT = 3
 EXIT_MEMORY = 4
-EXIT_DISK = 5
-_ROOM_BYTES = 2**20  # a disk with less is full: libraries do not always say why they could not write
 EXIT_STOPPED = 128 + signal.SIGTERM
 
 
@@ -76,7 +74,7 @@ def _run(protocol: TextIO, stop: _Stop) -> int:
     except Interrupted:
         return EXIT_STOPPED
     except (InputError, RefinementError) as error:
-        if _disk_is_full(error):
+        if failed_for_room(error, Path(".")):
             return EXIT_DISK
         Path("error.json").write_text(error.fault.model_dump_json())
         sys.stderr.write(f"{error}\n")
@@ -85,16 +83,12 @@ def _run(protocol: TextIO, stop: _Stop) -> int:
 
 
 def _unexpected(error: Exception) -> int:
-    if _disk_is_full(error):
+    if failed_for_room(error, Path(".")):
         return EXIT_DISK
     with contextlib.suppress(OSError):
         Path(CRASH_NAME).write_text(traceback.format_exc())
     sys.stderr.write(f"The program failed ({type(error).__name__}).\n")
     return EXIT_MEMORY if is_out_of_memory(error) else EXIT_BUG
-
-
-def _disk_is_full(error: Exception) -> bool:
-    return is_disk_full(error) or shutil.disk_usage(".").free < _ROOM_BYTES
 
 
 class _Stop:

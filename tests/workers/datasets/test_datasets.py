@@ -15,6 +15,7 @@ from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.datasets import DatasetView, ManifestEntry
 from tests.workers.conftest import ACCEPTED, SHORT_STALL, quick_settings, ready_dataset
 from workers.engine import Stores, open_stores
+from workers.process.disk_space import EXIT_DISK
 from workers.settings.errors import Conflict, LimitReached, NotFound
 from workers.settings.settings import Settings
 
@@ -149,6 +150,20 @@ async def test_a_check_that_does_not_pass_rejects_the_dataset(database_url: str,
         assert checked.error is not None
         assert (checked.state, checked.error.code) == ("rejected", code)
     assert list((settings.scratch_dir / "checks").iterdir()) == []
+
+
+async def test_a_check_that_found_the_disk_full_is_made_again(database_url: str, tmp_path):
+    mark = tmp_path / "mark"
+    full_once = f"mark = pathlib.Path({str(mark)!r}); mark.exists() or (mark.touch(), sys.exit({EXIT_DISK}))"
+    program = f"import pathlib, sys; {full_once}; {ACCEPTED}"
+    async with open_stores(checked_by(program, database_url, tmp_path)) as stores:
+        dataset = await stores.datasets.create("fox")
+        await stores.datasets.add_file(dataset.id, "a", chunks(b"x"))
+        await stores.datasets.finalize(dataset.id)
+        with pytest.raises(OSError, match="no room"):
+            await stores.datasets.check(dataset.id)
+        assert (await stores.datasets.get(dataset.id)).state == "finalizing"
+        assert (await stores.datasets.check(dataset.id)).state == "ready"
 
 
 async def test_two_checks_at_once_run_the_program_once(database_url: str, tmp_path):

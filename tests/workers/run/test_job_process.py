@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,7 +20,9 @@ from biresnerf.options.refine_options import RefineOptions
 from biresnerf.progress import Progress
 from tests.workers.conftest import ROOT, Counting, Slots, quick_settings, ready_dataset
 from workers.engine import open_stores
-from workers.run.job_process import EXIT_DISK, is_out_of_memory
+from workers.process.disk_space import EXIT_DISK
+from workers.records import PHOTO_LIST, shown_folder
+from workers.run.job_process import is_out_of_memory
 
 pytestmark = pytest.mark.server
 
@@ -139,6 +142,16 @@ def test_the_check_names_the_broken_image(tmp_path: Path, scene: Path):
     error = json.loads(bad.stdout)["error"]
     assert "r_2" in error["where"]
     assert str(folder) not in bad.stdout
+
+
+def test_a_full_disk_is_no_fault_of_the_files_that_are_checked(tmp_path: Path, scene: Path):
+    folder = tmp_path / "dataset"
+    shutil.copytree(scene, folder)
+    (shown := shown_folder(folder)).mkdir()
+    (shown / PHOTO_LIST).symlink_to("/dev/full")
+    command = [sys.executable, "-m", "workers.datasets.dataset_check_process", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert (done.returncode, done.stdout) == (EXIT_DISK, ""), done.stderr
 
 
 @pytest.mark.anyio
