@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from numba.core.dispatcher import Dispatcher
+from numba.core.registry import cpu_target
 
 from biresnerf.compile_kernels import compile_kernels
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
@@ -42,3 +46,16 @@ def test_an_adjustment_of_cameras_and_lenses_compiles_nothing_more():
     assert found.used
     assert len(before) >= 7
     assert compiled() == before
+
+
+@pytest.mark.parametrize("first", ["biresnerf.resume", "biresnerf.refinement.kernels.draw_pixels"])
+def test_kernels_are_found_in_the_cache_whichever_module_loads_numba(first):
+    """The cache is asked for a processor, and Numba reads which one when it meets its first kernel."""
+    program = f"""
+import {first}
+from numba.core.registry import cpu_target
+print(*cpu_target.target_context.codegen().magic_tuple())
+"""
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == [*cpu_target.target_context.codegen().magic_tuple()]
+    assert "-prefer-256-bit" in ran.stdout

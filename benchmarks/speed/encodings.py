@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
 
 from benchmarks.speed.clock import Clock, interleave, ratio, summary
 from benchmarks.speed.torch_forms import encode_unrolled, encode_vectorised
@@ -15,6 +14,7 @@ from biresnerf.field.cpu import encoding
 from biresnerf.field.cpu.field import tasks
 from biresnerf.field.cpu.segments_backward import add_position_gradient
 from biresnerf.field.grid_levels import GridLevels, grid_levels
+from biresnerf.field.numba_kernels import njit, prange
 from biresnerf.field.reference import operations as reference
 
 GRIDS = {

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numba import njit, prange
 
 from benchmarks.speed.clock import Clock
 from biresnerf.field.cpu.matrix_blocks import BLOCK, STRIDE, product
+from biresnerf.field.numba_kernels import njit, prange
 
 ACCESSES = 1 << 22
 REPEATS = 400

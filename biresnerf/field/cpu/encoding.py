@@ -8,7 +8,6 @@ features of an entry share one 8-byte word, so a corner costs one load.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
 from biresnerf.field.cpu.vector_access import (
     KERNEL,
@@ -20,6 +19,7 @@ from biresnerf.field.cpu.vector_access import (
     store,
 )
 from biresnerf.field.grid_levels import HASH_PRIMES
+from biresnerf.field.numba_kernels import njit, prange
 
 f4, u4, i4, i8, u8 = np.float32, np.uint32, np.int32, np.int64, np.uint64
 PRIME_Y, PRIME_Z = u4(HASH_PRIMES[1]), u4(HASH_PRIMES[2])

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from biresnerf.field.cpu.vector_access import KERNEL
+from biresnerf.field.numba_kernels import njit
 
 f4 = np.float32
 A, B, C = f4(0.48860251190291987), f4(1.0925484305920792), f4(0.94617469575756)

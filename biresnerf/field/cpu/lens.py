@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
+from biresnerf.field.numba_kernels import njit
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.distortion import NEWTON_DONE, NEWTON_STEPS
 

@@ -7,10 +7,10 @@ The definitions are in `field.reference.operations`. Rays live in the unit frame
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
 from biresnerf.field.cpu.matrix_blocks import exponential
 from biresnerf.field.cpu.vector_access import PARALLEL_KERNEL
+from biresnerf.field.numba_kernels import njit, prange
 from biresnerf.field.reference import operations
 
 f4, i4 = np.float32, np.int32

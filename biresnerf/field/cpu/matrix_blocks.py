@@ -8,7 +8,6 @@ Weights are [rows, columns], flattened; both counts are multiples of `CHANNELS`.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from biresnerf.field.cpu.vector_access import KERNEL, float_from_bits, load, store
 from biresnerf.field.cpu.vector_tiles import (
@@ -25,6 +24,7 @@ from biresnerf.field.cpu.vector_tiles import (
     product_tile_of_4,
     rectified_tile,
 )
+from biresnerf.field.numba_kernels import njit
 
 f4, u4, i4 = np.float32, np.uint32, np.int32
 CHANNELS = 8  # channel counts are padded to multiples of this; the colour's three outputs to 4

@@ -9,7 +9,6 @@ w3 [64, 32], w4 [64, 64], w5 [4, 64] (three colours and a row of zeros).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
 from biresnerf.field.cpu.matrix_blocks import (
     BLOCK,
@@ -26,6 +25,7 @@ from biresnerf.field.cpu.matrix_blocks import (
     zero_rest,
 )
 from biresnerf.field.cpu.vector_access import KERNEL, PARALLEL_KERNEL, load, next_task, reload, store
+from biresnerf.field.numba_kernels import njit, prange
 from biresnerf.field.reference import operations
 
 f4, i8 = np.float32, np.int64

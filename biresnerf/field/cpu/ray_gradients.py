@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
 from biresnerf.field.cpu.vector_access import PARALLEL_KERNEL
+from biresnerf.field.numba_kernels import njit, prange
 
 f4 = np.float32
 ONE, TWO = f4(1), f4(2)

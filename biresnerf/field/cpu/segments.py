@@ -10,7 +10,6 @@ values. The backward pass is in `segments_backward`.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
 from biresnerf.field.cpu.matrix_blocks import BLOCK, STRIDE, copy_in, copy_out, exponential, gather_in
 from biresnerf.field.cpu.network import (
@@ -25,6 +24,7 @@ from biresnerf.field.cpu.network import (
     view_in,
 )
 from biresnerf.field.cpu.vector_access import KERNEL, PARALLEL_KERNEL, load, next_task, store
+from biresnerf.field.numba_kernels import njit, prange
 from biresnerf.field.reference import operations
 
 f4, i4 = np.float32, np.int32

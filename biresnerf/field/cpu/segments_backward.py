@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
 from biresnerf.field.cpu.matrix_blocks import BLOCK, STRIDE, copy_out, gather_in, rectified_product, zero_rest
 from biresnerf.field.cpu.network import (
@@ -19,6 +18,7 @@ from biresnerf.field.cpu.network import (
     view_in,
 )
 from biresnerf.field.cpu.vector_access import KERNEL, PARALLEL_KERNEL, load, next_task, reload, store
+from biresnerf.field.numba_kernels import njit, prange
 
 f4 = np.float32
 ONE = f4(1)

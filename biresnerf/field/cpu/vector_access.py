@@ -7,15 +7,9 @@ that a loop both reads and writes is read with ``reload``. No bounds check, no n
 
 from __future__ import annotations
 
-import llvmlite.binding
 from llvmlite import ir
 from numba import types
-from numba.core import config
 from numba.extending import intrinsic
-
-# LLVM avoids 512-bit registers by default; the kernels here are long enough streams to gain from them.
-config.CPU_NAME = llvmlite.binding.get_host_cpu_name()
-config.CPU_FEATURES = llvmlite.binding.get_host_cpu_features().flatten() + ",-prefer-256-bit"
 
 KERNEL = {"nogil": True, "fastmath": True, "boundscheck": False, "error_model": "numpy", "cache": True}
 PARALLEL_KERNEL = {"parallel": True, **KERNEL}

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
+
+from biresnerf.field.numba_kernels import njit
 
 KERNEL = {"nogil": True, "cache": True, "error_model": "numpy"}
 

@@ -10,8 +10,8 @@ it is, so that they turn with an increment of the host's.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from biresnerf.field.numba_kernels import njit
 from biresnerf.refinement.adjustment.kernels.compiled import KERNEL
 from biresnerf.refinement.adjustment.kernels.photo_samples import sample
 

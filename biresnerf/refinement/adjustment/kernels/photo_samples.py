@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from numba import njit
-
+from biresnerf.field.numba_kernels import njit
 from biresnerf.refinement.adjustment.kernels.compiled import KERNEL
 
 

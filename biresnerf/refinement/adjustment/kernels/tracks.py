@@ -9,8 +9,8 @@ the world's axes: exp(w) R and c + s. One of a lens is of log f, k1 and k2.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from biresnerf.field.numba_kernels import njit
 from biresnerf.refinement.adjustment.kernels.compiled import KERNEL, LEAST_DETERMINANT
 
 

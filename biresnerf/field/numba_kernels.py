@@ -1,0 +1,16 @@
+"""`njit` and `prange`, which all kernels import from here: Numba reads its target once, when it meets its first kernel.
+
+A process whose first kernel came from elsewhere would compile all of them again, for a target that no cache holds.
+"""
+
+from __future__ import annotations
+
+import llvmlite.binding
+from numba import njit, prange
+from numba.core import config
+
+__all__ = ["njit", "prange"]
+
+# LLVM avoids 512-bit registers by default; the field's kernels are long enough streams to gain from them.
+config.CPU_NAME = llvmlite.binding.get_host_cpu_name()  # type: ignore[attr-defined]
+config.CPU_FEATURES = llvmlite.binding.get_host_cpu_features().flatten() + ",-prefer-256-bit"  # type: ignore[attr-defined]
