@@ -7,28 +7,31 @@ import json
 import re
 from pathlib import Path
 
-from biresnerf.options.formats import Loss, Need, formats
+from biresnerf.options.formats import Format, Loss, Need, formats
 from docs.generate.markdown import DASH, table
 
 _TESTS = Path(__file__).resolve().parents[2] / "tests"
 _NAMES = {"bpy": "Blender", "gaussian-splatting": "3D Gaussian Splatting", "open3d": "Open3D"}
 _END = "<!-- end -->"
-_LOSSES: dict[Loss, str] = {  # except rigs, which the sentence below the table names
+_RARE: dict[Loss, str] = {  # the sentence below the table names the formats that hold them
+    "rigs": "rigs",
+    "mask paths": "paths of masks",
+}
+_LOSSES: dict[Loss, str] = {
     "poses": "poses",
     "names": "names: rows follow the order of the files' names",
     "lenses": "lenses",
-    "some lenses": "two focal lengths, a principal point off the centre, lenses other than [these](#camera-models)",
-    "distortion": "any distortion",
+    "some lenses": "lenses other than [these](#camera-models)",
+    "distortion": "distortion",
     "points": "points",
-    "mask paths": "paths of masks",
     "masks": "masks",
 }
 _NEEDS: dict[Need, str] = {
-    "photos": "the input's photos",
-    "images folder": "photos directly in `images/`, where `convert` puts them",
-    "lens file": "`camera.json` beside it for the lens",
+    "photos": "the photos",
+    "images folder": "photos directly in `images/`",
+    "lens file": "`camera.json` for the lens",
     "bounds": "depth bounds",
-    "input": "the input's own keys",
+    "input": "the input's keys",
 }
 
 
@@ -80,27 +83,38 @@ def _readers() -> dict[str, list[str]]:
 
 
 def _write_table() -> str:
-    rows, readers = [], _readers()
-    for one in formats().values():
-        if not (one.in_set or one.in_result):
-            continue
-        when = "always" if one.always else "on request" if one.on_request else "where the input has it"
-        lost = [_LOSSES[loss] for loss in one.loses if loss != "rigs"] + ([one.lacks] if one.lacks else [])
-        rows.append(
-            (
-                f"`{one.name}`",
-                f"`{one.in_result}`",
-                when,
-                f"`{one.in_set}`",
-                one.heading.removeprefix("For "),
-                ", ".join(_NEEDS[need] for need in one.needs) or DASH,
-                "; ".join(lost) or DASH,
-                ", ".join(readers.get(one.name, [])) or DASH,
+    readers = _readers()
+    written = [one for one in formats().values() if one.in_set or one.in_result]
+    head = ("format", "file in a result", "written", "for", "cannot hold", "opened by")
+    rows = [
+        (
+            f"`{one.name}`",
+            f"`{one.in_result}`" + (f" (`convert`: `{one.in_set}`)" if one.in_set != one.in_result else ""),
+            _when(one),
+            one.heading.removeprefix("For "),
+            "; ".join(
+                [_LOSSES[loss] for loss in one.loses if loss not in _RARE] + [one.lacks] * bool(one.lacks)
             )
+            or DASH,
+            ", ".join(readers.get(one.name, [])) or DASH,
         )
-    head = ("format", "in a result", "written", "by `convert`", "for", "needs", "cannot hold", "opened by")
-    hold_rigs = [f"`{one.name}`" for one in formats().values() if one.in_set and "rigs" not in one.loses]
-    return f"{table(head, rows)}\nOnly {' and '.join(hold_rigs)} hold rigs.\n"
+        for one in written
+    ]
+    held = [
+        f"{words} ({', '.join(f'`{one.name}`' for one in written if _holds(one, loss))})"
+        for loss, words in _RARE.items()
+    ]
+    return f"{table(head, rows)}\nOnly some hold {' and '.join(held)}.\n"
+
+
+def _when(one: Format) -> str:
+    when = "always" if one.always else "on request" if one.on_request else "where the input has it"
+    return when + (f"; needs {', '.join(_NEEDS[need] for need in one.needs)}" if one.needs else "")
+
+
+def _holds(one: Format, loss: Loss) -> bool:
+    """Whether it holds what most formats lose, and is more than a picture of the set."""
+    return loss not in one.loses and not {"masks", "lenses"} & set(one.loses)
 
 
 def page_formats() -> str:

@@ -28,8 +28,7 @@ BOP = Format(
     found_as=("scene_camera.json",),
     suffixes=(".json",),
     gives="lenses, and poses (mm) where it has cam_R_w2c",
-    checked_against="files written from its description; real ones of Feo-cat/TransparentObjectPose and, with poses, "
-    "of patricksko/PoseEstimator, against its matrices",
+    checked_against="its description; Feo-cat/TransparentObjectPose, patricksko/PoseEstimator",
 )
 _HINT = "Give the scene_camera.json of the scene."
 _Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]

@@ -38,7 +38,7 @@ EUROC = Format(
     ),
     suffixes=(".csv",),
     gives="poses of cam0, its times and lens",
-    checked_against="files written from its description; real poses of MichaelGrupp/evo",
+    checked_against="its description; MichaelGrupp/evo",
 )
 _HINT = (
     "Give mav0/ as the dataset has it: state_groundtruth_estimate0/data.csv, cam0/sensor.yaml and cam0/data/."

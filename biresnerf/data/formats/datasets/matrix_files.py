@@ -32,10 +32,7 @@ MATRIX_FILES = Format(
     rank=83,
     found_as=("pose", "poses", "."),
     gives="poses; one lens, or one an image, from the intrinsics beside them",
-    checked_against=(
-        "files written from the programs' sources; real ones of andyzeng/tsdf-fusion-python (7-Scenes), of "
-        "andyzeng/3dmatch-toolbox (3DMatch) and of borglab/gtsfm (MobileBrick), against their own numbers"
-    ),
+    checked_against="the programs' sources; andyzeng/tsdf-fusion-python, andyzeng/3dmatch-toolbox, borglab/gtsfm",
 )
 _HINT = "Give a file of 4 rows of 4 numbers for each image, camera to world."
 _FOLDERS = ("pose", "poses")

@@ -24,8 +24,7 @@ MVSNET = Format(
     rank=86,
     found_as=("cams",),
     gives="poses, one lens an image",
-    checked_against="files written from its source; real ones of LiangliangNan/RealCameraViewer, "
-    "against their matrices",
+    checked_against="its source; LiangliangNan/RealCameraViewer",
 )
 _HINT = "Give an extrinsic matrix of 4 rows and an intrinsic one of 3, each below its name."
 _SUFFIX = "_cam.txt"

@@ -27,7 +27,7 @@ NERFIES = Format(
     rank=92,
     found_as=("camera",),
     gives="poses and lenses",
-    checked_against="files written from its source; no real file was at hand",
+    checked_against="its source",
 )
 _HINT = "Give the camera/ that the capture was processed into."
 _SCALES = ("rgb/1x", "rgb/2x", "rgb/4x", "rgb/8x", "rgb/16x", "rgb")

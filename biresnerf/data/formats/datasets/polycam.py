@@ -28,7 +28,7 @@ POLYCAM = Format(
     rank=85,
     found_as=("keyframes/corrected_cameras", "corrected_cameras", "keyframes/cameras", "cameras"),
     gives="poses and lenses, those that Polycam corrected where it has them",
-    checked_against="files written from nerfstudio's reader; no real file was at hand",
+    checked_against="nerfstudio's reader",
 )
 _HINT = "Export the raw data from Polycam again."
 _PHOTOS = {"corrected_cameras": "corrected_images", "cameras": "images"}

@@ -30,7 +30,7 @@ RECORD3D = Format(
     found_as=("metadata.json", "metadata"),
     suffixes=(".json",),
     gives="poses; lenses, one an image where the app kept them",
-    checked_against="files written from nerfstudio's reader; a real one of YaroslavGladun/door_handle_detection",
+    checked_against="nerfstudio's reader; YaroslavGladun/door_handle_detection",
 )
 _HINT = "Export the capture from Record3D again (RGBD frames and metadata)."
 _Coefficients: TypeAlias = tuple[float, float, float, float]

@@ -28,7 +28,7 @@ SDFSTUDIO = Format(
     found_as=("meta_data.json",),
     suffixes=(".json",),
     gives="poses and lenses",
-    checked_against="files written from its reader; no real file was at hand",
+    checked_against="its reader",
 )
 _HINT = "Give the meta_data.json that sdfstudio's scripts wrote."
 

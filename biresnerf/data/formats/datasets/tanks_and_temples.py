@@ -26,7 +26,7 @@ TANKS_AND_TEMPLES = Format(
     found_as=("*.log",),
     suffixes=(".log",),
     gives="poses",
-    checked_against="files written from its converter; the test.log of isl-org/TanksAndTemples",
+    checked_against="its converter; isl-org/TanksAndTemples",
 )
 _HINT = "Give five lines an image: its number, the number in the reconstruction and an error; then 4 rows of 4 numbers."
 _BEGINS = re.compile(rb"\s*\d+\s+-?\d+\s+\S+[ \t]*\r?\n(\s*[-+]?[\d.]+(e[-+]?\d+)?){4}\s", re.IGNORECASE)

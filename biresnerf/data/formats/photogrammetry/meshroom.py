@@ -41,10 +41,7 @@ MESHROOM = Format(
     found_as=("cameras.sfm", "sfm.sfm"),
     suffixes=(".sfm",),
     gives="poses and lenses; versions 1.0.0 to 1.2.12",
-    checked_against=(
-        "files that `convert` wrote, and the same in later versions; a real one of ledionkalludra/LoD2to3, against its "
-        "own numbers"
-    ),
+    checked_against="its writer; ledionkalludra/LoD2to3",
     in_set="cameras.sfm",
     loses=("rigs", "mask paths"),
     instead="pinhole",

@@ -36,8 +36,7 @@ METASHAPE = Format(
     found_as=("*.xml",),
     suffixes=(".xml",),
     gives="poses, cameras of type frame, from a camera export (XML)",
-    checked_against="files written from its manual; two real ones of KU-Leuven-Geomatics/geomapi and one of "
-    "bitbyt3r/metashape-automation, with skew, against their own numbers",
+    checked_against="its manual; KU-Leuven-Geomatics/geomapi, bitbyt3r/metashape-automation (skew)",
 )
 
 

@@ -39,8 +39,7 @@ REALITYCAPTURE = Format(
     found_as=("realitycapture.csv", "*.csv"),
     suffixes=(".csv",),
     gives="poses and lenses, from a csv of internal and external camera parameters; poses, of omega, phi, kappa",
-    checked_against="files that `convert` wrote; omega, phi, kappa: a real one of KU-Leuven-Geomatics/geomapi, against "
-    "the program's own XMP",
+    checked_against="its writer; KU-Leuven-Geomatics/geomapi (omega, phi, kappa)",
     in_set="realitycapture.csv",
     loses=("rigs", "points", "mask paths"),
     instead="pinhole",

@@ -31,8 +31,7 @@ REALITYCAPTURE_XMP = Format(
     rank=66,
     found_as=("images", "."),
     gives="poses and lenses, from an .xmp beside each photo",
-    checked_against="files written from the article on its camera maths; two real ones of KU-Leuven-Geomatics/geomapi, "
-    "against the program's own csv",
+    checked_against="its article on camera maths; KU-Leuven-Geomatics/geomapi",
 )
 _HINT = "Export the XMP again, with poses and Brown3 distortion or none."
 _MODELS = ("perspective", "brown3", "brown3t2", "brown4", "brown4t2", "division")

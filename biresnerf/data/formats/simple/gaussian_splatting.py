@@ -28,7 +28,7 @@ GAUSSIAN_SPLATTING = Format(
     found_as=("cameras.json",),
     suffixes=(".json",),
     gives="poses, two focal lengths an image",
-    checked_against="files written from its source; one real file",
+    checked_against="its source; a real file",
 )
 _Vector = tuple[float, float, float]
 

@@ -45,7 +45,7 @@ TRAJECTORY = Format(
     ),
     suffixes=(".txt",),
     gives="poses, TUM's times; a camera from the file beside it, KITTI's in `calib.txt`",
-    checked_against="files written with SciPy's quaternions (TUM) and from its description (KITTI)",
+    checked_against="SciPy's quaternions (TUM); its description (KITTI)",
 )
 TUM = Format(
     name="tum",
