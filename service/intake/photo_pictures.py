@@ -5,15 +5,19 @@ It is made when it is asked for, in a child program: `python -m service.intake.p
 
 from __future__ import annotations
 
+import hashlib
+import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from biresnerf import __version__
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.wire.datasets import CheckedCamera, CheckedPhoto, PhotoList
 from service.http.access import Caller
 from service.intake.sandboxed_child import Limits, run_child, run_confined
 from service.intake.uploads import staging_folder
-from workers.records import PHOTO_LIST
+from workers.records import PHOTO_LIST, DatasetFile
 from workers.settings.errors import NotFound
 
 PictureName = Literal["picture.jpg", "mask.png"]
@@ -33,12 +37,37 @@ class DrawRequest(FrozenModel):
     name: PictureName
 
 
-async def photo_picture(caller: Caller, dataset_id: str, number: int, name: PictureName) -> bytes:
+@dataclass(frozen=True)
+class Picture:
+    """A picture that can be drawn, of files that are not read before it is."""
+
+    files: tuple[DatasetFile, ...]
+    photo: CheckedPhoto
+    camera: CheckedCamera
+    name: PictureName
+
+    @property
+    def etag(self) -> str:
+        """Differs where the picture may: with the files, what is drawn of them, or the version that draws."""
+        sources = [file.sha256 for file in self.files]
+        drawn = [self.photo.model_dump_json(), self.camera.model_dump_json(), self.name, __version__]
+        return f'"{hashlib.sha256(json.dumps(sources + drawn).encode()).hexdigest()[:32]}"'
+
+    async def drawn(self, caller: Caller) -> bytes:
+        """The picture; raises `ProblemError` (``validation_timeout``, ``validation_resources``)."""
+        service = caller.service
+        async with service.decoding.turn(caller.tenant), staging_folder(service.staging_dir) as folder:
+            sources = [(file.key, file.path) for file in self.files]
+            await service.stores.files.stage(sources, folder / _FILES)
+            request = DrawRequest(folder=folder, photo=self.photo, camera=self.camera, name=self.name)
+            await run_confined("service.intake.photo_pictures", request, _LIMITS)
+            return (folder / self.name).read_bytes()
+
+
+async def photo_picture(caller: Caller, dataset_id: str, number: int, name: PictureName) -> Picture:
     """The photo of that number, turned as its pose means it, or its mask: white where pixels count, of the same size.
 
-    Raises:
-        NotFound: there is no such photo, or no mask, or it is a frame of a video.
-        ProblemError: ``validation_timeout``, ``validation_resources``.
+    Raises `NotFound`: there is no such photo, or no mask, or it is a frame of a video.
     """
     listed = PhotoList.model_validate_json(await caller.datasets.shown(dataset_id, PHOTO_LIST))
     photo = listed.photos[number] if number < len(listed.photos) else None
@@ -47,13 +76,8 @@ async def photo_picture(caller: Caller, dataset_id: str, number: int, name: Pict
     if name == "mask.png" and not photo.masked:
         raise NotFound(f"Photo {number} of dataset {dataset_id} has no mask.")
     wanted = (photo.path, photo.mask.path) if photo.masked else (photo.path,)
-    files = [await caller.datasets.file(dataset_id, path) for path in wanted]
-    service = caller.service
-    async with service.decoding.turn(caller.tenant), staging_folder(service.staging_dir) as folder:
-        await service.stores.files.stage([(file.key, file.path) for file in files], folder / _FILES)
-        request = DrawRequest(folder=folder, photo=photo, camera=listed.cameras[photo.camera], name=name)
-        await run_confined("service.intake.photo_pictures", request, _LIMITS)
-        return (folder / name).read_bytes()
+    files = tuple([await caller.datasets.file(dataset_id, path) for path in wanted])
+    return Picture(files, photo, listed.cameras[photo.camera], name)
 
 
 def draw(request: DrawRequest) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from service.http.access import Caller, ReadCaller
 from service.http.dependencies import DatasetId, IfNoneMatch
 from service.http.http_conditionals import none_match
 from service.http.problems import declared
-from service.intake.photo_pictures import photo_picture
+from service.intake.photo_pictures import PictureName, photo_picture
 from workers.records import FIRST_PHOTO, PHOTO_LIST, PHOTO_SHEET
 
 router = APIRouter(prefix="/v1/datasets/{dataset_id}", tags=["datasets"])
@@ -59,8 +59,7 @@ async def get_photo_picture(
     dataset_id: DatasetId, photo: _Photo, caller: ReadCaller, if_none_match: IfNoneMatch = None
 ) -> Response:
     """One photo of a checked dataset, turned as its pose means it, at most 1,280 px long; not of a video."""
-    content = await photo_picture(caller, dataset_id, photo, "picture.jpg")
-    return _unless_known(content, "image/jpeg", if_none_match)
+    return await _drawn(caller, dataset_id, photo, "picture.jpg", "image/jpeg", if_none_match)
 
 
 @router.get("/photos/{photo}/mask.png", response_class=Response, responses=_picture("PNG", _DRAWN))
@@ -68,21 +67,30 @@ async def get_photo_mask(
     dataset_id: DatasetId, photo: _Photo, caller: ReadCaller, if_none_match: IfNoneMatch = None
 ) -> Response:
     """The mask of one photo, of the same size as its picture: pixels count where it is white."""
-    content = await photo_picture(caller, dataset_id, photo, "mask.png")
-    return _unless_known(content, "image/png", if_none_match)
+    return await _drawn(caller, dataset_id, photo, "mask.png", "image/png", if_none_match)
 
 
 async def _shown(
     caller: Caller, dataset_id: str, name: str, kind: str, if_none_match: str | None
 ) -> Response:
     content = await caller.datasets.shown(dataset_id, name)
-    return _unless_known(content, kind, if_none_match)
-
-
-def _unless_known(content: bytes, kind: str, if_none_match: str | None) -> Response:
-    etag = f'"{hashlib.sha256(content).hexdigest()[:32]}"'
-    # A checked dataset never changes.
-    headers = {"ETag": etag, "Cache-Control": "private, max-age=86400", "X-Content-Type-Options": "nosniff"}
-    if not none_match(if_none_match, etag):
+    headers = _headers(f'"{hashlib.sha256(content).hexdigest()[:32]}"')
+    if not none_match(if_none_match, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     return Response(content, media_type=kind, headers=headers)
+
+
+async def _drawn(
+    caller: Caller, dataset_id: str, photo: int, name: PictureName, kind: str, if_none_match: str | None
+) -> Response:
+    """Nothing is decoded for a browser that has the picture."""
+    picture = await photo_picture(caller, dataset_id, photo, name)
+    headers = _headers(picture.etag)
+    if not none_match(if_none_match, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    return Response(await picture.drawn(caller), media_type=kind, headers=headers)
+
+
+def _headers(etag: str) -> dict[str, str]:
+    # A checked dataset never changes.
+    return {"ETag": etag, "Cache-Control": "private, max-age=86400", "X-Content-Type-Options": "nosniff"}

@@ -14,6 +14,7 @@ from PIL import Image
 
 from biresnerf.data.photos.image_files import EXIF_ORIENTATION
 from tests.service.conftest import (
+    Running,
     Tenant,
     dataset_ids,
     new_dataset,
@@ -88,6 +89,41 @@ def test_a_photo_and_its_mask_are_shown_as_its_pose_means_them(tenants: tuple[Te
     problem(mine.get(f"{place}/3/picture.jpg"), 404, "not_found")
     problem(other.get(f"{place}/1/picture.jpg"), 404, "not_found")
     problem(mine.get(f"{place}/-1/picture.jpg"), 422, "invalid_request")
+
+
+def test_a_browser_that_has_a_picture_is_told_so_without_reading_the_photo(
+    tenants: tuple[Tenant, Tenant], closed: Running
+) -> None:
+    mine = tenants[0].http
+    photo, away = encoded(stripes(61, 47), "JPEG"), np.zeros((47, 61), dtype=bool)
+    away[:, :7] = True
+    files = {"0.jpg": photo, "1.jpg": encoded(stripes(61, 47)[::-1], "JPEG"), "2.jpg": photo}
+    files["dynamic_mask_0.png"] = encoded(away, "PNG")
+    poses: Any = {"camera_model": "PINHOLE", "w": 61, "h": 47, "fl_x": 60.0, "frames": []}
+    poses["frames"] = [{"file_path": f"{i}.jpg", "transform_matrix": shifted(i)} for i in range(3)]
+    dataset = new_dataset(mine)
+    upload(mine, dataset, zip_of(files | {"transforms.json": json.dumps(poses).encode()}))
+    assert mine.post(f"/v1/datasets/{dataset}/finalize").json()["state"] == "ready"
+    place = f"/v1/datasets/{dataset}/photos"
+    pictures = ("0/picture.jpg", "0/mask.png", "1/picture.jpg", "2/picture.jpg")
+    tags = [mine.get(f"{place}/{name}").headers["etag"] for name in pictures]
+    assert len(set(tags)) == len(pictures)
+    known = {"If-None-Match": tags[0]}
+    stored = [path for path in closed.data_dir.rglob("*") if path.is_file() and path.read_bytes() == photo]
+    assert stored
+    for path in stored:
+        path.unlink()
+    assert mine.get(f"{place}/0/picture.jpg").is_error, "the photo is gone"
+    answer = mine.get(f"{place}/0/picture.jpg", headers=known)
+    assert (answer.status_code, answer.headers["etag"], answer.content) == (304, tags[0], b"")
+    assert mine.get(f"{place}/1/picture.jpg", headers=known).status_code == 200
+
+
+def shifted(by: float) -> list[list[float]]:
+    pose = np.eye(4)
+    pose[0, 3] = by
+    shown: list[list[float]] = pose.tolist()
+    return shown
 
 
 def stripes(width: int, height: int) -> NDArray[np.uint8]:
