@@ -21,7 +21,7 @@ class Option:
 
     Attributes:
         stage: the first stage whose work depends on it.
-        title: its name in forms; empty for what forms leave out.
+        title: its name in forms and tables.
         changes_result: whether poses, field or verdict depend on it. Other options may change when a run resumes.
         level: main: what forms show first; usual: for every user; expert: for users who know the method; research: for
             experiments with the method, left out of forms.
@@ -29,14 +29,14 @@ class Option:
     """
 
     stage: Stage
-    title: str = ""
+    title: str
     changes_result: bool = True
     level: Level = "expert"
     smaller: Callable[[Any], Any] | None = None
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Callable[[Any], Schema]) -> Schema:
         metadata = {"stage": self.stage, "changes_result": self.changes_result, "level": self.level}
-        return {**handler(schema), **metadata, **({"title": self.title} if self.title else {})}
+        return {**handler(schema), **metadata, "title": self.title}
 
 
 def all_required(schema: Schema) -> None:

@@ -40,10 +40,10 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
-    preset: Annotated[PresetName, Option("coarse", level="usual")] = Field(
+    preset: Annotated[PresetName, Option("coarse", "Preset", level="usual")] = Field(
         "balanced", description="Provides the value of every option that is left out."
     )
-    method: Annotated[MethodName, Option("coarse", level="research")] = Field(
+    method: Annotated[MethodName, Option("coarse", "Method", level="research")] = Field(
         "biresnerf",
         description="biresnerf-paper: the two stages as published; the last three: other published methods.",
     )
@@ -161,34 +161,34 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     field_rate_final: Annotated[float | Open, Option("coarse", "Field rate at the end")] = Field(
         OPEN, gt=0, le=0.5, description="Field learning rate at the end."
     )
-    warmup_steps: Annotated[int | Open, Option("fine", level="research")] = Field(
+    warmup_steps: Annotated[int | Open, Option("fine", "Warm-up steps", level="research")] = Field(
         OPEN,
         ge=1,
         le=1_000_000,
         description="Steps in which the reconstruction module's learning rate rises.",
     )
-    double_pose_step: Annotated[bool | Open, Option("coarse", level="research")] = Field(
+    double_pose_step: Annotated[bool | Open, Option("coarse", "Second pose step", level="research")] = Field(
         OPEN,
         description="Also update the poses with a second Adam at the field's learning rate, as BAA-NGP's code does.",
     )
-    pose_levels: Annotated[int, Option("coarse", level="research")] = Field(
+    pose_levels: Annotated[int, Option("coarse", "Pose module: levels", level="research")] = Field(
         3, ge=1, le=16, description="Levels of the pose-estimation module."
     )
-    pose_resolution_min: Annotated[int, Option("coarse", level="research")] = Field(
-        16, ge=2, le=128, description="Cells per side of its coarsest level."
+    pose_resolution_min: Annotated[int, Option("coarse", "Pose module: coarsest level", level="research")] = (
+        Field(16, ge=2, le=128, description="Cells per side of its coarsest level.")
     )
-    pose_resolution_max: Annotated[int, Option("coarse", level="research")] = Field(
-        72, ge=2, le=8192, description="Cells per side of its finest level."
+    pose_resolution_max: Annotated[int, Option("coarse", "Pose module: finest level", level="research")] = (
+        Field(72, ge=2, le=8192, description="Cells per side of its finest level.")
     )
-    reconstruction_levels: Annotated[int | Open, Option("fine", level="research")] = Field(
-        OPEN, ge=1, le=16, description="Levels of the reconstruction module."
-    )
-    reconstruction_resolution_min: Annotated[int | Open, Option("fine", level="research")] = Field(
-        OPEN, ge=4, le=8192, description="Cells per side of its coarsest level."
-    )
-    reconstruction_resolution_max: Annotated[int | Open, Option("fine", level="research")] = Field(
-        OPEN, ge=4, le=16384, description="Cells per side of its finest level."
-    )
+    reconstruction_levels: Annotated[
+        int | Open, Option("fine", "Reconstruction module: levels", level="research")
+    ] = Field(OPEN, ge=1, le=16, description="Levels of the reconstruction module.")
+    reconstruction_resolution_min: Annotated[
+        int | Open, Option("fine", "Reconstruction module: coarsest level", level="research")
+    ] = Field(OPEN, ge=4, le=8192, description="Cells per side of its coarsest level.")
+    reconstruction_resolution_max: Annotated[
+        int | Open, Option("fine", "Reconstruction module: finest level", level="research")
+    ] = Field(OPEN, ge=4, le=16384, description="Cells per side of its finest level.")
     table_size_log2: Annotated[int | Open, Option("fine", "Table size", smaller=lowered(2, 10))] = Field(
         OPEN, ge=10, le=22, description="log2 of the entries of a hashed level."
     )

@@ -4,7 +4,8 @@ import { useCallback, useMemo } from "preact/hooks";
 import type { PosesDocument, Report, ViewFile } from "schemas";
 import { historyOf, pointsOf } from "./result/widget_data";
 import { ResultView } from "./result_view";
-import { count, duration, fixed, optionText } from "./widgets/numbers";
+import { count, duration, fixed } from "./widgets/numbers";
+import { optionText, optionTitle, worded } from "./widgets/option_words";
 
 /** What report_html.py embeds. */
 interface Embedded {
@@ -56,7 +57,7 @@ function ReportPage({ data, licences }: { data: Embedded; licences: string }) {
           <dl class="options">
             {Object.entries(report.options).map(([key, value]) => (
               <div key={key}>
-                <dt>{key}</dt>
+                <dt>{optionTitle(key)}</dt>
                 <dd>{optionText(value)}</dd>
               </div>
             ))}
@@ -95,7 +96,7 @@ function Notes({ title, lines }: { title: string; lines: readonly string[] }) {
       <h2>{title}</h2>
       <ul class="notes">
         {lines.map((line) => (
-          <li key={line}>{line}</li>
+          <li key={line}>{worded(line)}</li>
         ))}
       </ul>
     </div>

@@ -27,14 +27,14 @@ export function ResultView({ poses, report, view, points, history, urlOf }: Prop
       <div class="panel">
         <ResultSummary {...{ report, rows, cellOf }} onSelect={setSelected} />
       </div>
-      <div class="job-pictures">
-        <div class="panel panel-scene">
-          <h2>Cameras</h2>
-          <SceneView {...{ cameras, points, cellOf, photoOf, ...choice }} />
-        </div>
+      <div class="job-pictures compared">
         <div class="panel panel-compare">
           <h2>Before and after</h2>
           <ImageCompare names={names} views={view?.views ?? []} centres={centres} urlOf={urlOf} {...choice} />
+        </div>
+        <div class="panel panel-scene">
+          <h2>Cameras</h2>
+          <SceneView {...{ cameras, points, cellOf, photoOf, ...choice }} />
         </div>
       </div>
       <div class="panel">

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 from biresnerf.options.option import Level
 from biresnerf.options.presets import (
     COMMON_VALUES,
@@ -38,6 +40,12 @@ JSON Schema.
 - The worker resolves options for its device. A job shows them as `options` (as requested) and `resolved_options` (as used).
 - The page's form leaves out the options for research.
 """
+
+
+def option_titles() -> str:
+    """What the page and report.html call the options: biresnerf/viewer/option_titles.json."""
+    titles = {name: option.title for name, option in OPTIONS.items()}
+    return json.dumps(titles, indent=1, ensure_ascii=False) + "\n"
 
 
 def options_page() -> str:

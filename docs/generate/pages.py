@@ -10,7 +10,7 @@ from pathlib import Path
 from docs.generate.commands_page import commands_page
 from docs.generate.format_tables import format_page, page_formats
 from docs.generate.notebooks import notebook
-from docs.generate.options_page import options_page
+from docs.generate.options_page import option_titles, options_page
 from docs.generate.pictures.badges import badges
 from docs.generate.pictures.conventions import conventions_svg
 from docs.generate.result_schema import result_schema
@@ -36,6 +36,7 @@ def _writers() -> dict[Path, Callable[[], str]]:
         ROOT / "docs/commands.md": commands_page,
         formats: partial(format_page, formats),
         ROOT / "service/web/formats.json": page_formats,
+        ROOT / "biresnerf/viewer/option_titles.json": option_titles,
         ROOT / "docs/result.schema.json": result_schema,
         ROOT / "docs/openapi.json": openapi_document,
         ROOT / "docs/pictures/conventions.svg": conventions_svg,

@@ -18,7 +18,9 @@ def expect_compared(page: Page, api: httpx.Client, first_job: str, second_job: s
         box.check()
     page.get_by_role("link", name="Compare").click()
     figures = page.get_by_role("region", name="Figures of both jobs")
-    expect(figures.get_by_role("row").filter(has_text="Option trial_steps")).to_contain_text("100000")
+    expect(figures.get_by_role("row").filter(has_text="Option “Steps of the verdict”")).to_contain_text(
+        "100000"
+    )
     expect(page.get_by_role("img", name="PSNR of the training views")).to_be_visible()
     differing = page.get_by_role("region", name="Differences of poses").get_by_role("row")
     expect(differing).to_have_count(11)

@@ -6,7 +6,6 @@ import re
 import shutil
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,8 @@ import pytest
 from click.testing import CliRunner
 from playwright.sync_api import (
     Browser,
-    BrowserContext,
-    ConsoleMessage,
     Locator,
     Page,
-    Route,
     expect,
     sync_playwright,
 )
@@ -27,20 +23,15 @@ from playwright.sync_api import (
 import hatch_build
 from biresnerf.commands.poses.make_scene import make_scene_command
 from tests.service.conftest import Running, running_service, short_folder
+from tests.web.watched import DESKTOP, PATIENCE_MS, PHONE, Watched, watched_page
 
 ROOT = Path(__file__).resolve().parents[2]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-SCREENSHOTS = ROOT / "build" / "screenshots"
-AXE = ROOT / "node_modules" / "axe-core" / "axe.min.js"
 # WebGL without a GPU, and the page painted without either: a sixth of the work.
 ARGUMENTS = [
     *("--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 ]
-DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 360, "height": 740}
-NARROW = {"width": 390, "height": 844}
-# On a machine that others use as well.
-PATIENCE_MS = 480_000
 expect.set_options(timeout=PATIENCE_MS)
 # The browser's own notifications, noted; and a user who looks at another window.
 LOOKS_ELSEWHERE = """
@@ -51,10 +42,6 @@ LOOKS_ELSEWHERE = """
         constructor(title, more) { super(title, more); window.told.push(title); }
     };
 """
-# Targets of 24 px are the one rule that axe leaves off.
-AXE_OPTIONS = "{resultTypes: ['violations'], rules: {'target-size': {enabled: true}}}"
-# What of a page's accessibility may not be wrong.
-SERIOUS = {"serious", "critical"}
 
 
 # Of a module, not of the session: its event loop runs in the main thread, where other tests want their own.
@@ -88,72 +75,6 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert said.exit_code == 0, said.output
     return folder
-
-
-@dataclass
-class Watched:
-    """A page, and what it asked for and complained of."""
-
-    page: Page
-    outside: list[str] = field(default_factory=list)
-    complaints: list[str] = field(default_factory=list)
-
-    def screenshot(self, name: str, *, full: bool = True) -> None:
-        SCREENSHOTS.mkdir(parents=True, exist_ok=True)
-        self.page.screenshot(path=SCREENSHOTS / f"{name}.png", full_page=full)
-
-    def serious_findings(self) -> list[str]:
-        """What axe finds wrong here, by rule and place."""
-        # A script tag would be against the page's own policy.
-        self.page.evaluate(AXE.read_text())
-        found: dict[str, Any] = self.page.evaluate(f"axe.run(document, {AXE_OPTIONS})")
-        return [
-            f"{one['id']}: {node['target']} {node['failureSummary']}"
-            for one in found["violations"]
-            if one["impact"] in SERIOUS
-            for node in one["nodes"]
-        ]
-
-    def findings_in_each_look(self) -> list[str]:
-        """The same in light and dark, wide and 390 px; and where one has to scroll sideways or has a small target."""
-        found = []
-        for scheme in ("dark", "light"):
-            for size in (NARROW, DESKTOP):
-                self.page.emulate_media(color_scheme=scheme)
-                self.page.set_viewport_size(size)
-                here = self.serious_findings() + (["it overflows"] if self.overflows() else [])
-                found += [f"{scheme}, {size['width']} px: {one}" for one in here]
-        return found
-
-    def overflows(self) -> bool:
-        """Whether one would have to scroll sideways."""
-        width = "document.documentElement.scrollWidth > document.documentElement.clientWidth"
-        return bool(self.page.evaluate(width))
-
-
-def complaint(said: ConsoleMessage) -> list[str]:
-    """What the browser says is wrong; a preview that another one replaced meanwhile is not."""
-    replaced = "/artifacts/preview/" in said.location["url"] and "404" in said.text
-    return [said.text] if said.type == "error" and not replaced else []
-
-
-def watched_page(context: BrowserContext, origin: str) -> Watched:
-    """A page that reaches the service alone; what else it asks for is refused and noted."""
-    watched = Watched(context.new_page())
-
-    def decide(route: Route) -> None:
-        url = route.request.url
-        if url.startswith((origin, "blob:", "data:")):
-            route.continue_()
-        else:
-            watched.outside.append(url)
-            route.abort()
-
-    context.route("**/*", decide)
-    watched.page.on("pageerror", lambda error: watched.complaints.append(str(error)))
-    watched.page.on("console", lambda said: watched.complaints.extend(complaint(said)))
-    watched.page.set_default_timeout(PATIENCE_MS)
-    return watched
 
 
 @pytest.fixture(scope="module")
@@ -254,7 +175,7 @@ def job_url(desktop: Watched, service: Running, kitchen: Path) -> str:
     submit = page.get_by_role("button", name="Refine the poses")
     expect(submit).to_be_visible()
     expect(check_row(page, "Poses")).to_contain_text("10 of 10 given")
-    assert desktop.serious_findings() == []
+    assert desktop.findings() == []
     page.get_by_text("A first result within minutes").click()
     page.get_by_label("Starting poses", exact=True).select_option("given")
     page.get_by_text("More options").click()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from playwright.sync_api import Browser, Page, expect
 
-from tests.web.conftest import DESKTOP, watched_page
+from tests.web.watched import DESKTOP, watched_page
 
 
 def expect_a_link_to_show_the_page_until_it_is_revoked(browser: Browser, page: Page, origin: str) -> None:

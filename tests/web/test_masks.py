@@ -17,7 +17,8 @@ from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
 from tests.service.conftest import Running
-from tests.web.conftest import Watched, check_row, drop
+from tests.web.conftest import check_row, drop
+from tests.web.watched import Watched
 
 PHOTO, SIZE = "train/r_3", 40
 # Rows and columns of a passer-by in one colour.

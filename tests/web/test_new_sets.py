@@ -14,7 +14,8 @@ from playwright.sync_api import Page, expect
 from biresnerf.viewer.report_html import read_report
 from service.web_page import EXAMPLE
 from tests.service.conftest import LIMITS, Running
-from tests.web.conftest import Watched, check_row, drop, zip_of
+from tests.web.conftest import check_row, drop, zip_of
+from tests.web.watched import Watched
 
 
 @pytest.fixture
@@ -72,7 +73,7 @@ def test_a_finished_example_is_one_click_away_and_needs_no_job(
     page.get_by_role("slider", name="Swipe between before and after").press("Home")
     expect(page.locator(".curves canvas").first).to_be_visible()
     tab.screenshot("example")
-    assert tab.serious_findings() == []
+    assert tab.findings() == []
     assert (tab.outside, tab.complaints) == ([], [])
     assert api.get("/jobs").json()["items"] == before
 
@@ -150,7 +151,7 @@ def test_a_refused_set_says_why_and_takes_another_also_after_a_reload(
         expect(page.get_by_text("Choose a folder")).to_be_visible()
         page.reload()
     tab.screenshot(f"refused-{fill.__name__.replace('_', '-')}")
-    assert tab.serious_findings() == []
+    assert tab.findings() == []
     assert tab.complaints == []
 
 

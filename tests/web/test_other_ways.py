@@ -15,11 +15,24 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, Route, expect
 
 from biresnerf.client import Client
+from tests.data.photos.video.filmed import film
 from tests.service.conftest import Running, running_service, short_folder
-from tests.web.conftest import DESKTOP, PHONE, Watched, check_row, drop, watched_page, zip_of
+from tests.web.conftest import check_row, drop, zip_of
+from tests.web.watched import DESKTOP, PHONE, Watched, watched_page
 
 PROGRAM = Path(__file__).with_name("matching_program.py")
 WAITING = 55
+# The picture with all photos is there, and more than one colour is seen of it.
+SHEET_DRAWN = """async () => {
+    const thumb = document.querySelector(".photo .thumb");
+    const url = thumb && /url\\("(.*)"\\)/.exec(getComputedStyle(thumb).backgroundImage)?.[1];
+    if (!url) return false;
+    const bitmap = await createImageBitmap(await (await fetch(url)).blob());
+    const pen = new OffscreenCanvas(bitmap.width, bitmap.height).getContext("2d");
+    pen.drawImage(bitmap, 0, 0);
+    const {data} = pen.getImageData(0, 0, bitmap.width, bitmap.height);
+    return new Set(data.filter((_, i) => i % 4 === 0)).size > 50;
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -150,8 +163,41 @@ def test_a_job_that_fails_says_what_and_what_to_do(
     page.get_by_role("button", name="Refine the poses").click()
     expect(page.get_by_role("alert")).to_contain_text("What to do")
     tab.screenshot("job-failed")
-    assert tab.serious_findings() == []
+    assert tab.findings() == []
     expect(page.get_by_role("button", name="Run again …")).to_be_visible()
+
+
+def test_options_that_contradict_each_other_are_named_as_in_the_form(
+    tab: Watched, service: Running, kitchen: Path
+) -> None:
+    page = tab.page
+    page.goto(service.url)
+    drop(page, kitchen)
+    page.get_by_text("More options").click()
+    page.get_by_label("Shortest stage 1", exact=True).fill("300")
+    page.get_by_label("Longest stage 1", exact=True).fill("200")
+    page.get_by_role("button", name="Refine the poses").click()
+    refusal = page.get_by_role("alert").first
+    expect(refusal).to_contain_text("“Shortest stage 1” (300) must not exceed “Longest stage 1” (200)")
+    assert tab.findings() == []
+
+
+def test_the_frames_of_a_video_are_shown_and_the_page_says_that_they_cannot_be_masked(
+    tab: Watched, service: Running, tmp_path: Path
+) -> None:
+    page, video = tab.page, tmp_path / "walk.mov"
+    film(video, range(0, 200, 5), [False] * 40)
+    page.goto(service.url)
+    drop(page, video)
+    frames = page.get_by_role("button", name=re.compile(r"^Leave out .*walk"))
+    expect(frames).to_have_count(40)
+    expect(page.get_by_text("masks need photos")).to_be_visible()
+    expect(page.get_by_role("radio", name="masks parts of it")).to_have_count(0)
+    page.wait_for_function(SHEET_DRAWN)
+    frames.first.click()
+    expect(page.get_by_role("region", name="What will happen")).to_contain_text("1 photo of 40 is left out.")
+    tab.screenshot("video")
+    assert tab.findings() == []
 
 
 def test_a_long_list_is_shown_piece_by_piece_and_all_of_it_is_live(
@@ -234,6 +280,6 @@ def test_what_feature_matches_say_is_seen_while_they_are_looked_for(
         expect(page.get_by_role("img", name="Each photo matches 0 to")).to_be_visible()
         expect(page.get_by_text("no other so far")).to_contain_text("r_9")
         watched.screenshot(name)
-        assert watched.serious_findings() == []
+        assert watched.findings() == []
         assert not watched.overflows()
         assert watched.complaints == []

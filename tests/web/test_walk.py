@@ -16,10 +16,11 @@ from playwright.sync_api import Browser, expect
 
 from tests.service.conftest import Running, operator
 from tests.web.comparison import expect_compared
-from tests.web.conftest import LOOKS_ELSEWHERE, Watched, again, another_job, asked_after_reload, curve_steps
+from tests.web.conftest import LOOKS_ELSEWHERE, again, another_job, asked_after_reload, curve_steps
 from tests.web.download_lines import expect_lines_to_bring_the_same
-from tests.web.photo_over_view import expect_photo_over_the_view
+from tests.web.result_views import expect_photo_over_the_view, expect_ticked_images_in_another_run
 from tests.web.sharing import expect_a_link_to_show_the_page_until_it_is_revoked
+from tests.web.watched import Watched
 
 
 def test_progress_is_live_and_a_reload_keeps_the_curves(desktop: Watched, job_url: str) -> None:
@@ -29,6 +30,7 @@ def test_progress_is_live_and_a_reload_keeps_the_curves(desktop: Watched, job_ur
     shown = curve_steps(page)
     share = int(bar.get_attribute("aria-valuenow") or 0)
     desktop.screenshot("job-running")
+    assert desktop.findings() == []
     page.wait_for_function(
         "was => Number(document.querySelector('[role=progressbar]').getAttribute('aria-valuenow')) > was",
         arg=share,
@@ -95,15 +97,8 @@ def test_the_table_sorts_and_chooses(desktop: Watched, done: dict[str, Any]) -> 
     expect(table.locator("tr[aria-current]")).to_have_count(1)
 
 
-def test_ticked_images_are_held_in_another_run(desktop: Watched, done: dict[str, Any]) -> None:
-    page = desktop.page
-    for name in ("./train/r_3", "./train/r_8"):
-        page.get_by_label(f"Select {name}", exact=True).check()
-    page.get_by_role("button", name="Run again with their given poses fixed").click()
-    dialog = page.get_by_role("dialog", name="Run again with other options")
-    expect(dialog.get_by_label("Photos to keep fixed", exact=True)).to_have_value("./train/r_3, ./train/r_8")
-    page.keyboard.press("Escape")
-    expect(dialog).to_be_hidden()
+def test_ticked_images_are_held_or_left_out_in_another_run(desktop: Watched, done: dict[str, Any]) -> None:
+    expect_ticked_images_in_another_run(desktop.page)
 
 
 def test_the_verdict_is_the_reports(desktop: Watched, done: dict[str, Any], api: httpx.Client) -> None:
@@ -153,7 +148,7 @@ def test_the_list_shows_the_job_with_its_picture_and_verdict(desktop: Watched, d
     page.wait_for_function("() => document.querySelector('.job-card img')?.naturalWidth > 0")
     expect(card.locator(".chip")).to_be_visible()
     desktop.screenshot("jobs")
-    assert desktop.serious_findings() == []
+    assert desktop.findings() == []
 
 
 def test_all_of_it_can_be_reached_by_keyboard(desktop: Watched, done: dict[str, Any]) -> None:
@@ -189,7 +184,7 @@ def test_all_of_it_can_be_reached_by_keyboard(desktop: Watched, done: dict[str, 
 
 
 def test_the_result_is_accessible_and_stayed_at_home(desktop: Watched, done: dict[str, Any]) -> None:
-    assert desktop.serious_findings() == []
+    assert desktop.findings() == []
     assert desktop.outside == []
     assert desktop.complaints == []
 
@@ -206,7 +201,7 @@ def test_a_phone_shows_the_same_without_scrolling_sideways(
             expect(page.locator(".curves canvas").first).to_be_visible()
         phone.screenshot(name)
         assert not phone.overflows(), name
-        assert phone.serious_findings() == []
+        assert phone.findings() == []
     assert phone.outside == []
     assert phone.complaints == []
 
@@ -222,7 +217,7 @@ def test_a_job_is_run_again_ended_and_deleted(
     steps = dialog.get_by_label("Steps", exact=True)
     assert steps.get_attribute("placeholder") == "500"
     steps.fill("20000")
-    assert tab.serious_findings() == []
+    assert tab.findings() == []
     dialog.get_by_role("button", name="Run from the start").click()
     job = another_job(page, job_url)
     options = api.get(f"/jobs/{job}").json()["options"]

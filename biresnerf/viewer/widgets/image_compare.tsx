@@ -69,7 +69,7 @@ function Picture(props: { view: ShownView; name: string; mode: Mode; urlOf: Imag
   const [at, setAt] = useState(0.5);
   const [missing, setMissing] = useState<string | null>(null);
   const [left, right] = SWIPES[mode === "refined" ? "refined" : "swipe"];
-  const frame = { aspectRatio: `${view.width} / ${view.height}`, maxWidth: `calc(62vh * ${view.width / view.height})` };
+  const frame = { aspectRatio: `${view.width} / ${view.height}`, maxWidth: `calc(max(62vh, 512px) * ${view.width / view.height})` };
   const picture = (kind: PictureKind, alt: string, style?: Record<string, string>) => {
     const file = view.pictures[kind];
     const source = file && urlOf(file);

@@ -39,9 +39,6 @@ export function duration(seconds: number): string {
     : `${Math.floor(minutes / 60)} h ${String(minutes % 60).padStart(2, "0")} min`;
 }
 
-/** The value of an option as it is set. */
-export const optionText = (value: unknown): string => (typeof value === "string" ? value : (JSON.stringify(value) ?? "–"));
-
 /** A predicted time, no more exact than it is. */
 export function roughly(seconds: number): string {
   if (seconds < 55) return `${Math.max(5, 5 * Math.round(seconds / 5))} s`;

@@ -1,8 +1,9 @@
 // The answer of a result: the verdict, its plain figures, warnings, and the photos that deserve a look.
 import type { ComponentChildren } from "preact";
-import type { Report } from "schemas";
+import type { PairedDifference, Report } from "schemas";
 import type { ImageRow, SheetCell } from "../result/widget_data";
-import { count, fixed, median, short } from "./numbers";
+import { count, fixed, median, short, signed } from "./numbers";
+import { worded } from "./option_words";
 import { Thumb } from "./thumb";
 import { Evidence, VerdictSentence } from "./verdict";
 import { ADVICE, ALARMING, type Flag } from "./words";
@@ -40,7 +41,7 @@ export function ResultSummary({ report, rows, cellOf, onSelect, actionsOf }: Res
       {report.warnings.length > 0 && (
         <ul class="warnings" aria-label="Warnings">
           {report.warnings.map((warning) => (
-            <li key={warning}>{warning}</li>
+            <li key={warning}>{worded(warning)}</li>
           ))}
         </ul>
       )}
@@ -92,16 +93,17 @@ interface Figure {
   readonly note: string;
 }
 
-/** What a person asks first: how many, how far, how exact, how well it renders. */
+/** What a person asks first: how sure, how far, how exact, how many, how well it renders. */
 function figuresOf(report: Report, rows: readonly ImageRow[]): Figure[] {
   const confirmed = rows.filter(({ flags }) => !flags.includes("uncertainty") && !flags.includes("contradicted")).length;
   const turned = rows.map((row) => row.moved_deg);
   const bounds = rows.flatMap(({ rotation_90 }) => (rotation_90 === null ? [] : [rotation_90]));
   const positions = rows.flatMap(({ position_90 }) => (position_90 === null ? [] : [position_90]));
   const error = report.verdict?.epipolar?.error_px;
+  const gain = report.verdict?.heldout?.psnr;
   const kept = report.verdict?.returned === "input";
   return [
-    { name: "Photos confirmed", value: `${confirmed} of ${rows.length}`, note: "poses that photos or matches support" },
+    ...(gain ? [{ name: "Unseen views gain", value: `${signed(gain.difference, 1)} dB`, note: sureWords(gain) }] : []),
     {
       name: kept ? "Refined cameras differ by" : "Cameras turned by",
       value: `${short(median(turned), 2)}°`,
@@ -119,8 +121,15 @@ function figuresOf(report: Report, rows: readonly ImageRow[]): Figure[] {
           },
         ]
       : []),
+    { name: "Photos confirmed", value: `${confirmed} of ${rows.length}`, note: "by matches or by the photo itself" },
     ...(report.heldout
       ? [{ name: "Final render", value: `${fixed(report.heldout.psnr, 1)} dB`, note: `PSNR of ${count(report.heldout.count, "unseen view")}` }]
       : []),
   ];
+}
+
+/** How sure a gain in PSNR is. */
+function sureWords({ low, high, count: views }: PairedDifference): string {
+  const test = `in the test on ${count(views, "view")}`;
+  return low === null || high === null ? test : `${signed(low, 1)} to ${signed(high, 1)} dB (95 % sure), ${test}`;
 }

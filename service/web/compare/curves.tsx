@@ -23,7 +23,7 @@ export function OverlaidCurves({ sides }: { sides: readonly [Side, Side] }) {
         height: HEIGHT_PX,
         legend: { show: false },
         scales: { x: { time: false } },
-        axes: [chartAxis({}), chartAxis({ label: "PSNR (dB)", size: 46 })],
+        axes: [chartAxis({ label: "step", size: 26 }), chartAxis({ label: "PSNR (dB)", size: 46 })],
         series: [
           {},
           ...sides.map(({ job }, index): uPlot.Series => ({

@@ -4,7 +4,8 @@ import type { ArtifactList, JobView, PosesDocument, Report } from "schemas";
 import { differencesOf } from "../../../biresnerf/viewer/result/align";
 import { type CurvePoint, historyOf } from "../../../biresnerf/viewer/result/widget_data";
 import { ScrolledTable } from "../../../biresnerf/viewer/widgets/controls";
-import { count, duration, fixed, median, optionText, short } from "../../../biresnerf/viewer/widgets/numbers";
+import { count, duration, fixed, median, short } from "../../../biresnerf/viewer/widgets/numbers";
+import { optionText, optionTitle } from "../../../biresnerf/viewer/widgets/option_words";
 import { once, useLoaded } from "../api/hooks";
 import { Problem, request, requestJson } from "../api/http";
 import { Chip, titleOf } from "../jobs/state";
@@ -76,7 +77,7 @@ const FIGURES: readonly { name: string; of: (side: Side) => string }[] = [
   { name: "Time", of: ({ report }) => duration(Object.values(report.seconds).reduce((a, b) => a + b, 0)) },
 ];
 const psnr = (value: number | null | undefined) => unit(fixed(value ?? null, 2), "dB");
-const unit = (text: string, name: string) => (text === "–" ? text : `${text} ${name}`);
+const unit = (text: string, name: string) => (text === "–" ? text : name === "°" ? `${text}°` : `${text} ${name}`);
 
 function Figures({ sides }: { sides: Sides }) {
   const options = sides.map(({ report }) => report.options as Readonly<Record<string, unknown>>);
@@ -98,7 +99,7 @@ function Figures({ sides }: { sides: Sides }) {
           <Row key={name} name={name} texts={sides.map(of)} />
         ))}
         {differing.map((name) => (
-          <Row key={name} name={`Option ${name}`} texts={options.map((values) => optionText(values[name]))} />
+          <Row key={name} name={`Option “${optionTitle(name)}”`} texts={options.map((values) => optionText(values[name]))} />
         ))}
       </tbody>
     </ScrolledTable>
@@ -129,12 +130,12 @@ function PoseTable({ first, second }: { first: Side; second: Side }) {
       <ScrolledTable label="Differences of poses">
         <thead>
           <tr>
-            <th scope="col">image</th>
+            <th scope="col">photo</th>
             <th scope="col" class="number">
               rotation °
             </th>
             <th scope="col" class="number">
-              distance
+              distance, units
             </th>
           </tr>
         </thead>

@@ -1,5 +1,6 @@
 // A job that did not succeed: what failed, for which images, and what to do next.
 import type { JobView } from "schemas";
+import { optionText, optionTitle } from "../../../biresnerf/viewer/widgets/option_words";
 import { ProblemBox } from "../parts/problem_box";
 
 export function Failure({ job, images }: { job: JobView; images: readonly string[] }) {
@@ -28,7 +29,7 @@ export function Failure({ job, images }: { job: JobView; images: readonly string
       )}
       {reduced.length > 0 && (
         <p>
-          Its second attempt used less memory: {reduced.map(([name, value]) => `${name} ${String(value)}`).join(", ")}.
+          Its second attempt used less memory: {reduced.map(([name, value]) => `${optionTitle(name)}: ${optionText(value)}`).join(", ")}.
         </p>
       )}
       {!error.hint && <p>{NEXT[error.code] ?? "The log below shows what it did last."}</p>}
@@ -56,8 +57,8 @@ const HEADINGS: Record<string, string> = {
   diverged: "The optimisation diverged",
 };
 const NEXT: Record<string, string> = {
-  timeout: "Run it again with fewer steps or smaller images (max_image_size), or ask the operator for more time.",
-  out_of_memory: "Run it again with a smaller max_image_size or samples_per_step, or with fewer photos.",
+  timeout: "Run it again with fewer steps or a smaller working image size, or ask the operator for more time.",
+  out_of_memory: "Run it again with a smaller working image size, with fewer samples per step, or with fewer photos.",
   too_many_crashes: "Run it again once; if it crashes again, send the operator its log.",
-  diverged: "Run it again with a smaller pose_rate, or have COLMAP find the poses (start: colmap).",
+  diverged: "Run it again with a smaller pose rate at the start, or with starting poses from COLMAP.",
 };

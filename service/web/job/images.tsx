@@ -1,4 +1,4 @@
-// The table of images; the job can be run again with the given poses of the ticked images kept fixed.
+// The table of images; the job can be run again without some of them, or with their given poses kept fixed.
 import { useState } from "preact/hooks";
 import type { JobView } from "schemas";
 import type { ImageRow } from "../../../biresnerf/viewer/result/widget_data";
@@ -23,7 +23,6 @@ export function Images({ job, widgets, ...table }: Props) {
   };
   const chosen = table.rows.filter(({ image }) => ticked.has(image));
   const given = chosen.filter(({ source }) => source === "given");
-  const fix = () => runAgainFixed(job, given);
   return (
     <>
       <widgets.ImageTable {...table} {...(isOver(job) && !shared.value && { ticked, onTick: tick })} />
@@ -31,8 +30,11 @@ export function Images({ job, widgets, ...table }: Props) {
         <p class="ticked" role="status">
           {count(chosen.length, "image")} selected
           {given.length < chosen.length && `, ${given.length} with a given pose`}
-          <button type="button" class="act small" disabled={given.length === 0} onClick={fix}>
+          <button type="button" class="act small" disabled={given.length === 0} onClick={() => runAgainWith(job, "fixed", given)}>
             Run again with their given poses fixed …
+          </button>
+          <button type="button" class="act small" onClick={() => runAgainWith(job, "leave_out", chosen)}>
+            Run again without them …
           </button>
           <CopyButton text={chosen.map(({ name }) => name).join("\n")} what="of the selected images" label="Copy names" />
         </p>
@@ -41,16 +43,23 @@ export function Images({ job, widgets, ...table }: Props) {
   );
 }
 
-/** Opens the dialog for another run that keeps the given poses of these images. */
-function runAgainFixed(job: JobView, rows: readonly ImageRow[]): void {
-  const before = Array.isArray(job.options.fixed) ? job.options.fixed : [];
-  runAgainRequest.set({ job: job.id, values: { fixed: [...new Set([...before, ...rows.map(({ name }) => name)])] } });
+/** Opens the dialog for another run that also keeps the given poses of these images fixed, or leaves them out. */
+function runAgainWith(job: JobView, option: "fixed" | "leave_out", rows: readonly ImageRow[]): void {
+  const before = job.options[option];
+  const names = [...(Array.isArray(before) ? before : []), ...rows.map(({ name }) => name)];
+  runAgainRequest.set({ job: job.id, values: { [option]: [...new Set(names)] } });
 }
 
 /** What the page offers for a photo that deserves a look. */
-export const holdActions = (job: JobView) => (row: ImageRow) =>
-  row.source === "given" && (
-    <button type="button" class="act small" onClick={() => runAgainFixed(job, [row])}>
-      Keep its given pose …
+export const photoActions = (job: JobView) => (row: ImageRow) => (
+  <span class="photo-actions">
+    {row.source === "given" && (
+      <button type="button" class="act small" onClick={() => runAgainWith(job, "fixed", [row])}>
+        Keep its given pose …
+      </button>
+    )}
+    <button type="button" class="act small" onClick={() => runAgainWith(job, "leave_out", [row])}>
+      Leave it out …
     </button>
-  );
+  </span>
+);

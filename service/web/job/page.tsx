@@ -1,12 +1,14 @@
 // One job: its progress, its result and what can be done with it.
 import { useEffect, useMemo, useState } from "preact/hooks";
 import type { JobView } from "schemas";
-import { duration, optionText } from "../../../biresnerf/viewer/widgets/numbers";
+import { duration, short } from "../../../biresnerf/viewer/widgets/numbers";
+import { optionText, optionTitle } from "../../../biresnerf/viewer/widgets/option_words";
+import { VERDICTS } from "../../../biresnerf/viewer/widgets/words";
 import { shared } from "../api/http";
 import { pictureUrl } from "../api/picture_urls";
 import { useStore } from "../api/store";
 import { Downloads } from "../downloads/downloads";
-import { Chip, isOver, ProgressBar, type Stage, STAGE_WORDS, titleOf } from "../jobs/state";
+import { Chip, isOver, ProgressBar, type Stage, STAGE_WORDS, STATE_WORDS, titleOf } from "../jobs/state";
 import { moment } from "../parts/format";
 import { NotifySwitch } from "../parts/notify";
 import { ProblemBox } from "../parts/problem_box";
@@ -26,7 +28,7 @@ export function JobPage({ id }: { id: string }) {
   const seen = useStore(live);
   const guest = useStore(shared);
   const { job, problem } = seen;
-  useTitle(job ? `${titleOf(job)} · ${job.verdict ?? job.state}` : "Job");
+  useTitle(job ? `${titleOf(job)} · ${endWords(job)}` : "Job");
   if (!job) return problem ? <ProblemBox problem={problem} /> : <p class="soft">Loading …</p>;
   return (
     <article class="job">
@@ -42,49 +44,50 @@ export function JobPage({ id }: { id: string }) {
   );
 }
 
+const endWords = ({ verdict, state }: JobView): string => (verdict ? VERDICTS[verdict].word : STATE_WORDS[state]);
+
 function Head({ job, seen }: { job: JobView; seen: LiveState }) {
   return (
     <header class="job-header">
       <div class="page-head">
         <h1>
-          <bdi>{titleOf(job)}</bdi> <Chip job={job} />
+          <bdi>{titleOf(job)}</bdi> {job.state === "succeeded" && job.verdict ? null : <Chip job={job} />}
         </h1>
         <Actions job={job} />
       </div>
       <ProgressBar job={job} />
       {!isOver(job) && <LiveNumbers job={job} connected={seen.connected} />}
-      {!isOver(job) && <NotifySwitch />}
       {!shared.value && job.expires_at && job.state !== "expired" && <p class="soft">Its files are kept until {moment(job.expires_at)}.</p>}
     </header>
   );
 }
 
 function LiveNumbers({ job, connected }: { job: JobView; connected: boolean }) {
-  const { loss, psnr, moved_deg } = job.metrics;
+  const { psnr, moved_deg } = job.metrics;
   const numbers = [
-    ["Loss", loss?.toExponential(2), ""],
-    ["PSNR", psnr?.toFixed(2), "dB"],
-    ["Cameras turn", moved_deg?.toPrecision(2), "° per check"],
-    ["Attempt", job.attempt > 1 ? String(job.attempt) : undefined, ""],
-  ].filter(([, value]) => value !== undefined);
+    ["Fit to the photos", psnr === undefined ? "" : `${psnr.toFixed(1)} dB`],
+    ["Cameras turn", moved_deg === undefined ? "" : `${short(moved_deg, 2)}° per check`],
+    ["Attempt", job.attempt > 1 ? String(job.attempt) : ""],
+  ].filter(([, value]) => value);
   return (
-    <dl class="live-numbers">
-      {numbers.map(([name, value, unit]) => (
-        <div key={name}>
-          <dt>{name}</dt>
-          <dd>
-            {value} {unit}
-          </dd>
-        </div>
-      ))}
-      {!connected && <div class="soft">The connection was lost; reconnecting …</div>}
-    </dl>
+    <div class="live">
+      <dl class="live-numbers">
+        {numbers.map(([name, value]) => (
+          <div key={name}>
+            <dt>{name}</dt>
+            <dd>{value}</dd>
+          </div>
+        ))}
+      </dl>
+      <NotifySwitch />
+      {!connected && <span class="soft">The connection was lost; reconnecting …</span>}
+    </div>
   );
 }
 
 /** For screen readers: stages and the end, but not each step. */
 function Announced({ job }: { job: JobView }) {
-  const text = isOver(job) ? `The job is over: ${job.verdict ?? job.state}` : job.stage ? `Now: ${job.stage}` : "Waiting";
+  const text = isOver(job) ? `The job is over: ${endWords(job)}` : job.stage ? `Now: ${job.stage}` : "Waiting";
   return (
     <p class="unseen" role="status">
       {text}
@@ -118,7 +121,7 @@ function Files({ live, seen }: { live: LiveJob; seen: LiveState }) {
 
 function Facts({ job, seen }: { job: JobView; seen: LiveState }) {
   const seconds = Object.entries(seen.report?.seconds ?? {});
-  const options = Object.entries(job.resolved_options ?? job.options).sort(([a], [b]) => (a < b ? -1 : 1));
+  const options = Object.entries(job.resolved_options ?? job.options).map(([name, value]) => [optionTitle(name), optionText(value)] as const);
   return (
     <details class="panel">
       <summary>
@@ -131,10 +134,10 @@ function Facts({ job, seen }: { job: JobView; seen: LiveState }) {
         <Fact name="Submitted" value={moment(job.created_at)} />
         {job.expires_at && <Fact name="Kept until" value={moment(job.expires_at)} />}
         {seconds.map(([stage, s]) => (
-          <Fact key={stage} name={`Time: ${STAGE_WORDS[stage as Stage] ?? stage}`} value={duration(s)} />
+          <Fact key={stage} name={`Time: ${(STAGE_WORDS[stage as Stage] ?? stage).toLowerCase()}`} value={duration(s)} />
         ))}
         {options.map(([name, value]) => (
-          <Fact key={name} name={name} value={optionText(value)} />
+          <Fact key={name} name={name} value={value} />
         ))}
       </dl>
     </details>

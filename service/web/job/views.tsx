@@ -9,7 +9,7 @@ import { useStore } from "../api/store";
 import { isOver } from "../jobs/state";
 import { ProblemBox } from "../parts/problem_box";
 import { useSetPhotos } from "../upload/set_photos";
-import { holdActions, Images } from "./images";
+import { Images, photoActions } from "./images";
 import type { LiveState } from "./live_job";
 import { Seeding } from "./seeding";
 
@@ -27,28 +27,33 @@ export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
   const cellOf = view?.contact_sheet ? ownCellOf : setCellOf;
   if (problem) return <ProblemBox problem={problem} />;
   if (over && !poses && !history.length) return null;
+  const scene = (
+    <Panel key="scene" name="Cameras" kind="panel-scene">
+      {widgets && poses ? (
+        <widgets.SceneView {...{ cameras, points, cellOf, photoOf, ...choice }} />
+      ) : (
+        <Placeholder job={job} for="cameras" />
+      )}
+    </Panel>
+  );
+  const pictures = (
+    <Panel key="pictures" name={view ? "Before and after" : job.stage === "seeding" ? "Feature matches" : "Preview"} kind="panel-compare">
+      {widgets && view ? (
+        <widgets.ImageCompare {...{ names, centres, urlOf, ...choice }} views={view.views} />
+      ) : (
+        <Preview seen={seen} poses={poses} urlOf={urlOf} />
+      )}
+    </Panel>
+  );
   return (
     <>
       {widgets && report && over && (
         <div class="panel">
-          <widgets.ResultSummary {...{ report, rows, cellOf }} onSelect={setChosen} {...(!guest && { actionsOf: holdActions(job) })} />
+          <widgets.ResultSummary {...{ report, rows, cellOf }} onSelect={setChosen} {...(!guest && { actionsOf: photoActions(job) })} />
         </div>
       )}
-      <div class="job-pictures">
-        <Panel name="Cameras" kind="panel-scene">
-          {widgets && poses ? (
-            <widgets.SceneView {...{ cameras, points, cellOf, photoOf, ...choice }} />
-          ) : (
-            <Placeholder job={job} for="cameras" />
-          )}
-        </Panel>
-        <Panel name={view ? "Before and after" : job.stage === "seeding" ? "Feature matches" : "Preview"} kind="panel-compare">
-          {widgets && view ? (
-            <widgets.ImageCompare {...{ names, centres, urlOf, ...choice }} views={view.views} />
-          ) : (
-            <Preview seen={seen} poses={poses} urlOf={urlOf} />
-          )}
-        </Panel>
+      <div class={view ? "job-pictures compared" : "job-pictures"}>
+        {view ? [pictures, scene] : [scene, pictures]}
       </div>
       <Panel name="Progress of the run" kind="panel-curves">
         {widgets && history.length > 1 ? (

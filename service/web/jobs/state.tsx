@@ -66,15 +66,13 @@ function progressWords(job: JobView): string {
   return parts.join(" · ");
 }
 
-/** How much of the whole run is done, verdict and files included, and how long the rest takes. */
+/** How much of the whole run is done, verdict and files included, and how long the rest takes; or how long it took. */
 export function ProgressBar({ job }: { job: JobView }) {
-  const over = isOver(job);
-  const { eta_s, fraction } = job.progress;
-  const share = job.state === "succeeded" ? 1 : fraction;
-  const left = over || eta_s === null ? "" : `${roughly(eta_s)} left`;
-  const tone = job.state === "failed" ? "bad" : over && job.state !== "succeeded" ? "idle" : "";
+  const { eta_s, fraction: share } = job.progress;
+  const left = eta_s === null ? "" : `${roughly(eta_s)} left`;
+  if (isOver(job)) return <p class="run-words">{progressWords(job)}</p>;
   return (
-    <div class={`run ${tone}`}>
+    <div>
       <div
         class="run-track"
         role="progressbar"
@@ -88,12 +86,10 @@ export function ProgressBar({ job }: { job: JobView }) {
       </div>
       <p class="run-words">
         <span>{progressWords(job)}</span>
-        {!over && (
-          <span class="number">
-            {percent(share)}
-            {left && ` · ${left}`}
-          </span>
-        )}
+        <span class="number">
+          {percent(share)}
+          {left && ` · ${left}`}
+        </span>
       </p>
     </div>
   );

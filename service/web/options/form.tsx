@@ -2,6 +2,7 @@
 import { useMemo } from "preact/hooks";
 import type { CheckReport, FieldProblem, OptionsView } from "schemas";
 import { roughly } from "../../../biresnerf/viewer/widgets/numbers";
+import { worded } from "../../../biresnerf/viewer/widgets/option_words";
 import { once, useLoaded } from "../api/hooks";
 import { requestJson } from "../api/http";
 import { ProblemBox } from "../parts/problem_box";
@@ -107,11 +108,11 @@ function FieldRow(props: RowProps) {
       {grouped ? <span class="field-name">{field.title}</span> : <label for={id}>{field.title}</label>}
       {grouped ? <Several {...props} /> : <Control {...props} id={id} described={described} />}
       <p class="soft" id={`${id}-help`}>
-        {field.help}
+        {worded(field.help)}
       </p>
       {problem && (
         <p class="bad" id={`${id}-problem`} role="alert">
-          {problem}
+          {worded(problem)}
         </p>
       )}
     </div>
@@ -131,7 +132,7 @@ function Control({ field, value, fallback, id, described, onChange }: RowProps &
         <option value="">{fallback}</option>
         {field.choices.map((choice) => (
           <option key={choice} value={choice}>
-            {field.kind === "yes-no" ? (choice === "true" ? "yes" : "no") : choice}
+            {field.kind === "yes-no" ? words(choice === "true") : words(choice)}
           </option>
         ))}
       </select>
@@ -169,7 +170,7 @@ function Several({ field, value, onChange }: RowProps) {
             checked={chosen.includes(choice)}
             onChange={(event) => toggle(choice, event.currentTarget.checked)}
           />
-          {choice}
+          {words(choice)}
         </label>
       ))}
     </div>

@@ -1,5 +1,6 @@
 // Form fields from the JSON Schema of the options.
 import type { OptionsView } from "schemas";
+import { optionText } from "../../../biresnerf/viewer/widgets/option_words";
 
 /** The part of JSON Schema that pydantic uses for the options. */
 interface Schema {
@@ -64,11 +65,7 @@ export function presetValue(view: OptionsView, preset: string, name: string): st
   return words(filled[name] ?? (view.json_schema as Schema).properties?.[name]?.default);
 }
 
-export function words(value: unknown): string {
-  if (value === null || value === undefined) return "decided by the run";
-  if (Array.isArray(value)) return value.length ? value.join(", ") : "none";
-  return typeof value === "boolean" ? (value ? "yes" : "no") : String(value);
-}
+export const words = (value: unknown): string => (value === null || value === undefined ? "decided by the run" : optionText(value));
 
 /** The value of the text in a field; undefined if it is empty. */
 export function parsed(field: Field, text: string): unknown {

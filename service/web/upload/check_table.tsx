@@ -2,6 +2,7 @@
 import type { ComponentChildren } from "preact";
 import type { DatasetView } from "schemas";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
+import { worded } from "../../../biresnerf/viewer/widgets/option_words";
 import { bytes } from "../parts/format";
 
 type Mark = "good" | "note" | "bad" | "wait";
@@ -18,6 +19,9 @@ const INTRINSICS: Record<string, string> = {
   guessed: "guessed, and refined with the poses",
 };
 
+/** What the report calls the format of photos without poses. */
+const ALONE = "images";
+const modelWords = (model: string) => model.toLowerCase().replaceAll("_", " ");
 const UNKNOWN = ["Images", "Poses", "Cameras", "Masks"];
 
 export function CheckTable({ dataset }: { dataset: DatasetView }) {
@@ -61,7 +65,7 @@ function Found({ dataset }: { dataset: DatasetView }) {
   return (
     <>
       <Line mark="good" name="Images">
-        {count(report.images, "image")}, each decoded in full; {report.format}
+        {count(report.images, "image")}, all readable{report.format !== ALONE && `; poses from ${report.format}`}
       </Line>
       <Line mark={report.without_pose ? "note" : "good"} name="Poses">
         {posed} of {report.images} given
@@ -69,7 +73,7 @@ function Found({ dataset }: { dataset: DatasetView }) {
         {posed > 0 && report.without_pose > 0 && "; the others will be found"}
       </Line>
       <Line mark="good" name="Cameras">
-        {count(report.cameras, "camera")}: {report.camera_models.join(", ")}; intrinsics{" "}
+        {count(report.cameras, "camera")}: {report.camera_models.map(modelWords).join(", ")}; lens{" "}
         {report.intrinsics.map((source) => INTRINSICS[source] ?? source).join(", ")}
       </Line>
       <Line mark="good" name="Masks">
@@ -78,7 +82,7 @@ function Found({ dataset }: { dataset: DatasetView }) {
       </Line>
       {report.warnings.map((warning) => (
         <Line key={warning} mark="note" name="Warning">
-          {warning}
+          {worded(warning)}
         </Line>
       ))}
     </>

@@ -35,12 +35,11 @@ export function DatasetPage({ id }: { id: string }) {
       {transfer && dataset.state === "open" && <Progress transfer={transfer} />}
       {transfer?.problem && <ProblemBox problem={transfer.problem} />}
       {interrupted && <ResumeUpload dataset={dataset} onStarted={() => rerender((n) => n + 1)} />}
-      <CheckTable dataset={dataset} />
+      {dataset.state === "ready" ? <NewJob key={dataset.id} dataset={dataset} /> : <CheckTable dataset={dataset} />}
       {dataset.state === "rejected" && dataset.error && (
         <ProblemBox problem={dataset.error} heading="The image set was rejected" />
       )}
       {dataset.state === "rejected" && <DropZone compact />}
-      {dataset.state === "ready" && <NewJob key={dataset.id} dataset={dataset} />}
     </div>
   );
 }

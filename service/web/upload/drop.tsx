@@ -35,8 +35,13 @@ export function DropZone({ onChosen, compact = false }: Props) {
   return (
     <section class={`drop ${over ? "over" : ""} ${compact ? "compact" : ""}`} aria-label="New image set">
       <div class="drop-words">
-        <p class="drop-lead">Drop photos here, or anywhere on this page: a folder, a COLMAP model with its photos, or an archive</p>
-        <p class="soft">Photos need no poses: COLMAP finds a start. Poses are read from {formats.read}. Archives: zip, tar, tar.gz.</p>
+        <p class="drop-lead">Drop photos or a video anywhere on this page</p>
+        <p class="soft">A folder or an archive will do. Poses are optional: known formats are read, and missing poses are found.</p>
+        <details class="drop-formats">
+          <summary>Which formats?</summary>
+          <p>Poses: {formats.read}.</p>
+          <p>Archives: zip, tar, tar.gz.</p>
+        </details>
       </div>
       <div class="drop-buttons">
         <FileButton label="Choose a folder" folder onFiles={(files) => void take(fromInput(files))} />
@@ -97,7 +102,7 @@ interface FileButtonProps {
 }
 
 function FileButton({ label, folder = false, photos = false, onFiles }: FileButtonProps) {
-  const kind = { webkitdirectory: folder, ...(photos && { accept: "image/*" }) }; // not in the types of Preact
+  const kind = { webkitdirectory: folder, ...(photos && { accept: "image/*,video/*" }) }; // not in the types of Preact
   return (
     <label class={`act ${folder ? "primary" : ""} ${photos ? "touch-only" : ""}`}>
       {label}

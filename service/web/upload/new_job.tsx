@@ -1,4 +1,4 @@
-// A checked set before its job: photos, given cameras, what will happen, and the form that submits the job.
+// A checked set before its job: what was found, what will happen, photos, given cameras, and the form that submits the job.
 import { useMemo, useState } from "preact/hooks";
 import type { DatasetView, JobView } from "schemas";
 import { bordersOf } from "../../../biresnerf/viewer/result/poses";
@@ -10,6 +10,7 @@ import { useMasks } from "../masks/use_masks";
 import { OptionsForm } from "../options/form";
 import type { Values } from "../options/schema";
 import { ProblemBox } from "../parts/problem_box";
+import { CheckTable } from "./check_table";
 import { Photos } from "./photos";
 import { Plan } from "./plan";
 import { type SetPhotos, useSet } from "./set_photos";
@@ -37,13 +38,16 @@ export function NewJob({ dataset }: { dataset: DatasetView }) {
   };
   return (
     <>
+      <div class="set-views">
+        <CheckTable dataset={dataset} />
+        <Plan report={report} values={values} leftOut={leftOut.size} />
+      </div>
       {photos && (
         <div class="set-views">
           <Photos {...{ photos, leftOut, masks }} onChange={leaveOut} />
           {report.with_pose > 0 && <Cameras photos={photos} />}
         </div>
       )}
-      <Plan report={report} values={values} leftOut={leftOut.size} />
       <form
         class="card"
         aria-label="Options"

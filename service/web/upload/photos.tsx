@@ -53,24 +53,30 @@ export function Photos({ photos: { list, cellOf }, leftOut, masks, onChange }: P
           </button>
         )}
       </div>
+      {list.photos.some(({ mask }) => !mask) && (
+        <p class="soft photos-note">Frames of a video cannot be masked here: masks need photos. Send the frames as photos to mask them.</p>
+      )}
       <ul class="photos">
-        {shown.map(({ name, world_from_cam, masked, mask }, index) => (
+        {shown.map(({ name, world_from_cam, masked, mask }, index) => {
+          const notes = [!world_from_cam && "no pose", masks.painted.has(index) ? "mask not saved" : masked && "masked"].filter(Boolean);
+          return (
           <li key={name}>
             <button
               type="button"
               class={leftOut.has(name) ? "photo left-out" : "photo"}
               aria-pressed={act === "mask" ? undefined : leftOut.has(name)}
-              aria-label={act === "mask" ? `Mask ${name}` : `Leave out ${name}`}
+              aria-label={[act === "mask" ? `Mask ${name}` : `Leave out ${name}`, ...notes].join(", ")}
+              data-notes={notes.join(", ")}
               title={name}
               disabled={act === "mask" && !mask}
               onClick={() => (act === "mask" ? masks.edit(index) : toggle(name))}
             >
               <Thumb cell={cellOf(index)} size={THUMB_PX} />
               <bdi class="photo-name">{name.slice(name.lastIndexOf("/") + 1)}</bdi>
-              <span class="soft">{[!world_from_cam && "no pose", masks.painted.has(index) ? "mask not saved" : masked && "masked"].filter(Boolean).join(", ")}</span>
             </button>
           </li>
-        ))}
+          );
+        })}
       </ul>
       {list.photos.length > shown.length && (
         <button type="button" class="act small" onClick={() => setAll(true)}>

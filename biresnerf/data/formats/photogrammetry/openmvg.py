@@ -44,7 +44,7 @@ OPENMVG = Format(
     instead="pinhole",
     lacks="two focal lengths; FULL_OPENCV beyond k3; colours of points",
     heading="For OpenMVG",
-    hint="Set root_path in it to the folder of the photos",
+    hint="Set the root path in it to the folder of the photos",
 )
 _Vector: TypeAlias = tuple[float, float, float]
 _FIRST = 2**31  # cereal's mark of what is mentioned for the first time
