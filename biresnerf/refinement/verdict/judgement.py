@@ -134,7 +134,7 @@ def judge_poses(
         if moved >= MEASURABLE_PX:
             heldout = compare_placed(
                 before, after, scene, optimiser, placed | (not grounded),
-                should_stop, report, Effort(rounds_most=rounds_most),
+                should_stop, report, Effort(rounds_most=rounds_most, pictured=True),
             )  # fmt: skip
     took(heldout.work if heldout else 0.0)
     verdict = decide(

@@ -10,14 +10,14 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.data.workload import LOOKS
+from biresnerf.data.workload import LOOKS, picture_share
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.adjustment.paired import paired
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.views.held_out_views import ROUNDS_MOST, unseen_rounds
-from biresnerf.refinement.views.pose_trials import PoseTrials, TrialScores, joined
+from biresnerf.refinement.views.pose_trials import PoseTrials, Trial, TrialScores, joined
 from biresnerf.report import HeldOutEvidence
 
 Array = NDArray[np.float64]
@@ -57,11 +57,13 @@ class Effort:
         times: the steps that the options say are taken so many times.
         rounds_most: small sets are trained so often, with other views left out, unless the first ones decide.
         looks: shares of a training after which fields are compared; the last is 1.
+        pictured: whether some held-out views are rendered with either rig, to be looked at.
     """
 
     times: int = 1
     rounds_most: int = ROUNDS_MOST
     looks: tuple[float, ...] = LOOKS
+    pictured: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +72,7 @@ class HeldOutComparison:
 
     Attributes:
         work: of all trainings, see `Trial.work`.
-        renders: of some held-out views [h, w, 3] with either rig, by their index.
+        renders: of some held-out views [h, w, 3] with either rig, by their index, if they were asked for.
     """
 
     views: list[int]
@@ -122,18 +124,25 @@ def compare_on_unseen_views(
                 report((done + look * (side + 1) / len(running)) / (done + look))
             scores = tuple(trial.scores() for trial in running)
             old, new = (joined(side) for side in zip(*earlier, scores, strict=True))
-            did = work + sum(trial.work for trial in running)
             evidence = _evidence(old, new, running[0].optimiser.step_index, len(set(seen) & set(held_out)))
             decided = _decided(evidence, EARLY if look < 1 else 1)
-            if not done and (decided or look == 1):
-                shown = [view for view in views if view in held_out][:SHOWN]
-                renders = {view: (running[0].render(view), running[1].render(view)) for view in shown}
+            if effort.pictured and not done and (decided or look == 1):
+                enough = picture_share(steps, unbounded=trials.frame.unbounded)
+                renders = _pictures(running, [view for view in views if view in held_out][:SHOWN], enough)
+            did = work + sum(trial.work for trial in running)
             found = HeldOutComparison(seen, old, new, evidence, did, renders)
             if decided:
                 return found
         earlier.append(scores)
         work = did
     return found
+
+
+def _pictures(pair: Sequence[Trial], views: Sequence[int], share: float) -> BeforeAfter:
+    """These views as both fields see them after so much of their training, or more."""
+    for trial in pair:
+        trial.train(share)
+    return {view: (pair[0].render(view), pair[1].render(view)) for view in views}
 
 
 def _evidence(before: TrialScores, after: TrialScores, steps: int, strictly: int) -> HeldOutEvidence:

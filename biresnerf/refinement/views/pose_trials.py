@@ -143,7 +143,7 @@ class Trial:
     should_stop: Callable[[], bool]
 
     def train(self, share: float) -> None:
-        """Step until this share of the training is done.
+        """Step until this share of the training is done. Beyond its end, above 1, the rates stay as they are there.
 
         Raises:
             Interrupted: ``should_stop`` returned true.

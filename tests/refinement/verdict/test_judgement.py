@@ -86,18 +86,18 @@ def test_other_views_are_left_out_only_until_they_decide(scene):
     assert far.heldout.psnr.low > 0.5
 
 
-def test_trainings_end_once_they_decide_and_the_work_they_were_is_told(scene):
+def test_trainings_end_once_they_decide_but_for_pictures(scene):
     dataset, images = scene
-    truth, steps = dataset.world_from_cam, 240
+    truth, steps, pictured = dataset.world_from_cam, 240, 300
     options = OPTIONS.model_copy(update={"trial_steps": steps})
     optimiser = tiny_optimiser(dataset, images, options, held_out=[3])
-    for noise, expected in ((0.3, steps // 4), (0.02, steps)):
+    for noise, decided, other_rounds in ((0.3, steps // 4, 0), (0.02, steps, steps)):
         run = given_scene(with_poses(dataset, perturb_poses(truth, noise, seed=1)), images, [3])
         works: list[float] = []
-        evidence = judge_poses(run, optimiser, took=works.append).verdict.heldout
-        assert evidence.steps == expected
-        rounds = 1 if expected < steps else 2
-        assert works == [2 * rounds * expected]
+        judgement = judge_poses(run, optimiser, took=works.append)
+        assert judgement.verdict.heldout.steps == decided
+        assert works == [2 * (pictured + other_rounds)]
+        assert judgement.renders.keys() == {3}
 
 
 def test_poses_that_a_broken_refinement_spoilt_are_not_returned(scene, noisy):
