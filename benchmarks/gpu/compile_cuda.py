@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain, product
 from pathlib import Path
@@ -21,13 +22,19 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from biresnerf.field.cuda import plans
-from biresnerf.field.cuda.launches import Launch
+from biresnerf.field.cuda.cameras import lens
+from biresnerf.field.cuda.cameras.kernels import cast, cast_backward, move, move_backward
+from biresnerf.field.cuda.cameras.poses_and_rays import BLOCK
+from biresnerf.field.cuda.launches import Launch, bind
 from biresnerf.field.cuda.workspace import Capacity, Workspace
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldShape
 from biresnerf.field.reference.field import ReferenceField
+from biresnerf.geometry.camera.distortion import NEWTON_STEPS
 
-POINTERS = {torch.float32: "*fp32", torch.int32: "*i32", torch.int64: "*i64", torch.uint8: "*u8"}
+POINTERS = {
+    torch.float64: "*fp64", torch.float32: "*fp32", torch.int32: "*i32", torch.int64: "*i64", torch.uint8: "*u8",
+}  # fmt: skip
 ALIGNED = 16
 CUOBJDUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
 
@@ -48,6 +55,7 @@ class Usage:
 def kernels() -> dict[str, Launch]:
     """Every kernel, by its name, constants and specialised arguments, at the paper's encodings."""
     found: dict[str, Launch] = {}
+    _add(found, cameras())
     for unbounded, reconstructing, capacity in product((False, True), (False, True), CAPACITIES):
         shape = FieldShape(grid_levels(3, 16, 72, 22), grid_levels(16, 128, 4096, 10), unbounded)
         field = ReferenceField(shape, 0, torch.device("cpu"))
@@ -56,13 +64,33 @@ def kernels() -> dict[str, Launch]:
         made = [plan(workspace, merged=True) for plan in (plans.forward, plans.viewing)]
         made += [plan(workspace) for plan in (plans.backward, plans.density)]
         made += [plans.update(workspace, name) for name in workspace.modules]
-        for launch in chain.from_iterable(made):
-            if isinstance(launch, Launch):
-                constants, _, attributes = _specialised(launch)
-                told = [launch.kernel.fn.__name__, *map(str, constants.values())]
-                told.append("".join("a" if (i,) in attributes else "-" for i in range(len(launch.arguments))))
-                found.setdefault(" ".join(told), launch)
+        _add(found, (launch for launch in chain.from_iterable(made) if isinstance(launch, Launch)))
     return found
+
+
+def cameras() -> Iterator[Launch]:
+    """The kernels of viewing directions, poses and rays, for counts that 16 divides and others."""
+    matrices, vectors = torch.zeros(1, 3, 4), torch.zeros(1, 3)
+    poses = {"matrices": matrices, "g_matrices": matrices, "start": matrices, "length": torch.zeros(1)}
+    rays = dict.fromkeys(("origin", "direction", "g_origin", "g_direction", "in_cam"), vectors)
+    increments = dict.fromkeys(("rotation", "translation", "g_rotation", "g_translation"), vectors)
+    indices = {name: torch.zeros(1, dtype=torch.int64) for name in ("body", "camera", "image")}
+    lenses = {name: torch.zeros(9).double() for name in ("fx", "fy", "cx", "cy", "distortion")}
+    pixels = {"xy": vectors, "out": vectors, "fisheye": torch.zeros(1, dtype=torch.uint8)}
+    buffers = {**poses, **rays, **increments, **indices, **lenses, **pixels}
+    for n in (64, 1001):
+        for kernel in (move, move_backward, cast, cast_backward):
+            yield bind(kernel, (1,), buffers, n=n, BLOCK=BLOCK)
+        for steps, fisheye in product((0, NEWTON_STEPS), (False, True)):
+            yield bind(lens.directions, (1,), buffers, n=n, STEPS=steps, FISHEYE=fisheye, BLOCK=lens.BLOCK)
+
+
+def _add(found: dict[str, Launch], launches: Iterable[Launch]) -> None:
+    for launch in launches:
+        constants, _, attributes = _specialised(launch)
+        told = [launch.kernel.fn.__name__, *map(str, constants.values())]
+        told.append("".join("a" if (i,) in attributes else "-" for i in range(len(launch.arguments))))
+        found.setdefault(" ".join(told), launch)
 
 
 def _specialised(launch: Launch) -> tuple[dict[str, Any], dict[str, str], dict[tuple[int], Any]]:

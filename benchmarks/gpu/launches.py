@@ -9,7 +9,8 @@ on the host would wait for a GPU, and raises here; what moves values between hos
 from __future__ import annotations
 
 import copy
-import traceback
+import linecache
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -22,10 +23,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import biresnerf
 from benchmarks.speed import scene
+from biresnerf.field.cuda.cameras import poses_and_rays
 from biresnerf.field.occupancy import DeviceOccupancyGrid
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
 from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.refinement.optimise import cast_rays
 from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
+from biresnerf.refinement.parameters import pose_parameters
 
 GPU = torch.device("meta")
 LIBRARY = str(Path(biresnerf.__file__).parent)
@@ -43,10 +47,12 @@ class Trace:
     Attributes:
         launches: operations by name, views and empty buffers left out.
         crossings: lines of code that move values between host and device.
+        calls: every operation as its line of code, its name, its numbers and its tensors' shapes.
     """
 
     launches: Counter[str] = field(default_factory=Counter)
     crossings: list[str] = field(default_factory=list)
+    calls: Counter[tuple[str, str]] = field(default_factory=Counter)
 
 
 class Recorder(TorchDispatchMode):
@@ -60,8 +66,10 @@ class Recorder(TorchDispatchMode):
         devices = {tensor.device.type for tensor in _tensors((args, result)) if tensor.ndim}
         if name not in MOVES_NOTHING and "meta" in devices:
             self.trace.launches[name] += 1
+        line = _line()
         if devices == {"meta", "cpu"}:
-            self.trace.crossings.append(_line())
+            self.trace.crossings.append(line)
+        self.trace.calls[line, f"{name} {_told((args, kwargs))}"] += 1
         return result
 
 
@@ -99,7 +107,7 @@ class PretendedMetrics:
 
 
 def pretended_directions(lenses: Intrinsics, image: Tensor, xy: Tensor) -> Tensor:
-    """In place of the kernel that finds viewing directions (`cuda/lens.py`)."""
+    """In place of the kernel that finds viewing directions (`cuda/cameras/lens.py`)."""
     return torch.cat([xy.double() / lenses.fx[image, None], torch.ones_like(xy[:, :1])], 1)
 
 
@@ -109,17 +117,41 @@ def traced_step(optimiser: JointOptimiser, *, looks_at_cells: bool = False) -> T
     Args:
         looks_at_cells: whether it is one of those that update the occupancy grid.
     """
-    made, recorder = _on_pretended_gpu(optimiser), Recorder()
-    rand, randint = torch.rand, torch.randint
+    first = OCCUPANCY_PERIOD * 2 + (0 if looks_at_cells else 1)
+    return _traces(optimiser, [first])[0]
+
+
+def changing_lines(optimiser: JointOptimiser) -> set[str]:
+    """Lines of code whose operations or numbers are others in later steps with as many rays.
+
+    Where there are any, a CUDA graph of the whole step would repeat what its first step did.
+    """
+    first, *later = (trace.calls for trace in _traces(optimiser, [33, 34, 40, 200]))
+    return {line for calls in later for line, _ in (first - calls) + (calls - first)}
+
+
+def _traces(optimiser: JointOptimiser, steps: list[int]) -> list[Trace]:
+    """Of these steps, all with the same number of rays."""
+    made, recorder, found = _on_pretended_gpu(optimiser), Recorder(), []
+    rand, randint, rays = torch.rand, torch.randint, made.rays
+
+    def launch(kernel: str, *arguments: object) -> None:
+        recorder.trace.launches[kernel] += 1
+
     with (
+        patch.object(pose_parameters, "camera_kernels", lambda device: poses_and_rays),
+        patch.object(cast_rays, "camera_kernels", lambda device: poses_and_rays),
+        patch.object(poses_and_rays, "_launch", launch),
         patch.object(torch, "rand", lambda *size, generator=None, **where: rand(*size, **where)),
         patch.object(torch, "randint", lambda *size, generator=None, **where: randint(*size, **where)),
     ):
         made.step()
-        made.step_index = OCCUPANCY_PERIOD * 2 + (0 if looks_at_cells else 1)
-        with recorder:
-            made.step()
-    return recorder.trace
+        for step in steps:
+            made.step_index, made.rays, recorder.trace = step, rays, Trace()
+            with recorder:
+                made.step()
+            found.append(recorder.trace)
+    return found
 
 
 def _on_pretended_gpu(optimiser: JointOptimiser) -> JointOptimiser:
@@ -151,18 +183,31 @@ def _tensors(value: object) -> Iterator[Tensor]:
             yield from _tensors(part)
 
 
+def _told(value: object) -> object:
+    """Numbers as they are, tensors by their shapes."""
+    if isinstance(value, Tensor):
+        return tuple(value.shape)
+    if isinstance(value, dict):
+        return {name: _told(each) for name, each in value.items()}
+    return [_told(each) for each in value] if isinstance(value, (tuple, list)) else value
+
+
 def _line() -> str:
-    own = [frame for frame in traceback.extract_stack() if frame.filename.startswith(LIBRARY)]
-    return f"{Path(own[-1].filename).name}: {own[-1].line}"
+    """The line of the library that asks for an operation; the way back has none but that which starts it."""
+    frame = sys._getframe()
+    while frame.f_back and not frame.f_code.co_filename.startswith(LIBRARY):
+        frame = frame.f_back
+    path = frame.f_code.co_filename
+    return f"{Path(path).name}: {linecache.getline(path, frame.f_lineno).strip()}"
 
 
 def main() -> None:
     for stage in ("coarse", "fine"):
-        launches = traced_step(scene.optimiser(stage, images=100, threads=2, rays=1024)).launches
-        print(
-            f"{stage}: {launches.total()} launches;",
-            ", ".join(f"{n} {k}" for k, n in launches.most_common(12)),
-        )
+        optimiser = scene.optimiser(stage, images=100, threads=2, rays=1024)
+        launches = traced_step(optimiser).launches
+        told = ", ".join(f"{n} {k}" for k, n in launches.most_common(12))
+        print(f"{stage}: {launches.total()} launches; {told}\nother numbers in later steps:")
+        print("", *sorted(changing_lines(optimiser)), sep="\n    ")
 
 
 if __name__ == "__main__":

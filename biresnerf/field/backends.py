@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 from collections.abc import Callable
+from types import ModuleType
 
 import torch
 from torch import Tensor
@@ -98,10 +99,19 @@ def directions_for(device: torch.device) -> Directions:
     if device.type == "cpu":
         from biresnerf.field.cpu.lens import directions_in_cam as by_kernel
     elif device.type == "cuda" and not gpu_faults(device):
-        from biresnerf.field.cuda.lens import directions_in_cam as by_kernel
+        from biresnerf.field.cuda.cameras.lens import directions_in_cam as by_kernel
     else:
         return directions_in_cam
     return by_kernel
+
+
+def camera_kernels(device: torch.device) -> ModuleType | None:
+    """The kernels of poses and rays on a GPU, see `cuda.cameras.poses_and_rays`; None elsewhere, or where wrong."""
+    if device.type != "cuda" or gpu_faults(device):
+        return None
+    from biresnerf.field.cuda.cameras import poses_and_rays
+
+    return poses_and_rays
 
 
 def make_field(shape: FieldShape, seed: int, device: torch.device, threads: int) -> RadianceField:

@@ -64,6 +64,13 @@ def se3_exp(rotvec: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
     return rotation, (left_jacobian @ velocity.unsqueeze(-1)).squeeze(-1)
 
 
+def moved_poses(rotvec: Tensor, velocity: Tensor, pose: Tensor) -> Tensor:
+    """Poses [n, 3, 4] that have followed twists [n, 3] for unit time, see `se3_exp`."""
+    turn, shift = se3_exp(rotvec, velocity)
+    centre = (turn @ pose[:, :, 3:])[:, :, 0] + shift
+    return torch.cat([turn @ pose[:, :, :3], centre[:, :, None]], 2)
+
+
 def so3_log(rotation: Tensor) -> Tensor:
     """Rotation vectors [..., 3] of angle at most pi, of rotation matrices [..., 3, 3].
 

@@ -14,8 +14,8 @@ import torch
 if importlib.util.find_spec("triton") is not None and not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"
     try:
-        for module in ("biresnerf.field.cuda.field", "biresnerf.field.cuda.lens"):
-            importlib.import_module(module)
+        for module in ("field", "cameras.lens", "cameras.kernels"):
+            importlib.import_module(f"biresnerf.field.cuda.{module}")
         with contextlib.suppress(ImportError):  # not in every version; else loaded at the first launch
             importlib.import_module("triton.experimental.gluon")
     finally:

@@ -25,7 +25,7 @@ def kernel(request: pytest.FixtureRequest):
     pytest.importorskip(
         "triton", reason="the CUDA backend's kernels need Triton, which exists for Linux only"
     )
-    module = importlib.import_module("biresnerf.field.cuda.lens")
+    module = importlib.import_module("biresnerf.field.cuda.cameras.lens")
     return module.directions_in_cam, torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 

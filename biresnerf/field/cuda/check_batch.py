@@ -6,12 +6,16 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import torch
+from torch import Tensor
 
 from biresnerf.field.grid_field import GridField
 from biresnerf.field.radiance_field import FieldShape, Marching, Merging, PositionGradient, Rays, Rendering
+from biresnerf.geometry.lie import moved_poses
 
 Field = TypeVar("Field", bound=GridField)
 MakeField = Callable[[FieldShape, int, torch.device], GridField]
+Moved = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
+Cast = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def random_field(
@@ -30,6 +34,43 @@ def random_field(
     if reconstructing:
         field.start_reconstruction()
     return field
+
+
+def defined_poses(
+    rotation: Tensor, translation: Tensor, body: Tensor, length: Tensor, start: Tensor
+) -> Tensor:
+    """What `cameras.poses_and_rays.moved_poses` computes."""
+    return moved_poses(rotation[body], translation[body] * length, start)
+
+
+def defined_rays(matrices: Tensor, camera: Tensor, in_cam: Tensor) -> tuple[Tensor, Tensor]:
+    """What `cameras.poses_and_rays.rays_of_cameras` computes."""
+    return matrices[camera][:, :, 3], (matrices[camera][:, :, :3] @ in_cam[:, :, None])[:, :, 0]
+
+
+def moved_and_cast(moved: Moved, cast: Cast, angle: float, device: torch.device) -> dict[str, Tensor]:
+    """Poses of cameras that have turned by `angle` (rad), some of them together, their rays, and gradients."""
+    draws = torch.Generator().manual_seed(11)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=draws).to(device)
+
+    turns = (angle * torch.nn.functional.normalize(random(4, 3))).requires_grad_()
+    shifts, start = random(4, 3).requires_grad_(), random(7, 3, 4)
+    body = torch.tensor([0, 0, 1, 2, 2, 2, 3], device=device)
+    camera = torch.arange(100, device=device) % 6  # the last one has no ray
+    poses = moved(turns, shifts, body, torch.full((1,), 0.7, device=device), start)
+    rays = cast(poses, camera, random(100, 3))
+    torch.autograd.backward(rays, [random(100, 3), random(100, 3)])
+    assert turns.grad is not None
+    assert shifts.grad is not None
+    return {
+        "poses": poses.detach(),
+        "origins": rays[0].detach(),
+        "directions": rays[1].detach(),
+        "gradient by rotations": turns.grad,
+        "gradient by translations": shifts.grad,
+    }
 
 
 def random_rays(count: int, trained: int, device: torch.device, *, unbounded: bool, seed: int = 7) -> Rays:

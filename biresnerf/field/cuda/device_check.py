@@ -18,8 +18,18 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from biresnerf.field.cuda.check_batch import MakeField, learn, random_field, random_marching, random_rays
-from biresnerf.field.cuda.lens import directions_in_cam as on_device
+from biresnerf.field.cuda.cameras import poses_and_rays
+from biresnerf.field.cuda.cameras.lens import directions_in_cam as on_device
+from biresnerf.field.cuda.check_batch import (
+    MakeField,
+    defined_poses,
+    defined_rays,
+    learn,
+    moved_and_cast,
+    random_field,
+    random_marching,
+    random_rays,
+)
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldRates, FieldShape, Merging, PositionGradient
 from biresnerf.field.reference.field import ReferenceField
@@ -30,6 +40,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 logger = logging.getLogger(__name__)
 
 LIMIT_S = 600.0  # the first run compiles all kernels
+CAMERA_TOLERANCE = 1e-3  # of poses and rays: torch's own products may be rounded to TF32
 TOLERANCE = 0.02  # products of the networks keep 10 bits of mantissa
 # Of the rays, how many may have other gradients: these jump where rounding moves a sample to the next cell. The same
 # holds for what is rendered of merged intervals, where rounding ends a run of them elsewhere.
@@ -85,7 +96,7 @@ def _check_in_own_process() -> list[str] | str:
 def _installation() -> str:
     """GPU, driver, versions, and the kernels' own text."""
     device = torch.cuda.get_device_properties(torch.cuda.current_device())
-    text = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
+    text = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py")))
     driver = Path("/proc/driver/nvidia/version")
     parts = (
         f"{device.name} {device.major}.{device.minor}",
@@ -102,10 +113,11 @@ def _cache_file() -> Path:
 
 
 def faults(make_fast: MakeField, device: torch.device) -> tuple[str, ...]:
-    """How the results of a backend, and of the lens kernel, differ from the definition."""
+    """How the results of a backend, and of the cameras' kernels, differ from the definition."""
     found = []
     if not _same_directions(device):
         found.append("viewing directions differ")
+    found += _differing_cameras(device)
     for unbounded in (False, True):
         results = [_computed(make, device, unbounded=unbounded) for make in (ReferenceField, make_fast)]
         for name, expected in results[0].items():
@@ -131,6 +143,18 @@ def _same_directions(device: torch.device) -> bool:
     image = torch.arange(100, device=device) % 2
     apart = (on_device(intrinsics, image, xy) - directions_in_cam(intrinsics, image, xy)).abs().max()
     return bool(apart < 1e-6)
+
+
+def _differing_cameras(device: torch.device) -> list[str]:
+    """What differs of poses, rays and their gradients, for turns from none to more than a radian."""
+    found = []
+    for angle in (0.0, 0.3, 2.0):
+        kernels = moved_and_cast(poses_and_rays.moved_poses, poses_and_rays.rays_of_cameras, angle, device)
+        for name, expected in moved_and_cast(defined_poses, defined_rays, angle, device).items():
+            apart = float((kernels[name] - expected).abs().max() / expected.abs().max())
+            if not apart <= CAMERA_TOLERANCE:
+                found.append(f"{name} of cameras that turned by {angle:.1f} rad: differ by {apart:.1%}")
+    return found
 
 
 def _off(value: Tensor, expected: Tensor) -> Tensor:

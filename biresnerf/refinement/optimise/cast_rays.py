@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from biresnerf.field.backends import Directions
+from biresnerf.field.backends import Directions, camera_kernels
 from biresnerf.geometry.camera.camera import Intrinsics, directions_with_gradient
 from biresnerf.refinement.kernels.cast_rays import CastRays
 
@@ -25,10 +25,14 @@ def cast_rays(matrices: Tensor, camera: Tensor, in_cam: Tensor) -> tuple[Tensor,
 
     Differentiable by `matrices` [n, 3, 4], which are unit_from_cam, and by `in_cam`.
     """
-    if matrices.device.type != "cpu" or in_cam.requires_grad:
+    if in_cam.requires_grad:
         return turned(matrices[camera], in_cam)
-    origin, direction = CastRays.apply(matrices, camera, in_cam)
-    return origin, direction
+    if matrices.device.type == "cpu":
+        origin, direction = CastRays.apply(matrices, camera, in_cam)
+        return origin, direction
+    if kernels := camera_kernels(matrices.device):
+        return kernels.rays_of_cameras(matrices, camera, in_cam)
+    return turned(matrices[camera], in_cam)
 
 
 def turned(matrix: Tensor, in_cam: Tensor) -> tuple[Tensor, Tensor]:

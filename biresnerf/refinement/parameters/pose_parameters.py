@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from biresnerf.field.adam import Adam
-from biresnerf.geometry.lie import se3_exp
+from biresnerf.field.backends import camera_kernels
+from biresnerf.geometry.lie import moved_poses
 from biresnerf.refinement.kernels.moved_poses import MovedPoses
 
 EPSILON = 1e-12
@@ -41,7 +42,7 @@ class PoseParameters:
         # None where every camera is its own body.
         self.body = body.to(device) if body is not None and count < len(body) else None
         self._row = torch.arange(count, device=device) if self.body is None else self.body
-        self.length = length
+        self.length, self._length = length, torch.full((1,), length, device=device)
         self.start = unit_from_cam[:, :3].to(torch.float32).to(device)
         self.rotation = torch.zeros(count, 3, device=device, requires_grad=True)
         self.translation = torch.zeros(count, 3, device=device, requires_grad=True)
@@ -53,19 +54,20 @@ class PoseParameters:
 
     def matrices(self) -> Tensor:
         """unit_from_cam [n, 3, 4], differentiable."""
-        if self.start.device.type != "cpu":
-            return self.defined_matrices()
-        found: Tensor = MovedPoses.apply(self.rotation, self.translation, self._row, self.length, self.start)
-        return found
+        rotation, translation, device = self.rotation, self.translation, self.start.device
+        if device.type == "cpu":
+            found: Tensor = MovedPoses.apply(rotation, translation, self._row, self.length, self.start)
+            return found
+        if kernels := camera_kernels(device):
+            return kernels.moved_poses(rotation, translation, self._row, self._length, self.start)
+        return self.defined_matrices()
 
     def defined_matrices(self) -> Tensor:
         """The same by torch's operations, on any device."""
         rotation, translation = self.rotation, self.translation
         if self.body is not None:
             rotation, translation = rotation[self.body], translation[self.body]
-        turn, shift = se3_exp(rotation, translation * self.length)
-        centre = (turn @ self.start[:, :, 3:])[:, :, 0] + shift
-        return torch.cat([turn @ self.start[:, :, :3], centre[:, :, None]], 2)
+        return moved_poses(rotation, translation * self.length, self.start)
 
     def members(self, camera: int) -> list[int]:
         """The cameras of one camera's body, itself included."""

@@ -15,6 +15,8 @@ pytestmark = pytest.mark.slow
 
 CAPABILITY = 90
 SPILLS = {"colour_backward": 128, "density_backward": 64}  # bytes of a thread; no other kernel may spill
+# The table that the sine of a large angle is reduced by lies on the stack, too.
+SINE = {"move": 48, "move_backward": 48, "directions": 48}
 SHARED = 99 * 1024  # bytes of a block, on the smallest GPU that is supported (compute capability 8.6)
 
 
@@ -34,9 +36,9 @@ def table():
 
 
 def test_no_kernel_spills_more_than_it_did_or_needs_more_memory_than_a_gpu_has(table):
-    assert {name.split()[0] for name, *_ in table} > {"march", "encode", "composite", *SPILLS}
+    assert {name.split()[0] for name, *_ in table} > {"march", "encode", "composite", *SPILLS, *SINE}
     for name, _, shared, _, stack in table:
-        assert int(stack) <= SPILLS.get(name.split()[0], 0), name
+        assert int(stack) <= (SPILLS | SINE).get(name.split()[0], 0), name
         assert int(shared) <= SHARED, name
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.gpu.launches import traced_step
+from benchmarks.gpu.launches import changing_lines, traced_step
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.parameters.intrinsics_parameters import lenses_of
@@ -67,3 +67,10 @@ def test_a_step_that_copies_to_the_device_is_listed(tiny):
     optimiser = trained(tiny)
     optimiser.exposure.shown = lambda rendering, image: rendering.colour * torch.ones(3).to(image.device)
     assert len(traced_step(optimiser).crossings) == 1
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_from_step_to_step_only_blur_and_rates_change(tiny, stage):
+    """What one graph of a whole step would have to read from the device instead."""
+    found = {line.split(":")[0] for line in changing_lines(trained(tiny, stage=stage))}
+    assert found <= {"photo_sampler.py", "adam.py", "joint_optimiser.py"}

@@ -1,0 +1,1 @@
+"""Cameras on a GPU: viewing directions of pixels, poses and rays."""
