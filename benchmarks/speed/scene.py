@@ -40,7 +40,7 @@ def photos(count: int, size: int) -> ImageSet:
     )
 
 
-def _new(images: int, threads: int, size: int, preset: str) -> JointOptimiser:
+def untrained(images: int, threads: int, size: int, preset: str) -> JointOptimiser:
     """From true poses; as many steps of either stage as are trained here, and as many to come."""
     options = RefineOptions(preset=preset, device="cpu", max_image_size=size, steps=4 * STEPS)
     options = options.model_copy(update={"coarse_steps_max": 2 * STEPS}).resolved("cpu")
@@ -52,7 +52,7 @@ def _new(images: int, threads: int, size: int, preset: str) -> JointOptimiser:
 
 @cache
 def _trained(stage: str, threads: int, size: int, preset: str) -> JointOptimiser:
-    made = _new(VIEWS, threads, size, preset)
+    made = untrained(VIEWS, threads, size, preset)
     for _ in range(STEPS):
         made.step()
     if stage == "fine":
@@ -66,7 +66,7 @@ def optimiser(
     stage: str, images: int, threads: int, rays: int, size: int = 200, preset: str = "paper"
 ) -> JointOptimiser:
     """An optimiser of the given preset's encodings in the middle of a stage."""
-    trained, made = _trained(stage, threads, size, preset), _new(images, threads, size, preset)
+    trained, made = _trained(stage, threads, size, preset), untrained(images, threads, size, preset)
     if stage == "fine":
         made.start_reconstruction()
         made.switch = trained.switch

@@ -40,7 +40,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 logger = logging.getLogger(__name__)
 
 LIMIT_S = 600.0  # the first run compiles all kernels
-CAMERA_TOLERANCE = 1e-3  # of poses and rays: torch's own products may be rounded to TF32
+CAMERA_TOLERANCE = 1e-3  # of poses, rays and their gradients: both compute them in float32 at least
 TOLERANCE = 0.02  # products of the networks keep 10 bits of mantissa
 # Of the rays, how many may have other gradients: these jump where rounding moves a sample to the next cell. The same
 # holds for what is rendered of merged intervals, where rounding ends a run of them elsewhere.
