@@ -50,7 +50,7 @@ COPY deploy/slim.py /
 RUN apt-get update && apt-get install -y --no-install-recommends binutils && python /slim.py /opt/venv
 WORKDIR /build
 # Of the last five the page was made: what is made of the same is not made again.
-COPY pyproject.toml README.md hatch_build.py build_web.mjs package.json package-lock.json tsconfig.json ./
+COPY pyproject.toml README.md LICENSE hatch_build.py build_web.mjs package.json package-lock.json tsconfig.json ./
 COPY biresnerf biresnerf
 COPY workers workers
 COPY service service

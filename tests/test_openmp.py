@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -14,8 +15,14 @@ pytestmark = pytest.mark.slow
 ENTRANCES = {
     "library": "import biresnerf\ntry: biresnerf.refine('none', 'out')\nexcept biresnerf.InputError: import torch",
     "command line": "from biresnerf.command_line import main\ntry: main()\nexcept SystemExit: import torch",
-    "job": "import pathlib; from workers.run.job_process import main; main(pathlib.Path('none')); import torch",
+    "job": "import pathlib; from workers.run.job_process import main; main(pathlib.Path()); import torch",
 }
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A job that finds no order leaves a file that says so where it runs."""
+    monkeypatch.chdir(tmp_path)
 
 
 def spins(program: str, **variables: str) -> list[int]:

@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SHOWN = (
     "*.md",
     "CITATION.cff",
+    "LICENSE",
     "docs/*.md",
     "docs/*.json",
     "docs/pictures/*",

@@ -25,6 +25,12 @@ def test_the_citation_is_of_this_version_and_licence():
     assert said("abstract") == PROJECT["description"]
 
 
+def test_the_licence_comes_with_the_package():
+    assert PROJECT["license-files"] == ["LICENSE"]
+    first_lines = (ROOT / "LICENSE").read_text("utf-8").split("\n", 3)[:3]
+    assert [line.strip() for line in first_lines] == ["", "Apache License", "Version 2.0, January 2004"]
+
+
 def test_all_files_name_one_address():
     assert said("repository-code") == ADDRESS
     assert all(url.startswith(ADDRESS) for url in PROJECT["urls"].values())
