@@ -61,6 +61,7 @@ def plot_errors(path: Path, sets: dict[str, CameraErrors], distance: float, titl
     centre.set(ylabel="position error (% of distance)", yscale="log", xlabel="image")
     for axes in (rotation, centre):
         axes.grid(alpha=0.3)
+        axes.yaxis.set_major_formatter("{x:g}")
         axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "biresnerf"}), whole_file(path) as temporary:
         figure.savefig(temporary, dpi=120, format=path.suffix[1:].lower())

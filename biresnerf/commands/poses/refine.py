@@ -52,8 +52,8 @@ def refine_command(
 ) -> int:
     """Refine the camera poses of INPUT, a folder of images with or without poses, or a video.
 
-    Results go to OUT: transforms.json and colmap/sparse/0 in the input's own frame and scale, report.json,
-    renders/ and config.json. --json prints report.json. Run the same command again to resume.
+    Results go to OUT: transforms.json and colmap/sparse/0 in the input's own frame and scale, and report.html,
+    which shows whether the poses improved. --json prints report.json. Run the same command again to resume.
     """
     named = {"preset": preset, "device": device, "seed": seed, "time_budget_s": time_budget_s}
     options = {**settings, **{key: value for key, value in named.items() if value is not None}}

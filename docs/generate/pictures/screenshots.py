@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 from PIL import Image
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, Playwright, sync_playwright
 
 from biresnerf.client import Client
 from biresnerf.commands.poses.make_scene import make_scene
@@ -37,17 +37,14 @@ ARGUMENTS = ("--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader")
 
 def main() -> None:
     """Make a scene, and take it through the page from the upload to the comparison of two jobs."""
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    if chromium is None:
-        raise SystemExit("There is no Chromium; on Debian: apt install chromium")
     with (
         tempfile.TemporaryDirectory() as temporary,
         temporary_service() as url,
         sync_playwright() as playwright,
     ):
         scene = Path(temporary, NAME)
+        browser = chromium_of(playwright)
         make_scene(scene, "dome", views=VIEWS, size=SIZE, noise=NOISE, seed=SEED)
-        browser = playwright.chromium.launch(executable_path=chromium, args=ARGUMENTS)
         page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
         page.set_default_timeout(PATIENCE_MS)
         page.goto(url)
@@ -64,6 +61,14 @@ def main() -> None:
             client.wait(second.id)
         _show_comparison(page, f"{url}/#/compare/{first}/{second.id}")
         browser.close()
+
+
+def chromium_of(playwright: Playwright) -> Browser:
+    """Debian's Chromium."""
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        raise SystemExit("There is no Chromium; on Debian: apt install chromium")
+    return playwright.chromium.launch(executable_path=chromium, args=ARGUMENTS)
 
 
 def _show_check(page: Page) -> None:
@@ -119,13 +124,16 @@ def _wait_for_drawing(page: Page) -> None:
 
 
 def _take(page: Page, name: str) -> None:
+    save_screenshot(page, SCREENSHOTS[name], SHOWN_HEIGHTS.get(name, HEIGHT))
+
+
+def save_screenshot(page: Page, path: Path, height: int = HEIGHT) -> None:
+    """Writes the upper ``height`` px of the page."""
     page.mouse.move(0, 0)
     page.evaluate("scrollTo(0, 0)")
     with Image.open(io.BytesIO(page.screenshot())) as picture:
-        picture.convert("RGB").crop((0, 0, WIDTH, SHOWN_HEIGHTS.get(name, HEIGHT))).save(
-            SCREENSHOTS[name], quality=QUALITY, method=6
-        )
-    print(f"written: {SCREENSHOTS[name]}")
+        picture.convert("RGB").crop((0, 0, WIDTH, height)).save(path, quality=QUALITY, method=6)
+    print(f"written: {path}")
 
 
 if __name__ == "__main__":
