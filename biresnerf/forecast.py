@@ -124,13 +124,16 @@ class Forecast:
         self._done = min(1.0, max(0.0, share))
 
     def stepped(self, stage: Literal["coarse", "fine"], seconds: float) -> None:
-        """Add the time of one step. The first of a stage is slower: it counts only until there is another.
+        """Add the time of one step. The first of a stage does not count: kernels may be compiled in it.
 
         What was not measured yet is expected to be as much slower than thought as the steps are.
         """
         unit = UNITS[stage]
-        self._steps[unit] = count = self._steps.get(unit, 0) + 1
-        share = max(1 / max(1, count - 1), 1 - MEMORY)
+        before = self._steps.get(unit, 0)
+        self._steps[unit] = before + 1
+        if before == 0:
+            return
+        share = max(1 / before, 1 - MEMORY)
         self.rates[unit] += share * (seconds / self.step_weights[stage] - self.rates[unit])
         self._measured[unit] = self._measured.get(unit, 0.0) + seconds
         self._slower = self.rates[unit] / self._expected[unit]

@@ -138,10 +138,13 @@ def test_nothing_is_predicted_before_any_work_is_known():
     assert Forecast().now() == (0.0, None)
 
 
-def test_the_first_step_counts_only_until_there_is_another_and_later_ones_alike():
+def test_a_first_step_that_compiles_says_nothing_and_later_ones_count_alike():
     found = Forecast()
-    found.stepped("coarse", 5.0)
-    assert found.rates["coarse step"] == 5.0
+    found.plan_steps(coarse=100, fine=0)
+    expected = found.left_s()
+    found.stepped("coarse", 60.0)
+    assert found.left_s() == expected
+    assert found.measured() == {}
     for seconds in (0.1, 0.2, 0.3):
         found.stepped("coarse", seconds)
     assert found.rates["coarse step"] == pytest.approx(0.2)

@@ -104,7 +104,8 @@ def _print_outcome(result: Path, scene: Path, truth: Path | None) -> None:
     held_out = report.heldout
     if held_out is not None:
         click.echo(
-            f"held-out views ({held_out.count}): PSNR {held_out.psnr:.2f} dB, SSIM {held_out.ssim:.3f}"
+            f"final render (unseen views: {held_out.count}): "
+            f"PSNR {held_out.psnr:.2f} dB, SSIM {held_out.ssim:.3f}"
         )
     click.echo(f"\nfiles: {os.path.relpath(result)}")
     for name in ("report.html", "transforms.json", "colmap/sparse/0", "renders", "report.json"):

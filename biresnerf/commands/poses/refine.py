@@ -89,16 +89,17 @@ def summary(report: Report, output: Path) -> str:
         f"{len(report.images)} cameras, moved by {moved[len(moved) // 2]:.3g} deg (median), {moved[-1]:.3g} deg (most)",
         f"{report.options.method}: {report.steps_done} steps"
         if report.switch_step is None
-        else f"stage 2 began at step {report.switch_step} of {report.steps_done} ({report.switch_reason})",
+        else f"stage 2 began at step {report.switch_step} of {report.steps_done}, "
+        + ("when the error was stable" if report.switch_reason == "stable" else "the step limit"),
     ]
     if report.heldout:
         lines.append(
-            f"held-out views ({report.heldout.count}): "
+            f"final render (unseen views: {report.heldout.count}): "
             f"PSNR {report.heldout.psnr:.2f} dB, SSIM {report.heldout.ssim:.3f}"
         )
         if report.heldout.unshared_opacity is not None:
             lines.append(
-                f"{100 * report.heldout.unshared_opacity:.1f} % of what they show lies where no second camera looks"
+                f"{100 * report.heldout.unshared_opacity:.1f} % of it lies where no second camera looks"
             )
     lines += [f"warning: {warning}" for warning in report.warnings]
     lines.append(f"time: {sum(report.seconds.values()):.0f} s; results in {output}")
