@@ -145,12 +145,15 @@ class Result:
             "rotated, median": f"{np.nanmedian(self.rotated_deg):.3g}°"
             if self._any_before
             else "no poses before",
-            "held-out PSNR": "none" if self.report.heldout is None else f"{self.report.heldout.psnr:.2f} dB",
+            "final render, PSNR": "none"
+            if self.report.heldout is None
+            else f"{self.report.heldout.psnr:.2f} dB",
             "folder": str(self.folder),
         }
         table = "".join(f"<tr><th>{escape(k)}</th><td>{escape(v)}</td></tr>" for k, v in rows.items())
         notes = "".join(f"<li>{escape(warning)}</li>" for warning in self.report.warnings)
-        return f"<p><b>{escape(self._headline)}</b></p><table>{table}</table><ul>{notes}</ul>"
+        listed = f"<ul>{notes}</ul>" if notes else ""
+        return f"<p><b>{escape(self._headline)}</b></p><table>{table}</table>{listed}"
 
     @property
     def _headline(self) -> str:
