@@ -24,18 +24,15 @@ _LEVELS: dict[Level, str] = {
 }
 _HEAD = """# Options of a refinement
 
-Written by `make docs` from the models in `biresnerf/options/refine_options.py` and `biresnerf/options/presets.py`; a test fails when they differ.
+Written by `make docs`. Set any of them with `--set KEY=VALUE` on the command line (`--preset`, `--device` and `--seed` have flags
+of their own), in the object `options` of a job over HTTP, or by name in Python (`biresnerf.refine(..., steps=2000)`). On the command
+line a value is JSON where possible, else text: `--set holdout=0`, `--set start=given`. `GET /v1/options` has the JSON Schema.
 
-On the command line `--set KEY=VALUE` sets any of them (`--preset`, `--device` and `--seed` have flags of their own), over
-HTTP they are the object `options` of a job, from Python `biresnerf.RefineOptions(...)`. Values are JSON where they can be
-read as such, else text: `--set holdout=0`, `--set start=given`, `--set verdict=false`. `GET /v1/options` is the same as a
-JSON Schema.
-
-- Which to start with: [quick start](quick-start.md). What they do, with the paper's symbols: [method](method.md).
-- A key that is left out takes the method's value, else the preset's, else its own.
-- With `steps` alone the preset's proportions are kept: `coarse_steps_min`, `coarse_steps_max`, `check_every`,
-  `warmup_steps` are scaled. `trial_steps` becomes a quarter of `steps` where the preset has more.
-- *touches* is the first stage that an option affects; [a fork](jobs.md) that changes it takes over the stages before. Options
+- Start with the [quick start](quick-start.md); [method](method.md) explains what they do, with the paper's symbols.
+- An option that is left out has the method's value, else the preset's, else its default.
+- If you set `steps` alone, `coarse_steps_min`, `coarse_steps_max`, `check_every` and `warmup_steps` are scaled with it.
+  `trial_steps` becomes a quarter of `steps` where the preset has more.
+- *touches* is the first stage that an option affects; [a fork](jobs.md#forks) that changes it takes over the stages before. Options
   that do not affect the poses may also change when a run resumes.
 - The worker resolves options for its device. A job shows them as `options` (as requested) and `resolved_options` (as used).
 - The page's form leaves out the options for research.
