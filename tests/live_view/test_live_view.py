@@ -7,6 +7,7 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -233,3 +234,41 @@ def test_the_cameras_of_a_refinement_can_be_watched(tmp_path):
     finally:
         process.kill()
     assert json.loads(out)["state"] == "complete"
+
+
+class SlowBrowser:
+    """A client that has read where to look from, and takes its time until the cameras are drawn."""
+
+    def __init__(self) -> None:
+        self.camera = self
+        self.looks: list[np.ndarray] = []
+        self.asked, self.drawn = threading.Event(), threading.Event()
+
+    @property
+    def position(self) -> np.ndarray:
+        return self.looks[-1]
+
+    @position.setter
+    def position(self, look: np.ndarray) -> None:
+        if self.asked.is_set():
+            self.drawn.set()
+        else:
+            self.asked.set()
+            self.drawn.wait(1)
+        self.looks.append(look)
+
+
+def test_a_browser_that_connects_while_cameras_are_drawn_keeps_the_new_look(result, tmp_path, monkeypatch):
+    view, browser = LiveView(tmp_path / "out", port=free_port()), SlowBrowser()
+    try:
+        monkeypatch.setattr(view.server, "get_clients", lambda: {0: browser})
+        connecting = threading.Thread(target=view._look_at_all, args=(browser,))
+        connecting.start()
+        assert browser.asked.wait(10)
+        assert view.update()
+        connecting.join()
+        before, after = browser.looks
+        assert not np.allclose(before, after)
+        np.testing.assert_array_equal(browser.position, view._first_look[0])
+    finally:
+        view.stop()
