@@ -94,7 +94,7 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     leave_out: Annotated[Names, Option("seeding", "Photos to leave out", level="usual")] = Field(
         (), max_length=10_000, description="Names of photos to treat as if they were not in the set."
     )
-    video_frames: Annotated[int, Option("seeding", "Frames of videos", level="main")] = Field(
+    video_frames: Annotated[int, Option("seeding", "Frames of videos", level="usual")] = Field(
         0, ge=0, le=2000, description="Sharp frames to take of videos; 0: 120, or as many as before."
     )
     fixed: Annotated[Names, Option("coarse", "Photos to keep fixed", level="main")] = Field(

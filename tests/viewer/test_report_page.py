@@ -225,6 +225,8 @@ def test_the_table_says_how_exact_each_pose_is_and_finds_those_not_known(stated)
 def test_drawn_ellipsoids_hold_nine_in_ten_errors_so_many_times_too_large(stated, result):
     switch = stated.get_by_label("Uncertainty ×10")
     assert switch.count() == 1
+    assert not switch.is_checked()  # ellipsoids hide the scene
+    switch.check()
     choose(stated, 1)
     drawn = np.array(stage(stated)["uncertainty"].replace(",", " ").split(), float).reshape(3, 3)
     key = "world_from_cam_before" if result.report.verdict.returned == "input" else "world_from_cam"

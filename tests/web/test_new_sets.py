@@ -59,7 +59,7 @@ def test_a_finished_example_is_one_click_away_and_needs_no_job(
     page = tab.page
     before = api.get("/jobs").json()["items"]
     page.goto(service.url)
-    page.get_by_role("link", name="See a finished example").click()
+    page.get_by_role("link", name="See a finished example", exact=True).click()
     expect(page.get_by_role("region", name="Verdict")).to_contain_text("The refined poses are better")
     report = read_report(EXAMPLE)
     expect(page.get_by_text(f"{len(report.images)} photos of a made scene")).to_be_visible()
@@ -76,6 +76,23 @@ def test_a_finished_example_is_one_click_away_and_needs_no_job(
     assert tab.findings() == []
     assert (tab.outside, tab.complaints) == ([], [])
     assert api.get("/jobs").json()["items"] == before
+
+
+def test_who_has_no_job_yet_sees_what_comes_of_one(tab: Watched, service: Running) -> None:
+    page = tab.page
+    page.route("**/v1/jobs?*", lambda route: route.fulfill(json={"items": [], "next_cursor": None}))
+    page.goto(service.url)
+    shown = page.get_by_role("region", name="What comes of it")
+    for words in ("given poses", "refined poses", "photo"):
+        expect(shown.get_by_text(words, exact=True)).to_be_visible()
+    page.wait_for_function(
+        "() => [...document.querySelectorAll('.outcome img')].filter(e => e.naturalWidth > 0).length === 3"
+    )
+    tab.screenshot("no-jobs-yet")
+    assert tab.findings_in_each_look() == []
+    shown.get_by_role("link").click()
+    expect(page.get_by_role("heading", name="A finished example")).to_be_visible()
+    assert (tab.outside, tab.complaints) == ([], [])
 
 
 def test_a_checked_set_shows_its_photos_and_cameras_and_leaves_photos_out(
@@ -103,6 +120,7 @@ def test_a_checked_set_shows_its_photos_and_cameras_and_leaves_photos_out(
     expect(photos.nth(3)).to_have_attribute("aria-pressed", "true")
     tab.screenshot("checked-set")
     assert tab.findings_in_each_look() == []
+    expect(page.locator(".field:visible")).to_have_count(4)
     page.get_by_text("More options").click()
     distance = "./train/r_1, ./train/r_2, 0.5"
     page.get_by_label("Scale", exact=True).fill(distance)

@@ -17,7 +17,7 @@ interface SceneChoice {
   readonly layer: string | null;
 }
 
-export const FIRST_CHOICE: SceneChoice = { lines: 1, before: true, uncertainty: true, photos: true, by: "moved_deg", caps: {}, layer: null };
+export const FIRST_CHOICE: SceneChoice = { lines: 1, before: true, uncertainty: false, photos: true, by: "moved_deg", caps: {}, layer: null };
 
 const COLOURS = (["moved_deg", "moved_units", "delta_psnr", "source"] as const).map((value) => {
   const { label, unit } = scaleOf(value, 1);

@@ -11,6 +11,7 @@ import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 import { DropZone } from "../upload/drop";
 import { type Jobs, lasting, loadJobs, ORDERS, type Order, PAGE, SEARCHED_MAX, type Wish } from "./load_jobs";
+import { Outcome } from "./outcome";
 import { Selection } from "./selection";
 import { Chip, type JobState, ProgressBar, STATE_WORDS, titleOf } from "./state";
 import { WaitingSets } from "./waiting_sets";
@@ -73,13 +74,14 @@ export function JobsPage() {
         </section>
       )}
       {found && found.jobs.length === 0 && <p class="soft empty">{emptyWords(found.wish)}</p>}
+      {found && found.jobs.length === 0 && !asked && <Outcome />}
     </>
   );
 }
 
 function emptyWords({ state, search }: Wish): string {
   if (search) return `No job is called “${search}”.`;
-  return state ? `No job is ${STATE_WORDS[state]}.` : "No jobs yet. Drop an image set above to start.";
+  return state ? `No job is ${STATE_WORDS[state]}.` : "No jobs yet.";
 }
 
 function Cards({ jobs, more, onMore, onChanged }: Jobs & { onMore: () => void; onChanged: () => void }) {
