@@ -60,7 +60,7 @@ const CHARTS: readonly Chart[] = [
   },
   {
     title: "Stability signal",
-    axis: "dB over the later half of the steps",
+    axis: "dB, later half of the steps",
     of: (line) => line.still_deg != null,
     later: "begins at the detector's sixth check",
     curves: [

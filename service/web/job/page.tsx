@@ -66,19 +66,21 @@ function LiveNumbers({ job, connected }: { job: JobView; connected: boolean }) {
   const { psnr, moved_deg } = job.metrics;
   const numbers = [
     ["Fit to the photos", psnr === undefined ? "" : `${psnr.toFixed(1)} dB`],
-    ["Cameras turn", moved_deg === undefined ? "" : `${short(moved_deg, 2)}° per check`],
+    ["Cameras last turned by", moved_deg === undefined ? "" : `${short(moved_deg, 2)}°`],
     ["Attempt", job.attempt > 1 ? String(job.attempt) : ""],
   ].filter(([, value]) => value);
   return (
     <div class="live">
-      <dl class="live-numbers">
-        {numbers.map(([name, value]) => (
-          <div key={name}>
-            <dt>{name}</dt>
-            <dd>{value}</dd>
-          </div>
-        ))}
-      </dl>
+      {numbers.length > 0 && (
+        <dl class="live-numbers">
+          {numbers.map(([name, value]) => (
+            <div key={name}>
+              <dt>{name}</dt>
+              <dd>{value}</dd>
+            </div>
+          ))}
+        </dl>
+      )}
       <NotifySwitch />
       {!connected && <span class="soft">The connection was lost; reconnecting …</span>}
     </div>

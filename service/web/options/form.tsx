@@ -6,7 +6,7 @@ import { worded } from "../../../biresnerf/viewer/widgets/option_words";
 import { once, useLoaded } from "../api/hooks";
 import { requestJson } from "../api/http";
 import { ProblemBox } from "../parts/problem_box";
-import { type Field, fieldsOf, parsed, presetValue, type Values, words } from "./schema";
+import { type Field, fieldsOf, helpOf, parsed, presetValue, type Values, words } from "./schema";
 
 const PRESET_WORDS: Record<string, string> = {
   fast: "A first result within minutes",
@@ -108,7 +108,7 @@ function FieldRow(props: RowProps) {
       {grouped ? <span class="field-name">{field.title}</span> : <label for={id}>{field.title}</label>}
       {grouped ? <Several {...props} /> : <Control {...props} id={id} described={described} />}
       <p class="soft" id={`${id}-help`}>
-        {worded(field.help)}
+        {worded(helpOf(field, String(value ?? props.fallback)))}
       </p>
       {problem && (
         <p class="bad" id={`${id}-problem`} role="alert">

@@ -59,6 +59,15 @@ function fieldOf(name: string, property: Schema): Field {
   return field;
 }
 
+/** What a field is for and, where its help says "choice: meaning" of several choices, what the present one means. */
+export function helpOf({ help, choices }: Field, present: string): string {
+  const named = choices.filter((choice) => help.includes(`${choice}: `));
+  if (named.length < 2) return help;
+  const purpose = help.slice(0, Math.min(...named.map((choice) => help.indexOf(`${choice}: `))));
+  const meaning = named.includes(present) ? help.split(`${present}: `)[1]!.split(";")[0]!.replace(/\.$/, "") : "";
+  return meaning ? `${purpose}${meaning[0]!.toUpperCase()}${meaning.slice(1)}.` : purpose;
+}
+
 /** The value of a field that is left empty. */
 export function presetValue(view: OptionsView, preset: string, name: string): string {
   const filled: Values = { ...view.presets[preset as keyof OptionsView["presets"]] };
