@@ -152,9 +152,7 @@ class ImageReport(FrozenModel):
         examples=[21.4],
         description="In the verdict's training on the input's poses, dB; its unseen views only.",
     )
-    trial_psnr_after: float | None = Field(
-        None, examples=[24.9], description="The same on the refined poses."
-    )
+    trial_psnr_after: float | None = Field(None, examples=[24.9], description="On the refined poses.")
     epipolar_px_before: float | None = Field(
         None, description="Median symmetric epipolar error of its feature matches with the input's poses, px."
     )
@@ -191,8 +189,7 @@ class CameraReport(FrozenModel):
     )
     observable: bool | None = Field(
         None,
-        description="Whether they tell the focal length of this camera: if not, it was kept. None where they were "
-        "not asked.",
+        description="Whether they tell the focal length: if not, it was kept. None where they were not asked.",
     )
 
 
@@ -265,6 +262,9 @@ class Report(FrozenModel):
     verdict: Verdict | None = Field(
         None,
         description="None of a partial result, and where none was asked for; the poses are the refined ones then.",
+    )
+    verdict_so_far: Verdict | None = Field(
+        None, description="Of a preview or a partial result: by feature matches alone."
     )
     images: tuple[ImageReport, ...]
     cameras: tuple[CameraReport, ...] = ()

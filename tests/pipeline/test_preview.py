@@ -37,6 +37,8 @@ def test_a_running_refinement_shows_poses_and_a_view_and_a_finished_one_cleans_u
     assert [image["name"] for image in poses["images"]] == list(read_dataset(scene).names)
     report = Report.model_validate_json((output / "preview" / "report.json").read_text())
     assert (report.state, report.verdict, len(report.images)) == ("partial", None, 8)
+    assert report.verdict_so_far is not None, "by matches, of which this run has none"
+    assert report.verdict_so_far.heldout is None
     assert 0 < report.steps_done < 400
     so_far = json.loads((output / "preview" / "transforms.json").read_text())
     assert [frame["file_path"] for frame in so_far["frames"]] == list(read_dataset(scene).names)

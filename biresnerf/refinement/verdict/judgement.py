@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -95,6 +95,16 @@ def _rounds(stages: TwoStages) -> int:
     return int(min(max(in_time, 1), ROUNDS_MOST))
 
 
+def verdict_so_far(stages: TwoStages) -> Verdict | None:
+    """What feature matches and motion say of the poses as they are now; None where the options ask for no verdict.
+
+    No field is trained for it: it takes as long as a few steps.
+    """
+    if not stages.optimiser.options.verdict:
+        return None
+    return decide(_compare(stages.scene, stages.optimiser).findings)
+
+
 def judge_poses(
     scene: Scene,
     optimiser: JointOptimiser,
@@ -111,6 +121,38 @@ def judge_poses(
         Interrupted: ``should_stop`` returned true.
     """
     report(0.0)
+    found = _compare(scene, optimiser)
+    heldout: HeldOutComparison | None = None
+    if found.findings.moved_px >= MEASURABLE_PX:
+        heldout = compare_placed(
+            found.before, found.after, scene, optimiser, found.placed | (not found.findings.grounded),
+            should_stop, report, Effort(rounds_most=rounds_most, pictured=True),
+        )  # fmt: skip
+    took(heldout.work if heldout else 0.0)
+    verdict = decide(replace(found.findings, heldout=heldout.evidence if heldout else None))
+    return _with_images(verdict, scene.images, optimiser, found, heldout)
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """The input's poses and the optimised ones, compared by all but unseen views.
+
+    Attributes:
+        before, after: in the input's frame.
+        placed: images [n] that had more than a guess for a pose before.
+        turned, shifted: how far each camera moved [n], degrees and units.
+    """
+
+    before: Rig
+    after: Rig
+    placed: NDArray[np.bool_]
+    turned: Array
+    shifted: Array
+    epipolar: EpipolarComparison | None
+    findings: Findings
+
+
+def _compare(scene: Scene, optimiser: JointOptimiser) -> _Compared:
     dataset, images = scene.dataset, scene.images
     refined = optimiser.lenses.refined(dataset)
     rows = range(len(dataset))
@@ -121,7 +163,6 @@ def judge_poses(
     grounded = sum(frame.pose_source not in GUESSED for frame in dataset.frames) > len(dataset) / 2
     lost = int(optimiser.camera_errors.lost.sum())
     failed = failed_checks(after.world_from_cam, lost)
-    heldout: HeldOutComparison | None = None
     epipolar: EpipolarComparison | None = None
     moved = 0.0
     placed = np.array([frame.pose_source not in GUESSES for frame in dataset.frames])
@@ -131,25 +172,17 @@ def judge_poses(
             epipolar = compare_on_matches(
                 before, after, scene.tracks, placed, started_from_matches=bool(scene.start.matched.any())
             )
-        if moved >= MEASURABLE_PX:
-            heldout = compare_placed(
-                before, after, scene, optimiser, placed | (not grounded),
-                should_stop, report, Effort(rounds_most=rounds_most, pictured=True),
-            )  # fmt: skip
-    took(heldout.work if heldout else 0.0)
-    verdict = decide(
-        Findings(
-            failed=failed,
-            moved_px=moved,
-            heldout=heldout.evidence if heldout else None,
-            epipolar=epipolar.evidence if epipolar else None,
-            compared_with=_source_of_poses(dataset),
-            grounded=grounded,
-            working_share=working_share(before, images),
-            out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
-        )
+    findings = Findings(
+        failed=failed,
+        moved_px=moved,
+        heldout=None,
+        epipolar=epipolar.evidence if epipolar else None,
+        compared_with=_source_of_poses(dataset),
+        grounded=grounded,
+        working_share=working_share(before, images),
+        out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
     )
-    return _with_images(verdict, images, optimiser, before, heldout, epipolar, turned, shifted)
+    return _Compared(before, after, placed, turned, shifted, epipolar, findings)
 
 
 def motion(before: Array, after: Array) -> tuple[Array, Array]:
@@ -169,20 +202,18 @@ def _with_images(
     verdict: Verdict,
     images: ImageSet,
     optimiser: JointOptimiser,
-    before: Rig,
+    found: _Compared,
     heldout: HeldOutComparison | None,
-    epipolar: EpipolarComparison | None,
-    turned: Array,
-    shifted: Array,
 ) -> Judgement:
     trial_psnr, epipolar_px = np.full((2, len(images)), np.nan), np.full((2, len(images)), np.nan)
     if heldout is not None:
         trial_psnr[:, heldout.views] = heldout.before.psnr, heldout.after.psnr
-    if epipolar is not None:
-        epipolar_px[:] = epipolar.before, epipolar.after
-    sharpness = image_flags.sharpness(images, before.world_from_cam)
+    if found.epipolar is not None:
+        epipolar_px[:] = found.epipolar.before, found.epipolar.after
+    before = found.before.world_from_cam
+    sharpness = image_flags.sharpness(images, before)
     gain = image_flags.gains(optimiser)
-    distance = focus_point(before.world_from_cam).mean_distance
+    distance = focus_point(before).mean_distance
     return Judgement(
         verdict=verdict,
         trial_psnr=trial_psnr,
@@ -191,7 +222,7 @@ def _with_images(
         sharpness=sharpness,
         gain=gain,
         contradicted=contradicted(epipolar_px[1]),
-        moved_far=image_flags.moved_far(turned, shifted, distance),
+        moved_far=image_flags.moved_far(found.turned, found.shifted, distance),
         blurred=image_flags.blurred(sharpness),
         exposure_off=image_flags.exposure_off(gain),
     )

@@ -21,7 +21,7 @@ from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.choose_start import MARGIN_DB
 from biresnerf.refinement.start.first_step import poses_in_input_frame
 from biresnerf.refinement.verdict.camera_reports import camera_reports, focal_warnings
-from biresnerf.refinement.verdict.judgement import Judgement, motion
+from biresnerf.refinement.verdict.judgement import Judgement, motion, verdict_so_far
 from biresnerf.refinement.verdict.pose_uncertainty import FIXED
 from biresnerf.refinement.views.evaluation import ViewScore
 from biresnerf.refinement.views.floaters import unshared_opacity
@@ -55,6 +55,7 @@ def run_report(
         state=state,
         options=optimiser.options,
         verdict=judgement.verdict if judgement is not None else None,
+        verdict_so_far=verdict_so_far(stages) if state == "partial" and judgement is None else None,
         images=_image_reports(stages, scores, judgement, refined, uncertainty),
         cameras=camera_reports(dataset, optimiser.lenses),
         heldout=held_out_report(optimiser, scores) if scores else None,

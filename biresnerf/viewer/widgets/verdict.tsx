@@ -3,7 +3,7 @@ import type { PairedDifference, Report, Verdict } from "schemas";
 import { VerdictChip } from "./controls";
 import { count, fixed, short, signed } from "./numbers";
 
-export function VerdictSentence({ report: { verdict, state, options } }: { report: Report }) {
+export function VerdictSentence({ report: { verdict, verdict_so_far, state, options } }: { report: Report }) {
   return (
     <p class="verdict-sentence">
       {verdict ? (
@@ -14,7 +14,7 @@ export function VerdictSentence({ report: { verdict, state, options } }: { repor
         <>
           <span class="chip chip-plain">{state === "partial" ? "partial" : "no verdict"}</span>
           {state === "partial"
-            ? "The run was stopped early: these are the best poses so far. They were not compared with the input's."
+            ? `The run was stopped early: these are the best poses so far. ${verdict_so_far?.why[0] ?? "They were not compared with the input's."}`
             : options.verdict === false
               ? "No verdict was requested: the result holds the refined poses."
               : "No verdict was reached."}
