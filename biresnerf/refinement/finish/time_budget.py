@@ -6,6 +6,7 @@ import logging
 import time
 from functools import partial
 
+from biresnerf.data.workload import FIRST_ROUND, LEARNING
 from biresnerf.refinement.finish.work_ahead import work_ahead
 from biresnerf.refinement.stages.two_stages import TwoStages
 
@@ -40,10 +41,10 @@ def budget_warnings(stages: TwoStages) -> tuple[str, ...]:
 
 
 def choose_steps(stages: TwoStages, most: int) -> None:
-    """Leave a run as many steps as there is time for, `most` in all."""
+    """Leave a run as many steps as there is time for, `most` in all; fewer where poses stand still from now on."""
     optimiser = stages.optimiser
     before = optimiser.schedule.steps
-    high = before if optimiser.poses_held else most
+    high = round((FIRST_ROUND + LEARNING) * most) if optimiser.poses_held else most
     low = min(high, max(optimiser.step_index, round(LEAST * most)))
     left_s = stages.ends - time.monotonic()
     while low < high:
@@ -53,7 +54,7 @@ def choose_steps(stages: TwoStages, most: int) -> None:
         else:
             high = steps - 1
     if low != before:
-        logger.info("%d steps in place of %d: %.0f s left", low, before, left_s)
+        logger.debug("%d steps in place of %d: %.0f s left", low, before, left_s)
         optimiser.set_steps(low)
         stages.forecast.left |= work_ahead(stages)
 

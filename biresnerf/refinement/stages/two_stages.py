@@ -51,8 +51,8 @@ class TwoStages:
         origin: what the run was started with; goes into every checkpoint.
 
     Attributes:
-        plan: called when it is known how long the steps of a stage take, and after cameras were adjusted; it may
-            shorten the run.
+        plan: called when it is known how long the steps of a stage take, after cameras were adjusted, and at each
+            check of stage 2; it may change how many steps the run takes.
         ends: of `time.monotonic`, when the run is to end.
     """
 
@@ -109,7 +109,7 @@ class TwoStages:
         self.monitor.report(self._progress(CHECKPOINT.as_posix(), self._preview()))
 
     def replan(self) -> None:
-        """The rest of the run may be shortened: how long it takes has been measured."""
+        """The rest of the run may become shorter or longer: how long it takes has been measured."""
         self.plan(self)
         self._take_lengths()
 
@@ -198,6 +198,7 @@ class TwoStages:
         if optimiser.switch is not None:
             self._write_history(error, last)
             self._repair_if_due()
+            self.replan()
             return
         still_deg = self.detector.still_deg(optimiser.pose_rate(), optimiser.options.check_every)
         verdict = self.detector.check(optimiser.step_index, error, self._moved_deg, still_deg)

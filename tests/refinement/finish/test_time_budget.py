@@ -5,6 +5,7 @@ import time
 
 import pytest
 
+from biresnerf.data.workload import FIRST_ROUND, LEARNING
 from biresnerf.forecast import RATES
 from biresnerf.refinement.finish.time_budget import LEAST, budget_warnings, choose_steps, keep_to_budget
 from biresnerf.refinement.finish.work_ahead import step_weights, work_ahead
@@ -69,6 +70,45 @@ def test_steps_that_were_too_few_are_added_again_where_they_turn_out_faster(scen
     stages.optimiser.start_reconstruction()
     choose_steps(with_step_of(stages, 0.7), STEPS)
     assert few < stages.optimiser.schedule.steps < STEPS
+
+
+@pytest.mark.parametrize(
+    ("seconds", "steps"), [(1e6, round((FIRST_ROUND + LEARNING) * STEPS)), (400.0, None)]
+)
+def test_time_that_an_adjustment_leaves_goes_to_the_field_at_the_poses_it_found(
+    scene, tmp_path, seconds, steps
+):
+    stages = with_step_of(stages_of(scene, tmp_path), 1.0)
+    stages.ends = time.monotonic() + 100  # as far as was known before it
+    choose_steps(stages, STEPS)
+    few = stages.optimiser.schedule.steps
+    stages.optimiser.start_reconstruction()
+    stages.optimiser.poses_held = True
+    stages.record = stages.record.model_copy(update={"adjusted": True})
+    stages.optimiser.end_after(LEARNING)
+    assert stages.optimiser.schedule.steps < few
+    stages.ends = time.monotonic() + seconds
+    choose_steps(stages, STEPS)
+    found = stages.optimiser.schedule.steps
+    assert found > few
+    if steps is None:
+        assert left_s(stages) == pytest.approx(seconds, rel=0.02)
+    else:
+        assert found == steps
+
+
+@pytest.mark.slow
+def test_a_run_is_planned_again_at_each_check_of_stage_2(scene, tmp_path):
+    stages = stages_of(scene, tmp_path, steps=120, coarse_steps_min=10, coarse_steps_max=20, check_every=10)
+    planned = []
+    stages.plan = lambda found: planned.append(found.optimiser.step_index)
+    assert finished(stages)
+    switch = stages.optimiser.switch
+    due = {step for step in range(switch + 1, 121) if step % 10 == 0} | {
+        MEASURED_STEPS,
+        switch + MEASURED_STEPS,
+    }
+    assert set(planned) == due - ({MEASURED_STEPS} if switch < MEASURED_STEPS else set())
 
 
 @pytest.mark.slow
