@@ -264,7 +264,7 @@ class Report(FrozenModel):
         description="None of a partial result, and where none was asked for; the poses are the refined ones then.",
     )
     verdict_so_far: Verdict | None = Field(
-        None, description="Of a preview or a partial result: by feature matches alone."
+        None, examples=[None], description="Of a preview or a partial result: by feature matches alone."
     )
     images: tuple[ImageReport, ...]
     cameras: tuple[CameraReport, ...] = ()
