@@ -20,12 +20,12 @@ Phase = Literal[
     "features", "matching", "mapping", "trying", "coarse", "fine", "adjusting", "checking", "evaluating", "judging"
 ]  # fmt: skip
 Unit = Literal[
-    "megapixel", "comparison", "image", "trial step", "coarse step", "fine step", "adjustment", "evaluation"
+    "megapixel", "comparison", "mapped feature", "trial step", "coarse step", "fine step", "adjustment", "evaluation"
 ]  # fmt: skip
 UNITS: dict[Phase, Unit] = {
     "features": "megapixel",
     "matching": "comparison",
-    "mapping": "image",
+    "mapping": "mapped feature",
     "trying": "trial step",
     "coarse": "coarse step",
     "fine": "fine step",
@@ -38,7 +38,7 @@ UNITS: dict[Phase, Unit] = {
 RATES: dict[Unit, float] = {
     "megapixel": 1.1,
     "comparison": 4.2,  # a billion of features of one photo with those of another
-    "image": 0.2,
+    "mapped feature": 0.053,  # a thousand
     "trial step": 0.0125,
     "coarse step": 0.015,
     "fine step": 0.0155,

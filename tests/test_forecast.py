@@ -104,7 +104,7 @@ def test_the_phases_of_matching_follow_each_other():
     found.enter("mapping")
     found.leave()
     assert found.left == {}
-    assert set(found.measured()) == {"megapixel", "comparison", "image"}
+    assert set(found.measured()) == {"megapixel", "comparison", "mapped feature"}
     assert found.measured()["megapixel"] == pytest.approx(0.2, abs=0.1)
 
 
@@ -154,7 +154,7 @@ def test_a_first_step_that_compiles_says_nothing_and_later_ones_count_alike():
 def test_time_before_the_run_begins_is_no_part_of_it(monkeypatch):
     clock = [100.0]
     monkeypatch.setattr("biresnerf.forecast.time.monotonic", lambda: clock[0])
-    found = Forecast({**RATES, "image": 1.0})
+    found = Forecast({**RATES, "mapped feature": 1.0})
     clock[0] += 900  # kernels are compiled
     found.begins()
     found.left["mapping"] = 30
@@ -168,7 +168,7 @@ def test_a_machine_remembers_what_its_runs_measured(cache):
     remember_rates("cpu", 2, {"coarse step": 0.3, "comparison": 1.0})
     known = remembered_rates("cpu", 2)
     assert (known["coarse step"], known["comparison"]) == (pytest.approx(0.2), 1.0)
-    assert known["image"] == RATES["image"] / 2
+    assert known["mapped feature"] == RATES["mapped feature"] / 2
     assert remembered_rates("cuda", 2)["comparison"] == RATES["comparison"] / 2
 
 

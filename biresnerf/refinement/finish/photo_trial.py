@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.workload import PHOTO_TRIALS
 from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.similarity import align_robust
 from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.views.compare_rigs import Effort, Rig, compare_placed
 from biresnerf.refinement.views.motion import moved_px
@@ -18,6 +19,21 @@ logger = logging.getLogger(__name__)
 
 # In px at working size. Poses nearer to the truth than this predict unseen photos as well as it does (docs/verdict.md).
 UNSEEN_PX = 0.5
+
+
+def photos_will_be_asked(stages: TwoStages) -> bool:
+    """Whether photos will have to judge the adjusted cameras, as far as the present poses tell.
+
+    Cameras that are adjusted to tracks end near those that matches placed: where the present ones are as near, photos
+    do not tell them apart. Unknown is yes.
+    """
+    scene, optimiser = stages.scene, stages.optimiser
+    matched, present = scene.start.matched_poses, optimiser.poses.poses().numpy()
+    if matched is None or not (np.isfinite(matched).all() and np.isfinite(present).all()):
+        return True
+    lenses = tuple(scene.dataset.camera_of(i) for i in range(len(scene.dataset)))
+    carried = align_robust(matched, present, with_rotations=True).apply_to_poses(matched)
+    return moved_px(Rig(present, lenses), Rig(carried, lenses), scene.images) >= UNSEEN_PX
 
 
 def photos_object(stages: TwoStages, unit_from_cam: NDArray[np.float64], cameras: Sequence[Camera]) -> bool:

@@ -9,7 +9,7 @@ from biresnerf.data.workload import FIRST_ROUND, LEARNING
 from biresnerf.forecast import Phase
 from biresnerf.refinement.finish.adjust_cameras import adjust_cameras
 from biresnerf.refinement.finish.outcome import Finish
-from biresnerf.refinement.finish.work_ahead import work_ahead
+from biresnerf.refinement.finish.work_ahead import expect_as_measured
 from biresnerf.refinement.stages.two_stages import TwoStages
 
 AFTER: tuple[Phase, ...] = ("evaluating", "judging")  # phases of the run that follow
@@ -33,13 +33,12 @@ def run_stage_2(stages: TwoStages) -> Finish:
         if stages.optimiser.poses_held:
             stages.optimiser.end_after(LEARNING)
         stages.record = stages.record.model_copy(update={"adjusted": True})
-        stages.forecast.left |= work_ahead(stages)
-        if _is_over(stages, first):
-            stages.forecast.left["adjusting"] = 0.0
+        stages.adjusts_again = not _is_over(stages, first)
+        expect_as_measured(stages)
         stages.replan()
     stages.run_stage_2()
     held = stages.optimiser.poses_held
-    if first is not None and (_is_over(stages, first) or not _time_to_adjust_again(stages)):
+    if first is not None and not (stages.adjusts_again and _time_to_adjust_again(stages)):
         return first
     last = adjust_cameras(stages)
     # The poses that are held are what the first adjustment made of the field's.

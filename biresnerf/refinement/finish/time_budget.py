@@ -7,7 +7,7 @@ import time
 from functools import partial
 
 from biresnerf.data.workload import FIRST_ROUND, LEARNING
-from biresnerf.refinement.finish.work_ahead import work_ahead
+from biresnerf.refinement.finish.work_ahead import checks_ahead, expect_as_measured, work_ahead
 from biresnerf.refinement.stages.two_stages import TwoStages
 
 logger = logging.getLogger(__name__)
@@ -18,11 +18,12 @@ OVERDRAWN = 1.1  # times the budget: the report warns of more
 
 
 def keep_to_budget(stages: TwoStages, started: float, steps_asked: int) -> None:
-    """Let a run that started at this `time.monotonic` end within its budget, if it has one.
+    """Let a run that started at this `time.monotonic` end within its budget; predict its end if it has none.
 
     What it took before it was interrupted counts.
     """
     seconds = stages.optimiser.options.time_budget_s
+    stages.plan = expect_as_measured
     if seconds:
         stages.ends = started + (1 - WRITING) * seconds - sum(stages.record.seconds.values())
         stages.plan = partial(choose_steps, most=steps_asked)
@@ -46,20 +47,22 @@ def choose_steps(stages: TwoStages, most: int) -> None:
     before = optimiser.schedule.steps
     high = round((FIRST_ROUND + LEARNING) * most) if optimiser.poses_held else most
     low = min(high, max(optimiser.step_index, round(LEAST * most)))
-    left_s = stages.ends - time.monotonic()
+    left_s, checks = stages.ends - time.monotonic(), checks_ahead(stages)
     while low < high:
         steps = (low + high + 1) // 2
-        if _needed_s(stages, steps) <= left_s:
+        if _needed_s(stages, steps, checks) <= left_s:
             low = steps
         else:
             high = steps - 1
     if low != before:
         logger.debug("%d steps in place of %d: %.0f s left", low, before, left_s)
         optimiser.set_steps(low)
-        stages.forecast.left |= work_ahead(stages)
+    expect_as_measured(stages)
 
 
-def _needed_s(stages: TwoStages, steps: int) -> float:
+def _needed_s(stages: TwoStages, steps: int, checks: bool) -> float:
     optimiser = stages.optimiser
     options = optimiser.options.with_steps(steps) if optimiser.switch is None else optimiser.options
-    return stages.forecast.left_s(work_ahead(stages, options.model_copy(update={"steps": steps})))
+    return stages.forecast.left_s(
+        work_ahead(stages, options.model_copy(update={"steps": steps}), checks=checks)
+    )

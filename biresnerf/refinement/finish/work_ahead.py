@@ -9,6 +9,7 @@ from biresnerf.data.photos.images import load_images
 from biresnerf.data.workload import ADJUSTMENT, after_steps, step_weights, steps_share, workload
 from biresnerf.forecast import Forecast, Phase
 from biresnerf.options.refine_options import ResolvedOptions
+from biresnerf.refinement.finish.photo_trial import photos_will_be_asked
 from biresnerf.refinement.optimise.methods import find_method
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.two_stages import TwoStages
@@ -38,8 +39,19 @@ def expect_rest(stages: TwoStages) -> None:
     forecast.left = work_ahead(stages)
 
 
-def work_ahead(stages: TwoStages, options: ResolvedOptions | None = None) -> dict[Phase, float]:
-    """What is left of a run after its first step, with other options (of its steps) if given."""
+def expect_as_measured(stages: TwoStages) -> None:
+    """The rest of a run on its way, as its poses and what it has done tell it now."""
+    stages.forecast.left |= work_ahead(stages)
+
+
+def work_ahead(
+    stages: TwoStages, options: ResolvedOptions | None = None, *, checks: bool | None = None
+) -> dict[Phase, float]:
+    """What is left of a run after its first step, with other options (of its steps) if given.
+
+    Args:
+        checks: what `checks_ahead` says, where it was asked already.
+    """
     scene, optimiser = stages.scene, stages.optimiser
     unbounded = optimiser.frame.unbounded
     steps = optimiser.schedule.steps if options is None else options.steps
@@ -48,12 +60,19 @@ def work_ahead(stages: TwoStages, options: ResolvedOptions | None = None) -> dic
     weights = step_weights(options, unbounded=unbounded)
     adjusts, first = adjusts_cameras(scene.dataset, optimiser.method), not stages.record.adjusted
     each = adjustment(scene) if adjusts else 0.0
-    checks = adjusts and first and scene.tracks is not None
+    checks = checks_ahead(stages) if checks is None else checks
     return {
         "coarse": coarse * weights["coarse"],
         "fine": fine * weights["fine"],
-        **after_steps(options, unbounded, adjusting=(1 + first) * each, checks=checks),
+        **after_steps(options, unbounded, adjusting=(first + stages.adjusts_again) * each, checks=checks),
     }
+
+
+def checks_ahead(stages: TwoStages) -> bool:
+    """Whether photos will judge the adjusted cameras."""
+    scene = stages.scene
+    adjusts = adjusts_cameras(scene.dataset, stages.optimiser.method) and not stages.record.adjusted
+    return adjusts and scene.tracks is not None and photos_will_be_asked(stages)
 
 
 def adjustment(scene: Scene) -> float:

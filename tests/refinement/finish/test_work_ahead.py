@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from biresnerf.data.points.tracks import Tracks
-from biresnerf.data.workload import FIRST_ROUND, LEARNING, step_weights
+from biresnerf.data.workload import FIRST_ROUND, LEARNING, step_weights, workload
 from biresnerf.forecast import Forecast
-from biresnerf.refinement.finish.work_ahead import expect_rest, expect_run, work_ahead
+from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.geometry.similarity import Similarity
+from biresnerf.refinement.finish.work_ahead import expect_as_measured, expect_rest, expect_run, work_ahead
 from biresnerf.refinement.stages.two_stages import TwoStages
 from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
 
@@ -48,6 +50,23 @@ def test_what_was_adjusted_once_is_adjusted_once_more_and_not_checked_again(stag
     after = work_ahead(stages)
     assert after["adjusting"] == before["adjusting"] / 2
     assert after["checking"] == 0
+    stages.adjusts_again = False
+    assert work_ahead(stages)["adjusting"] == 0
+
+
+@pytest.mark.parametrize(("off", "asked"), [(0.0, False), (0.1, True)])
+def test_photos_are_expected_to_judge_only_cameras_that_matches_would_move_visibly(stages_of, off, asked):
+    stages = stages_of(TRACKS)
+    present = stages.optimiser.poses.poses().numpy()
+    moved = perturb_poses(present, off, seed=1) if off else present
+    # In another frame and scale than the run's own, as the user's are.
+    turned = Similarity(
+        2.0, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([1.0, 2.0, 3.0])
+    ).apply_to_poses(moved)
+    stages.scene = replace(stages.scene, start=replace(stages.scene.start, matched_poses=turned))
+    assert (work_ahead(stages)["checking"] > 0) == asked
+    expect_as_measured(stages)
+    assert (stages.forecast.left["checking"] > 0) == asked
 
 
 def test_the_verdict_takes_time_only_where_it_is_asked_for(stages_of):
@@ -72,4 +91,17 @@ def test_matching_is_expected_where_poses_are_compared_with_matches(scene):
     found = Forecast()
     expect_run(found, scene[0], tiny_options(start="auto"))
     assert all(found.left[phase] > 0 for phase in ("features", "matching", "mapping", "trying", "checking"))
-    assert found.left["mapping"] == len(scene[0])
+
+
+def test_mapping_is_more_work_where_photos_have_more_features(scene):
+    pytest.importorskip("pycolmap")
+
+    def mapping(times: int) -> float:
+        cameras = tuple(c.resized(times * c.width, times * c.height) for c in scene[0].cameras)
+        enlarged = replace(scene[0], cameras=cameras)
+        return workload(enlarged, tiny_options(start="auto"), unbounded=False, adjusts=True).amounts[
+            "mapping"
+        ]
+
+    assert mapping(1) < 0.5 * len(scene[0])
+    assert mapping(100) > 5 * mapping(1)
