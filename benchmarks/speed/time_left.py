@@ -1,8 +1,8 @@
 """How accurate the predicted time left is: ``python -m benchmarks.speed.time_left SET... [--preset fast]``.
 
 Each SET holds true poses, which get BARF's noise (0.15). Prints how long each run took, and at 10, 25, 50,
-75 and 90 % of that time the predicted seconds to the end over the actual ones. Before the first step nothing is
-predicted (``-``).
+75 and 90 % of that time the predicted seconds to the end over the actual ones. With ``--phases`` a second table says
+of each phase what it was predicted to take from these moments on, and what it took (predicted / actual, s).
 """
 
 from __future__ import annotations
@@ -11,30 +11,75 @@ import argparse
 import tempfile
 import time
 from bisect import bisect_right
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, Literal
+from unittest import mock
 
-from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf import pipeline
+from biresnerf.commands.settings_option import parse_settings
+from biresnerf.compile_kernels import compile_kernels
+from biresnerf.forecast import UNITS, Forecast, Phase, Unit
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.options.refine_options import parse_options
-from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
-from biresnerf.studies.scenes import with_poses
+from biresnerf.studies.scenes import find_scene, read_scene, with_poses
 
 SHARES = (0.1, 0.25, 0.5, 0.75, 0.9)
 
 
-def told_and_taken(path: Path, preset: str, noise: float) -> tuple[float, list[float | None]]:
-    """The seconds of a run, and the ratios of the time told and the time that was left."""
-    truth = read_dataset(path)
+class Watched(Forecast):
+    """A forecast that keeps what it said of each phase at each report, and what the phase had taken by then."""
+
+    def __init__(self, rates: Mapping[Unit, float]) -> None:
+        super().__init__(rates)
+        self.said: list[tuple[float, dict[Phase, float], dict[Phase, float]]] = []
+        self.taken: dict[Phase, float] = {}
+
+    def enter(self, phase: Phase) -> None:
+        super().enter(phase)
+        self._entered = time.monotonic()
+
+    def leave(self) -> None:
+        if self._phase is not None:
+            self.taken[self._phase] = self.taken.get(self._phase, 0.0) + time.monotonic() - self._entered
+        super().leave()
+
+    def stepped(self, stage: Literal["coarse", "fine"], seconds: float) -> None:
+        self.taken[stage] = self.taken.get(stage, 0.0) + seconds
+        super().stepped(stage, seconds)
+
+    def now(self) -> tuple[float, float | None]:
+        self.said.append((time.monotonic(), {p: self.seconds(p) for p in self.left}, dict(self.taken)))
+        return super().now()
+
+    def phases_at(self, moment: float) -> dict[Phase, tuple[float, float]]:
+        """Of each phase, once the run is over: the seconds from a moment on, predicted and actual."""
+        _, said, taken = self.said[max(0, bisect_right([when for when, _, _ in self.said], moment) - 1)]
+        rest = {phase: seconds - taken.get(phase, 0.0) for phase, seconds in self.taken.items()}
+        return {p: (said.get(p, 0.0), rest.get(p, 0.0)) for p in UNITS if said.get(p) or rest.get(p)}
+
+
+def told_and_taken(
+    path: Path, preset: str, noise: float, settings: Mapping[str, Any]
+) -> tuple[float, list[float | None], list[dict[Phase, tuple[float, float]]]]:
+    """The seconds of a run, the ratios of the time told and the time that was left, and both of each phase."""
+    truth = read_scene(find_scene(path, 1, test_views=0))
     given = with_poses(truth, perturb_poses(truth.world_from_cam, noise, seed=1))
     told: list[tuple[float, float | None]] = []
+    made: list[Watched] = []
 
     def listen(progress: Progress) -> None:
         told.append((time.monotonic(), progress.eta_s))
 
     began = time.monotonic()
-    with tempfile.TemporaryDirectory() as folder:
-        refine_poses(given, Path(folder), parse_options({"preset": preset}), listen)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        mock.patch.object(
+            pipeline, "Forecast", side_effect=lambda rates: made.append(Watched(rates)) or made[-1]
+        ),
+    ):
+        pipeline.refine_poses(given, Path(folder), parse_options({"preset": preset, **settings}), listen)
     seconds = time.monotonic() - began
     ratios: list[float | None] = []
     for share in SHARES:
@@ -42,7 +87,7 @@ def told_and_taken(path: Path, preset: str, noise: float) -> tuple[float, list[f
         at, eta_s = told[max(0, bisect_right([when for when, _ in told], now) - 1)]
         left_s = None if eta_s is None else eta_s - (now - at)
         ratios.append(None if left_s is None else left_s / ((1 - share) * seconds))
-    return seconds, ratios
+    return seconds, ratios, [made[0].phases_at(began + share * seconds) for share in SHARES]
 
 
 def main() -> None:
@@ -50,13 +95,23 @@ def main() -> None:
     parser.add_argument("sets", nargs="+", type=Path)
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--noise", type=float, default=0.15)
+    parser.add_argument("--phases", action="store_true")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="an option of the runs"
+    )
     options = parser.parse_args()
+    compile_kernels(field=True)
     print("| set | seconds |" + "".join(f" at {share:.0%} |" for share in SHARES))
     print("|---|---|" + "---|" * len(SHARES))
     for path in options.sets:
-        seconds, ratios = told_and_taken(path, options.preset, options.noise)
+        settings = parse_settings(tuple(options.set))
+        seconds, ratios, phases = told_and_taken(path, options.preset, options.noise, settings)
         cells = "".join(" - |" if ratio is None else f" {ratio:.2f} |" for ratio in ratios)
         print(f"| {path.name} | {seconds:.0f} |{cells}", flush=True)
+        for phase in UNITS if options.phases else ():
+            both = (found.get(phase) for found in phases)
+            cells = "".join(" |" if one is None else f" {one[0]:.1f} / {one[1]:.1f} |" for one in both)
+            print(f"| | {phase} |{cells}", flush=True)
 
 
 if __name__ == "__main__":
