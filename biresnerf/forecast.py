@@ -42,7 +42,7 @@ RATES: dict[Unit, float] = {
     "trial step": 0.0125,
     "coarse step": 0.015,
     "fine step": 0.0155,
-    "adjustment": 0.13,
+    "adjustment": 0.05,
     "evaluation": 2.4,
 }
 MEMORY = 0.98  # of the running mean of a step's time

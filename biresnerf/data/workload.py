@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from biresnerf.data.model.dataset import Dataset
@@ -38,13 +38,19 @@ PHOTO_TRIALS = 2
 # difference after 200 steps, 4 dB after 400).
 OPEN_STEPS = 2  # times the steps of a scene with a background
 OPEN_STEP = 1.6  # times the work of a step of one, as measured (docs/speed.md)
-# As measured (docs/speed.md): the rendering of a scene with a background against one without; an adjustment's
-# work in thousands of observations of tracks, how many a photo has, and the work without any.
-OPEN_EVALUATION, OBSERVATIONS, ADJUSTMENT = 3.0, 1200, 20.0
+# As measured (docs/speed.md): the rendering of an open scene against one with a background.
+OPEN_EVALUATION = 3.0
+# Thousands of observations of tracks that take as long as what an adjustment does without any: surfaces, patches, and
+# their choice, which are bounded. lego at 100 px, fountain-P11, temple and fox (4, 35, 58 and 87 thousand) take 7.0,
+# 6.9, 10.6 to 16.6, and 11.0 to 12.1 s.
+ADJUSTMENT = 140.0
+OBSERVED = 0.5  # of a photo's features, of tracks: 0.4 to 0.8 in these sets
+# Trial steps that take as long as the rest of a verdict: temple's takes 2.8 s without its training, fox's 3.5.
+JUDGING = 250.0
 # Features of a megapixel, and the time for a small photo's.
 FEATURES_OF_MEGAPIXEL, THOROUGH = 10_000, 4.0
 # Thousands of features that an image takes as long to be mapped as: lego at 100 px (100 images of 100), temple (47 of
-# 3,072) and fox (50 of 5,184) take 1.8, 7.8 and 13.6 s.
+# 3,072) and fox (50 of 3,257) take 1.8, 8.9 and 9.1 s.
 EACH_MAPPED = 0.25
 SAMPLES = 1 << 15  # of a step of weight 1, with 8 levels in stage 2
 
@@ -83,12 +89,17 @@ def workload(dataset: Dataset, options: ResolvedOptions, *, unbounded: bool, adj
         "coarse": coarse * weights["coarse"],
         "fine": (round(share * options.steps) - coarse) * weights["fine"],
     }
+    observations = 0.0
     if matched:
-        amounts |= _matching(dataset, options.seeding_effort)
+        features, pairs, search = _search(dataset, options.seeding_effort)
+        amounts["features"] = search
+        amounts |= matching_work([features] * len(dataset), pairs)
+        observations = OBSERVED * features * len(dataset)
     if matched and options.start == "auto" and dataset.posed.any():
         amounts["trying"] = LOOKS[0] * _trial(TRIAL_STEPS, unbounded=unbounded)
-    each = ADJUSTMENT + matched * OBSERVATIONS * len(dataset) / 1000 if adjusts else 0.0
-    amounts |= after_steps(options, unbounded, adjusting=2 * each, checks=matched and adjusts)
+    # Mostly, matches start the run and move cameras little after it: photos need not judge that.
+    adjusting = 2 * (ADJUSTMENT + observations / 1000) if adjusts else 0.0
+    amounts |= after_steps(options, unbounded, adjusting=adjusting, checks=False)
     return Workload(amounts, weights, share)
 
 
@@ -118,12 +129,12 @@ def after_steps(
         "checking": PHOTO_TRIALS * trial if checks else 0.0,
         "evaluating": OPEN_EVALUATION if unbounded else 1.0,
         # the first look of the first round decides mostly, and its fields are trained on for their pictures
-        "judging": options.verdict * picture_share(options.trial_steps, unbounded=unbounded) * trial,
+        "judging": options.verdict * (JUDGING + picture_share(options.trial_steps, unbounded=unbounded) * trial),
     }
 
 
-def _matching(dataset: Dataset, effort: SeedingEffort) -> dict[Phase, float]:
-    """What COLMAP has before it, as far as it is known before its features are."""
+def _search(dataset: Dataset, effort: SeedingEffort) -> tuple[float, float, float]:
+    """Features of an image that COLMAP may find, the pairs it matches, and the work of its search for features."""
     count, guided = len(dataset), dataset.posed.all()
     all_up_to = GUIDED_ALL_PAIRS_UP_TO if guided else ALL_PAIRS_UP_TO
     chosen = chosen_pairs(count, NEIGHBOURS if guided else BY_NAME + BY_LIKENESS)
@@ -135,10 +146,15 @@ def _matching(dataset: Dataset, effort: SeedingEffort) -> dict[Phase, float]:
     shrunk = [min(1.0, asked["widest_image"] / max(camera.width, camera.height)) for camera in sizes]
     pixels = sum(c.width * c.height * share**2 for c, share in zip(sizes, shrunk, strict=True)) / 1e6
     features = min(asked["most_features"], FEATURES_OF_MEGAPIXEL * pixels / count)
+    return features, pairs, pixels * (THOROUGH if asked["thorough"] else 1.0)
+
+
+def matching_work(features: Sequence[float], pairs: float) -> dict[Phase, float]:
+    """What COLMAP has before it where so many pairs of images with so many features [n] are to be matched."""
+    mean = sum(features) / len(features)
     return {
-        "features": pixels * (THOROUGH if asked["thorough"] else 1.0),
-        "matching": pairs * features**2 / 1e9,
-        "mapping": count * (EACH_MAPPED + features / 1000),
+        "matching": pairs * mean**2 / 1e9,
+        "mapping": EACH_MAPPED * len(features) + sum(features) / 1000,
     }
 
 

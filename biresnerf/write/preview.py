@@ -15,6 +15,8 @@ from biresnerf.data.show.history import HISTORY
 from biresnerf.data.show.renders import picture_stems
 from biresnerf.data.show.view_file import PREVIEW, THUMBNAIL
 from biresnerf.data.show.view_pictures import write_thumbnail
+from biresnerf.data.workload import matching_work
+from biresnerf.forecast import Phase
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refinement.stages.two_stages import TwoStages
@@ -25,6 +27,7 @@ from biresnerf.write.output_folder import REPORT, OutputFolder
 from biresnerf.write.result import described, write_rendered
 
 TRANSFORMS = "transforms.json"
+PHASES: tuple[Phase, ...] = ("features", "matching", "mapping")  # of seeding
 
 
 def write_preview(folder: OutputFolder, stages: TwoStages) -> tuple[str, ...]:
@@ -73,6 +76,7 @@ class SeedingPreview:
     def __init__(self, dataset: Dataset, folder: OutputFolder, monitor: Monitor) -> None:
         self._dataset, self._folder, self._monitor = dataset, folder, monitor
         self._found: SeedingProgress | None = None  # until COLMAP reports
+        self._counted = False  # whether all features are
 
     def __enter__(self) -> SeedingPreview:
         return self
@@ -99,11 +103,16 @@ class SeedingPreview:
         if len(found.features) < count:
             forecast.enter("features")
             forecast.advance(len(found.features) / count)
-        elif found.tried < found.pairs:
-            forecast.enter("matching")
-            forecast.advance(found.tried / found.pairs)
-        else:
-            forecast.enter("mapping")
+            return
+        if not self._counted:
+            self._counted = True
+            forecast.left |= matching_work(list(found.features.values()), found.pairs)
+        phase: Phase = "mapping" if found.matched else "matching"
+        forecast.enter(phase)
+        for earlier in PHASES[: PHASES.index(phase)]:
+            forecast.left.pop(earlier, None)  # too short to be seen
+        if not found.matched:
+            forecast.advance(found.tried / max(1, found.pairs))
 
     def show_candidate(self, seeding: Seeding) -> None:
         """Show the first candidate, if COLMAP ran; others may be tried before any pose moves."""

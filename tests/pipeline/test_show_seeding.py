@@ -14,11 +14,15 @@ from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.seeding import seeding_progress
 from biresnerf.data.seeding.cached_mapping import remembered_mapping
 from biresnerf.data.seeding.seeding_preview import TILE, write_contact_sheet
+from biresnerf.data.seeding.seeding_progress import SeedingProgress
+from biresnerf.data.workload import EACH_MAPPED
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
-from biresnerf.progress import Progress
+from biresnerf.progress import Monitor, Progress
+from biresnerf.write.output_folder import OutputFolder
+from biresnerf.write.preview import SeedingPreview
 from tests.data.scenes import arc_poses, plain_features, textured_arc
 
 pytestmark = pytest.mark.slow
@@ -51,6 +55,8 @@ def test_what_is_told_on_the_way_is_what_colmap_answers(photos: Path):
     counts = [(len(found.features), len(found.matches)) for found in told]
     assert counts == sorted(counts)
     assert set(told[-1].features) == set(range(VIEWS))
+    assert [found.matched for found in told] == sorted(found.matched for found in told)
+    assert told[-1].matched
     matches = np.zeros((VIEWS, VIEWS), dtype=int)
     for (a, b), count in told[-1].matches.items():
         matches[a, b] = matches[b, a] = count
@@ -88,6 +94,23 @@ def test_photos_alone_are_shown_at_once_then_what_matches_then_the_poses(photos:
     assert [image["name"] for image in found] == [image["name"] for image in after["images"]]
     poses = np.array([[*image["world_from_cam"], (0, 0, 0, 1)] for image in found])
     assert pose_error(poses, arc_poses(VIEWS)).aligned.rotation_deg.max < 3.0
+
+
+def test_what_is_left_of_matching_follows_from_the_features_found_and_mapping_stays_mapping(photos, tmp_path):
+    monitor = Monitor()
+    left = monitor.forecast.left = {"features": 1.0, "matching": 1.0, "mapping": 1.0}
+    counts = dict.fromkeys(range(VIEWS), 2000)
+    with SeedingPreview(read_dataset(photos), OutputFolder(tmp_path / "out"), monitor) as show:
+        show(SeedingProgress({0: 2000, 1: 2000}, {}, 0, 45))
+        assert (left["matching"], left["mapping"]) == (1.0, 1.0)
+        show(SeedingProgress(counts, {}, 9, 45))
+        mapping = VIEWS * (EACH_MAPPED + 2)
+        assert left == {"matching": pytest.approx(45 * 2000**2 / 1e9), "mapping": mapping}
+        show(SeedingProgress(counts, {(0, 1): 90}, 45, 45, matched=True))
+        assert left == {"mapping": mapping}
+        show(SeedingProgress(counts, {}, 20, 45, matched=True))  # contradicting pairs were taken out
+        assert left == {"mapping": mapping}
+        assert monitor.forecast.left_s() > 0
 
 
 def test_the_sheet_shows_each_photo_at_its_place_and_leaves_out_the_unreadable(tmp_path: Path):

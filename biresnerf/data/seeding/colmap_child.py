@@ -21,6 +21,7 @@ from biresnerf.data.seeding.colmap_pairs import (
     write_position_priors,
 )
 from biresnerf.data.seeding.colmap_tracks import keep_from_mapping, write_tracks
+from biresnerf.data.seeding.seeding_progress import MATCHED
 
 DATABASE = "database.db"
 SAYS = "seeding: "  # before lines meant for the job's log; all others are COLMAP's own
@@ -60,6 +61,7 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     numbers = extract_features(request, database, images, extraction_options(request))
     say(f"features of {count} images found")
     match_features(request, database, work)
+    (work / MATCHED).touch()
     tracks = write_tracks(database, work)
     if request["cam_from_world"]:
         drop_contradicting_pairs(database, request["cam_from_world"])

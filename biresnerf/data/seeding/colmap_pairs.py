@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.seeding.seeding_progress import PAIRS
+
 COARSEST, NEAREST_TO_NEXT = (
     256,
     0.8,
@@ -38,7 +40,7 @@ def match_features(request: dict[str, Any], database: Path, work: Path) -> None:
     if pairs is None:
         pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification)
         return
-    listed = work / "pairs.txt"
+    listed = work / PAIRS
     listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), "utf-8")
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(listed)

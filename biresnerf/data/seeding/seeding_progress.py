@@ -10,6 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 LOOK_EVERY_S = 2.0
+# Beside the database: the pairs to match, where not all are, and a sign that they are matched. The database does not
+# tell: pairs that contradict the others are taken out of it again.
+PAIRS, MATCHED = "pairs.txt", "matched"
 _MOST_IMAGES = 2_147_483_647  # of a pair's number in COLMAP's database, a pair being number * most + number
 
 
@@ -21,21 +24,29 @@ class SeedingProgress:
         features: how many each has, of those that were looked at.
         matches: how many features each pair has in common once that was verified; pairs with any alone.
         tried: how many pairs were verified, of `pairs` in all.
+        matched: whether matching is over.
     """
 
     features: dict[int, int] = field(default_factory=dict)
     matches: dict[tuple[int, int], int] = field(default_factory=dict)
     tried: int = 0
     pairs: int = 0
+    matched: bool = False
 
 
 OnSeeding = Callable[[SeedingProgress], None]
 
 
 def read_progress(database: Path, pairs: int) -> SeedingProgress | None:
-    """What the database of images called by their numbers holds now, of so many pairs; none while it cannot be read."""
+    """What the database of images called by their numbers holds now; none while it cannot be read.
+
+    So many pairs are expected, unless it is known by now.
+    """
     if not database.is_file():
         return None
+    listed, matched = database.with_name(PAIRS), database.with_name(MATCHED).is_file()
+    if listed.is_file():
+        pairs = len(listed.read_text("utf-8").splitlines())
     try:
         with closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=0.1)) as opened:
             names = dict(opened.execute("SELECT image_id, name FROM images"))
@@ -50,7 +61,8 @@ def read_progress(database: Path, pairs: int) -> SeedingProgress | None:
             continue
         a, b = sorted((index[pair // _MOST_IMAGES], index[pair % _MOST_IMAGES]))
         matches[a, b] = count
-    return SeedingProgress({index[image]: count for image, count in features}, matches, len(tried), pairs)
+    counts = {index[image]: count for image, count in features}
+    return SeedingProgress(counts, matches, len(tried), pairs, matched)
 
 
 class SeedingWatch:

@@ -12,7 +12,8 @@ from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.finish.work_ahead import expect_as_measured
 from biresnerf.refinement.stages.two_stages import TwoStages
 
-AFTER: tuple[Phase, ...] = ("evaluating", "judging")  # phases of the run that follow
+AFTER: tuple[Phase, ...] = ("adjusting", "evaluating", "judging")  # phases that follow the last step
+SLACK = 0.05  # of a run's time budget
 
 
 def run_stage_2(stages: TwoStages) -> Finish:
@@ -33,7 +34,7 @@ def run_stage_2(stages: TwoStages) -> Finish:
         if stages.optimiser.poses_held:
             stages.optimiser.end_after(LEARNING)
         stages.record = stages.record.model_copy(update={"adjusted": True})
-        stages.adjusts_again = not _is_over(stages, first)
+        stages.adjusts_again = not _is_over(stages, first) and _time_to_adjust_again(stages)
         expect_as_measured(stages)
         stages.replan()
     stages.run_stage_2()
@@ -51,6 +52,10 @@ def _is_over(stages: TwoStages, first: Finish) -> bool:
 
 
 def _time_to_adjust_again(stages: TwoStages) -> bool:
-    """Whether a second adjustment, as long as the first, leaves time for what follows it."""
+    """Whether there is time for a second adjustment, as long as the first, and for what follows it.
+
+    The steps were chosen so that there just is: it must not be left out for a moment that they took longer.
+    """
     after_s = sum(stages.forecast.seconds(phase) for phase in AFTER)
-    return time.monotonic() + stages.record.seconds.get("adjusting", 0.0) + after_s < stages.ends
+    slack_s = SLACK * stages.optimiser.options.time_budget_s
+    return time.monotonic() + after_s < stages.ends + slack_s

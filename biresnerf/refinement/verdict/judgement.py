@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import GUESSES, Dataset
 from biresnerf.data.photos.images import ImageSet
+from biresnerf.data.workload import JUDGING
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.refinement.lost.own_matches import contradicted
@@ -82,7 +83,7 @@ def judge(stages: TwoStages) -> Judgement | None:
         judgement = judge_poses(
             stages.scene, stages.optimiser, stages.monitor.should_stop,
             lambda share: stages.report_evaluation(share, message=message), _rounds(stages),
-            stages.forecast.took,
+            lambda work: stages.forecast.took(JUDGING + work),
         )  # fmt: skip
     logger.info("verdict: %s", judgement.verdict.verdict)
     return judgement

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from biresnerf.data.points.tracks import Tracks
-from biresnerf.data.workload import FIRST_ROUND, LEARNING, step_weights, workload
+from biresnerf.data.workload import FIRST_ROUND, JUDGING, LEARNING, step_weights, workload
 from biresnerf.forecast import Forecast
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import Similarity
@@ -71,7 +71,7 @@ def test_photos_are_expected_to_judge_only_cameras_that_matches_would_move_visib
 
 def test_the_verdict_takes_time_only_where_it_is_asked_for(stages_of):
     assert work_ahead(stages_of(verdict=False))["judging"] == 0
-    few, many = (work_ahead(stages_of(trial_steps=steps))["judging"] for steps in (50, 100))
+    few, many = (work_ahead(stages_of(trial_steps=steps))["judging"] - JUDGING for steps in (50, 100))
     assert many > 0
     assert many == pytest.approx(2 * few)
 
@@ -90,7 +90,8 @@ def test_matching_is_expected_where_poses_are_compared_with_matches(scene):
     pytest.importorskip("pycolmap")
     found = Forecast()
     expect_run(found, scene[0], tiny_options(start="auto"))
-    assert all(found.left[phase] > 0 for phase in ("features", "matching", "mapping", "trying", "checking"))
+    assert all(found.left[phase] > 0 for phase in ("features", "matching", "mapping", "trying"))
+    assert found.left["checking"] == 0, "matches mostly start the run"
 
 
 def test_mapping_is_more_work_where_photos_have_more_features(scene):
