@@ -124,12 +124,13 @@ def after_steps(
 ) -> dict[Phase, float]:
     """Work in the phases after the steps."""
     trial = _trial(options.trial_steps, unbounded=unbounded)
+    pictured = picture_share(options.trial_steps, unbounded=unbounded)
     return {
         "adjusting": adjusting,
         "checking": PHOTO_TRIALS * trial if checks else 0.0,
         "evaluating": OPEN_EVALUATION if unbounded else 1.0,
         # the first look of the first round decides mostly, and its fields are trained on for their pictures
-        "judging": options.verdict * (JUDGING + picture_share(options.trial_steps, unbounded=unbounded) * trial),
+        "judging": options.verdict * (JUDGING + pictured * trial),
     }
 
 
