@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from benchmarks.speed import shares, time_left
+from benchmarks.runs import shares, time_left
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 
 pytestmark = pytest.mark.slow

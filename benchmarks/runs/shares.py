@@ -1,4 +1,4 @@
-"""Where the time of a whole run goes: ``python -m benchmarks.speed.shares SET... [--preset fast] [--seed 1]``.
+"""Where the time of a whole run goes: ``python -m benchmarks.runs.shares SET... [--preset fast] [--seed 1]``.
 
 Each SET holds true poses, which get BARF's noise (0.15). Prints a row for each as soon as it is done: wall seconds of
 the parts, the share of all but steps, adjusting and checking (``rest``), and the mean rotation error. With ``--clock

@@ -1,4 +1,4 @@
-"""How accurate the predicted time left is: ``python -m benchmarks.speed.time_left SET... [--preset fast]``.
+"""How accurate the predicted time left is: ``python -m benchmarks.runs.time_left SET... [--preset fast]``.
 
 Each SET holds true poses, which get BARF's noise (0.15). Prints how long each run took, and at 10, 25, 50,
 75 and 90 % of that time the predicted seconds to the end over the actual ones. With ``--phases`` a second table says
