@@ -37,7 +37,7 @@ UNITS: dict[Phase, Unit] = {
 # Seconds of one core of an AMD EPYC (Zen 4), medians over nine sets (docs/speed.md): where nothing was measured yet.
 RATES: dict[Unit, float] = {
     "megapixel": 1.1,
-    "comparison": 4.2,  # a billion of features of one photo with those of another
+    "comparison": 5.0,  # a billion of features of one photo with those of another
     "mapped feature": 0.053,  # a thousand
     "trial step": 0.0125,
     "coarse step": 0.015,

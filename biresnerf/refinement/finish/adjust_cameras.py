@@ -37,6 +37,8 @@ def adjust_cameras(stages: TwoStages) -> Finish:
     if found is None:
         return Finish()
     chosen, finish = found
+    if finish.heeds_photos:
+        stages.forecast.left["adjusting"] = 0.0  # unless photos object
     cameras, lenses = optimiser.lenses.refined(stages.scene.dataset).cameras, chosen.lenses
     if lenses is not None:
         cameras = corrected_cameras(cameras, lenses.correction) or cameras
