@@ -1,5 +1,6 @@
 """Stage 2 in two rounds: when cameras are held after the first adjustment, and when they go on with the field."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from biresnerf.data.workload import FIRST_ROUND, LEARNING
 from biresnerf.refinement.finish import rounds
 from biresnerf.refinement.finish.adjust_cameras import adjust_cameras
+from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.finish.rounds import run_stage_2
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
@@ -97,3 +99,26 @@ def test_cameras_are_adjusted_again_only_where_there_is_time(tmp_path, rng, monk
     run_stage_2(run)
     assert run.optimiser.step_index == run.optimiser.options.steps
     assert len(calls) == adjusted
+
+
+@pytest.mark.parametrize(
+    ("budget_s", "late_s", "again"), [(1000, 10, True), (1000, 60, False), (0, 10, False)]
+)
+def test_an_adjustment_that_was_planned_for_is_not_left_out_for_a_moment(
+    tmp_path, rng, monkeypatch, budget_s, late_s, again
+):
+    """Steps are chosen so that what follows them just ends in time; they may take a little longer than that."""
+    run, _ = stages(tmp_path, rng)
+    run.optimiser.options = run.optimiser.options.model_copy(update={"time_budget_s": budget_s})
+    adjustments: list[float] = []
+
+    def refused(run):
+        adjustments.append(run.optimiser.step_index)
+        run.ends = time.monotonic() + 100 - late_s
+        return Finish()
+
+    monkeypatch.setattr(rounds, "adjust_cameras", refused)
+    monkeypatch.setattr(run.forecast, "seconds", lambda phase: 100.0 if phase == "adjusting" else 0.0)
+    run.run_stage_1()
+    run_stage_2(run)
+    assert len(adjustments) == 1 + again
