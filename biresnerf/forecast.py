@@ -20,11 +20,12 @@ Phase = Literal[
     "features", "matching", "mapping", "trying", "coarse", "fine", "adjusting", "checking", "evaluating", "judging"
 ]  # fmt: skip
 Unit = Literal[
-    "megapixel", "comparison", "mapped feature", "trial step", "coarse step", "fine step", "adjustment", "evaluation"
+    "megapixel", "compared feature", "mapped feature", "trial step", "coarse step", "fine step", "adjustment",
+    "evaluation",
 ]  # fmt: skip
 UNITS: dict[Phase, Unit] = {
     "features": "megapixel",
-    "matching": "comparison",
+    "matching": "compared feature",
     "mapping": "mapped feature",
     "trying": "trial step",
     "coarse": "coarse step",
@@ -34,10 +35,10 @@ UNITS: dict[Phase, Unit] = {
     "evaluating": "evaluation",
     "judging": "trial step",
 }
-# Seconds of one core of an AMD EPYC (Zen 4), medians over nine sets (docs/speed.md): where nothing was measured yet.
+# Seconds of one core of an AMD EPYC (Zen 4), medians over sets (docs/speed.md): where nothing was measured yet.
 RATES: dict[Unit, float] = {
     "megapixel": 1.1,
-    "comparison": 5.0,  # a billion of features of one photo with those of another
+    "compared feature": 13.5,  # a million of one photo, with all of another
     "mapped feature": 0.053,  # a thousand
     "trial step": 0.0125,
     "coarse step": 0.015,

@@ -104,7 +104,7 @@ def test_the_phases_of_matching_follow_each_other():
     found.enter("mapping")
     found.leave()
     assert found.left == {}
-    assert set(found.measured()) == {"megapixel", "comparison", "mapped feature"}
+    assert set(found.measured()) == {"megapixel", "compared feature", "mapped feature"}
     assert found.measured()["megapixel"] == pytest.approx(0.2, abs=0.1)
 
 
@@ -165,25 +165,32 @@ def test_time_before_the_run_begins_is_no_part_of_it(monkeypatch):
 def test_a_machine_remembers_what_its_runs_measured(cache):
     assert remembered_rates("cpu", 2) == {unit: rate / 2 for unit, rate in RATES.items()}
     remember_rates("cpu", 2, {"coarse step": 0.1})
-    remember_rates("cpu", 2, {"coarse step": 0.3, "comparison": 1.0})
+    remember_rates("cpu", 2, {"coarse step": 0.3, "compared feature": 1.0})
     known = remembered_rates("cpu", 2)
-    assert (known["coarse step"], known["comparison"]) == (pytest.approx(0.2), 1.0)
+    assert (known["coarse step"], known["compared feature"]) == (pytest.approx(0.2), 1.0)
     assert known["mapped feature"] == RATES["mapped feature"] / 2
-    assert remembered_rates("cuda", 2)["comparison"] == RATES["comparison"] / 2
+    assert remembered_rates("cuda", 2)["compared feature"] == RATES["compared feature"] / 2
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{", "[]", '{"cpu 2": 5}', '{"cpu 2": {"comparison": "slow"}}', '{"cpu 2": {"comparison": -1.0}}'],
+    [
+        "",
+        "{",
+        "[]",
+        '{"cpu 2": 5}',
+        '{"cpu 2": {"compared feature": "slow"}}',
+        '{"cpu 2": {"compared feature": -1.0}}',
+    ],
 )
 def test_a_damaged_memory_is_none(cache, text):
     (cache_folder() / RATES_FILE).parent.mkdir()
     (cache_folder() / RATES_FILE).write_text(text)
-    assert remembered_rates("cpu", 2)["comparison"] == RATES["comparison"] / 2
-    remember_rates("cpu", 2, {"comparison": 1.0})
+    assert remembered_rates("cpu", 2)["compared feature"] == RATES["compared feature"] / 2
+    remember_rates("cpu", 2, {"compared feature": 1.0})
 
 
 def test_a_machine_without_room_for_a_memory_runs_all_the_same(cache, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc/none")
-    remember_rates("cpu", 2, {"comparison": 1.0})
-    assert remembered_rates("cpu", 2)["comparison"] == RATES["comparison"] / 2
+    remember_rates("cpu", 2, {"compared feature": 1.0})
+    assert remembered_rates("cpu", 2)["compared feature"] == RATES["compared feature"] / 2

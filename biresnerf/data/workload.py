@@ -153,8 +153,10 @@ def _search(dataset: Dataset, effort: SeedingEffort) -> tuple[float, float, floa
 def matching_work(features: Sequence[float], pairs: float) -> dict[Phase, float]:
     """What COLMAP has before it where so many pairs of images with so many features [n] are to be matched."""
     mean = sum(features) / len(features)
+    # Linear, as measured: of temple, fountain-P11 and fox (310, 55 and 330 pairs; 1,934, 6,688 and 3,257 features) a
+    # million takes 12.4, 13.0 and 17.2 s.
     return {
-        "matching": pairs * mean**2 / 1e9,
+        "matching": pairs * mean / 1e6,
         "mapping": EACH_MAPPED * len(features) + sum(features) / 1000,
     }
 

@@ -105,7 +105,7 @@ def test_what_is_left_of_matching_follows_from_the_features_found_and_mapping_st
         assert (left["matching"], left["mapping"]) == (1.0, 1.0)
         show(SeedingProgress(counts, {}, 9, 45))
         mapping = VIEWS * (EACH_MAPPED + 2)
-        assert left == {"matching": pytest.approx(45 * 2000**2 / 1e9), "mapping": mapping}
+        assert left == {"matching": pytest.approx(45 * 2000 / 1e6), "mapping": mapping}
         show(SeedingProgress(counts, {(0, 1): 90}, 45, 45, matched=True))
         assert left == {"mapping": mapping}
         show(SeedingProgress(counts, {}, 20, 45, matched=True))  # contradicting pairs were taken out
