@@ -118,16 +118,17 @@ def compare_on_unseen_views(
         trials = PoseTrials(images, views, rigs, options, steps, device, threads, should_stop)
         running = [trials.begin(rig.world_from_cam, rig.lenses(images)) for rig in pair]
         seen = seen + views
+        pictured = effort.pictured and not done
+        enough = picture_share(steps, unbounded=trials.frame.unbounded) if pictured else 0.0
         for look in effort.looks:
             for side, trial in enumerate(running):
                 trial.train(look)
-                report((done + look * (side + 1) / len(running)) / (done + look))
+                report((done + look * (side + 1) / len(running)) / (done + max(look, enough)))
             scores = tuple(trial.scores() for trial in running)
             old, new = (joined(side) for side in zip(*earlier, scores, strict=True))
             evidence = _evidence(old, new, running[0].optimiser.step_index, len(set(seen) & set(held_out)))
             decided = _decided(evidence, EARLY if look < 1 else 1)
-            if effort.pictured and not done and (decided or look == 1):
-                enough = picture_share(steps, unbounded=trials.frame.unbounded)
+            if pictured and (decided or look == 1):
                 renders = _pictures(running, [view for view in views if view in held_out][:SHOWN], enough)
             did = work + sum(trial.work for trial in running)
             found = HeldOutComparison(seen, old, new, evidence, did, renders)
