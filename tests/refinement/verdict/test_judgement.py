@@ -95,9 +95,12 @@ def test_trainings_end_once_they_decide_but_for_pictures(scene):
     for noise, decided, other_rounds in ((0.3, steps // 4, 0), (0.02, steps, steps)):
         run = given_scene(with_poses(dataset, perturb_poses(truth, noise, seed=1)), images, [3])
         works: list[float] = []
-        judgement = judge_poses(run, optimiser, took=works.append)
+        shares: list[float] = []
+        judgement = judge_poses(run, optimiser, report=shares.append, took=works.append)
         assert judgement.verdict.heldout.steps == decided
         assert works == [2 * (pictured + other_rounds)]
+        if not other_rounds:
+            assert shares[-1] == pytest.approx(decided / pictured), "pictures take the rest"
         assert judgement.renders.keys() == {3}
 
 
