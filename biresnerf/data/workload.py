@@ -164,7 +164,7 @@ def matching_work(features: Sequence[float], pairs: float) -> dict[Phase, float]
 def picture_share(trial_steps: int, *, unbounded: bool) -> float:
     """How much of a training it takes to show what a field has learned; 1 is the whole."""
     steps = trial_steps * (OPEN_STEPS if unbounded else 1)
-    return min(max(PICTURE_STEPS / max(steps, 1), 1.0), PICTURE_SHARE)
+    return max(LOOKS[0], min(PICTURE_STEPS / max(steps, 1), PICTURE_SHARE))
 
 
 def _trial(steps: int, *, unbounded: bool) -> float:
