@@ -19,6 +19,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
 from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PatchPhotos, PosePrior
 from biresnerf.refinement.adjustment.patch_points import Surfaces, find_patches
+from biresnerf.refinement.kernels.batch_errors import add_errors
 from biresnerf.refinement.kernels.draw_pixels import draw_pixels
 from biresnerf.refinement.optimise.cast_rays import cast_rays, viewing_directions
 from biresnerf.refinement.optimise.pixel_chances import PixelChances
@@ -51,6 +52,7 @@ def _cast_one_ray() -> None:
     draw_pixels(
         weight, nowhere, one, 1, chances, np.ones((1, 2), np.int64), one, photo, one, nowhere, colour, weight
     )
+    add_errors(one, colour, colour, weight, weight, np.zeros((1, 3), np.float32))
     camera = torch.zeros(1, dtype=torch.int64)
     lens = Intrinsics.from_cameras([Camera("PINHOLE", SIZE, SIZE, (SIZE, SIZE, SIZE / 2, SIZE / 2))])
     in_cam = viewing_directions(directions_for(cpu), lens, camera, torch.ones(1, 2))

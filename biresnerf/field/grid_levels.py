@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -25,15 +26,15 @@ class GridLevels:
     hashed: np.ndarray  # bool [levels]
     offset: np.ndarray  # int64 [levels + 1], in entries
 
-    @property
+    @cached_property
     def levels(self) -> int:
         return len(self.scale)
 
-    @property
+    @cached_property
     def entries(self) -> int:
         return int(self.offset[-1])
 
-    @property
+    @cached_property
     def width(self) -> int:
         """Features of one encoded point."""
         return self.levels * FEATURES

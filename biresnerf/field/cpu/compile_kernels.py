@@ -6,7 +6,7 @@ import torch
 
 from biresnerf.field.cpu.field import CpuField
 from biresnerf.field.grid_levels import grid_levels
-from biresnerf.field.radiance_field import FieldRates, FieldShape, Marching, PositionGradient, Rays
+from biresnerf.field.radiance_field import FieldRates, FieldShape, Marching, Merging, PositionGradient, Rays
 
 
 def compile_field_kernels() -> None:
@@ -17,7 +17,8 @@ def compile_field_kernels() -> None:
     origin = torch.tensor([[0.0, 0.0, -2.0]], requires_grad=True)
     direction = torch.tensor([[0.0, 0.0, 1.0]], requires_grad=True)
     rays = Rays(origin, direction, torch.ones(1, 3), torch.zeros(1), trained=1)
-    marching = Marching(0.1, 0.1, 10.0, 64, torch.ones(4, 4, 4, dtype=torch.uint8))
+    occupied = torch.ones(4, 4, 4, dtype=torch.uint8)
+    marching = Marching(0.1, 0.1, 10.0, 64, occupied, Merging(light=0.03, most=8))
     field.render(rays, marching, PositionGradient()).colour.sum().backward()
     field.step(FieldRates(1e-3, 1e-3, (1e-3,) * 2, 1e-3))
     field.density(torch.full((1, 3), 0.5))

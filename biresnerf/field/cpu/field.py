@@ -57,6 +57,12 @@ class CpuField(GridField):
         largest = int(np.concatenate([np.diff(grid.offset) for grid in self.grids.values()]).max())
         self._scratch = np.zeros((workers, 2 * largest), f4)
         self._pending: tuple[Samples, np.ndarray] | None = None
+        # Tables and their moments stay where they are for good.
+        self._words = {name: table.numpy().reshape(-1).view(np.uint64) for name, table in self.tables.items()}
+        self._flat = {
+            name: tuple(t.numpy().reshape(-1) for t in (table, *self.moments[name]))
+            for name, table in self.tables.items()
+        }
         self._clearances: tuple[Tensor | None, int, np.ndarray] = (None, 0, np.empty(0))
 
     def _width(self, modules: tuple[str, ...]) -> int:
@@ -89,10 +95,10 @@ class CpuField(GridField):
         jacobians, row = [], 0
         smoothings = (gradient.pose_smoothing, gradient.reconstruction_smoothing)
         for name, smoothing in zip(modules, smoothings, strict=False):
-            grid, words = self.grids[name], self.tables[name].numpy().reshape(-1).view(np.uint64)
+            grid = self.grids[name]
             jacobian = self._buffers.take(f"{role} jacobian {name}", grid.levels, derivatives, n)
             encoding.encode(
-                x, words, grid.scale, grid.stride, grid.hashed, grid.offset, f4(smoothing),
+                x, self._words[name], grid.scale, grid.stride, grid.hashed, grid.offset, f4(smoothing),
                 features[row : row + grid.width], jacobian,
             )  # fmt: skip
             jacobians.append(jacobian)
@@ -238,11 +244,10 @@ class CpuField(GridField):
         grid, step = self.grids[name], self.steps[name]
         row = 0 if name == "pose" else self.grids["pose"].width
         adam = tuple(map(f4, (BETA1, BETA2, EPSILON, 1 / (1 - BETA1**step), 1 / (1 - BETA2**step) ** 0.5)))
-        table, moment1, moment2 = (t.numpy().reshape(-1) for t in (self.tables[name], *self.moments[name]))
         encoding.update_table(
             samples.x, begin, end, g_features[row : row + grid.width],
             grid.scale, grid.stride, grid.hashed, grid.offset,
-            table, moment1, moment2, rates, adam, self._scratch, tasks(), self.workers,
+            *self._flat[name], rates, adam, self._scratch, tasks(), self.workers,
         )  # fmt: skip
 
     def discard_gradients(self) -> None:

@@ -24,13 +24,18 @@ _LARGEST_BITS = np.array(ONE - EDGE, f4).view(np.uint32)
 
 
 @njit(inline="always", fastmath=True)
+def _largest(px, py, pz):
+    return max(abs(px), max(abs(py), abs(pz)))
+
+
+@njit(inline="always", fastmath=True)
 def _grid_position(px, py, pz, unbounded):
-    """Position in [0, 1]^3 and the largest coordinate m."""
-    m = max(abs(px), max(abs(py), abs(pz)))
-    factor = f4(0.5)
+    """Position in [0, 1]^3. A bounded scene must not pay for the divisions of an unbounded one."""
+    factor = HALF
     if unbounded:
+        m = _largest(px, py, pz)
         factor = f4(0.25) * (ONE if m <= ONE else (TWO - ONE / m) / m)
-    return px * factor + f4(0.5), py * factor + f4(0.5), pz * factor + f4(0.5), m
+    return px * factor + HALF, py * factor + HALF, pz * factor + HALF
 
 
 @njit(inline="always", fastmath=True)
@@ -107,10 +112,11 @@ def march(
         n = 0
         first = True
         while t < t_end and n < most:
-            _, _, _, m = _grid_position(ox + t * dx, oy + t * dy, oz + t * dz, unbounded)
-            dt = step
-            if unbounded and m > ONE:
-                dt = step * m * m
+            dt, m = step, f4(0)
+            if unbounded:
+                m = _largest(ox + t * dx, oy + t * dy, oz + t * dz)
+                if m > ONE:
+                    dt = step * m * m
             if first:  # a random start within the first interval decorrelates the rays
                 t += jitter[r] * dt
                 first = False
@@ -118,7 +124,7 @@ def march(
             middle = t + f4(0.5) * dt
             if middle >= t_end:
                 break
-            gx, gy, gz, _ = _grid_position(ox + middle * dx, oy + middle * dy, oz + middle * dz, unbounded)
+            gx, gy, gz = _grid_position(ox + middle * dx, oy + middle * dy, oz + middle * dz, unbounded)
             ix = min(max(i4(gx * side), 0), side - 1)
             iy = min(max(i4(gy * side), 0), side - 1)
             iz = min(max(i4(gz * side), 0), side - 1)
@@ -151,7 +157,7 @@ def pack(origin, direction, t_buffer, dt_buffer, count, offset, unbounded, x, t,
         for k in range(count[r]):
             i = base + k
             at = t_buffer[r, k]
-            gx, gy, gz, _ = _grid_position(
+            gx, gy, gz = _grid_position(
                 origin[r, 0] + at * direction[r, 0],
                 origin[r, 1] + at * direction[r, 1],
                 origin[r, 2] + at * direction[r, 2],

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from biresnerf.data.photos.images import ImageSet
+from biresnerf.refinement.kernels.batch_errors import add_errors
 
 STANDS_OUT = 2.0  # times the median error
 STANDS_OUT_UNTRAINED = 4.0  # for held-out views too few to be compared with each other
@@ -149,6 +150,16 @@ class CameraErrors:
 
     def add(self, image: Tensor, colour: Tensor, target: Tensor, opacity: Tensor, weight: Tensor) -> None:
         """One batch: image, opacity and weight [rays], rendered and target colours [rays, 3]."""
+        if self._sums.device.type != "cpu":
+            self.defined_add(image, colour, target, opacity, weight)
+            return
+        shown, wanted = colour.contiguous().numpy(), target.contiguous().numpy()
+        add_errors(image.numpy(), shown, wanted, opacity.numpy(), weight.numpy(), self._sums.numpy())
+
+    def defined_add(
+        self, image: Tensor, colour: Tensor, target: Tensor, opacity: Tensor, weight: Tensor
+    ) -> None:
+        """The same by torch's operations, on any device."""
         squared = ((colour - target) ** 2).mean(1)
         values = torch.stack([torch.ones_like(squared), squared, opacity], 1)
         self._sums.index_add_(0, image, values * weight[:, None])

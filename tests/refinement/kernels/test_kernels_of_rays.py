@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
+from biresnerf.refinement.optimise.camera_errors import CameraErrors
 from biresnerf.refinement.optimise.cast_rays import cast_rays, turned
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
+from tests.refinement.tiny_scene import photos_set
 
 CPU = torch.device("cpu")
 CAMERAS, RAYS = 7, 200
@@ -79,3 +82,18 @@ def test_directions_that_depend_on_lenses_get_their_gradient() -> None:
     in_cam = torch.randn(RAYS, 3, requires_grad=True)
     cast_rays(matrices, camera, in_cam)[1].sum().backward()
     torch.testing.assert_close(in_cam.grad, matrices[0, :, :3].sum(0).expand(RAYS, 3))
+
+
+def test_errors_of_a_batch_are_those_of_torch() -> None:
+    random = torch.Generator().manual_seed(5)
+    image = torch.randint(CAMERAS - 1, (RAYS,), generator=random)  # the last camera has no rays
+    colour, target = torch.rand(2, RAYS, 3, generator=random)
+    opacity, weight = torch.rand(2, RAYS, generator=random)
+    photos = photos_set([np.zeros((2, 2, 3), np.uint8)] * CAMERAS)
+    ours, theirs = CameraErrors(photos, [], CPU), CameraErrors(photos, [], CPU)
+    for _ in range(2):
+        ours.add(image, colour, target, opacity, weight)
+        theirs.defined_add(image, colour, target, opacity, weight)
+    sums = ours.state()["sums"]
+    assert (sums[:, -1] == 0).all()
+    torch.testing.assert_close(sums, theirs.state()["sums"], rtol=2e-6, atol=2e-6)
