@@ -16,7 +16,7 @@ from workers.database.job_queue import Entry
 from workers.engine import Stores
 from workers.jobs import claim as claims
 from workers.jobs.claim import Fenced, claim_job
-from workers.jobs.job_states import Requeue
+from workers.jobs.job_states import Requeue, finish
 from workers.jobs.ledger import Ledger
 from workers.queue.janitor import Janitor, release_worker
 from workers.run.attempt import Attempt
@@ -135,6 +135,33 @@ async def test_a_worker_that_is_lost_costs_a_job_nothing_before_it_starts_and_af
     await release_worker(database, worker, 60.0)
     (row,) = await database.fetch("SELECT state, attempt, crashes, setback FROM jobs")
     assert row == {"state": "queued", "attempt": 0, "crashes": 0, "setback": None}
+
+
+async def test_a_janitor_and_a_worker_that_woke_up_end_jobs_of_one_tenant_at_once(
+    stores: Stores, database: Database
+):
+    """Both make room for a job that is held: whoever had the tenant first waited for the other's job, without end."""
+    await stores.tenants.set("local", max_running=2)
+    cancelled, published, held = await queued(stores), await queued(stores), await queued(stores)
+    for job_id in (cancelled, published):
+        worker = await registered(database)
+        await taken(database, worker)
+        assert await claim_job(database, job_id, worker, max_attempts=3, stall_s=60.0) is not None
+    await stores.jobs.cancel(cancelled)
+    async with database.transaction() as connection:
+        await connection.execute("SELECT 1 FROM jobs WHERE id = %s FOR UPDATE", (published,))
+        janitor = asyncio.create_task(release_worker(database, None, 60.0))
+        while not await database.fetch("SELECT 1 FROM pg_stat_activity WHERE wait_event_type = 'Lock'"):
+            await asyncio.sleep(0.01)
+        await finish(connection, published, "succeeded", None)
+    await janitor
+    rows = await database.fetch("SELECT id, state, held FROM jobs")
+    assert {row["id"]: row["state"] for row in rows} == {
+        cancelled: "cancelled",
+        published: "succeeded",
+        held: "queued",
+    }
+    assert not any(row["held"] for row in rows)
 
 
 async def test_a_claim_whose_acknowledgement_was_lost_counts_once(
