@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -46,7 +45,7 @@ from service.routes import (
 )
 from workers.engine import open_stores
 from workers.process.watchdog import end_if_hung
-from workers.settings.errors import NotFound, Unavailable
+from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.settings.traces import flush_traces
 
@@ -91,7 +90,7 @@ def create_app(settings: Settings) -> FastAPI:
             swept = await asyncio.to_thread(sweep_staging, service.staging_dir)
             if swept:
                 logger.info("removed %d unfinished uploads", swept)
-            service.keep_running(_repeat(_finish_checks, service))
+            service.keep_running(_repeat(finish_checks, service))
             service.keep_running(_repeat(finish_uploads, service))
             # Workers do the same; without any, trash and tallies would pile up.
             service.keep_running(stores.janitor.run())
@@ -147,11 +146,13 @@ async def _repeat(work: Callable[[Service], Awaitable[None]], service: Service) 
         await asyncio.sleep(_UNFINISHED_EVERY_S)
 
 
-async def _finish_checks(service: Service) -> None:
+async def finish_checks(service: Service) -> None:
     """Finishes checks whose process was killed."""
     for dataset_id in await service.stores.datasets.unfinished():
-        with contextlib.suppress(NotFound):  # deleted meanwhile
+        try:
             await service.stores.datasets.check(dataset_id)
+        except (FaultError, OSError) as error:  # of this one, which may be deleted by now; others may do well
+            logger.warning("dataset %s is not checked yet: %s", dataset_id, error)
 
 
 async def finish_uploads(service: Service) -> None:
