@@ -60,7 +60,8 @@ async def delete_unless_rescued(database: Database, files: FileStore, folder: st
 async def empty_trash(database: Database, files: FileStore) -> None:
     """Delete the folders that are due, at most 20. Raises `Unavailable`.
 
-    Outside of a transaction: a thousand files in a bucket take their time. Safe to run concurrently.
+    Outside of a transaction: a thousand files in a bucket take their time. Safe to run concurrently. What cannot be
+    deleted is tried again later, after what is due by then.
     """
     for row in await database.fetch(
         # What is being rescued just now is passed over.
@@ -68,20 +69,31 @@ async def empty_trash(database: Database, files: FileStore) -> None:
         " FOR UPDATE SKIP LOCKED",
         FOLDERS_AT_ONCE,
     ):
-        folder, keep = row["prefix"], row["keep"]
-        found = await _sizes(files, folder, keep)
-        await files.delete_prefix(folder, keep=keep)
-        left = await _sizes(files, folder, keep)
+        folder = row["prefix"]
+        try:
+            found, left = await _delete(files, folder, row["keep"])
+        except Unavailable:
+            await _try_later(database, row["id"])
+            raise
         if left:
-            log.error("%d files of %s could not be deleted; trying again", len(left), folder)
-            await database.fetch(
-                "UPDATE trash SET not_before = clock_timestamp() + make_interval(secs => %s) WHERE id = %s",
-                *(RETRY_S, row["id"]),
-            )
+            log.error("%d files of %s could not be deleted; trying again", left, folder)
+            await _try_later(database, row["id"])
             continue
         await database.fetch("DELETE FROM trash WHERE id = %s", row["id"])
         level = logging.INFO if _WHOLE.fullmatch(folder) else logging.DEBUG
         log.log(level, "deleted %s: %d files, %d bytes; none is left", folder, len(found), sum(found))
+
+
+async def _try_later(database: Database, row_id: int) -> None:
+    later = "UPDATE trash SET not_before = clock_timestamp() + make_interval(secs => %s) WHERE id = %s"
+    await database.fetch(later, RETRY_S, row_id)
+
+
+async def _delete(files: FileStore, folder: str, keep: str | None) -> tuple[list[int], int]:
+    """Sizes of the files that were there, and how many there still are."""
+    found = await _sizes(files, folder, keep)
+    await files.delete_prefix(folder, keep=keep)
+    return found, len(await _sizes(files, folder, keep))
 
 
 async def _sizes(files: FileStore, folder: str, keep: str | None) -> list[int]:
