@@ -148,10 +148,13 @@ class Courier:
         """The same for the files that show how far the job is."""
         prefix = self._new_prefix("previews")
         found = files_inside(self._output, progress.preview)
-        artifacts = [
-            await store_artifact(self._files, prefix, name, path) for name, path in sorted(found.items())
-        ]
-        if artifacts:  # the job may have ended meanwhile, and have cleaned up
+        try:
+            artifacts = [
+                await store_artifact(self._files, prefix, name, path) for name, path in sorted(found.items())
+            ]
+        except FileNotFoundError:
+            return  # the job has ended meanwhile, and has cleaned up
+        if artifacts:
             await self._point(prefix, self._ledger.preview(prefix, artifacts, progress))
 
     async def _store_reusable(self, stage: ReusableStage, progress: Progress) -> None:

@@ -120,6 +120,23 @@ async def test_of_a_cancelled_job_the_last_checkpoint_is_not_stored_but_its_prev
     assert [kind for kind, _, _ in run.notes.pointers] == ["preview"]
 
 
+async def test_a_preview_that_the_job_takes_away_at_its_end_is_no_error(
+    run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    run.wrote("a.png", "b.png")
+    store = couriers.store_artifact
+
+    async def while_the_job_cleans_up(files: FileStore, prefix: str, name: str, path: Path) -> Any:
+        stored = await store(files, prefix, name, path)
+        (run.output / "b.png").unlink()
+        return stored
+
+    monkeypatch.setattr(couriers, "store_artifact", while_the_job_cleans_up)
+    run.courier.offer(Progress(stage="fine", fraction=1.0, preview=("a.png", "b.png")))
+    await run.end()
+    assert (run.notes.pointers, caplog.records) == ([], [])
+
+
 async def test_files_outside_of_the_output_and_links_are_not_stored(run: Run, tmp_path: Path):
     (tmp_path / "secret").write_text("s")
     (run.output / "link").symlink_to(tmp_path / "secret")
