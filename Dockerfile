@@ -38,13 +38,12 @@ ENV PIP_CONSTRAINT=/requirements/constraints.txt \
     PIP_BUILD_CONSTRAINT=/requirements/constraints.txt \
     PIP_DISABLE_PIP_VERSION_CHECK=1 \
     PIP_NO_CACHE_DIR=1 \
-    PIP_NO_COMPILE=1 \
     PIP_ROOT_USER_ACTION=ignore
-# Without pip: what installs packages stays in this stage.
+# Without pip: what installs packages stays in this stage. Bytecode comes below (PIP_NO_COMPILE=1 would have pip write it).
 RUN python -m venv --without-pip /opt/venv
 COPY --from=requirements /requirements /requirements
-RUN pip --python /opt/venv install --no-deps --index-url "${TORCH_INDEX}" torch \
-    && pip --python /opt/venv install -r /requirements/libraries.txt
+RUN pip --python /opt/venv install --no-compile --no-deps --index-url "${TORCH_INDEX}" torch \
+    && pip --python /opt/venv install --no-compile -r /requirements/libraries.txt
 # Of the libraries, what no process uses: a quarter. `strip` stays in this stage.
 COPY deploy/slim.py /
 RUN apt-get update && apt-get install -y --no-install-recommends binutils && python /slim.py /opt/venv
@@ -56,7 +55,7 @@ COPY workers workers
 COPY service service
 COPY --from=page /build/biresnerf/viewer biresnerf/viewer
 COPY --from=page /build/service/web service/web
-RUN pip --python /opt/venv install --no-deps .
+RUN pip --python /opt/venv install --no-compile --no-deps .
 # Numba and Python know a file by its size and time. An image keeps whole seconds, so the times are made whole first.
 # Then each process is loaded once, which leaves the bytecode of what it uses: half of what is installed is never used.
 RUN find /opt/venv/lib -name '*.py' -exec touch -d @1700000000 {} + \
