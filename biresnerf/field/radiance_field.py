@@ -141,6 +141,10 @@ class RadianceField(ABC):
     def discard_gradients(self) -> None:
         """Discard the gradients of the last backward."""
 
+    def release_memory(self) -> None:
+        """Free what a step takes besides the field itself; the next step takes it again, as large as it needs."""
+        self.discard_gradients()
+
     @abstractmethod
     def state(self) -> dict[str, Tensor]:
         """Everything that `load_state` needs to continue exactly, as flat named tensors."""

@@ -47,7 +47,7 @@ class CudaField(GridField):
     ) -> None:
         _refuse_the_wrong_mode(device)
         super().__init__(shape, seed, device)
-        self._samples = samples
+        self._samples = self._samples_least = samples
         self._workspace: Workspace | None = None
         self._sample_count = SampleCount(device)
         self._forward_number = 0  # of the forward pass whose samples the buffers hold
@@ -171,6 +171,11 @@ class CudaField(GridField):
     def discard_gradients(self) -> None:
         self._pending = None
         super().discard_gradients()
+
+    def release_memory(self) -> None:
+        super().release_memory()
+        self._samples = self._samples_least
+        self._drop_workspace()
 
     def _most_of_a_ray(self, marching: Marching) -> int:
         """The most samples that a ray can have."""

@@ -88,6 +88,7 @@ class JointOptimiser:
         # The step at which stage 2 began. A method of one stage is in its last from the first step.
         self.switch: int | None = None if self.method.two_stages else 0
         self.poses_held = False  # whether poses and lenses stay as they are
+        self.batch_share = 1.0  # of the samples asked for; less where they do not fit in memory
         self.mobility = (
             torch.ones(2, len(self.poses), device=device)
             if mobility is None or not self.method.robust_extensions
@@ -197,7 +198,7 @@ class JointOptimiser:
             if lens_rate > 0:
                 self.poses.dolly(self.lenses.step(lens_rate, focal=schedule.focal_moves(self.switch)))
         self.step_index += 1
-        self._adapt_rays(rendering.samples, schedule.samples(t, self.switch))
+        self._adapt_rays(rendering.samples, int(self.batch_share * schedule.samples(t, self.switch)))
         shown = colour.detach().clamp(max=1)
         self.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach(), batch.weight)
         error = ((shown - batch.sharp) ** 2 * batch.weight[:, None])[: batch.trained].mean()
@@ -279,6 +280,7 @@ class JointOptimiser:
             switch=self.switch,
             rays=self.rays,
             poses_held=self.poses_held,
+            batch_share=self.batch_share,
             planned_steps=self.options.steps,
             steps=self.schedule.steps,
         )
@@ -288,7 +290,7 @@ class JointOptimiser:
         self.generator.set_state(tensors["generator"])
         load_state_of(self._parts(), tensors)
         self.step_index, self.switch, self.rays = numbers.step_index, numbers.switch, numbers.rays
-        self.poses_held = numbers.poses_held
+        self.poses_held, self.batch_share = numbers.poses_held, numbers.batch_share
         if numbers.planned_steps != self.options.steps:
             self._plan(numbers.planned_steps)
         self._end_at(numbers.steps)

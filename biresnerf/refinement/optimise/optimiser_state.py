@@ -16,6 +16,7 @@ class StepState(FrozenModel):
         switch: the step that stage 2 began at, None before.
         rays: of the next step.
         poses_held: whether poses stand still.
+        batch_share: of the samples asked for, how many fit in the device's memory.
         planned_steps: that the lengths of the run follow from: fewer than asked for where time is short.
         steps: where the run ends.
     """
@@ -24,6 +25,7 @@ class StepState(FrozenModel):
     switch: int | None
     rays: int
     poses_held: bool
+    batch_share: float = 1.0
     planned_steps: int
     steps: int
 

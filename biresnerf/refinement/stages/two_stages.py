@@ -21,6 +21,7 @@ from biresnerf.progress import Monitor, Progress
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.lost.own_matches import OwnMatches
 from biresnerf.refinement.optimise.async_metrics import StepResult
+from biresnerf.refinement.optimise.device_memory import step_that_fits
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.checkpoint import (
@@ -158,7 +159,7 @@ class TwoStages:
             self.monitor.report(self._progress(CHECKPOINT.as_posix()))
             raise Interrupted(f"stopped at step {optimiser.step_index}; run again to go on")
         started, stage = time.monotonic(), self.stage
-        result = optimiser.step()
+        result = step_that_fits(optimiser)
         # Without the check: the time of a repair within it says nothing about the steps to come.
         self.forecast.stepped(stage, time.monotonic() - started)
         if not math.isfinite(result.loss):

@@ -15,6 +15,7 @@ from biresnerf.refinement.finish.given_poses import accuracy_report, accuracy_wa
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.finish.time_budget import budget_warnings
 from biresnerf.refinement.lost.own_matches import LEAST_PAIRS
+from biresnerf.refinement.optimise.device_memory import smaller_batches
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.two_stages import TwoStages
@@ -78,6 +79,7 @@ def run_report(
         + accuracy_warnings(finish.given, optimiser.options)
         + unmatched_warnings(scene)
         + gpu_warnings(optimiser.device)
+        + smaller_batches(optimiser)
         + budget_warnings(stages)
         + _unknown_warnings(dataset, uncertainty),
     )

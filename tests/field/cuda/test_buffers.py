@@ -74,3 +74,16 @@ def test_results_do_not_depend_on_what_buffers_held_and_nothing_else_is_written(
     for one, other in zip(found, expected, strict=True):
         assert torch.isfinite(one).all()
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-7)
+
+
+def test_a_field_whose_buffers_were_freed_takes_smaller_ones_for_fewer_rays_and_renders_the_same():
+    field, marching, gradient = make_fast(samples=64), make_marching(), PositionGradient(1.0, 1.0, 1.0)
+    field.render(make_rays(60), marching, gradient)
+    large = field._workspace.capacity.samples
+    expected = field.render(make_rays(6), marching, gradient).colour.detach()
+    assert field._workspace.capacity.samples == large
+    field.release_memory()
+    assert field._workspace is None
+    found = field.render(make_rays(6), marching, gradient).colour.detach()
+    assert field._workspace.capacity.samples < large
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-7)

@@ -1,0 +1,48 @@
+"""Steps on a GPU whose memory may be too small for the batch that the options ask for."""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser, StepResult
+
+logger = logging.getLogger(__name__)
+
+LEAST_SHARE = (
+    1 / 16
+)  # of the samples that the options ask for; if even these do not fit, batches are not the cause
+
+
+def step_that_fits(optimiser: JointOptimiser) -> StepResult:
+    """A step of the joint optimisation. From where a GPU's memory is too small on, steps have half of the samples.
+
+    What a failed step has gathered of exposures' and poses' gradients adds to the next one's: it is a sample of the
+    same gradient.
+
+    Raises:
+        torch.OutOfMemoryError: not even a sixteenth of the samples fit.
+    """
+    while True:
+        try:
+            return optimiser.step()
+        except torch.OutOfMemoryError:
+            if optimiser.batch_share <= LEAST_SHARE:
+                raise
+        # After the handler, as the error's traceback holds the step's tensors.
+        optimiser.batch_share /= 2
+        optimiser.rays = max(optimiser.method.rays_least, optimiser.rays // 2)
+        optimiser.field.release_memory()
+        torch.cuda.empty_cache()
+        logger.warning("%s", smaller_batches(optimiser)[0])
+
+
+def smaller_batches(optimiser: JointOptimiser) -> tuple[str, ...]:
+    """A warning where the batch did not fit."""
+    if optimiser.batch_share == 1:
+        return ()
+    return (
+        f"The GPU's memory is too small for samples_per_step={optimiser.options.samples_per_step}: steps had "
+        f"{optimiser.batch_share:.2g} of these samples. Poses may be less exact.",
+    )
