@@ -45,7 +45,7 @@ class ShownProgress:
             if news:
                 self._bar.write(progress.message, sys.stderr)
         elif news or progress.stage != self._stage or self._count % LINE_EVERY == 0:
-            print(f"{progress.stage:<10} {100 * progress.fraction:3.0f} % {detail}", file=sys.stderr)
+            sys.stderr.write(f"{progress.stage:<10} {100 * progress.fraction:3.0f} % {detail}\n")
         self._stage, self._message = progress.stage, progress.message
 
 

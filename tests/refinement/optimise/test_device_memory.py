@@ -12,7 +12,6 @@ from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.verdict.run_report import run_report
 from tests.refinement.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
-
 OPTIONS = tiny_options(samples_per_step=1 << 16)
 
 
