@@ -1,5 +1,5 @@
 // The photo and the mask over it, to paint on by pointer and by keyboard.
-import { useEffect, useRef, useState } from "preact/hooks";
+import { useEffect, useLayoutEffect, useRef, useState } from "preact/hooks";
 import type { Mask, Place } from "./mask";
 
 export type Tool = "paint" | "erase" | "fill";
@@ -32,7 +32,7 @@ export function Stage({ photo, mask, tool, radius, onBegin, use, onEnd }: Props)
   const { width, height } = photo;
   const [brush, setBrush] = useState<Place>({ x: width / 2, y: height / 2 });
   useEffect(() => below.current!.getContext("2d")!.putImageData(photo, 0, 0), [photo]);
-  useEffect(() => mask.draw(above.current!));
+  useLayoutEffect(() => mask.draw(above.current!)); // before the browser shows other changes of the same click
   const inside = ({ x, y }: Place): Place => ({ x: Math.max(0, Math.min(width - 0.5, x)), y: Math.max(0, Math.min(height - 0.5, y)) });
   const placeOf = (event: PointerEvent): Place => {
     const box = above.current!.getBoundingClientRect();
